@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from drakegrasp.dataset.checks.findings import Violation
     from drakegrasp.dataset.checks.run import check_dataset
     from drakegrasp.dataset.reader import GraspDataset, Sample
+    from drakegrasp.dataset.scenes.reader import SceneDataset
     from drakegrasp.dataset.trials import Trials
     from drakegrasp.errors import DrakegraspError
     from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
@@ -51,6 +52,7 @@ _HOMES = {
     "Posture": "simulation.postures.posture",
     "Replay": "build.replay",
     "Sample": "dataset.reader",
+    "SceneDataset": "dataset.scenes.reader",
     "Score": "scoring.run",
     "Trials": "dataset.trials",
     "Verification": "verification.result",
@@ -85,6 +87,7 @@ __all__ = [
     "Posture",
     "Replay",
     "Sample",
+    "SceneDataset",
     "Score",
     "Trials",
     "Verification",

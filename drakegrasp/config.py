@@ -365,6 +365,33 @@ class RandomizeConfig(_Section):
     mass: Range | None = None  # factor of the object's mass and inertia
 
 
+class ScenesConfig(_Section):
+    """The scenes of scenes.hdf5 and their cameras; see docs/how-to/train-on-scenes.md."""
+
+    # "assembled" makes the file whenever a dataset is assembled, "asked" for `drakegrasp scenes`.
+    when: Literal["asked", "assembled"] = "asked"
+    place: NonNegative = 0.1  # [m] at most, of the object from T along each axis of the table
+    views: Annotated[int, Field(ge=1, le=1000)] = 16  # of a scene to train on
+    distance: Range = (0.4, 0.9)  # [m] of the camera from the point that it looks at
+    elevation_deg: Annotated[
+        tuple[Annotated[float, Field(ge=0.0, le=90.0)], Annotated[float, Field(ge=0.0, le=90.0)]],
+        AfterValidator(_rising),
+    ] = (20.0, 85.0)  # of the camera above that point
+    aim: NonNegative = 0.05  # [m] at most, of that point from the object along each axis
+    roll_deg: Annotated[float, Field(ge=0.0, le=180.0)] = 15.0  # at most, about the line of sight
+    width: Annotated[int, Field(ge=8, le=2048)] = 320  # [px]
+    height: Annotated[int, Field(ge=8, le=2048)] = 240  # [px]
+    fov_y_deg: Annotated[float, Field(gt=0.0, lt=180.0)] = 42.5  # of a RealSense D435 (colour)
+    near: Positive = 0.05  # [m]
+    far: Annotated[float, Field(gt=0.0, le=6.5)] = 3.0  # [m]; 16 bits hold 6.5 m in 0.1 mm
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ScenesConfig:
+        if self.near >= self.far:
+            raise ValueError(f"near must be less than far, got {self.near} and {self.far}")
+        return self
+
+
 class FilterConfig(_ExtensibleSection):
     """Which successes become samples, decided when the files are assembled.
 
@@ -453,7 +480,7 @@ UNIT_CANDIDATES, LARGEST_UNIT = 50, 400
 #: Keys that change no shard: they act on assembled shards, or only say where to stop.
 POSTPROCESSING_KEYS = (
     *("filters", "split", "max_grasps", "samples", "samples_per_object"),
-    *("samples_patience", "attempt_seconds", "verify"),
+    *("samples_patience", "attempt_seconds", "verify", "scenes"),
 )
 
 
@@ -500,6 +527,7 @@ class Config(_Section):
     certify: CertifyConfig = CertifyConfig()
     camera: CameraConfig = CameraConfig()
     randomize: RandomizeConfig = RandomizeConfig()
+    scenes: ScenesConfig = ScenesConfig()
     max_grasps: Count | None = None  # successes per object after which no more are tried
     # Samples, before the filter of outliers, after which no more is tried: of all objects, which
     # share them in turns, and of each; an object may have fewer.
@@ -553,13 +581,16 @@ class Config(_Section):
     def to_dict(self) -> dict[str, Any]:
         """Return the resolved values as plain JSON types.
 
-        `filters.own` and `candidates.postures` leave no trace where there are none.
+        `filters.own` and `candidates.postures` leave no trace where there are none, nor do `scenes`
+        that are the defaults.
         """
         tree = self.model_dump(mode="json")
         if not self.filters.own:
             del tree["filters"]["own"]
         if self.candidates.postures is None:
             del tree["candidates"]["postures"]
+        if self.scenes == ScenesConfig():
+            del tree["scenes"]
         return tree
 
     @property
@@ -604,7 +635,7 @@ class Config(_Section):
         """
         values = {**self.to_dict(), "hand": PurePath(self.hand).stem}
         for key in POSTPROCESSING_KEYS:
-            del values[key]
+            values.pop(key, None)
         del values["candidates"]["max"]  # a dataset may grow
         if not self.certify.repeats:
             del values["certify"]  # without repeats the noise is not used

@@ -111,6 +111,30 @@ def assemble(
 
 
 @click.command()
+@dataset_argument()
+@shared("--set", "--workers", "--quiet")
+def scenes(out: Path, overrides: tuple[str, ...], workers: int | None, quiet: bool) -> None:
+    """Render scenes whose cameras know no grasp, to train on.
+
+    The command writes OUT/scenes.hdf5: each object of OUT in each resting pose, seen by sixteen
+    cameras (five fixed ones to test), with all hands that closed on it. --set changes keys of
+    `scenes`, e.g. scenes.views=8.
+    """
+    from drakegrasp.build.scenes.make import make_scenes
+    from drakegrasp.runtime.executor import processes
+    from drakegrasp.runtime.progress import progress_bar
+
+    with (
+        processes(workers) as execute,
+        progress_bar("scenes", "objects", show=not quiet) as progress,
+    ):
+        made = make_scenes(out, overrides=overrides, execute=execute, progress=progress)
+    for split, count in made.scenes.items():
+        say(f"{split}: {count:,} scenes, {made.views[split]:,} views")
+    say(f"{made.grasps:,} grasps in {made.path}")
+
+
+@click.command()
 @click.argument("into", type=PATH, metavar="INTO")
 @click.argument("outs", type=PATH, metavar="OUTS...", nargs=-1, required=True)
 @shared("--workers")

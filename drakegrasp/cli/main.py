@@ -19,7 +19,7 @@ import click
 from drakegrasp import __version__
 from drakegrasp.cli.audit import audit
 from drakegrasp.cli.bench import bench
-from drakegrasp.cli.build import assemble, build, merge, stats
+from drakegrasp.cli.build import assemble, build, merge, scenes, stats
 from drakegrasp.cli.errors import Commands, say, say_finding, say_json
 from drakegrasp.cli.export import export
 from drakegrasp.cli.hand import hand
@@ -152,8 +152,8 @@ objects.add_command(morph)
 
 # The help lists them in this order.
 for _command in (
-    *(doctor, objects, audit, hand, build, assemble, merge, check, stats, inspect_, figures),
-    *(replay, verify, score, bench_set, export, bench),
+    *(doctor, objects, audit, hand, build, assemble, merge, scenes, check, stats, inspect_),
+    *(figures, replay, verify, score, bench_set, export, bench),
 ):
     main.add_command(_command)
 

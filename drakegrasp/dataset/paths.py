@@ -13,9 +13,10 @@ from drakegrasp.foreign_files import read_content
 from drakegrasp.runtime.files import refuse_broken_seal
 from drakegrasp.runtime.names import NAME_RULE, is_name
 
-#: The file of all attempts, the two files of samples by camera, and the manifest.
+#: The file of all attempts, the two of samples by camera, that of scenes, and the manifest.
 TRIALS_FILE = "trials.hdf5"
 DATA_FILES = {camera: f"grasping_{camera}.hdf5" for camera in CAMERAS}
+SCENES_FILE = "scenes.hdf5"
 FILE_NAME = "manifest.json"
 #: What assembling writes: these files are of one state.
 ASSEMBLED_FILES = (TRIALS_FILE, *DATA_FILES.values())

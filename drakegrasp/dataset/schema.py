@@ -100,7 +100,8 @@ class Field:
             `/grasps`.
         shape: Axes of one row, separated by blanks; empty for a scalar. An axis is an integer
             or a letter: `k` fingers, `j` joints of the hand, `6k` length of a grasp (18 for three
-            fingers), `S` size of an image [px].
+            fingers), `S` size of an image [px]; in scenes.hdf5 `h` rows and `w` columns of an image
+            [px], `o` objects of a scene.
         dtype: NumPy's name, or "str" for UTF-8 text.
         unit: SI unit, or "-".
         frame: Letter of the frame in which it is expressed, or "-".
@@ -649,6 +650,106 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
           of="forces.contacts.distance"),
     Field("selected_angle", "k", "float64", "rad", "-",
           "method forces: angle of the predicted normals from them", of="forces.contacts.angle"),
+)
+
+#: What a view is of in `/views` of scenes.hdf5.
+VIEW_KINDS = ("drawn", "ring", "single")
+#: Points on the surface of an object in `/objects` of scenes.hdf5.
+SURFACE_POINTS = 4096
+#: What one value in a depth image of scenes.hdf5 is [m].
+DEPTH_UNIT = 1e-4
+
+#: A row per object and resting pose, in `/scenes` of scenes.hdf5. A scene is a list of `o` objects
+#: on the table; there is one today.
+SCENE_FIELDS: tuple[Field, ...] = (
+    Field("split", "", "uint8", "-", "-",
+          f"{', '.join(f'{i} {name}' for i, name in enumerate(SPLITS))}: by object, whatever "
+          "`split.by` is"),
+    Field("object", "o", "int32", "-", "-", "rows of /objects"),
+    Field("resting", "o", "uint8", "-", "-", "indices of the objects' resting poses"),
+    Field("probability", "o", "float64", "-", "-", "shares of the drops that ended in them"),
+    Field("X_TO", "o 12", "float64", "m, -", "T",
+          "poses of the objects: resting poses, turned about Tz and moved on the table"),
+    Field("mass", "o", "float64", "kg", "-", "masses; what was drawn for an attempt may differ"),
+    Field("friction_hand", "o", "float64", "-", "-",
+          "effective coefficients of friction between hand and objects, likewise"),
+    Field("friction_table", "o", "float64", "-", "-",
+          "effective coefficients of friction between table and objects, likewise"),
+)
+
+#: A row per camera and scene, in `/views` of scenes.hdf5.
+VIEW_FIELDS: tuple[Field, ...] = (
+    Field("scene", "", "int32", "-", "-", "row of /scenes"),
+    Field("kind", "", "uint8", "-", "-",
+          f"the camera: {', '.join(f'{i} {name}' for i, name in enumerate(VIEW_KINDS))}"),
+    Field("rgb", "h w 3", "uint8", "-", "C", "colours", sample=True),
+    Field("depth", "h w", "uint16", "0.1 mm", "C",
+          "clean depth; 0 where there is nothing between `near` and `far`", sample=True),
+    Field("mask", "h w", "uint8", "-", "C",
+          "1 + index in the scene of the object that is seen, 0 everywhere else", sample=True),
+    Field("K", "9", "float64", "px", "-", "camera matrix, 3x3 row-major"),
+    Field("X_TC", "12", "float64", "m, -", "T", "pose of the camera"),
+    *(replace(field, optional=False) for field in CONDITION_FIELDS
+      if field.name in ("object_colour", "table_colour", "light_direction", "light_strength",
+                        "depth_noise", "depth_seed")),
+)
+
+#: A row per closed hand, in `/grasps` of scenes.hdf5: those of a scene stand together.
+SCENE_GRASP_FIELDS: tuple[Field, ...] = (
+    Field("scene", "", "int32", "-", "-", "row of /scenes"),
+    Field("object", "", "uint8", "-", "-", "index in the scene of the object that is grasped"),
+    Field("trial_id", "", "int64", "-", "-", "row of trials.hdf5"),
+    Field("outcome", "", "uint8", "-", "-", "verdict, see /trials"),
+    Field("tested", "", "bool", "-", "-",
+          "whether the hand was lifted to a verdict; else whether it would hold is unknown"),
+    Field("held", "", "bool", "-", "-", "whether it holds"),
+    *_WORDS,
+    Field("sample", "", "bool", "-", "-", "whether it is a sample of the dataset"),
+    Field("audited", "", "bool", "-", "-",
+          "whether it was to be lifted in any case: such hands are a fair share of those that may "
+          "lift", of="audited"),
+    Field("source", "", "uint8", "-", "-", "sampler of the palm pose, see /trials", of="source"),
+    Field("family", "", "int32", "-", "-",
+          "number of the first-round attempt that it was refined from or is, within the scene"),
+    Field("weight", "", "float32", "-", "-", "weight of a sample, see /train; 0 of others"),
+    *_PRESHAPE,
+    Field("X_TG", "12", "float32", "m, -", "T", "pose of the palm at the start and while closing"),
+    Field("X_TG_held", "12", "float32", "m, -", "T",
+          "pose of the palm after the lift, relative to the resting object; NaN if not lifted"),
+    replace(_JOINTS, name="q_open", dtype="float32", of="",
+            meaning="positions of the hand's joints where it starts to close, fully open"),
+    replace(_JOINTS, dtype="float32", of="closed_q",
+            meaning="positions of the hand's joints after closing"),
+    replace(_JOINTS, name="q_held", dtype="float32", of="lifted_q",
+            meaning="positions of the hand's joints after the lift; NaN if not lifted"),
+    *(field for suffix, when in (("", "after closing"), ("_held", "after the lift, on the resting "
+                                                         "object; NaN if not lifted"))
+      for field in (
+        Field(f"p_TQ{suffix}", "k 3", "float32", "m", "T", f"contact points {when}",
+              per_finger=True),
+        Field(f"nhat_Q_T{suffix}", "k 3", "float32", "-", "T",
+              f"unit normals out of the object {when}", per_finger=True),
+        Field(f"f_Q_T{suffix}", "k 3", "float32", "N", "T",
+              f"forces of the fingertips on the object {when}"),
+    )),
+)
+
+#: A row per view and grasp of its scene, in `/visible` of scenes.hdf5, view by view.
+VISIBLE_FIELDS: tuple[Field, ...] = (
+    Field("view", "", "int32", "-", "-", "row of /views"),
+    Field("grasp", "", "int32", "-", "-", "row of /grasps"),
+    Field("visible", "k", "bool", "-", "-",
+          "whether the camera sees the contact after closing: neither object nor table is before "
+          "it, and it is in the image"),
+)
+
+#: A row per object, in `/objects` of scenes.hdf5.
+SCENE_OBJECT_FIELDS: tuple[Field, ...] = (
+    *(field for field in OBJECT_FIELDS if field.name in ("name", "class_name", "mesh_sha256")),
+    Field("p_OS", f"{SURFACE_POINTS} 3", "float32", "m", "O",
+          "points spread evenly over the surface", sample=True),
+    Field("nhat_S_O", f"{SURFACE_POINTS} 3", "float32", "-", "O",
+          "unit normals out of the object at these points", sample=True),
 )
 
 #: A row per predicted grasp, in `/rows` of the results for rows of a dataset.

@@ -14,11 +14,42 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
-from drakegrasp.config import CameraConfig
+from drakegrasp.config import CameraConfig, ScenesConfig
 from drakegrasp.frames import invert_pose, make_pose, transform_points
 
 #: Sine of the angle between view and vertical below which +Ty is up in the image (0.06 degrees).
 LOOKS_VERTICALLY = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lens:
+    """What a camera sees from its pose.
+
+    Attributes:
+        width, height: Of its images [px].
+        K: Camera matrix (3, 3) [px].
+        near, far: Range of its depths [m].
+    """
+
+    width: int
+    height: int
+    K: Array
+    near: float
+    far: float
+
+    @classmethod
+    def of(cls, config: CameraConfig | ScenesConfig) -> Lens:
+        """Return the lens of a configuration: square pixels, centre in the image's middle.
+
+        With the vertical field of view φ and H rows, f = H / (2 tan(φ/2)).
+        """
+        square = isinstance(config, CameraConfig)
+        width, height = (config.size,) * 2 if square else (config.width, config.height)
+        sine, cosine = sin_cos_deg(config.fov_y_deg / 2.0)
+        focal = float(height * cosine / (2.0 * sine))
+        K = [[focal, 0.0, (width - 1) / 2.0], [0.0, focal, (height - 1) / 2.0], [0.0, 0.0, 1.0]]
+        near, far = config.near, config.far
+        return cls(width=width, height=height, K=np.array(K), near=near, far=far)
 
 
 def intrinsics(config: CameraConfig) -> Array:
@@ -28,10 +59,7 @@ def intrinsics(config: CameraConfig) -> Array:
 
         f = S / (2 tan(φ/2)),   c = (S − 1) / 2,   K = [[f, 0, c], [0, f, c], [0, 0, 1]]
     """
-    sine, cosine = sin_cos_deg(config.fov_y_deg / 2.0)
-    focal = float(config.size * cosine / (2.0 * sine))
-    centre = (config.size - 1) / 2.0
-    return np.array([[focal, 0.0, centre], [0.0, focal, centre], [0.0, 0.0, 1.0]])
+    return Lens.of(config).K
 
 
 def camera_pose_oto(

@@ -17,17 +17,27 @@ In: the clean depth image. Out: the image with errors, or clean depths from it a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array
-from drakegrasp.config import CameraConfig
 from drakegrasp.seeding import Stream
 
 #: A pixel is in the shadow if one that is nearer covers it by more than this [px]: far above
 #: rounding.
 COVERED = 1e-3
+
+
+class DepthRange(Protocol):
+    """Near and far plane of a depth image [m]: of a configuration, a lens or a file."""
+
+    @property
+    def near(self) -> float: ...  # noqa: D102
+
+    @property
+    def far(self) -> float: ...  # noqa: D102
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +56,11 @@ class DepthSensor:
 
 
 def spoil_depth(
-    depth: npt.NDArray[np.float32], K: Array, sensor: DepthSensor, camera: int, config: CameraConfig
+    depth: npt.NDArray[np.float32],
+    K: Array,
+    sensor: DepthSensor,
+    camera: int,
+    config: DepthRange,
 ) -> npt.NDArray[np.float32]:
     """Return a depth image (S, S) [m] with the errors of a sensor.
 
@@ -70,7 +84,7 @@ def spoil_depth(
 
 
 def clean_depth(
-    depth: npt.NDArray[np.float32], sensor: DepthSensor, camera: int, config: CameraConfig
+    depth: npt.NDArray[np.float32], sensor: DepthSensor, camera: int, config: DepthRange
 ) -> npt.NDArray[np.float32]:
     """Return a depth image (S, S) [m] without the noise of a sensor; what is lost stays lost.
 
@@ -100,7 +114,7 @@ def shadow(depth: npt.NDArray[np.float32], K: Array, baseline: float) -> npt.NDA
     return covered
 
 
-def _measured(depth: npt.NDArray[np.float32], config: CameraConfig) -> npt.NDArray[np.bool_]:
+def _measured(depth: npt.NDArray[np.float32], config: DepthRange) -> npt.NDArray[np.bool_]:
     """Return where (S, S) there is a depth; pixels at a clipping plane hold none."""
     return (depth > np.float32(config.near)) & (depth < np.float32(config.far))
 

@@ -46,7 +46,7 @@ from drakegrasp.hand.parsing import make_parser
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour
 from drakegrasp.vision.appearance import Appearance, usual_appearance
-from drakegrasp.vision.camera import intrinsics
+from drakegrasp.vision.camera import Lens
 
 #: Colour of pixels beyond the table.
 BACKGROUND = np.array([0.86, 0.90, 0.94])
@@ -71,6 +71,21 @@ class RenderedView:
     """
 
     image: npt.NDArray[np.float32]
+    mask: npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Capture:
+    """The images of one camera as the engine gives them.
+
+    Attributes:
+        rgb: (H, W, 3) uint8.
+        depth: (H, W) float32 [m]; 0 where something is too near, inf where nothing is near enough.
+        mask: (H, W) uint8, 1 where the object is seen.
+    """
+
+    rgb: npt.NDArray[np.uint8]
+    depth: npt.NDArray[np.float32]
     mask: npt.NDArray[np.uint8]
 
 
@@ -197,22 +212,34 @@ def render(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> Rend
     Raises:
         BlankImageError: If the image is blank, which means that OpenGL failed.
     """
+    config = renderer.config
+    seen = capture(renderer, Lens.of(config), X_TO, X_TC)
+
+    # Pack them as files hold them.
+    image = np.empty_like(seen.rgb, shape=(4, config.size, config.size), dtype=np.float32)
+    image[:3] = np.moveaxis(seen.rgb, 2, 0) / np.float32(255.0)
+    # Drake gives 0 for too near and infinity for too far.
+    image[3] = np.clip(seen.depth, config.near, config.far)
+    return RenderedView(image=image, mask=seen.mask)
+
+
+def capture(renderer: Renderer, lens: Lens, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> Capture:
+    """Return what a camera with a lens of its own sees; arguments and errors as for `render`."""
     # Place the object.
-    plant, config = renderer.plant, renderer.config
+    plant = renderer.plant
     plant_context = plant.GetMyMutableContextFromRoot(renderer.context)
     plant.SetFreeBodyPose(plant_context, renderer.object, RigidTransform(multiply(X_WT, X_TO)))
 
     # The camera; it is given by its pose in the world.
-    X_WC = RigidTransform(multiply(X_WT, X_TC))
-    K = intrinsics(config)
+    X_WC, K = RigidTransform(multiply(X_WT, X_TC)), lens.K
     core = RenderCameraCore(
         ENGINE,
         # The engine measures the principal point from the corner of pixel (0, 0), not its centre.
-        CameraInfo(config.size, config.size, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5),
-        ClippingRange(config.near, config.far),
+        CameraInfo(lens.width, lens.height, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5),
+        ClippingRange(lens.near, lens.far),
         RigidTransform(),
     )
-    depth_camera = DepthRenderCamera(core, DepthRange(config.near, config.far))
+    depth_camera = DepthRenderCamera(core, DepthRange(lens.near, lens.far))
     colour_camera = ColorRenderCamera(core, False)
 
     # Render depth, labels and colour.
@@ -223,10 +250,5 @@ def render(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> Rend
     rgb = query.RenderColorImage(colour_camera, world, X_WC).data[:, :, :3]
     if not rgb.any() or not depth.any():
         raise BlankImageError(BLANK)
-
-    # Pack them as files hold them.
-    image = np.empty_like(rgb, shape=(4, config.size, config.size), dtype=np.float32)
-    image[:3] = np.moveaxis(rgb, 2, 0) / np.float32(255.0)
-    # Drake gives 0 for too near and infinity for too far.
-    image[3] = np.clip(depth, config.near, config.far)
-    return RenderedView(image=image, mask=(labels == int(renderer.object.index())).astype(np.uint8))
+    mask = (labels == int(renderer.object.index())).astype(np.uint8)
+    return Capture(rgb=rgb, depth=depth, mask=mask)

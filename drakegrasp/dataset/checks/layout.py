@@ -16,12 +16,14 @@ from drakegrasp.config import Config, parse_stored
 from drakegrasp.dataset.assembly.decisions import lens_attributes
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
 from drakegrasp.dataset.checks.rows import CheckedFile, identity
-from drakegrasp.dataset.layout.attributes import OF_CAMERA, ORIGIN, attribute_mistakes
-from drakegrasp.dataset.layout.structure import DATA_TABLES, TRIAL_TABLES, differences
-from drakegrasp.dataset.schema import CONVENTIONS, OTHER_SCHEMA, SCHEMA_VERSION
+from drakegrasp.dataset.layout.attributes import OF_CAMERA, OF_SCENES, ORIGIN, attribute_mistakes
+from drakegrasp.dataset.layout.structure import DATA_TABLES, SCENE_TABLES, TRIAL_TABLES, differences
+from drakegrasp.dataset.schema import CAMERAS, CONVENTIONS, OTHER_SCHEMA, SCHEMA_VERSION
 from drakegrasp.errors import first_line
 from drakegrasp.runtime.json_text import parse_json
 
+#: Key of scenes.hdf5 among the files that are checked.
+SCENES = "scenes"
 #: K, near and far are float64 copies of the configuration's values.
 CAMERA_TOLERANCE = 1e-9
 
@@ -35,7 +37,9 @@ def look_at(name: str, file: h5py.File, camera: str, findings: Findings) -> Chec
         camera: `oto` or `otm`; empty for the trials.
         findings: Where violations go.
     """
-    fields = DATA_TABLES if camera else TRIAL_TABLES
+    scenes = camera == SCENES
+    fields = SCENE_TABLES if scenes else DATA_TABLES if camera else TRIAL_TABLES
+    rules = OF_SCENES if scenes else OF_CAMERA if camera else ORIGIN
     config, attributes, counts = None, dict[str, Any](), dict[str, int]()
 
     # Another version has another layout: its version is all that is told.
@@ -45,7 +49,7 @@ def look_at(name: str, file: h5py.File, camera: str, findings: Findings) -> Chec
         findings.add([of_file(name, what, f"{version}; {OTHER_SCHEMA}")])
     else:
         # Its attributes: those that break no rule of their own are compared.
-        mistakes = attribute_mistakes(file, OF_CAMERA if camera else ORIGIN)
+        mistakes = attribute_mistakes(file, rules)
         attributes = {key: value for key, value in file.attrs.items() if key not in mistakes}
         for key, mistake in mistakes.items():
             if key != "config":  # `_read_config` says it
@@ -92,10 +96,13 @@ def _attributes(
         if not str(attributes.get(f"convention_{key}", "")).strip():
             yield of_file(name, f"attribute convention_{key} must be there", "none")
 
-    due: dict[str, Any] = {"camera": camera} if camera else {}
+    due: dict[str, Any] = {"camera": camera} if camera in CAMERAS else {}
     if config is not None:
         due |= {"config_hash": config.simulation_hash(), "seed": config.seed}
-        due |= lens_attributes(config.camera)
+        if camera == SCENES:
+            due |= {"near": config.scenes.near, "far": config.scenes.far}
+        else:
+            due |= lens_attributes(config.camera)
     for key in due.keys() & attributes.keys():
         value, expected = attributes[key], due[key]
         same = value == expected

@@ -19,13 +19,14 @@ from drakegrasp.dataset.checks.assembled import Again, objects_and_successes, or
 from drakegrasp.dataset.checks.attempts import Dataset
 from drakegrasp.dataset.checks.data_file import samples_tasks, splits
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
-from drakegrasp.dataset.checks.layout import look_at
+from drakegrasp.dataset.checks.layout import SCENES, look_at
 from drakegrasp.dataset.checks.object_files import carried_hand_as_built, check_object, object_tasks
 from drakegrasp.dataset.checks.rows import Check, CheckedFile
+from drakegrasp.dataset.checks.scenes import other_state, scene_tasks, tables
 from drakegrasp.dataset.checks.trials_file import successes, trials_tasks
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.manifest import read_manifest, refuse_older
-from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, TRIALS_FILE
+from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, SCENES_FILE, TRIALS_FILE
 from drakegrasp.dataset.schema import CAMERAS, refuse_other_schema
 from drakegrasp.errors import DataError, first_line
 from drakegrasp.runtime.executor import Executor, in_order, run_here
@@ -72,13 +73,21 @@ def _check_file(path: Path, check: Check) -> None:
     # Its attributes say which of the files it is, whatever its name.
     with file:
         camera = str(file.attrs.get("camera", ""))
-        if camera not in CAMERAS and "trials" not in file:
+        if "scenes" in file and "views" in file:
+            refuse_other_schema(path, file.attrs.get("schema_version"))
+            scenes = look_at(path.name, file, SCENES, check.findings)
+        elif camera not in CAMERAS and "trials" not in file:
             raise DataError(
                 f"{path}: must be a data file or the trials of a dataset, got another HDF5 file"
             )
-        refuse_other_schema(path, file.attrs.get("schema_version"))
-        camera = camera if camera in CAMERAS else ""
-        files = {camera: look_at(path.name, file, camera, check.findings)}
+        else:
+            scenes = None
+            refuse_other_schema(path, file.attrs.get("schema_version"))
+            camera = camera if camera in CAMERAS else ""
+            files = {camera: look_at(path.name, file, camera, check.findings)}
+    if scenes is not None:
+        _check_scenes(scenes, check)
+        return
     check.total = _rows(files)
     _check_rows(files, check)
 
@@ -119,8 +128,29 @@ def _check_directory(out: Path, check: Check) -> None:
         with check.readable(trials):
             objects_and_successes(trials, manifest, decided, check.findings)
     _check_rows(files, check, dataset, again, frozenset(current))
+    if (out / SCENES_FILE).exists() and (
+        scenes := _look_at(out, SCENES, SCENES_FILE, check.findings)
+    ):
+        # Grasps of broken trials are not compared.
+        _check_scenes(scenes, check, dataset if "" in current else None)
     if not check.findings:
         _check_card(out, check.findings)  # else it would differ for the same cause
+
+
+def _check_scenes(scenes: CheckedFile, check: Check, dataset: Dataset | None = None) -> None:
+    """Judge scenes.hdf5, with the dataset around it if there is one."""
+    if len(scenes.counts) < len(scenes.fields):
+        return  # a finding already
+    check.total += scenes.counts["scenes"]
+    entries = dataset.manifest.objects if dataset else ()
+    groups = {entry.name: entry.group or entry.mesh_name for entry in entries}
+    before = len(check.findings.violations())
+    if dataset is not None:
+        check.findings.add(other_state(scenes, dataset.out))
+    with check.readable(scenes):
+        check.findings.add(tables(scenes, groups))
+    if len(check.findings.violations()) == before:
+        check.judge(scene_tasks(scenes, dataset), {SCENES: scenes})
 
 
 def _check_rows(
@@ -157,20 +187,25 @@ def _check_rows(
 
 def _look_at_files(out: Path, findings: Findings) -> dict[str, CheckedFile]:
     """Return the files of a dataset that can be read, by camera; the trials under ""."""
-    files = {}
-    for camera, name in (*DATA_FILES.items(), ("", TRIALS_FILE)):
-        try:
-            with open_hdf5(out / name) as file:
-                files[camera] = look_at(name, file, camera, findings)
-        except OSError as error:
-            got = first_line(error) if (out / name).exists() else "none; `drakegrasp assemble`"
-            findings.add([of_file(name, "the file must be there and readable", got)])
-        except DataError as error:
-            # One with values elsewhere; that some files are half replaced concerns them all.
-            refuse_half_replaced(out)
-            got = first_line(error).rpartition(", got ")[2]
-            findings.add([of_file(name, "the file must hold its own values", got)])
-    return files
+    names = (*DATA_FILES.items(), ("", TRIALS_FILE))
+    looked = {camera: _look_at(out, camera, name, findings) for camera, name in names}
+    return {camera: file for camera, file in looked.items() if file is not None}
+
+
+def _look_at(out: Path, camera: str, name: str, findings: Findings) -> CheckedFile | None:
+    """Return a file of a dataset, if it can be read."""
+    try:
+        with open_hdf5(out / name) as file:
+            return look_at(name, file, camera, findings)
+    except OSError as error:
+        got = first_line(error) if (out / name).exists() else "none; `drakegrasp assemble`"
+        findings.add([of_file(name, "the file must be there and readable", got)])
+    except DataError as error:
+        # One with values elsewhere; that some files are half replaced concerns them all.
+        refuse_half_replaced(out)
+        got = first_line(error).rpartition(", got ")[2]
+        findings.add([of_file(name, "the file must hold its own values", got)])
+    return None
 
 
 def _check_card(out: Path, findings: Findings) -> None:

@@ -87,6 +87,8 @@ OF_CAMERA: Mapping[str, Rule] = {
     "camera": (f"one of {', '.join(CAMERAS)}", lambda v: isinstance(v, str) and v in CAMERAS),
     "split_by": ("class or object", lambda v: isinstance(v, str) and v in ("class", "object")),
 }
+#: Of scenes.hdf5, whose views have their own camera matrices.
+OF_SCENES: Mapping[str, Rule] = {key: rule for key, rule in ORIGIN.items() if key != "K"}
 
 
 def attribute_mistakes(file: h5py.File, rules: Mapping[str, Rule]) -> dict[str, Difference]:

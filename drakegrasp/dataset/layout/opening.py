@@ -17,8 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.hdf5 import open_hdf5, says_damage
-from drakegrasp.dataset.layout.attributes import OF_CAMERA, ORIGIN, Rule, attribute_mistakes
-from drakegrasp.dataset.layout.structure import DATA_TABLES, TRIAL_TABLES, differences
+from drakegrasp.dataset.layout.attributes import (
+    OF_CAMERA,
+    OF_SCENES,
+    ORIGIN,
+    Rule,
+    attribute_mistakes,
+)
+from drakegrasp.dataset.layout.structure import DATA_TABLES, SCENE_TABLES, TRIAL_TABLES, differences
 from drakegrasp.dataset.schema import refuse_other_schema
 from drakegrasp.errors import DataError, first_line, printable
 
@@ -46,6 +52,19 @@ def open_trials(path: Path) -> Iterator[h5py.File]:
     with opened(path, "the trials of a dataset") as file:
         refuse_other_attributes(path, file, ORIGIN)
         refuse_first(path, differences(file, TRIAL_TABLES))
+        yield file
+
+
+@contextmanager
+def open_scenes(path: Path) -> Iterator[h5py.File]:
+    """Open scenes.hdf5 while the block runs.
+
+    Raises:
+        DataError: If it is missing, damaged, or differs from the schema.
+    """
+    with opened(path, "the scenes of a dataset") as file:
+        refuse_other_attributes(path, file, OF_SCENES)
+        refuse_first(path, differences(file, SCENE_TABLES))
         yield file
 
 

@@ -15,10 +15,15 @@ import numpy as np
 from drakegrasp.dataset.schema import (
     DATA_FIELDS,
     OBJECT_FIELDS,
+    SCENE_FIELDS,
+    SCENE_GRASP_FIELDS,
+    SCENE_OBJECT_FIELDS,
     SCHEMA_VERSION,
     SPLITS,
     SUCCESS_FIELDS,
     TRIAL_FIELDS,
+    VIEW_FIELDS,
+    VISIBLE_FIELDS,
     Field,
     is_readable,
 )
@@ -30,6 +35,13 @@ TRIAL_TABLES: Tables = {
     "objects": OBJECT_FIELDS,
     "trials": TRIAL_FIELDS,
     "successes": SUCCESS_FIELDS,
+}
+SCENE_TABLES: Tables = {
+    "objects": SCENE_OBJECT_FIELDS,
+    "scenes": SCENE_FIELDS,
+    "views": VIEW_FIELDS,
+    "grasps": SCENE_GRASP_FIELDS,
+    "visible": VISIBLE_FIELDS,
 }
 
 
@@ -149,7 +161,7 @@ def _lengths(
                 if axis == "6k":
                     votes["k"].append(length // 6)
                 elif isinstance(axis, str):
-                    votes[axis].append(length)
+                    votes.setdefault(axis, []).append(length)
     known = {letter: _most_frequent(lengths) for letter, lengths in votes.items()}
     return {letter: length for letter, length in (known | {"6k": 6 * known["k"]}).items() if length}
 

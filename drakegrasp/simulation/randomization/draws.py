@@ -53,13 +53,18 @@ def draw_conditions(
         standoff_index: Index of its stand-off.
         child: Its number in the family of that first-round attempt.
     """
+    place = (candidate, standoff_index, child) if child else (candidate, standoff_index)
+    stream = Stream(config.seed, object_key(model.name), *place, _PLACE)
+    return conditions_from(stream, model, config)
+
+
+def conditions_from(stream: Stream, model: ObjectModel, config: Config) -> Conditions:
+    """Return conditions that a stream gives, see `draw_conditions`."""
     usual, rules = usual_conditions(model, config.physics), config.randomize
     if rules == RandomizeConfig():
         return usual
 
     # One number in [0, 1) per word.
-    place = (candidate, standoff_index, child) if child else (candidate, standoff_index)
-    stream = Stream(config.seed, object_key(model.name), *place, _PLACE)
     numbers = stream.uniform(max(words.stop for words in WORDS.values()))
     drawn = {name: numbers[words] for name, words in WORDS.items()}
 

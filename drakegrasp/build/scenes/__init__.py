@@ -1,0 +1,1 @@
+"""Making scenes.hdf5: what is on the table, the cameras, and all closed hands."""

@@ -1,0 +1,1 @@
+"""Reading scenes.hdf5 to train on it."""

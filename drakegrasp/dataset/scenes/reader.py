@@ -1,0 +1,415 @@
+"""Scenes to train on, as point clouds or images with grasps. Imports h5py and NumPy only.
+
+>>> data = SceneDataset("OUT/scenes.hdf5", points=2048)   # doctest: +SKIP
+>>> item = data[0]                                        # doctest: +SKIP
+>>> item["points"].shape, item["X_AG"].shape              # doctest: +SKIP
+((2048, 3), (8, 4, 4))
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import Array
+from drakegrasp.dataset.hdf5 import AnyArray, read_texts
+from drakegrasp.dataset.layout.opening import open_scenes, opened
+from drakegrasp.dataset.layout.structure import SCENE_TABLES
+from drakegrasp.dataset.layout.trial_files import stamp
+from drakegrasp.dataset.schema import DEPTH_UNIT, SPLITS
+from drakegrasp.errors import DataError
+from drakegrasp.frames import invert_pose, unpack_pose
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.json_text import parse_json
+from drakegrasp.seeding import Stream
+from drakegrasp.vision.depth_sensor import DepthSensor, spoil_depth
+
+Frame = Literal["table", "camera"]
+#: Which grasps that do not hold are drawn: hands that were lifted and lost the object; these, and
+#: hands that closed without all fingertips on it; none.
+Negatives = Literal["tested", "closed", "none"]
+#: What a grasp must be to count as one to learn: a sample, or held at all.
+Positives = Literal["sample", "held"]
+#: Whether each object comes as often, or each view.
+Balance = Literal["object", "view"]
+#: How many times the points of an item are kept of each view.
+POOL = 2
+#: Streams of what is kept of a view, and of what is drawn for an item.
+_VIEW, _ITEM, _ORDER = 0, 1, 2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Pool:
+    """Points of a view that are kept, in random order: their pixels, depths, colours, objects."""
+
+    uv: npt.NDArray[np.uint16]
+    depth: npt.NDArray[np.float32]
+    rgb: npt.NDArray[np.uint8]
+    mask: npt.NDArray[np.uint8]
+
+    @property
+    def nbytes(self) -> int:
+        return sum(array.nbytes for array in vars(self).values())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Lens:
+    """What `spoil_depth` asks of a camera: near and far plane [m]."""
+
+    near: float
+    far: float
+
+
+class SceneDataset:
+    """Views of one split with grasps, as a sequence of items: dictionaries of NumPy arrays.
+
+    An item is a view, and some grasps of its scene that are drawn for it: good ones and bad ones in
+    turns, good ones by their weights. The frame A is {T}, the table's, or {C}, the view's camera.
+
+    | key | shape, type | what |
+    |---|---|---|
+    | `points` | (n, 3) float32 | what the camera sees of object and table, p_AP [m] |
+    | `colours` | (n, 3) float32 | their R, G, B in 0..1 |
+    | `on_object` | (n,) bool | whether they are on the object |
+    | `X_AG`, `X_AG_held` | (g, 4, 4) float32 | palm while closing, and after the lift [m] |
+    | `q_open`, `q`, `q_held` | (g, j) float32 | joints open, closed, after the lift [rad or m] |
+    | `p_AQ`, `nhat_Q_A` | (g, k, 3) float32 | contacts after closing [m], outward unit normals |
+    | `f_Q_A` | (g, k, 3) float32 | forces of the fingertips after closing [N] |
+    | `p_AQ_held`, `nhat_Q_A_held`, `f_Q_A_held` | (g, k, 3) float32 | the same after the lift |
+    | `visible` | (g, k) bool | whether the camera sees the contact after closing |
+    | `held`, `sample`, `precision`, `stable`, `tested` | (g,) bool | labels, see the schema |
+    | `outcome` | (g,) uint8 | see `Outcome` |
+    | `weight` | (g,) float32 | of a sample among samples like it; 0 of others |
+    | `trial_id` | (g,) int64 | row of trials.hdf5 |
+    | `X_TC` | (4, 4) float32 | pose of the camera; X_TA is this, or 1 |
+    | `X_AO` | (4, 4) float32 | pose of the object |
+    | `mass`, `friction_hand`, `friction_table` | () float32 | of the object [kg], coefficients |
+    | `view`, `scene`, `object` | () int64 | rows of /views, /scenes, /objects |
+
+    With `points=None` there are images in place of the points: `rgb` (h, w, 3) uint8, `depth`
+    (h, w) float32 [m], 0 where there is none, `mask` (h, w) uint8, 1 + index of the object, and the
+    camera matrix `K` (3, 3) float32 [px]. What was not lifted is NaN in all that ends in `_held`,
+    and so are contacts of fingers that do not touch.
+
+    Any number of processes may read, forked or spawned: none keeps the file open. Each keeps points
+    of the views that it has read. What is drawn depends on seed, epoch and index alone.
+
+    Args:
+        path: OUT/scenes.hdf5.
+        points: n, of an item; None for images.
+        frame: `table` or `camera`.
+        negatives: Bad grasps to draw: `tested`, those that were lifted and lost the object;
+            `closed`, also hands that closed without all fingertips on it; `none`.
+        balance: `object`, so that each object comes as often; `view`, so that each view does.
+        split: `train`, `valid` or `test`.
+        grasps: g, of an item. Where a scene has fewer, some come several times.
+        positives: Good grasps to draw: `sample`, or `held`, whatever the filters say. One that is
+            held and no sample is never a bad one.
+        on_object: Share of the points that are on the object, as far as it is in the image.
+        noise: Whether depths get the noise that was drawn for their view, if there was any.
+        seed: Of all draws.
+        cache: Memory for points of views, per process [byte]; what does not fit is read again.
+
+    Attributes:
+        path, split, frame: As given.
+        names, classes: Of the objects, by their rows.
+        joints, fingers: Names of the hand's joints and fingers, in the order of the arrays.
+        views: Rows of /views that items are of: those of scenes with a grasp to draw.
+        epoch: Changes what is drawn; set it before each round.
+
+    Raises:
+        DataError: If the file is missing, damaged or differs from the schema, an argument is
+            unknown, or the split has no grasp to draw.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        points: int | None = 2048,
+        frame: Frame = "table",
+        negatives: Negatives = "tested",
+        balance: Balance = "object",
+        split: str = "train",
+        grasps: int = 8,
+        positives: Positives = "sample",
+        on_object: float = 0.75,
+        noise: bool = True,
+        seed: int = 0,
+        cache: int = 512 << 20,
+    ) -> None:
+        _refuse_other("frame", frame, get_args(Frame))
+        _refuse_other("negatives", negatives, get_args(Negatives))
+        _refuse_other("balance", balance, get_args(Balance))
+        _refuse_other("positives", positives, get_args(Positives))
+        _refuse_other("split", split, SPLITS)
+        for name, count in (("points", points), ("grasps", grasps)):
+            if count is not None and count < 1:
+                raise DataError(f"{name} must be 1 or more, got {count}")
+        if not 0.0 <= on_object <= 1.0:
+            raise DataError(f"on_object must be 0 to 1, got {on_object}")
+        self.path, self.split, self.frame, self.epoch = Path(path), split, frame, 0
+        self._points, self._grasps, self._seed = points, grasps, seed
+        self._on_object, self._noise, self._cache = on_object, noise, cache
+        self._pools: dict[int, _Pool] = {}
+        self._kept = 0
+
+        # All but images and surfaces is read now.
+        self._stamp = stamp(self.path)
+        with open_scenes(self.path) as file:
+            self.names, self.classes = (
+                read_texts(file["objects"][key]) for key in ("name", "class_name")
+            )
+            self._tables = {
+                group: {f.name: file[group][f.name][:] for f in fields if not f.sample}
+                for group, fields in SCENE_TABLES.items()
+                if group not in ("objects", "visible")
+            }
+            self._visible = file["visible/visible"][:]
+            self.joints = tuple(parse_json(file.attrs["joints"]))
+            self.fingers = tuple(parse_json(file.attrs["fingers"]))
+            self._lens = _Lens(near=float(file.attrs["near"]), far=float(file.attrs["far"]))
+        self._number()
+        self._choose(negatives, positives)
+        self.views, self._order = self._order_of(balance)
+        if not len(self.views):
+            raise DataError(f"{self.path}: {split} must have grasps to draw, got none")
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    def __getitem__(self, index: int) -> dict[str, AnyArray]:
+        index = operator.index(index)
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"index must be below {len(self)}, got {index}")
+        index %= len(self)
+        stream = Stream(self._seed, _ITEM, self.epoch, index)
+        view = self._view_of(index)
+        X_TC, scene = self._X_TC[view], self._scene_of[view]
+        X_AT = invert_pose(X_TC) if self.frame == "camera" else np.eye(4)
+        item = self._images(view) if self._points is None else self._cloud(view, X_AT, stream)
+        item |= self._grasps_of(view, self._drawn(scene, stream), X_AT)
+        scenes = self._tables["scenes"]
+        item |= {
+            key: np.float32(scenes[key][scene, 0])
+            for key in ("mass", "friction_hand", "friction_table")
+        }
+        return item | {
+            "X_TC": X_TC.astype(np.float32),
+            "X_AO": (X_AT @ unpack_pose(scenes["X_TO"][scene, 0])).astype(np.float32),
+            "view": np.int64(view),
+            "scene": np.int64(scene),
+            "object": np.int64(scenes["object"][scene, 0]),
+        }
+
+    def __iter__(self) -> Iterator[dict[str, AnyArray]]:
+        return (self[i] for i in range(len(self)))
+
+    def __repr__(self) -> str:
+        return f"SceneDataset({str(self.path)!r}, split={self.split!r}): {len(self)} views"
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Another process keeps points of its own.
+        return {**self.__dict__, "_pools": {}, "_kept": 0}
+
+    @property
+    def tables(self) -> Mapping[str, Mapping[str, AnyArray]]:
+        """Columns of /scenes, /views and /grasps by their names, all splits; no images."""
+        return self._tables
+
+    def grasps_in(self, view: int, *, frame: Frame = "table") -> dict[str, AnyArray]:
+        """Return all grasps of a view's scene, by the keys of an item; g is their number."""
+        _refuse_other("frame", frame, get_args(Frame))
+        first, last = self._bounds[self._scene_of[view] : self._scene_of[view] + 2]
+        X_AT = invert_pose(self._X_TC[view]) if frame == "camera" else np.eye(4)
+        return self._grasps_of(view, np.arange(first, last), X_AT)
+
+    def surface(self, object: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        """Return points p_OS (4096, 3) [m] on an object, by its row, and their unit normals."""
+        with self._opened() as file:
+            points, normals = (file["objects"][name][object] for name in ("p_OS", "nhat_S_O"))
+        return points, normals
+
+    # What there is
+
+    def _number(self) -> None:
+        """Number the rows of /grasps by scene and of /visible by view."""
+        views, scenes = self._tables["views"], self._tables["scenes"]
+        count = len(scenes["split"])
+        grasps = np.bincount(self._tables["grasps"]["scene"], minlength=count)
+        self._bounds = np.concatenate([[0], np.cumsum(grasps)])
+        self._scene_of = views["scene"]
+        of_views = grasps[self._scene_of]
+        self._first_visible = np.concatenate([[0], np.cumsum(of_views)])
+        if self._first_visible[-1] != len(self._visible):
+            raise DataError(
+                f"{self.path}: /visible must have {self._first_visible[-1]} rows, a row for each "
+                f"view and grasp of its scene, got {len(self._visible)}"
+            )
+        self._X_TC = unpack_pose(views["X_TC"])
+
+    def _choose(self, negatives: Negatives, positives: Positives) -> None:
+        """Find the good and bad grasps of each scene, and the weights of the good ones."""
+        grasps = self._tables["grasps"]
+        bad = grasps["tested"] & ~grasps["held"]
+        if negatives == "closed":
+            bad |= grasps["outcome"] == Outcome.MISSING_FINGERTIP
+        if negatives == "none":
+            bad[:] = False
+        good = grasps[positives]
+        weight = np.where(grasps["sample"], grasps["weight"], 1.0).astype(float)
+        self._kinds = []
+        for first, last in zip(self._bounds[:-1], self._bounds[1:], strict=True):
+            rows = np.arange(first, last)
+            own = rows[good[rows]]
+            self._kinds.append((own, np.cumsum(weight[own]), rows[bad[rows]]))
+
+    def _order_of(self, balance: Balance) -> tuple[AnyArray, AnyArray]:
+        """Return the views to draw from, and of each item the object's place, or the view."""
+        scenes = self._tables["scenes"]
+        usable = np.array([len(good) + len(bad) > 0 for good, _, bad in self._kinds], dtype=bool)
+        usable &= scenes["split"] == SPLITS.index(self.split)
+        views = np.flatnonzero(usable[self._scene_of]) if len(usable) else np.zeros(0, np.int64)
+        self._balance = balance
+        if balance == "view" or not len(views):
+            return views, np.arange(len(views))
+        objects = scenes["object"][self._scene_of[views], 0]
+        self._by_object = [views[objects == i] for i in np.unique(objects)]
+        return views, np.arange(len(views)) % len(self._by_object)
+
+    # What is drawn
+
+    def _view_of(self, index: int) -> int:
+        """Return the view of an item: the next one of its object in this epoch's order."""
+        if self._balance == "view":
+            return int(self.views[index])
+        place = int(self._order[index])
+        own = self._by_object[place]
+        turn, number = divmod(index // len(self._by_object), len(own))
+        order = Stream(self._seed, _ORDER, self.epoch, place, turn).permutation(len(own))
+        return int(own[order[number]])
+
+    def _drawn(self, scene: int, stream: Stream) -> npt.NDArray[np.int64]:
+        """Return rows (g,) of /grasps: good and bad ones in turns."""
+        good, until, bad = self._kinds[scene]
+        u = stream.uniform(self._grasps)
+        rows = np.empty(self._grasps, dtype=np.int64)
+        is_good = np.arange(self._grasps) % 2 == 0 if len(good) and len(bad) else len(good) > 0
+        is_good = np.broadcast_to(is_good, self._grasps)
+        if len(good):
+            chosen = np.searchsorted(until, u[is_good] * until[-1], side="right")
+            rows[is_good] = good[np.minimum(chosen, len(good) - 1)]
+        if len(bad):
+            rows[~is_good] = bad[(u[~is_good] * len(bad)).astype(np.int64)]
+        return rows
+
+    def _grasps_of(self, view: int, rows: AnyArray, X_AT: Array) -> dict[str, AnyArray]:
+        """Return the values of some grasps of a view's scene."""
+        grasps = self._tables["grasps"]
+        R_TA = X_AT[:3, :3].T
+        first = self._first_visible[view] - self._bounds[self._scene_of[view]]
+        found = {key: grasps[key][rows] for key in _AS_STORED}
+        found["visible"] = self._visible[first + rows]
+        for suffix in ("", "_held"):
+            X_TG = unpack_pose(grasps[f"X_TG{suffix}"][rows])
+            points, normals, forces = (
+                grasps[f"{name}{suffix}"][rows] for name in ("p_TQ", "nhat_Q_T", "f_Q_T")
+            )
+            found[f"X_AG{suffix}"] = (X_AT @ X_TG).astype(np.float32)
+            found[f"p_AQ{suffix}"] = (points @ R_TA + X_AT[:3, 3]).astype(np.float32)
+            found[f"nhat_Q_A{suffix}"] = (normals @ R_TA).astype(np.float32)
+            found[f"f_Q_A{suffix}"] = (forces @ R_TA).astype(np.float32)
+        return found
+
+    # What is seen
+
+    def _cloud(self, view: int, X_AT: Array, stream: Stream) -> dict[str, AnyArray]:
+        """Return the points of an item: some that follow each other in what is kept of the view."""
+        pool, n = self._pool(view), self._points
+        rows = (int(stream.integers(len(pool.depth), 1)[0]) + np.arange(n)) % len(pool.depth)
+        f_u, f_v, c_u, c_v = self._tables["views"]["K"][view][[0, 4, 2, 5]].astype(np.float32)
+        z, uv = pool.depth[rows], pool.uv[rows].astype(np.float32)
+        p_CP = np.column_stack([z * (uv[:, 0] - c_u) / f_u, z * (uv[:, 1] - c_v) / f_v, z])
+        X_AC = (X_AT @ self._X_TC[view]).astype(np.float32)
+        return {
+            "points": p_CP @ X_AC[:3, :3].T + X_AC[:3, 3],
+            "colours": pool.rgb[rows] / np.float32(255.0),
+            "on_object": pool.mask[rows] > 0,
+        }
+
+    def _pool(self, view: int) -> _Pool:
+        """Return what is kept of a view; it is read when it is first needed."""
+        if view in self._pools:
+            return self._pools[view]
+        images, count = self._images(view), POOL * (self._points or 0)
+        pixels = self._pixels(images["depth"], images["mask"], count, view)
+        v, u = np.divmod(pixels, images["depth"].shape[1])
+        pool = _Pool(
+            uv=np.column_stack([u, v]).astype(np.uint16),
+            depth=images["depth"][v, u],
+            rgb=images["rgb"][v, u],
+            mask=images["mask"][v, u],
+        )
+        if self._kept + pool.nbytes <= self._cache:
+            self._pools[view] = pool
+            self._kept += pool.nbytes
+        return pool
+
+    def _pixels(
+        self, depth: AnyArray, mask: AnyArray, count: int, view: int
+    ) -> npt.NDArray[np.int64]:
+        """Return pixels (count,) with a depth, in random order; some come twice if there are few.
+
+        Raises:
+            DataError: If no pixel has a depth.
+        """
+        stream, has_depth = Stream(self._seed, _VIEW, view), depth > 0.0
+        own = np.flatnonzero(has_depth & (mask > 0))
+        others = np.flatnonzero(has_depth & (mask == 0))
+        if not len(own) + len(others):
+            raise DataError(f"{self.path}: view {view} must have a pixel with a depth, got none")
+        wanted = round(self._on_object * count) if len(others) else count
+        wanted = wanted if len(own) else 0
+        chosen = [
+            pixels[stream.permutation(max(number, len(pixels)))[:number] % len(pixels)]
+            for pixels, number in ((own, wanted), (others, count - wanted))
+            if number
+        ]
+        found = np.concatenate(chosen)
+        return found[stream.permutation(count)]
+
+    def _images(self, view: int) -> dict[str, AnyArray]:
+        """Return the images of a view and its camera matrix."""
+        views = self._tables["views"]
+        with self._opened() as file:
+            rgb, stored, mask = (file["views"][name][view] for name in ("rgb", "depth", "mask"))
+        depth, K = stored * np.float32(DEPTH_UNIT), views["K"][view].reshape(3, 3)
+        noise = float(views["depth_noise"][view])
+        if self._noise and noise:
+            sensor = DepthSensor(noise=noise, seed=int(views["depth_seed"][view]))
+            depth = spoil_depth(depth, K, sensor, 0, self._lens)
+        return {"rgb": rgb, "depth": depth, "mask": mask, "K": K.astype(np.float32)}
+
+    def _opened(self) -> Any:
+        """Open the file, which must be the one that the tables were read from."""
+        if stamp(self.path) != self._stamp:
+            raise DataError(f"{self.path}: must stay while it is read, got another; open it again")
+        return opened(self.path, "the scenes of a dataset", again=True)
+
+
+#: Fields of /grasps that items hold as they are.
+_AS_STORED = (
+    *("q_open", "q", "q_held", "held", "sample", "precision", "stable", "tested", "outcome"),
+    *("weight", "trial_id"),
+)
+
+
+def _refuse_other(name: str, value: object, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise DataError(f"{name} must be one of {', '.join(known)}, got {value!r}")
