@@ -77,7 +77,10 @@ HEAVY = (
     *("pydrake", "dask", "distributed", "trimesh", "scipy", "matplotlib", "rich", "pydantic"),
     *("yaml", "click", "torch"),
 )
-READERS = ("grasp", "dataset.schema", "dataset.shards", "dataset.reader", "dataset.trials")
+READERS = (
+    *("grasp", "dataset.schema", "dataset.shards", "dataset.reader", "dataset.trials"),
+    "dataset.scenes.reader",
+)
 CHECKERS = ("dataset.checks.run", "dataset.assemble")
 
 

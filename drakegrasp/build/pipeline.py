@@ -17,6 +17,7 @@ from drakegrasp.build.counts import Counts
 from drakegrasp.build.done_units import find_tasks, find_units
 from drakegrasp.build.events import BuildEvents
 from drakegrasp.build.prepare import PrepareTask, prepare_one
+from drakegrasp.build.scenes.make import make_scenes_locked
 from drakegrasp.build.target import Target, refuse_two_ends, target_of
 from drakegrasp.build.warnings import nothing_trains, too_heavy
 from drakegrasp.build.work_unit import WorkUnit, run_unit
@@ -37,6 +38,7 @@ from drakegrasp.dataset.manifest import (
     release_directory,
     write_manifest,
 )
+from drakegrasp.dataset.paths import SCENES_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
@@ -265,6 +267,9 @@ def _build(
             assemble_locked(out, manifest, execute=job.execute, progress=report)
     else:
         write_card(out)  # the licence of a mesh may be stated otherwise now
+    if config.scenes.when == "assembled" and (stale or not (out / SCENES_FILE).is_file()):
+        with progress_bar("scenes", "objects", show=job.show) as report:
+            make_scenes_locked(out, execute=job.execute, progress=report)
 
     # Report.
     if counts.damaged:

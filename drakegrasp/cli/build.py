@@ -1,7 +1,8 @@
-"""`drakegrasp build`, `assemble`, `merge` and `stats`, and what they print."""
+"""`drakegrasp build`, `assemble`, `merge`, `scenes` and `stats`, and what they print."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from drakegrasp.cli.options import (
 if TYPE_CHECKING:
     from drakegrasp.build.pipeline import BuildReport
     from drakegrasp.build.request import BuildRequest
+    from drakegrasp.build.scenes.make import Scenes
 
 
 @click.command()
@@ -105,8 +107,11 @@ def assemble(
         assemble_files(
             out, overrides=overrides, rejected=rejected, execute=execute, progress=progress
         )
+        manifest = read_manifest(out)
+    if manifest.config.scenes.when == "assembled":
+        write_scenes(out, workers=workers)
     print_stats(out)
-    for sentence in unused_rejections(out, rejected, read_manifest(out).rejected):
+    for sentence in unused_rejections(out, rejected, manifest.rejected):
         say(sentence)
 
 
@@ -120,18 +125,29 @@ def scenes(out: Path, overrides: tuple[str, ...], workers: int | None, quiet: bo
     cameras (five fixed ones to test), with all hands that closed on it. --set changes keys of
     `scenes`, e.g. scenes.views=8.
     """
+    made = write_scenes(out, overrides=overrides, workers=workers, show=not quiet)
+    for split, count in made.scenes.items():
+        say(f"{split}: {count:,} scenes, {made.views[split]:,} views")
+    say(f"{made.grasps:,} grasps in {made.path}")
+
+
+def write_scenes(
+    out: Path,
+    *,
+    overrides: Sequence[str] = (),
+    workers: int | None = None,
+    show: bool = True,
+) -> Scenes:
+    """Write scenes.hdf5 in processes of this machine."""
     from drakegrasp.build.scenes.make import make_scenes
     from drakegrasp.runtime.executor import processes
     from drakegrasp.runtime.progress import progress_bar
 
     with (
         processes(workers) as execute,
-        progress_bar("scenes", "objects", show=not quiet) as progress,
+        progress_bar("scenes", "objects", show=show) as progress,
     ):
-        made = make_scenes(out, overrides=overrides, execute=execute, progress=progress)
-    for split, count in made.scenes.items():
-        say(f"{split}: {count:,} scenes, {made.views[split]:,} views")
-    say(f"{made.grasps:,} grasps in {made.path}")
+        return make_scenes(out, overrides=overrides, execute=execute, progress=progress)
 
 
 @click.command()

@@ -1,9 +1,9 @@
 """Which contacts a camera sees, told from its depth image; NumPy only.
 
-A contact is hidden if the ray from it to the camera meets the object or the table first. The
-contact is the centre of a pressed patch, so it may lie inside the object, and on a surface that is
-seen at a slant the depth changes by much from one pixel to the next. So the point is lifted off the
-surface along its normal by `LIFT` first, and of the four pixels around it the farthest counts.
+A contact is hidden if its normal points away from the camera, or if the ray from it to the camera
+meets the object or the table first. It is the centre of a pressed patch, so it may lie a little
+inside the object, and on a surface that is seen at a slant the depth changes by much from one pixel
+to the next. So of the four pixels around it the farthest counts, and `BEFORE` is allowed.
 """
 
 from __future__ import annotations
@@ -11,15 +11,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import Array
+from drakegrasp.arithmetic import Array, dot
 from drakegrasp.dataset.schema import DEPTH_UNIT
 from drakegrasp.frames import invert_pose, transform_points
 from drakegrasp.vision.camera import project
 
-#: By how much a contact is lifted off the surface [m].
-LIFT = 3e-3
-#: What is nearer than the lifted contact by more than this hides it [m].
-BEFORE = 2e-3
+#: What is nearer than a contact by more than this hides it [m].
+BEFORE = 3e-3
 
 
 def visible_contacts(
@@ -34,19 +32,20 @@ def visible_contacts(
         K: Camera matrix (3, 3) [px].
         depth: Clean depth image (h, w) [DEPTH_UNIT], 0 where there is nothing.
     """
-    p, nhat = p_TQ.reshape(-1, 3), nhat_Q_T.reshape(-1, 3)
-    rows = np.flatnonzero(np.isfinite(p).all(axis=1) & np.isfinite(nhat).all(axis=1))
-    p_CQ = transform_points(invert_pose(X_TC), p[rows] + LIFT * nhat[rows])
+    p = p_TQ.reshape(-1, 3)
+    # A comparison with NaN is false.
+    rows = np.flatnonzero(dot(nhat_Q_T.reshape(-1, 3), X_TC[:3, 3] - p) > 0.0)
+    p_CQ = transform_points(invert_pose(X_TC), p[rows])
     rows, p_CQ = rows[p_CQ[:, 2] > 0.0], p_CQ[p_CQ[:, 2] > 0.0]
 
-    # The four pixels around each, as far as they are in the image.
+    # The four pixels around each that is in the image.
     height, width = depth.shape
     u, v = np.floor(project(K, p_CQ)).astype(np.int64).T
     within = (u >= 0) & (v >= 0) & (u < width - 1) & (v < height - 1)
     u, v, rows, z = u[within], v[within], rows[within], p_CQ[within, 2]
     around = depth[np.array([v, v, v + 1, v + 1]), np.array([u, u + 1, u, u + 1])]
-    seen = np.where(around == 0, np.inf, around * DEPTH_UNIT).max(axis=0)
+    farthest = np.where(around == 0, np.inf, around * DEPTH_UNIT).max(axis=0)
 
     visible = np.zeros(len(p), dtype=np.bool_)
-    visible[rows] = seen >= z - BEFORE
+    visible[rows] = farthest >= z - BEFORE
     return visible.reshape(p_TQ.shape[:-1])

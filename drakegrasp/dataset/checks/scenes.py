@@ -44,6 +44,8 @@ PICTURE_TOLERANCE = DEPTH_TOLERANCE + DEPTH_UNIT / 2.0  # [m]
 MEASURED_PIXELS = 16
 #: A contact that is seen is not so far behind all that is seen within SILHOUETTE pixels of it.
 BEHIND, SILHOUETTE = 5e-3, 2  # [m], [px]
+#: By how much less than the 3 mm of a hidden contact something is before it, for rounding [m].
+HIDDEN = 2.5e-3
 #: Outcomes after which it is unknown whether the hand holds; `table_contact` may be one of them.
 UNKNOWN = (Outcome.MISSING_FINGERTIP, Outcome.HAND_CONTACT, Outcome.NOT_LIFTED, Outcome.MOVED)
 
@@ -316,25 +318,37 @@ def object_pixels(views: Batch, X_TO: Array, model: ObjectModel) -> Iterator[Vio
 def seen_contacts(
     views: Batch, of: Mapping[int, Batch], grasps: Batch | None
 ) -> Iterator[Violation]:
-    """Contacts that are seen project onto the mask, and are not behind all that is seen there."""
-    beside, behind = np.zeros(len(views)), np.zeros(len(views))
+    """Contacts that are seen are on the mask and not behind all around; others have their cause."""
+    beside, behind, open_ = np.zeros((3, len(views)))
     for i, view in enumerate(views.rows.tolist()):
         if view not in of or grasps is None:
             continue
-        p_TQ = grasps["p_TQ"].astype(float)[of[view]["visible"]]
-        p_CQ = transform_points(invert_pose(unpack_pose(views["X_TC"][i])), p_TQ)
-        depth, mask = views["depth"][i] * DEPTH_UNIT, views["mask"][i]
-        v, u = np.nonzero(mask)
-        for pixel, z in zip(project(views["K"][i].reshape(3, 3), p_CQ), p_CQ[:, 2], strict=True):
-            apart = np.hypot(u - pixel[0], v - pixel[1]).min(initial=np.inf)
-            beside[i] = max(beside[i], apart)
+        X_TC, seen = unpack_pose(views["X_TC"][i]), of[view]["visible"].ravel()
+        p_TQ, nhat = (grasps[name].astype(float).reshape(-1, 3) for name in ("p_TQ", "nhat_Q_T"))
+        p_CQ = transform_points(invert_pose(X_TC), p_TQ)
+        pixels = project(views["K"][i].reshape(3, 3), p_CQ)
+        depth, (v, u) = views["depth"][i] * DEPTH_UNIT, np.nonzero(views["mask"][i])
+        for k in np.flatnonzero(seen):
+            apart = np.hypot(u - pixels[k, 0], v - pixels[k, 1]).min(initial=np.inf)
+            beside[i] = max(beside[i], apart) if np.isfinite(p_CQ[k]).all() else np.inf
             if apart <= MASK_TOLERANCE:
-                farthest = _around(depth, pixel).max()
-                behind[i] = max(behind[i], z - farthest if farthest > 0.0 else 0.0)
+                farthest = _around(depth, pixels[k]).max()
+                behind[i] = max(behind[i], p_CQ[k, 2] - farthest if farthest else 0.0)
+
+        # What is hidden, though in the image and turned to the camera, has something before it.
+        facing = np.einsum("ij,ij->i", nhat, X_TC[:3, 3] - p_TQ) > POSITION_TOLERANCE
+        edge = np.array(depth.shape[::-1]) - 2.0
+        inside = ((pixels > 1.0) & (pixels < edge)).all(axis=1) & (p_CQ[:, 2] > 0.0)
+        for k in np.flatnonzero(~seen & facing & inside):
+            around = _around(depth, pixels[k])
+            nearest = around.min(where=around > 0.0, initial=np.inf)
+            open_[i] += nearest > p_CQ[k, 2] - HIDDEN
     what = f"visible contacts must project within {MASK_TOLERANCE:g} px of the mask"
     yield from views.broken(what, beside > MASK_TOLERANCE, beside)
     what = f"visible contacts must not be more than {BEHIND:g} m behind all around them"
     yield from views.broken(what, behind > BEHIND, behind)
+    what = f"hidden contacts that face the camera must have something {HIDDEN:g} m before them"
+    yield from views.broken(what, open_ > 0, lambda i: f"{open_[i]:.0f} without")
 
 
 def _around(depth: AnyArray, pixel: Array) -> AnyArray:

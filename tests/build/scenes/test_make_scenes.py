@@ -1,0 +1,117 @@
+"""scenes.hdf5: the same bytes whoever makes it, places and cameras, labels, visible contacts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from drakegrasp.build.scenes.make import make_scenes, split_objects
+from drakegrasp.build.scenes.visible import visible_contacts
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.errors import ConfigError
+from drakegrasp.frames import unpack_pose
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import processes
+from drakegrasp.vision.viewpoints import fixed_viewpoints
+
+pytestmark = pytest.mark.sim
+
+
+@pytest.fixture(scope="module")
+def scenes(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    import shutil
+
+    out = Path(shutil.copytree(sound, tmp_path_factory.mktemp("scenes") / "out"))
+    return make_scenes(out).path
+
+
+def test_bytes_do_not_depend_on_the_number_of_workers(scenes: Path, out: Path) -> None:
+    with processes(2) as execute:
+        again = make_scenes(out, execute=execute)
+    assert again.path.read_bytes() == scenes.read_bytes()
+
+
+def test_nothing_else_of_the_dataset_changes(sound: Path, scenes: Path) -> None:
+    names = {path.name for path in scenes.parent.iterdir()} - {"build.lock"}
+    assert names == {path.name for path in sound.iterdir()} | {"scenes.hdf5"}
+    for path in sound.iterdir():
+        if path.is_file():
+            assert path.read_bytes() == (scenes.parent / path.name).read_bytes()
+
+
+def test_objects_are_turned_and_moved_and_cameras_differ_by_split(scenes: Path) -> None:
+    with h5py.File(scenes) as file:
+        X_TO = unpack_pose(file["scenes/X_TO"][:, 0])
+        split, X_TC = file["scenes/split"][:], unpack_pose(file["views/X_TC"][:])
+        scene, kind = file["views/scene"][:], file["views/kind"][:]
+    assert len(np.unique(X_TO[:, :2, 3])) == 6 and np.abs(X_TO[:, :2, 3]).max() <= 0.1
+    # The boxes of the dataset stand upright, unturned.
+    assert np.abs(X_TO[:, 0, 1]).min() > 0.01
+    for number, own in enumerate(split):
+        poses, kinds = X_TC[scene == number], kind[scene == number]
+        if own == 0:
+            assert len(poses) == 16 and not kinds.any()
+            assert len(np.unique(poses[:, :3, 3], axis=0)) == 16
+        else:
+            np.testing.assert_array_equal(poses, fixed_viewpoints())
+            assert kinds.tolist() == [1, 1, 1, 1, 2]
+
+
+def test_only_lifts_to_a_verdict_are_tested(scenes: Path) -> None:
+    with h5py.File(scenes) as file:
+        grasps = {name: file["grasps"][name][:] for name in ("outcome", "tested", "held", "sample")}
+        ids = file["grasps/trial_id"][:]
+    tested = set(grasps["outcome"][grasps["tested"]].tolist())
+    assert tested == {Outcome.SUCCESS, Outcome.SLIPPED, Outcome.DROPPED, Outcome.TABLE_CONTACT}
+    untested = set(grasps["outcome"][~grasps["tested"]].tolist())
+    # A hand that touched the table after closing was not lifted.
+    assert untested == {Outcome.MISSING_FINGERTIP, Outcome.HAND_CONTACT, Outcome.TABLE_CONTACT}
+    assert (grasps["held"] == (grasps["outcome"] == Outcome.SUCCESS)).all()
+    assert grasps["sample"].sum() > 0 and len(np.unique(ids)) == len(ids)
+
+
+def test_other_settings_than_of_scenes_are_refused(out: Path) -> None:
+    with pytest.raises(ConfigError, match="only keys of scenes can change"):
+        make_scenes(out, overrides=["filters.max_slip=1"])
+    made = make_scenes(out, overrides=["scenes.views=2", "scenes.width=64", "scenes.height=48"])
+    assert made.views["train"] == 2 * made.scenes["train"]
+    with h5py.File(made.path) as file:
+        assert file["views/rgb"].shape[1:] == (48, 64, 3)
+
+
+@pytest.mark.parametrize(
+    ("present", "splits"),
+    [
+        ([{0, 1}, {2}, {2}], [0, 2, 2]),
+        # The first has no sample: its class trains.
+        ([set(), {2}, {2}], [0, 2, 2]),
+        # The last is the only one of its class, which does not train.
+        ([{0}, {2}, set()], [0, 2, 2]),
+    ],
+)
+def test_by_class_no_object_is_in_two_splits(
+    sound: Path, present: list[set[int]], splits: list[int]
+) -> None:
+    manifest = read_manifest(sound)
+    split = manifest.config.split.model_copy(update={"by": "class", "valid_fraction": 0.0})
+    manifest = replace(manifest, config=manifest.config.model_copy(update={"split": split}))
+    assert split_objects(manifest, present) == splits
+
+
+def test_what_is_before_a_contact_hides_it_and_so_does_its_normal() -> None:
+    # The camera looks down at a plane 0.5 m away, half of which is hidden by one at 0.4 m.
+    depth = np.full((48, 64), 5000, dtype=np.uint16)
+    depth[:, :32] = 4000
+    K = np.array([[100.0, 0.0, 31.5], [0.0, 100.0, 23.5], [0.0, 0.0, 1.0]])
+    X_TC = np.diag([1.0, -1.0, -1.0, 1.0])
+    X_TC[2, 3] = 0.5
+    up, down = [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]
+    p_TQ = [[0.1, 0, 0], [-0.1, 0, 0], [0.1, 0, 0], [0.1, 0, -0.002], [0.1, 0, -0.004], [1, 0, 0]]
+    nhat = [up, up, down, up, up, up]
+    seen = visible_contacts(np.array(p_TQ), np.array(nhat), X_TC, K, depth)
+    assert seen.tolist() == [True, False, False, True, False, False]
+    assert not visible_contacts(np.full((1, 3), np.nan), np.array([up]), X_TC, K, depth).any()

@@ -1,0 +1,126 @@
+"""SceneDataset: what an item holds lies on what the camera sees, and what is drawn is as asked."""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drakegrasp.build.scenes.make import make_scenes
+from drakegrasp.dataset.scenes.reader import SceneDataset
+from drakegrasp.errors import DataError
+from drakegrasp.frames import invert_pose, transform_points
+
+pytestmark = pytest.mark.sim
+
+
+@pytest.fixture(scope="module")
+def path(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = Path(shutil.copytree(sound, tmp_path_factory.mktemp("scenes") / "out"))
+    return make_scenes(out).path
+
+
+def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    return (
+        a.keys() == b.keys()
+        and all(np.array_equal(a[k], b[k], equal_nan=True) for k in a if a[k].dtype.kind == "f")
+        and all(np.array_equal(a[k], b[k]) for k in a if a[k].dtype.kind != "f")
+    )
+
+
+@pytest.mark.parametrize("frame", ["table", "camera"])
+def test_points_lie_on_object_and_table(path: Path, frame: Any) -> None:
+    data = SceneDataset(path, points=512, frame=frame)
+    item = data[3]
+    X_TA = item["X_TC"].astype(float) if frame == "camera" else np.eye(4)
+    p_TP = transform_points(X_TA, item["points"])
+    assert np.abs(p_TP[~item["on_object"], 2]).max() < 3e-4
+    assert 0.7 < item["on_object"].mean() < 0.8
+
+    # The object is a box, whose surface points are in its own frame.
+    X_OA = invert_pose(item["X_AO"])
+    own, _ = data.surface(int(item["object"]))
+    half = np.abs(own).max(axis=0)
+    p_OP = transform_points(X_OA, item["points"][item["on_object"]])
+    outside = np.abs(np.abs(p_OP) - half).min(axis=1)
+    assert outside.max() < 5e-4 and (np.abs(p_OP) < half + 5e-4).all()
+    # Contacts of the dataset are on the box, too.
+    touching = np.isfinite(item["p_AQ"]).all(axis=2)
+    p_OQ = transform_points(X_OA, item["p_AQ"][touching])
+    assert np.abs(np.abs(p_OQ) - half).min(axis=1).max() < 1e-3
+
+
+def test_items_are_the_same_in_both_frames(path: Path) -> None:
+    table, camera = (SceneDataset(path, points=64, frame=f)[5] for f in ("table", "camera"))
+    for name in ("p_AQ", "points"):
+        moved = transform_points(table["X_TC"], camera[name].reshape(-1, 3))
+        np.testing.assert_allclose(moved, table[name].reshape(-1, 3), atol=1e-6)
+    np.testing.assert_allclose(table["X_TC"] @ camera["X_AG"], table["X_AG"], atol=1e-6)
+
+
+def test_good_and_bad_grasps_come_in_turns(path: Path) -> None:
+    data = SceneDataset(path, points=16, grasps=6, split="test")
+    for item in data:
+        assert item["sample"].tolist() == [True, False] * 3
+        assert item["tested"].all() and not item["held"][1::2].any()
+    assert all(item["sample"].all() for item in SceneDataset(path, points=16, negatives="none"))
+    closed = SceneDataset(path, points=16, grasps=64, negatives="closed")[0]
+    assert not closed["tested"].all() and closed["held"][::2].all()
+
+
+def test_objects_come_as_often_as_each_other(path: Path) -> None:
+    data = SceneDataset(path, points=16, split="test")
+    assert len(data) == 10
+    assert sorted(np.unique([int(i["object"]) for i in data], return_counts=True)[1]) == [5, 5]
+    # Each view once, in an order that the epoch changes.
+    views = [int(item["view"]) for item in data]
+    data.epoch = 1
+    again = [int(item["view"]) for item in data]
+    assert sorted(views) == sorted(again) == data.views.tolist() and views != again
+
+
+def test_images_are_those_of_the_file(path: Path) -> None:
+    item = SceneDataset(path, points=None)[0]
+    assert item["rgb"].shape == (240, 320, 3) and item["rgb"].dtype == np.uint8
+    assert item["depth"].dtype == np.float32 and 0.3 < item["depth"][item["mask"] > 0].min() < 1.0
+    v, u = np.nonzero(item["mask"])
+    centre = np.array([u.mean(), v.mean(), 1.0]) * item["depth"][item["mask"] > 0].mean()
+    p_TP = transform_points(item["X_TC"], (np.linalg.inv(item["K"]) @ centre)[None])[0]
+    assert np.linalg.norm(p_TP - item["X_AO"][:3, 3]) < 0.06
+
+
+def _item(data: SceneDataset) -> dict[str, Any]:
+    return data[1]
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_other_processes_read_the_same(path: Path, method: str) -> None:
+    data = SceneDataset(path, points=32)
+    first = data[1]
+    assert same(pickle.loads(pickle.dumps(data))[1], first)
+    with multiprocessing.get_context(method).Pool(1) as pool:
+        assert same(pool.apply(_item, (data,)), first)
+
+
+def test_a_cache_that_is_full_changes_nothing(path: Path) -> None:
+    small, large = SceneDataset(path, points=32, cache=0), SceneDataset(path, points=32)
+    assert same(small[2], large[2]) and same(small[2], large[2])
+    assert not small._pools and len(large._pools) == 1
+
+
+def test_another_file_and_unknown_arguments_are_refused(path: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copy(path, tmp_path))
+    data = SceneDataset(copy, points=32)
+    data[0]
+    copy.write_bytes(path.read_bytes())
+    with pytest.raises(DataError, match="must stay while it is read"):
+        SceneDataset.__getitem__(data, 1 + data._order.argmax())
+    with pytest.raises(DataError, match="frame must be one of table, camera, got 'palm'"):
+        SceneDataset(path, frame="palm")  # type: ignore[arg-type]
+    with pytest.raises(DataError, match="valid must have grasps to draw"):
+        SceneDataset(path, split="valid")
