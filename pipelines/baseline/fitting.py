@@ -43,7 +43,7 @@ def fit(
         them that went into `loading`.
     """
     optimizer = torch.optim.AdamW(network.parameters(), settings.rate, weight_decay=DECAY)
-    total = max(steps * settings.epochs, 1)
+    total: int = max(steps * settings.epochs, 1)
 
     def rate(step: int) -> float:
         falling = 0.5 * (1 + math.cos(math.pi * min(step / total, 1.0)))
@@ -90,11 +90,11 @@ def fit(
     return {**losses, "best": best, "seconds": seconds, "loading": waited / seconds}
 
 
-@torch.no_grad()
 def mean_loss(
     network: nn.Module, loss: Callable[[Batch], Tensor], batches: Iterator[Batch]
 ) -> float:
     """Return the mean loss of batches, which is NaN without any."""
     network.eval()
-    values = [loss(batch).item() for batch in batches]
+    with torch.no_grad():
+        values = [loss(batch).item() for batch in batches]
     return sum(values) / len(values) if values else math.nan

@@ -53,7 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     try:
         checkpoint = load(arguments.checkpoint, "postures", "contacts")
-        arrays = PREDICT[checkpoint["task"]](checkpoint, arguments)
+        with torch.no_grad():
+            arrays = PREDICT[checkpoint["task"]](checkpoint, arguments)
     except DrakegraspError as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201
         return 2
@@ -70,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def load(path: Path, *tasks: str) -> dict[str, Any]:
     """Return the content of a checkpoint of one of some tasks."""
     try:
-        content = torch.load(path, weights_only=True)
+        content: dict[str, Any] = torch.load(path, weights_only=True)
         task = content["task"]
     except Exception as error:  # whatever a damaged archive raises
         raise DataError(f"{path}: must be a checkpoint of train.py, got {error!r:.80}") from error
@@ -82,7 +83,6 @@ def load(path: Path, *tasks: str) -> dict[str, Any]:
 # Postures
 
 
-@torch.no_grad()
 def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
     """Return postures for the views of a split, best first, as a file of postures has them."""
     network = PostureNetwork(PostureSize(**checkpoint["size"]))
@@ -173,7 +173,6 @@ def _views(data: dg.SceneDataset, per_scene: int | None) -> list[int]:
 # Contacts
 
 
-@torch.no_grad()
 def predict_contacts(checkpoint: dict[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
     """Return `grasps` (n, h, 6k) and `confidence` (n, h) for the samples of a split."""
     data = dg.GraspDataset(arguments.data, split=arguments.split)

@@ -98,8 +98,10 @@ def train_classifier(arguments: argparse.Namespace) -> dict[str, Any]:
         return functional.binary_cross_entropy_with_logits(logits, labels)
 
     history = _fit(arguments, network, loss, train, valid, cloud_batches)
-    pairs = [judged(network, hand, batch) for batch in _valid_batches(arguments, valid)]
-    network.temperature.copy_(temperature(*(torch.cat(each) for each in zip(*pairs, strict=True))))
+    with torch.no_grad():
+        pairs = [judged(network, hand, batch) for batch in _valid_batches(arguments, valid)]
+        logits, labels = (torch.cat(each) for each in zip(*pairs, strict=True))
+        network.temperature.copy_(temperature(logits, labels))
     _save(arguments, network, history, train, hand=hand.as_dict())
     return history
 
@@ -144,7 +146,6 @@ def judged(network: GraspClassifier, hand: HandCoordinates, batch: Batch) -> tup
     return logits, labels.float()
 
 
-@torch.no_grad()
 def temperature(logits: Tensor, labels: Tensor) -> Tensor:
     """Return the temperatures (2,) that make logits (n, 2) say how often labels (n, 2) are true."""
     tried = torch.logspace(-1, 1, 81)
@@ -202,7 +203,7 @@ def _fit(
 def _valid_batches(
     arguments: argparse.Namespace, valid: Any, batches: Any = cloud_batches
 ) -> Iterator[Batch]:
-    return batches(valid, arguments.batch, 0, augment=False, seed=arguments.seed)
+    yield from batches(valid, arguments.batch, 0, augment=False, seed=arguments.seed)
 
 
 def _save(
