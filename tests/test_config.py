@@ -112,6 +112,19 @@ camera:
   fov_y_deg: 40.0
   near: 0.02
   far: 1.0
+scenes:
+  when: assembled
+  place: 0.2
+  views: 8
+  distance: [0.5, 0.8]
+  elevation_deg: [30, 60]
+  aim: 0.03
+  roll_deg: 10
+  width: 160
+  height: 120
+  fov_y_deg: 45
+  near: 0.1
+  far: 2
 randomize:
   object_colour: 0.5
   table_colour: 0.4

@@ -27,7 +27,7 @@ def fit(
     steps: int,
     settings: argparse.Namespace,
 ) -> dict[str, Any]:
-    """Fit a network in its place, and leave it with the weights that validated best.
+    """Fit a network in its place, and leave it with the weights that validated best, else the last.
 
     Args:
         network: The network; `loss` uses it.
@@ -72,7 +72,7 @@ def fit(
 
         # What it says of objects that it did not see.
         losses["valid"].append(mean_loss(network, loss, valid()))
-        if losses["valid"][-1] <= min(losses["valid"]):
+        if not losses["valid"][-1] > min(losses["valid"]):  # or there is nothing to validate with
             best, weights = epoch, copy.deepcopy(network.state_dict())
         seconds = perf_counter() - start
         print(  # noqa: T201

@@ -100,8 +100,9 @@ def train_classifier(arguments: argparse.Namespace) -> dict[str, Any]:
     history = _fit(arguments, network, loss, train, valid, cloud_batches)
     with torch.no_grad():
         pairs = [judged(network, hand, batch) for batch in _valid_batches(arguments, valid)]
-        logits, labels = (torch.cat(each) for each in zip(*pairs, strict=True))
-        network.temperature.copy_(temperature(logits, labels))
+        if pairs:
+            logits, labels = (torch.cat(each) for each in zip(*pairs, strict=True))
+            network.temperature.copy_(temperature(logits, labels))
     _save(arguments, network, history, train, hand=hand.as_dict())
     return history
 
@@ -176,13 +177,15 @@ def scenes_of(data: dg.SceneDataset) -> np.ndarray:
 
 def _scenes(
     arguments: argparse.Namespace, negatives: Any
-) -> tuple[dg.SceneDataset, dg.SceneDataset]:
-    """Return the parts that train and validate."""
+) -> tuple[dg.SceneDataset, dg.SceneDataset | None]:
+    """Return the parts that train and validate; a small dataset may have nothing that validates."""
     options = {"negatives": negatives, "seed": arguments.seed}
-    return (
-        dg.SceneDataset(arguments.data, split="train", **options),
-        dg.SceneDataset(arguments.data, split="valid", balance="view", **options),
-    )
+    train = dg.SceneDataset(arguments.data, split="train", **options)
+    try:
+        valid = dg.SceneDataset(arguments.data, split="valid", balance="view", **options)
+    except DataError:
+        return train, None
+    return train, valid
 
 
 def _fit(
@@ -203,7 +206,8 @@ def _fit(
 def _valid_batches(
     arguments: argparse.Namespace, valid: Any, batches: Any = cloud_batches
 ) -> Iterator[Batch]:
-    yield from batches(valid, arguments.batch, 0, augment=False, seed=arguments.seed)
+    if valid is not None and len(valid):
+        yield from batches(valid, arguments.batch, 0, augment=False, seed=arguments.seed)
 
 
 def _save(

@@ -16,10 +16,15 @@ from drakegrasp.dataset.schema import (
     LOOK_FIELDS,
     OBJECT_FIELDS,
     PREDICTED_ROW_FIELDS,
+    SCENE_FIELDS,
+    SCENE_GRASP_FIELDS,
+    SCENE_OBJECT_FIELDS,
     SCHEMA_VERSION,
     SUCCESS_FIELDS,
     TRIAL_FIELDS,
     VERIFICATION_FIELDS,
+    VIEW_FIELDS,
+    VISIBLE_FIELDS,
     Field,
 )
 
@@ -28,7 +33,8 @@ _HEAD = f"""<!-- Made by `make docs-pages` from dataset/schema.py: change that, 
 # The dataset's format
 
 Schema version {SCHEMA_VERSION}. In the shapes `N` is the number of rows, `k` of fingers, `j` of
-the hand's joints, `6k` the length of a grasp (18 for three fingers) and `S` the size of the images.
+the hand's joints, `6k` the length of a grasp (18 for three fingers) and `S` the size of the images;
+in `scenes.hdf5` `h` and `w` are those of its images, and `o` is the number of objects in a scene.
 Frames are explained in [frames-and-units.md](frames-and-units.md). Every dataset of a file carries
 its `unit`, `frame` and `meaning` as attributes; one of joints (`j`) also has the names of its
 `joints`, in JSON.
@@ -43,6 +49,7 @@ OUT/
   trials.hdf5              a row per attempt, whatever its outcome
   grasping_oto.hdf5        samples, camera rolled with the palm
   grasping_otm.hdf5        the same samples, image up is world up
+  scenes.hdf5              views that know no grasp, with all closed hands; only if asked for
   DATACARD.md, .json       what it is, how it was made, counts, licences, known limits
   log.jsonl                what happened while it was built, and when: a line of JSON per event
   reject.json              grasps that an inspection rejects; only if there was one
@@ -156,6 +163,18 @@ the values in use, drawn for the attempt or not, see
 [randomisation](../explanation/randomization.md).
 """
 
+_SCENES = """
+## scenes.hdf5
+
+`drakegrasp scenes` makes it, see [training on scenes](../how-to/train-on-scenes.md). A scene is an
+object in a resting pose, somewhere on the table; all cameras of a scene have its colours and its
+light, and each its own noise of depth. The file has the attributes of `trials.hdf5` but `K`; `near`
+and `far` are those of its cameras. Images are stored in one chunk each, gzip 1. Unlike in the data
+files, what was not lifted is NaN.
+
+### /scenes
+"""
+
 _VERIFICATION = """
 ## The results of `drakegrasp verify`
 
@@ -204,6 +223,16 @@ def format_page() -> str:
             _fields(OBJECT_FIELDS),
             "\n### /successes\n",
             _fields(SUCCESS_FIELDS),
+            _SCENES,
+            _fields(SCENE_FIELDS),
+            "\n### /views\n",
+            _fields(VIEW_FIELDS),
+            "\n### /grasps\n",
+            _fields(SCENE_GRASP_FIELDS),
+            "\n### /visible\n",
+            _fields(VISIBLE_FIELDS),
+            "\n### /objects of scenes.hdf5\n",
+            _fields(SCENE_OBJECT_FIELDS),
             _SHARDS,
             _fields(LOOK_FIELDS),
             _VERIFICATION,

@@ -187,12 +187,15 @@ def _views(
                 "X_TC": pack_pose(X_TC),
                 **_conditions(look, _stream(config, name, k, _CAMERA + number)),
             }
+
+            # What it sees of the contacts.
             contacts = (grasps[key][own] for key in ("p_TQ", "nhat_Q_T"))
             visible["visible"].append(visible_contacts(*contacts, X_TC, lens.K, depth))
             visible["view"].append(np.full(len(own), len(numbers["scene"])))
             visible["grasp"].append(own)
             for key, values in numbers.items():
                 values.append(row[key])
+
     columns = {key: np.array(values) for key, values in numbers.items()}
     return columns, images, {key: np.concatenate(parts) for key, parts in visible.items()}
 

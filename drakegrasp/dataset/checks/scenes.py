@@ -339,10 +339,10 @@ def seen_contacts(
         facing = np.einsum("ij,ij->i", nhat, X_TC[:3, 3] - p_TQ) > POSITION_TOLERANCE
         edge = np.array(depth.shape[::-1]) - 2.0
         inside = ((pixels > 1.0) & (pixels < edge)).all(axis=1) & (p_CQ[:, 2] > 0.0)
-        for k in np.flatnonzero(~seen & facing & inside):
-            around = _around(depth, pixels[k])
-            nearest = around.min(where=around > 0.0, initial=np.inf)
-            open_[i] += nearest > p_CQ[k, 2] - HIDDEN
+        hidden = ~seen & facing & inside
+        u, v = np.rint(pixels[hidden]).astype(int).T
+        before = (depth[v, u] > 0.0) & (depth[v, u] < p_CQ[hidden, 2] - HIDDEN)
+        open_[i] = np.count_nonzero(~before)
     what = f"visible contacts must project within {MASK_TOLERANCE:g} px of the mask"
     yield from views.broken(what, beside > MASK_TOLERANCE, beside)
     what = f"visible contacts must not be more than {BEHIND:g} m behind all around them"

@@ -40,22 +40,10 @@ Positives = Literal["sample", "held"]
 Balance = Literal["object", "view"]
 #: How many times the points of an item are kept of each view.
 POOL = 2
-#: Streams of what is kept of a view, and of what is drawn for an item.
-_VIEW, _ITEM, _ORDER = 0, 1, 2
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Pool:
-    """Points of a view that are kept, in random order: their pixels, depths, colours, objects."""
-
-    uv: npt.NDArray[np.uint16]
-    depth: npt.NDArray[np.float32]
-    rgb: npt.NDArray[np.uint8]
-    mask: npt.NDArray[np.uint8]
-
-    @property
-    def nbytes(self) -> int:
-        return sum(array.nbytes for array in vars(self).values())
+#: Of so many times the pixels that are wanted, they are drawn one by one: few come twice.
+MANY = 8
+#: Streams of what is kept of a view, of what is drawn for an item, and of orders.
+_VIEW, _ITEM, _ORDER, _ROUND = 0, 1, 2, 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,8 +85,9 @@ class SceneDataset:
     camera matrix `K` (3, 3) float32 [px]. What was not lifted is NaN in all that ends in `_held`,
     and so are contacts of fingers that do not touch.
 
-    Any number of processes may read, forked or spawned: none keeps the file open. Each keeps points
-    of the views that it has read. What is drawn depends on seed, epoch and index alone.
+    Any number of processes may read, forked or spawned: none keeps the file open. Each keeps
+    points, or images, of the views that it has read. What is drawn depends on seed, epoch
+    and index alone.
 
     Args:
         path: OUT/scenes.hdf5.
@@ -114,14 +103,14 @@ class SceneDataset:
         on_object: Share of the points that are on the object, as far as it is in the image.
         noise: Whether depths get the noise that was drawn for their view, if there was any.
         seed: Of all draws.
-        cache: Memory for points of views, per process [byte]; what does not fit is read again.
+        cache: Memory for points or images of views, per process [byte]; others are read again.
 
     Attributes:
         path, split, frame: As given.
         names, classes: Of the objects, by their rows.
         joints, fingers: Names of the hand's joints and fingers, in the order of the arrays.
         views: Rows of /views that items are of: those of scenes with a grasp to draw.
-        epoch: Changes what is drawn; set it before each round.
+        epoch: Changes what is drawn.
 
     Raises:
         DataError: If the file is missing, damaged or differs from the schema, an argument is
@@ -157,7 +146,8 @@ class SceneDataset:
         self.path, self.split, self.frame, self.epoch = Path(path), split, frame, 0
         self._points, self._grasps, self._seed = points, grasps, seed
         self._on_object, self._noise, self._cache = on_object, noise, cache
-        self._pools: dict[int, _Pool] = {}
+        # Of views: images, or of some pixels in random order `uv`, `depth`, `rgb` and `mask`.
+        self._pools: dict[int, dict[str, AnyArray]] = {}
         self._kept = 0
 
         # All but images and surfaces is read now.
@@ -184,16 +174,24 @@ class SceneDataset:
     def __len__(self) -> int:
         return len(self._order)
 
-    def __getitem__(self, index: int) -> dict[str, AnyArray]:
-        index = operator.index(index)
+    def __getitem__(self, index: int | tuple[int, int]) -> dict[str, AnyArray]:
+        """Return an item by its index, or by epoch and index, as `rounds` gives them."""
+        epoch, index = index if isinstance(index, tuple) else (self.epoch, operator.index(index))
         if not -len(self) <= index < len(self):
             raise IndexError(f"index must be below {len(self)}, got {index}")
         index %= len(self)
-        stream = Stream(self._seed, _ITEM, self.epoch, index)
-        view = self._view_of(index)
+
+        # The view, and its frame.
+        stream = Stream(self._seed, _ITEM, epoch, index)
+        view = self._view_of(epoch, index)
         X_TC, scene = self._X_TC[view], self._scene_of[view]
         X_AT = invert_pose(X_TC) if self.frame == "camera" else np.eye(4)
-        item = self._images(view) if self._points is None else self._cloud(view, X_AT, stream)
+
+        # What is seen, grasps, and the object.
+        if self._points is None:
+            item = {name: image.copy() for name, image in self._kept_of(view).items()}
+        else:
+            item = self._cloud(view, X_AT, stream)
         item |= self._grasps_of(view, self._drawn(scene, stream), X_AT)
         scenes = self._tables["scenes"]
         item |= {
@@ -222,6 +220,10 @@ class SceneDataset:
     def tables(self) -> Mapping[str, Mapping[str, AnyArray]]:
         """Columns of /scenes, /views and /grasps by their names, all splits; no images."""
         return self._tables
+
+    def rounds(self, seed: int = 0) -> Rounds:
+        """Return a sampler for torch's DataLoader: each round has all items in another order."""
+        return Rounds(self, seed)
 
     def grasps_in(self, view: int, *, frame: Frame = "table") -> dict[str, AnyArray]:
         """Return all grasps of a view's scene, by the keys of an item; g is their number."""
@@ -285,14 +287,14 @@ class SceneDataset:
 
     # What is drawn
 
-    def _view_of(self, index: int) -> int:
-        """Return the view of an item: the next one of its object in this epoch's order."""
+    def _view_of(self, epoch: int, index: int) -> int:
+        """Return the view of an item: the next one of its object in the epoch's order."""
         if self._balance == "view":
             return int(self.views[index])
         place = int(self._order[index])
         own = self._by_object[place]
         turn, number = divmod(index // len(self._by_object), len(own))
-        order = Stream(self._seed, _ORDER, self.epoch, place, turn).permutation(len(own))
+        order = Stream(self._seed, _ORDER, epoch, place, turn).permutation(len(own))
         return int(own[order[number]])
 
     def _drawn(self, scene: int, stream: Stream) -> npt.NDArray[np.int64]:
@@ -331,35 +333,36 @@ class SceneDataset:
 
     def _cloud(self, view: int, X_AT: Array, stream: Stream) -> dict[str, AnyArray]:
         """Return the points of an item: some that follow each other in what is kept of the view."""
-        pool, n = self._pool(view), self._points
-        rows = (int(stream.integers(len(pool.depth), 1)[0]) + np.arange(n)) % len(pool.depth)
+        pool, n = self._kept_of(view), self._points
+        rows = (int(stream.integers(len(pool["uv"]), 1)[0]) + np.arange(n)) % len(pool["uv"])
         f_u, f_v, c_u, c_v = self._tables["views"]["K"][view][[0, 4, 2, 5]].astype(np.float32)
-        z, uv = pool.depth[rows], pool.uv[rows].astype(np.float32)
+        z, uv = pool["depth"][rows], pool["uv"][rows].astype(np.float32)
         p_CP = np.column_stack([z * (uv[:, 0] - c_u) / f_u, z * (uv[:, 1] - c_v) / f_v, z])
         X_AC = (X_AT @ self._X_TC[view]).astype(np.float32)
         return {
             "points": p_CP @ X_AC[:3, :3].T + X_AC[:3, 3],
-            "colours": pool.rgb[rows] / np.float32(255.0),
-            "on_object": pool.mask[rows] > 0,
+            "colours": pool["rgb"][rows] / np.float32(255.0),
+            "on_object": pool["mask"][rows] > 0,
         }
 
-    def _pool(self, view: int) -> _Pool:
-        """Return what is kept of a view; it is read when it is first needed."""
+    def _kept_of(self, view: int) -> dict[str, AnyArray]:
+        """Return what is kept of a view, its images or some pixels; read when it is first needed.
+
+        The caller must not change it.
+        """
         if view in self._pools:
             return self._pools[view]
-        images, count = self._images(view), POOL * (self._points or 0)
-        pixels = self._pixels(images["depth"], images["mask"], count, view)
-        v, u = np.divmod(pixels, images["depth"].shape[1])
-        pool = _Pool(
-            uv=np.column_stack([u, v]).astype(np.uint16),
-            depth=images["depth"][v, u],
-            rgb=images["rgb"][v, u],
-            mask=images["mask"][v, u],
-        )
-        if self._kept + pool.nbytes <= self._cache:
-            self._pools[view] = pool
-            self._kept += pool.nbytes
-        return pool
+        kept = self._images(view)
+        if self._points is not None:
+            pixels = self._pixels(kept["depth"], kept["mask"], POOL * self._points, view)
+            v, u = np.divmod(pixels, kept["depth"].shape[1])
+            kept = {name: kept[name][v, u] for name in ("depth", "rgb", "mask")}
+            kept["uv"] = np.column_stack([u, v]).astype(np.uint16)
+        size = sum(array.nbytes for array in kept.values())
+        if self._kept + size <= self._cache:
+            self._pools[view] = kept
+            self._kept += size
+        return kept
 
     def _pixels(
         self, depth: AnyArray, mask: AnyArray, count: int, view: int
@@ -377,12 +380,11 @@ class SceneDataset:
         wanted = round(self._on_object * count) if len(others) else count
         wanted = wanted if len(own) else 0
         chosen = [
-            pixels[stream.permutation(max(number, len(pixels)))[:number] % len(pixels)]
+            pixels[_choice(stream, len(pixels), number)]
             for pixels, number in ((own, wanted), (others, count - wanted))
             if number
         ]
-        found = np.concatenate(chosen)
-        return found[stream.permutation(count)]
+        return np.concatenate(chosen)[stream.permutation(count)]
 
     def _images(self, view: int) -> dict[str, AnyArray]:
         """Return the images of a view and its camera matrix."""
@@ -401,6 +403,31 @@ class SceneDataset:
         if stamp(self.path) != self._stamp:
             raise DataError(f"{self.path}: must stay while it is read, got another; open it again")
         return opened(self.path, "the scenes of a dataset", again=True)
+
+
+def _choice(stream: Stream, among: int, count: int) -> npt.NDArray[np.int64]:
+    """Return indices (count,) below `among`, each once if they are not very many or too few."""
+    if among > MANY * count:
+        return stream.integers(among, count)
+    return stream.permutation(max(count, among))[:count] % among
+
+
+class Rounds:
+    """All items of a dataset in a random order, with the epoch, which is one more each round.
+
+    The epoch goes with the index, so it reaches workers that stay, and these keep what they read.
+    """
+
+    def __init__(self, data: SceneDataset, seed: int) -> None:
+        self.data, self.epoch, self._seed = data, data.epoch, seed
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        epoch, self.epoch = self.epoch, self.epoch + 1
+        order = Stream(self._seed, _ROUND, epoch).permutation(len(self))
+        return ((epoch, index) for index in order.tolist())
 
 
 #: Fields of /grasps that items hold as they are.

@@ -84,6 +84,17 @@ def test_objects_come_as_often_as_each_other(path: Path) -> None:
     assert sorted(views) == sorted(again) == data.views.tolist() and views != again
 
 
+def test_each_round_draws_anew_and_says_its_epoch(path: Path) -> None:
+    data = SceneDataset(path, points=16, split="test")
+    rounds = data.rounds()
+    first, second = list(rounds), list(rounds)
+    assert sorted(first) == [(0, i) for i in range(10)] and sorted(second)[0] == (1, 0)
+    assert [i for _, i in first] != [i for _, i in second]
+    zero, one = data[0, 3], data[1, 3]
+    data.epoch = 1
+    assert same(data[3], one) and not same(one, zero)
+
+
 def test_images_are_those_of_the_file(path: Path) -> None:
     item = SceneDataset(path, points=None)[0]
     assert item["rgb"].shape == (240, 320, 3) and item["rgb"].dtype == np.uint8
