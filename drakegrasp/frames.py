@@ -27,6 +27,8 @@ P_WT = np.array([0.0, 0.0, 0.65])
 
 #: How far a rotation matrix may be from orthogonal: files hold them in single precision.
 ROTATION_TOLERANCE = 1e-4
+#: What is farther from the origin of its frame is no contact and no palm [m].
+FARTHEST = 1e3
 #: Other kinds of array, by NumPy's letter, as errors name them.
 _OTHER_KINDS = {"U": "text", "S": "text", "b": "truth values", "c": "complex numbers"}
 

@@ -2,7 +2,7 @@
 
 \b
     python pipelines/submit_build.py --cluster local ...
-    python pipelines/submit_build.py --cluster ssh node1 node2 --cores 16 --interface eth0 --tls ...
+    python pipelines/submit_build.py --cluster ssh node1 node2 --cores 16 --interface eth0 ...
     python pipelines/submit_build.py --cluster slurm --workers 200 --walltime 04:00:00 ...
     python pipelines/submit_build.py --cluster scheduler tcp://10.0.0.1:8786 ...
     python pipelines/submit_build.py --cluster scheduler-file scheduler.json ...
@@ -25,7 +25,7 @@ from distributed import Client
 from drakegrasp.api.building import build_on, find_sources
 from drakegrasp.cli.build import print_plan, print_report
 from drakegrasp.cli.errors import OneCommand
-from drakegrasp.cli.options import build_options, parse_request, shared, tls_files, tls_options
+from drakegrasp.cli.options import build_options, chosen_tls, parse_request, shared, tls_options
 from drakegrasp.cluster.connect import dashboard_line
 from drakegrasp.cluster.launch import start_cluster
 from drakegrasp.cluster.request import KINDS, ClusterRequest, describe, worker_count
@@ -57,9 +57,6 @@ from drakegrasp.hand.description import load_hand
     "--interface", metavar="NAME", help="Network interface on which scheduler and workers listen."
 )
 @click.option("--host", metavar="ADDRESS", help="Address on which the scheduler listens, instead.")
-@click.option(
-    "--tls", is_flag=True, help="Encrypt, with certificates made for this run; local always does."
-)
 @tls_options
 @shared("--times")
 @click.option("--dry-run", is_flag=True, help="Only print what would run.")
@@ -72,13 +69,12 @@ def main(
     walltime: str | None,
     interface: str | None,
     host: str | None,
-    tls: bool,
     times: Path | None,
     dry_run: bool,
     **options: Any,
 ) -> None:
     """Run the script."""
-    files = tls_files(options)
+    tls = chosen_tls(options)
     request = parse_request(options)
     cluster = ClusterRequest(
         kind=kind,
@@ -89,8 +85,7 @@ def main(
         walltime=walltime,
         host=host,
         interface=interface,
-        tls=tls,
-        tls_files=files,
+        **tls,
     )
 
     # Say what will run before anything starts.

@@ -13,7 +13,7 @@ import trimesh
 from helpers.datasets import make_dataset
 from helpers.meshes import G3DB, SMALL, write_fixed
 from helpers.objects import CUBE, box_model
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from drakegrasp.build.pipeline import build
 from drakegrasp.config import Config
@@ -27,8 +27,8 @@ from drakegrasp.runtime.executor import run_here
 os.environ.setdefault("LP_NUM_THREADS", "0")
 os.environ.setdefault("DRAKE_ALLOW_NETWORK", "none")
 
-# Shared machines stall now and then; an example is never too slow by itself.
-settings.register_profile("drakegrasp", deadline=None)
+# Shared machines stall now and then; an example is never too slow by itself, nor is its making.
+settings.register_profile("drakegrasp", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("drakegrasp")
 
 

@@ -229,7 +229,7 @@ PAPER = {
 #: They act on assembled shards or on predicted grasps, or say only where to stop.
 NOT_SIMULATED = (
     *("filters", "split", "max_grasps", "samples", "samples_per_object", "samples_patience"),
-    *("attempt_seconds", "verify"),
+    *("attempt_seconds", "verify", "scenes"),
 )
 
 

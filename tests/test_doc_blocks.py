@@ -35,6 +35,8 @@ NOT_RUN = {
     "ssh ": "another machine",
     "dask ": "a cluster; tests/cluster starts one",
     "python pipelines/submit_build.py ": "a cluster; tests/cluster/test_submit.py",
+    "python pipelines/make_certificates.py ": "a cluster; tests/cluster/test_submit.py",
+    "tls=": "options of the lines below it",
     "python docs/examples/": "tests/test_examples.py runs it",
     "python pipelines/measurements/": "measures for minutes to hours",
     "drakegrasp build ": "simulates for minutes to hours; tests/build; with --plan it is run",
@@ -68,6 +70,7 @@ NO_CODE = {
 PY_NOT_RUN = {
     "dg.build_dataset(": "simulates for hours; tests/test_api.py",
     "datasets.load_dataset(": "tests/exchange/test_hub.py reads a folder so",
+    "dg.SceneDataset(": "wants scenes and torch; tests/dataset/scenes",
     'dg.place_object("mug.obj"': "tests/verification/test_verify.py",
 }
 #: Commands that simulate, which want a dataset that was simulated.

@@ -180,7 +180,8 @@ def command_lines(page: Path) -> Iterator[tuple[click.Command, list[str]]]:
 
 def options_of(command: click.Command) -> set[str]:
     """Return the options of a command, of a group those of all its commands."""
-    options = {o for p in command.params for o in p.opts if isinstance(p, click.Option)}
+    given = [param for param in command.params if isinstance(param, click.Option)]
+    options = {name for param in given for name in (*param.opts, *param.secondary_opts)}
     below = command.commands.values() if isinstance(command, click.Group) else ()
     return options.union({"--help", "-h"}, *map(options_of, below))
 

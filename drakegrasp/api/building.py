@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drakegrasp.api.workers import announced, refuse_workers
+from drakegrasp.api.workers import announced, connection, end_imported_script
 from drakegrasp.build.pipeline import (
     BuildReport,
     build_locked,
@@ -20,8 +20,6 @@ from drakegrasp.build.pipeline import (
 )
 from drakegrasp.build.request import BUILTIN, refuse_unknown
 from drakegrasp.cluster.admission import admitted_workers
-from drakegrasp.cluster.certificates import security_of
-from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.config import Config
 from drakegrasp.dataset.lock import build_lock
@@ -38,7 +36,7 @@ from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.scoring.benchmark import FILE_NAME, NAME, PRESET, write_objects
 from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.postures.table import PostureTable, refuse_unknown_objects
+from drakegrasp.simulation.postures.table import PostureTable, unknown_objects
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -56,6 +54,7 @@ def build_dataset(
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
+    tls: bool = True,
     tls_files: tuple[Path, Path, Path] | None = None,
     show: bool = True,
 ) -> BuildReport:
@@ -72,32 +71,35 @@ def build_dataset(
         manifest: YAML file with units and classes per mesh, if it is not beside the meshes.
         only: Names of the objects to build; all if empty.
         postures: Instead of drawn palm poses: a file of postures, or a table of them. Only the
-            objects that it names are built.
+            objects that it names are built; rows that are no posture are told, and left out.
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
-        tls_files: To encrypt: certificate authority, certificate and private key (PEM).
+        tls: Whether the scheduler must want a certificate.
+        tls_files: Certificate authority, certificate and private key (PEM) for it.
         show: Whether to show progress on standard error.
 
     Raises:
         MeshError: If there is no mesh.
-        GraspError: If a row of the postures is none, or of an object that is not there.
-        ConfigError: If both workers and a scheduler are given, or the address is empty.
+        GraspError: If no row of the postures is one of an object that is there.
+        ConfigError: If both workers and a scheduler are given, the address is empty, or the
+            scheduler wants no certificate although `tls` says so.
         DataError: If `out` cannot be used, another process builds there, or no mesh can be
             simulated.
         MachineError: If there is no scheduler, the workers cannot do the work, or no room is
             left; the same call continues when that is fixed.
     """
-    refuse_workers(workers, scheduler, scheduler_file)
+    end_imported_script()
+    cluster = connection(workers, scheduler, scheduler_file, tls, tls_files)
     out, config = Path(out).absolute(), config or load_config()
     hand = load_hand(config.hand_source)
     drive_of(hand, config.lift)
     if isinstance(postures, str | Path):
         postures = read_postures(Path(postures), hand)
     sources = find_sources(objects, units, manifest)
-    security = None if tls_files is None else security_of(tls_files)
-    cluster = announced(connect(workers, scheduler, scheduler_file, security=security), show)
-    return build_on(cluster, sources, out, config, only=only, postures=postures, show=show)
+    return build_on(
+        announced(cluster, show), sources, out, config, only=only, postures=postures, show=show
+    )
 
 
 def find_sources(
@@ -149,10 +151,14 @@ def build_on(
     known = draw_builtin(config.builtin) if sources is None else sources
     refuse_unknown(only, [each.name for each in known])
     if postures is not None:
-        refuse_unknown_objects(postures, [each.name for each in known])
-        only = [name for name in dict.fromkeys(postures.objects) if not only or name in only]
+        postures = postures.refuse(unknown_objects(postures, [each.name for each in known]))
+        named = dict.fromkeys(
+            name for name, bad in zip(postures.objects, postures.invalid, strict=True) if not bad
+        )
+        only = [name for name in named if not only or name in only]
         if not only:
-            raise GraspError("postures must be of an object that is built, got none of them")
+            why = f": {postures.refused}" if postures.refused else ", got none of them"
+            raise GraspError(f"postures must be of an object that is built{why}")
     with build_lock(out) as dead, ExitStack() as stack:
         # A directory that cannot be used is refused before workers start.
         before = claim_directory(out, config)
@@ -196,6 +202,8 @@ def make_benchmark(
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
+    tls: bool = True,
+    tls_files: tuple[Path, Path, Path] | None = None,
     show: bool = True,
 ) -> BuildReport:
     """Make the frozen benchmark `drakegrasp-bench-1`; the same as `drakegrasp bench-set`.
@@ -207,6 +215,8 @@ def make_benchmark(
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
+        tls: Whether the scheduler must want a certificate.
+        tls_files: Certificate authority, certificate and private key (PEM) for it.
         show: Whether to show progress on standard error.
 
     Raises:
@@ -227,6 +237,8 @@ def make_benchmark(
         workers=workers,
         scheduler=scheduler,
         scheduler_file=scheduler_file,
+        tls=tls,
+        tls_files=tls_files,
         show=show,
     )
 

@@ -24,7 +24,9 @@ from drakegrasp.scoring.references import REFERENCES
 from drakegrasp.scoring.run import Request, Score
 from drakegrasp.scoring.run import score as score_request
 from drakegrasp.scoring.verdict import Verdict, protocol_verdict, verdict_of
+from drakegrasp.simulation.postures.table import PostureTable
 from drakegrasp.verification.placed_grasp import dataset_config, overridden_keys, place_on_rows
+from drakegrasp.verification.placed_postures import place_postures_on_rows
 from drakegrasp.verification.verify import PlacedGrasp
 
 #: Receives verdicts as they come: called with the place of a grasp and its verdict.
@@ -47,13 +49,16 @@ def score(
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
+    tls: bool = True,
+    tls_files: tuple[Path, Path, Path] | None = None,
     show: bool = False,
 ) -> Score:
     """Return the score of predicted grasps beside reference rows; see docs/how-to/score.md.
 
     Args:
         predictions: In the frame of the rows' camera: (n, 6k), one per row, or (n, m, 6k), m per
-            row; or a file of them, or several files of one method that was trained several times.
+            row; or a file of them or of postures, or several files of one method that was trained
+            several times.
             An empty list scores the reference rows alone.
         dataset: The split whose rows the predictions are for.
         rows: With an array: (n,), the row of each; all rows, in order, if None.
@@ -70,6 +75,8 @@ def score(
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
+        tls: Whether the scheduler must want a certificate.
+        tls_files: Certificate authority, certificate and private key (PEM) for it.
         show: Whether to show progress on standard error.
 
     Raises:
@@ -101,8 +108,11 @@ def score(
     )
 
     # Its verdicts, by this process or workers, and the card.
-    def try_all(grasps: Array, chosen: Sequence[int], deliver: Deliver) -> None:
-        placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
+    def try_all(grasps: Array | PostureTable, chosen: Sequence[int], deliver: Deliver) -> None:
+        if isinstance(grasps, PostureTable):
+            placed = place_postures_on_rows(grasps, dataset, chosen, overrides=settings)
+        else:
+            placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
         if peer:
             _try_by_protocol(placed, protocol, deliver, workers=workers, show=show)
             return
@@ -111,6 +121,8 @@ def score(
             workers=workers,
             scheduler=scheduler,
             scheduler_file=scheduler_file,
+            tls=tls,
+            tls_files=tls_files,
             on_result=lambda index, result: deliver(index, verdict_of(result)),
             show=show,
         )

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.api.workers import refuse_workers
+from drakegrasp.api.workers import connection, end_imported_script
 from drakegrasp.cluster.admission import admitted_workers
-from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.config import Config
 from drakegrasp.dataset.reader import GraspDataset
@@ -254,6 +253,8 @@ def run_verification(
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
+    tls: bool = True,
+    tls_files: tuple[Path, Path, Path] | None = None,
     on_result: ResultCallback = ignore_result,
     show: bool = True,
 ) -> list[Verification]:
@@ -267,18 +268,22 @@ def run_verification(
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
+        tls: Whether the scheduler must want a certificate.
+        tls_files: Certificate authority, certificate and private key (PEM) for it.
         on_result: Is called with each verdict in the caller's order, once all earlier ones exist.
         show: Whether to show progress on standard error.
 
     Raises:
-        ConfigError: If both workers and a scheduler are given.
+        ConfigError: If both workers and a scheduler are given, or the scheduler wants no
+            certificate although `tls` says so.
         MachineError: If a worker would give other results than this machine.
     """
-    refuse_workers(workers, scheduler, scheduler_file)
+    end_imported_script()
+    cluster = connection(workers, scheduler, scheduler_file, tls, tls_files)
     alone = len(grasps) <= FEW_GRASPS or count_workers(workers) == 1
     if alone and not (scheduler or scheduler_file):
         return _verify_on(None, grasps, on_result, show=show)
-    with connect(workers, scheduler, scheduler_file) as client:
+    with cluster as client:
         return _verify_on(client, grasps, on_result, show=show)
 
 

@@ -9,7 +9,8 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drakegrasp.cluster.connect import dashboard_line, has_dashboard
+from drakegrasp.cluster.certificates import chosen_security
+from drakegrasp.cluster.connect import connect, dashboard_line, has_dashboard
 from drakegrasp.errors import ConfigError
 from drakegrasp.runtime.executor import count_workers
 
@@ -26,22 +27,40 @@ def announced(cluster: AbstractContextManager[Client], show: bool) -> Iterator[C
         yield client
 
 
-def refuse_workers(
-    workers: int | None, scheduler: str | None, scheduler_file: str | Path | None
-) -> None:
-    """Refuse a number of workers that is below one, or given with a scheduler.
+def end_imported_script() -> None:
+    """End this process if it was started as a worker, and only imports the caller's script.
 
-    A process that was started as a worker, and that only imports the caller's script, ends here.
-
-    Raises:
-        ConfigError: If so.
+    Python imports the script into each process that it starts: a call that is not under
+    `if __name__ == "__main__"` would begin there, too.
     """
-    # Python imports the script into each process that it starts: a call that is not under
-    # `if __name__ == "__main__"` would begin there, too.
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         sys.exit(1)
+
+
+def connection(
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_file: str | Path | None,
+    tls: bool,
+    tls_files: tuple[Path, Path, Path] | None,
+) -> AbstractContextManager[Client]:
+    """Return what connects to the workers that a caller asks for, when it is entered.
+
+    Args:
+        workers: Processes on this machine; one per core if None.
+        scheduler: Address of a running scheduler.
+        scheduler_file: Its JSON file, instead of the address.
+        tls: Whether the scheduler must want a certificate.
+        tls_files: Certificate authority, certificate and private key (PEM).
+
+    Raises:
+        ConfigError: If the number of workers is below one or given with a scheduler, the address
+            is empty, or the choice of TLS contradicts itself.
+    """
     if scheduler is not None and not scheduler.strip():
         raise ConfigError(f"scheduler must be an address like tcp://host:8786, got {scheduler!r}")
     if workers is not None and (scheduler or scheduler_file):
         raise ConfigError("workers must not be given with a scheduler, which has its own")
     count_workers(workers)
+    security = chosen_security(tls, tls_files, elsewhere=bool(scheduler or scheduler_file))
+    return connect(workers, scheduler, scheduler_file, security=security, tls=tls)

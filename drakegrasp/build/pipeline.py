@@ -42,7 +42,7 @@ from drakegrasp.dataset.paths import SCENES_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
-from drakegrasp.errors import ConfigError, DataError, DrakegraspError, listed
+from drakegrasp.errors import ConfigError, DataError, DrakegraspError, GraspError, listed
 from drakegrasp.hand.carried import carry_hand
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.parsing import position_order
@@ -51,7 +51,7 @@ from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.postures.table import PostureTable
+from drakegrasp.simulation.postures.table import PostureTable, misfits
 from drakegrasp.simulation.sampling.own import own_sampler
 
 
@@ -126,6 +126,7 @@ def build(
         ConfigError: As `refuse_unusable`.
         DataError: If the directory cannot be used, another process builds there, or no mesh
             can be simulated.
+        GraspError: If no row of the postures is one of these objects.
         HandError: If the hand cannot be used.
         DiskFullError: If there is no room; the same call goes on when there is.
         MachineError: If the workers cannot do the work.
@@ -189,7 +190,7 @@ def build_locked(
         execute: Does the work.
         dead: Who held the lock before and died, as `build_lock` yields it.
         postures: What is tried instead of palm poses of samplers; the configuration knows it by
-            its digest, see `posture_config`.
+            its digest, see `posture_config`. Rows that are none are told, and left out.
         pool: The executor's processes, as for `build`.
         show: Whether to show progress on standard error.
 
@@ -251,6 +252,9 @@ def _build(
     write_manifest(manifest, out)
     if warning := too_heavy(manifest):
         job.events.warn(warning)
+    if job.postures is not None and (refused := _refused_postures(job.postures, manifest)):
+        job.events.warn(refused)
+        notices.append(refused)
 
     # Simulate the work units that are not done; killed workers leave temporary files.
     with progress_bar("simulate", "attempts", show=job.show) as report:
@@ -292,6 +296,20 @@ def _build(
         assembled=stale,
         assembly=summarise(out),
     )
+
+
+def _refused_postures(postures: PostureTable, manifest: Manifest) -> str:
+    """Return which rows of the postures are not tried, and why; empty if all are.
+
+    Raises:
+        GraspError: If none is left.
+    """
+    for entry in manifest.objects:
+        reasons = misfits(postures, entry.name, entry.scale, len(entry.resting))
+        postures = postures.refuse(reasons)
+    if all(postures.invalid):
+        raise GraspError(postures.refused)
+    return postures.refused
 
 
 def _sweep(out: Path) -> list[str]:

@@ -143,7 +143,6 @@ def prepare(
         postures: What is tried of it instead of palm poses of samplers.
 
     Raises:
-        GraspError: If a posture is for a resting pose or a scale that the object does not have.
         MeshError: If the mesh cannot be repaired, its size is implausible, or the object does
             not come to rest.
     """

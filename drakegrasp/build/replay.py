@@ -20,6 +20,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.trial import start_meetings
 from drakegrasp.visualization.recording import record_attempt
 
 
@@ -34,6 +35,8 @@ class Replay:
         found: The outcome now.
         differences: Largest absolute difference of each field whose values differ.
         versions: Packages whose versions differ, as "then -> now".
+        meetings: Of a start collision the links of the hand that meet the object or the table
+            where it starts, by "object" and "table".
     """
 
     trial_id: int
@@ -42,6 +45,7 @@ class Replay:
     found: Outcome
     differences: dict[str, float]
     versions: dict[str, str]
+    meetings: dict[str, list[str]]
 
     @property
     def same(self) -> bool:
@@ -68,6 +72,11 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
     record = try_attempt(setup, stored.attempt)
     row = trial_rows(setup, [stored.attempt], [record], [measure_contacts(setup, record)])
 
+    # What a hand met that could not start.
+    meetings = {}
+    if record.outcome is Outcome.START_COLLISION:
+        meetings = start_meetings(setup.scene_of(stored.attempt), record.X_TO, stored.attempt)
+
     # Compare bit for bit; other versions may explain a difference.
     now = installed_versions(config)
     return Replay(
@@ -85,6 +94,7 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
             for key, then in stored.versions.items()
             if now.get(key) != then
         },
+        meetings=meetings,
     )
 
 

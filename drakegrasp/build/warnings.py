@@ -14,7 +14,12 @@ from drakegrasp.objects.sources import MeshSource
 
 
 def nothing_trains(sources: Sequence[MeshSource], split: SplitConfig) -> str:
-    """Return why no sample of these meshes can be in the split `train`; empty if one can."""
+    """Return why no sample of these meshes can be in the split `train`; empty if one can.
+
+    A configuration that names no class to train on, as a benchmark's, means it.
+    """
+    if split.train_classes == ():
+        return ""
     classes = [source.class_name for source in sources]
     if split_rule(split, classes, [source.group or source.name for source in sources]) == "object":
         return ""

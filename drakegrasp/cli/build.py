@@ -13,11 +13,11 @@ from drakegrasp.cli.options import (
     FILE,
     PATH,
     build_options,
+    chosen_workers,
+    connection_options,
     dataset_argument,
     parse_request,
     shared,
-    tls_files,
-    tls_options,
 )
 
 if TYPE_CHECKING:
@@ -28,20 +28,12 @@ if TYPE_CHECKING:
 
 @click.command()
 @build_options
-@shared("--workers", "--scheduler", "--scheduler-file")
-@tls_options
+@connection_options
 @click.option(
     "--plan", is_flag=True, help="Only print the hours and bytes that the build would take."
 )
 @shared("--times")
-def build(
-    workers: int | None,
-    scheduler: str | None,
-    scheduler_file: Path | None,
-    plan: bool,
-    times: Path | None,
-    **options: Any,
-) -> None:
+def build(plan: bool, times: Path | None, **options: Any) -> None:
     """Build a dataset from a directory of meshes.
 
     The command simulates grasps of every object and writes trials.hdf5,
@@ -49,12 +41,12 @@ def build(
     """
     from drakegrasp.api.building import build_dataset
 
-    files = tls_files(options)
+    workers = chosen_workers(options)
     request = parse_request(options)
     if plan and request.postures is not None:
         raise click.UsageError("--plan must be used without --postures: a row is an attempt")
     if plan:
-        print_plan(request, workers, times)
+        print_plan(request, workers["workers"], times)
         return
     report = build_dataset(
         request.objects,
@@ -64,10 +56,7 @@ def build(
         manifest=request.manifest,
         only=request.only,
         postures=request.postures,
-        workers=workers,
-        scheduler=scheduler,
-        scheduler_file=scheduler_file,
-        tls_files=files,
+        **workers,
         show=request.show,
     )
     print_report(report)
@@ -195,15 +184,18 @@ def print_stats(out: Path) -> None:
         funnel_table,
         hold_table,
         make_console,
+        preshape_table,
         split_line,
         split_table,
         unfinished_line,
     )
+    from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.dataset.paths import DATA_FILES
     from drakegrasp.dataset.statistics import (
         count_funnel,
         count_splits,
         count_unfinished,
+        preshapes_of,
         split_rule_of,
     )
 
@@ -216,6 +208,8 @@ def print_stats(out: Path) -> None:
         table = funnel_table(funnel, compact=True)
     console.print(table)
     console.print(hold_table(funnel))
+    if preshapes := preshapes_of(funnel, read_manifest(out).config):
+        console.print(preshape_table(preshapes))
     console.print()
     if unfinished is None:
         splits = count_splits(out)

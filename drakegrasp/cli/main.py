@@ -28,6 +28,7 @@ from drakegrasp.cli.morph import morph
 from drakegrasp.cli.options import PATH, chosen_settings, dataset_argument, shared
 from drakegrasp.cli.score import bench_set, score
 from drakegrasp.cli.verify.command import verify
+from drakegrasp.errors import printable
 from drakegrasp.runtime.allocator import restart_with_jemalloc
 
 
@@ -135,6 +136,8 @@ def replay(out: Path, trial: int, html: Path | None) -> None:
     # Whatever differs is printed: values first, then versions, which may explain them.
     again = replay_trial(out, trial)
     say(f"trial {trial} of {again.object_name}: was {again.recorded.label}, is {again.found.label}")
+    for other, links in again.meetings.items():
+        say(f"  where it starts, {', '.join(map(printable, links))} of the hand meet the {other}")
     for name, difference in again.differences.items():
         how = "is missing in one" if math.isnan(difference) else f"by up to {difference:.3g}"
         say(f"  {name} differs: {how}")

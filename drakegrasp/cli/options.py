@@ -113,7 +113,8 @@ _TABLE = {
     ),
     "--tls-ca-file": _row(
         "FILE",
-        "Encrypt, with your own certificate authority (PEM); needs the next two options.",
+        "Your own certificate authority (PEM), as a running scheduler needs it; with the next two "
+        "options.",
         type=FILE,
     ),
     "--tls-cert": _row(
@@ -122,6 +123,13 @@ _TABLE = {
         type=FILE,
     ),
     "--tls-key": _row("FILE", "The certificate's private key.", type=FILE),
+    "--tls/--no-tls": _row(
+        None,
+        "Whether connections need a certificate. Workers that the command starts get one that is "
+        "made for the run.",
+        default=True,
+        show_default=True,
+    ),
     # What is said.
     "--times": _row(
         "FILE",
@@ -150,7 +158,9 @@ _BUILD = (
     *("--max-grasps", "--samples", "--samples-per-object", "--postures", "--only", "--certify"),
     *("--seed", "--units", "--manifest", "--quiet"),
 )
-_TLS = ("--tls-ca-file", "--tls-cert", "--tls-key")
+_TLS_FILES = ("--tls-ca-file", "--tls-cert", "--tls-key")
+_TLS = ("--tls/--no-tls", *_TLS_FILES)
+_CONNECTION = ("--workers", "--scheduler", "--scheduler-file")
 
 
 def shared(*names: str, **changes: Any) -> Callable[[F], F]:
@@ -176,8 +186,13 @@ def build_options(command: F) -> F:
 
 
 def tls_options(command: F) -> F:
-    """Give a command the files of TLS; it passes them on to `tls_files`."""
+    """Give a command the options of TLS; it passes them on to `chosen_tls`."""
     return shared(*_TLS)(command)
+
+
+def connection_options(command: F) -> F:
+    """Give a command the options of who does the work; it passes them on to `chosen_workers`."""
+    return shared(*_CONNECTION, *_TLS)(command)
 
 
 def _tidied(context: click.Context, parameter: click.Parameter, out: Path) -> Path:
@@ -194,21 +209,29 @@ def dataset_argument(name: str = "out", metavar: str = "OUT") -> Callable[[F], F
     return click.argument(name, type=PATH, metavar=metavar, callback=_tidied)
 
 
-def tls_files(options: dict[str, Any]) -> tuple[Path, Path, Path] | None:
+def chosen_workers(options: dict[str, Any]) -> dict[str, Any]:
+    """Take the values of `connection_options` out of a command's options, for a public call."""
+    return {
+        **{_parameter(name): options.pop(_parameter(name)) for name in _CONNECTION},
+        **chosen_tls(options),
+    }
+
+
+def chosen_tls(options: dict[str, Any]) -> dict[str, Any]:
     """Take the values of `tls_options` out of a command's options.
 
     Returns:
-        The authority, the certificate and its key; None if none of them is given.
+        `tls`, and `tls_files`: the authority, the certificate and its key, or None.
 
     Raises:
         click.UsageError: If only some are given.
     """
-    match [options.pop(_parameter(name)) for name in _TLS]:
-        case [None, None, None]:
-            return None
-        case [Path() as ca, Path() as cert, Path() as key]:
-            return ca, cert, key
-    raise click.UsageError(f"{', '.join(_TLS[:-1])} and {_TLS[-1]} must be given together")
+    files = tuple(options.pop(_parameter(name)) for name in _TLS_FILES)
+    if None in files and any(files):
+        raise click.UsageError(
+            f"{', '.join(_TLS_FILES[:-1])} and {_TLS_FILES[-1]} must be given together"
+        )
+    return {"tls": options.pop("tls"), "tls_files": files if any(files) else None}
 
 
 def parse_request(options: Mapping[str, Any]) -> BuildRequest:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import FILE, PATH, shared
+from drakegrasp.cli.options import FILE, PATH, chosen_workers, connection_options, shared
 
 if TYPE_CHECKING:
     from drakegrasp.scoring.run import Score
@@ -70,7 +70,7 @@ DEFAULT_FOLDER = Path("score")
     help="Folder of the card and of the verdicts; the same command goes on from there.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the card as JSON.")
-@shared("--workers", "--scheduler", "--scheduler-file")
+@connection_options
 @shared("--quiet", help="Show neither progress nor the table.")
 def score(
     predictions: tuple[Path, ...],
@@ -84,13 +84,14 @@ def score(
     out: Path,
     as_json: bool,
     quiet: bool,
-    **workers: Any,
+    **options: Any,
 ) -> None:
     """Score predicted grasps beside reference rows, and write a card.
 
     Each of PREDICTIONS is a .npy, HDF5 or Parquet file: (n, 6k) numbers, one grasp per row of the
-    split, or (n, m, 6k), m per row, in the camera's frame. Several files are of one method that
-    was trained several times. Without any, the reference rows are scored alone.
+    split, or (n, m, 6k), m per row, in the camera's frame; or a file of postures with the `row`
+    that each is for. Several files are of one method that was trained several times. Without any,
+    the reference rows are scored alone.
 
     DIR gets card.json, card.md, card.png, and the verdicts, so that an interrupted score goes on.
     """
@@ -100,6 +101,8 @@ def score(
     from drakegrasp.dataset.reader import GraspDataset
     from drakegrasp.errors import DataError, GraspError
     from drakegrasp.scoring.references import REFERENCES
+
+    workers = chosen_workers(options)
 
     # A bad dataset is wrong usage, as for `verify`.
     try:
@@ -167,13 +170,15 @@ def _command(
 
 @click.command("bench-set")
 @click.argument("out", type=PATH, metavar="OUT")
-@shared("--only", "--set", "--workers", "--scheduler", "--scheduler-file", "--quiet")
+@shared("--only", "--set")
+@connection_options
+@shared("--quiet")
 def bench_set(
     out: Path,
     only: tuple[str, ...],
     overrides: tuple[str, ...],
     quiet: bool,
-    **workers: Any,
+    **options: Any,
 ) -> None:
     """Make the frozen benchmark drakegrasp-bench-1 in OUT.
 
@@ -188,7 +193,7 @@ def bench_set(
         out,
         only=only,
         overrides=overrides,
-        **workers,
+        **chosen_workers(options),
         show=not quiet,
     )
     print_report(report)

@@ -12,7 +12,15 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from drakegrasp.dataset.statistics import Funnel, SplitCount, Unfinished, held_note, why_no_samples
+from drakegrasp.dataset.statistics import (
+    NO_NAME,
+    Funnel,
+    PreshapeCount,
+    SplitCount,
+    Unfinished,
+    held_note,
+    why_no_samples,
+)
 from drakegrasp.errors import printable
 from drakegrasp.objects.audit import AuditRow
 from drakegrasp.objects.memory import needed_limit
@@ -133,6 +141,17 @@ def hold_table(funnel: Funnel) -> Table:
     if note := held_note(funnel):
         notes.append(note)
     table.caption = "\n".join(notes)
+    return table
+
+
+def preshape_table(counts: Sequence[PreshapeCount]) -> Table:
+    """Return how the attempts of each preshape ended, a row per preshape."""
+    table = _table("Preshapes", "preshape", "attempts", "held", "stable", "samples")
+    for count in counts:
+        numbers = count.attempts, count.held, count.stable, count.samples
+        table.add_row(_safe(count.preshape), *(f"{n:,}" for n in numbers))
+    if any(count.preshape == NO_NAME for count in counts):
+        table.caption = f"{NO_NAME}: postures for which all fingers close"
     return table
 
 

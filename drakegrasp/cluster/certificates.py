@@ -15,7 +15,7 @@ from typing import Any
 
 from distributed.security import Security
 
-from drakegrasp.errors import MachineError
+from drakegrasp.errors import ConfigError, MachineError
 
 
 def make_certificates(folder: Path) -> tuple[Path, Path, Path]:
@@ -30,6 +30,29 @@ def make_certificates(folder: Path) -> tuple[Path, Path, Path]:
         path.touch(mode=0o600)
         path.write_text(text, encoding="ascii")
     return paths
+
+
+def chosen_security(
+    tls: bool, files: tuple[Path, Path, Path] | None, *, elsewhere: bool
+) -> Security | None:
+    """Return the certificates that a caller gives; None if there are none.
+
+    Args:
+        tls: Whether connections need a certificate.
+        files: Authority, certificate and private key.
+        elsewhere: Whether workers or scheduler are not started on this machine.
+
+    Raises:
+        ConfigError: If the choice contradicts itself.
+    """
+    if not tls and not elsewhere:
+        raise ConfigError(
+            "--no-tls (tls=False) must not be given for workers on this machine: every user of it "
+            "could run programs as you"
+        )
+    if not tls and files is not None:
+        raise ConfigError("--no-tls (tls=False) must not be given with certificates")
+    return None if files is None else security_of(files)
 
 
 def security_of(files: tuple[Path, Path, Path]) -> Security:

@@ -15,7 +15,7 @@ from distributed.security import Security
 
 from drakegrasp.cluster.admission import SATURATION, SILENCE_SECONDS, worker_environment
 from drakegrasp.cluster.local import PrivateCluster, undisturbed_loop
-from drakegrasp.errors import MachineError
+from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.runtime.allocator import PRELOAD, SETTINGS, kept_variables
 from drakegrasp.runtime.environment import available_cores
 
@@ -68,6 +68,7 @@ def connect(
     scheduler_file: str | Path | None = None,
     *,
     security: Security | None = None,
+    tls: bool = True,
     memory: str | None = None,
 ) -> Iterator[Client]:
     """Connect to a running scheduler, or start a cluster on this machine, while the block runs.
@@ -76,17 +77,19 @@ def connect(
         workers: Processes of a cluster on this machine; one per core if None.
         scheduler: Address of a running scheduler.
         scheduler_file: Its JSON file, instead of the address.
-        security: Certificates; without them a cluster on this machine makes its own, and
-            connections to a running scheduler are not encrypted.
+        security: Certificates; without them a cluster on this machine makes its own, and a
+            running scheduler gets those of Dask's settings (`distributed.comm.tls`).
+        tls: Whether a running scheduler must want a certificate.
         memory: Limit per process on this machine, e.g. "2GB"; an equal share of it if None.
 
     Raises:
+        ConfigError: If the scheduler wants no certificate, and should.
         MachineError: If there is no scheduler at the address.
     """
     # Dask sets variables here for the workers that it starts here.
     with kept_variables(PRELOAD, SETTINGS), dask.config.set(dask_settings()):
         if scheduler or scheduler_file:
-            cluster = _connect_remote(scheduler, scheduler_file, security)
+            cluster = _connect_remote(scheduler, scheduler_file, security, tls)
         else:
             cluster = _start_local(workers, security, memory)
         with cluster as client:
@@ -94,15 +97,24 @@ def connect(
 
 
 def _connect_remote(
-    scheduler: str | None, scheduler_file: str | Path | None, security: Security | None
+    scheduler: str | None,
+    scheduler_file: str | Path | None,
+    security: Security | None,
+    tls: bool,
 ) -> Client:
-    file = None if scheduler_file is None else str(scheduler_file)
+    address, file = scheduler, None if scheduler_file is None else str(scheduler_file)
     # Dask waits for a missing file for ever.
     if file is not None and not scheduler:
         if not Path(file).is_file():
             raise MachineError(f"{file}: must be the file of a running Dask scheduler, got none")
-        if not _names_scheduler(Path(file)):
+        address = _address_of(Path(file))
+        if address is None:
             raise MachineError(f"{file}: must be the file of a running Dask scheduler, got another")
+    if tls and not str(address).startswith("tls://"):
+        raise ConfigError(
+            f"scheduler must have an address that begins with tls://, got {address}: anybody who "
+            "reaches its port can run programs as you; --no-tls (tls=False) connects all the same"
+        )
     try:
         return _RemoteClient(
             scheduler, scheduler_file=file, timeout=CONNECT_SECONDS, security=security
@@ -113,13 +125,14 @@ def _connect_remote(
         ) from None
 
 
-def _names_scheduler(file: Path) -> bool:
-    """Return whether a file is JSON with the address of a scheduler; a new one may be empty yet."""
+def _address_of(file: Path) -> str | None:
+    """Return the address in a scheduler's file; None if it has none, or is empty yet."""
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return False
-    return isinstance(content, dict) and isinstance(content.get("address"), str)
+        return None
+    address = content.get("address") if isinstance(content, dict) else None
+    return address if isinstance(address, str) else None
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from tornado.ioloop import PeriodicCallback
 
 from drakegrasp.cluster.admission import worker_environment
 from drakegrasp.cluster.certificates import (
+    chosen_security,
     make_certificates,
     private_directory,
     security_of,
@@ -77,7 +78,12 @@ def start_cluster(request: ClusterRequest, out: Path) -> Iterator[Client]:
             address = request.where[0] if request.kind == "scheduler" else None
             file = request.where[0] if request.kind == "scheduler-file" else None
             running = connect(
-                request.workers, address, file, security=security, memory=request.memory
+                request.workers,
+                address,
+                file,
+                security=security,
+                tls=request.tls,
+                memory=request.memory,
             )
         with running as client:
             yield client
@@ -140,7 +146,7 @@ def _refuse_quotes(security: Security | None) -> None:
     """
     for path in server_options(security).get("security", {}).values():
         if "'" in str(path):
-            raise ConfigError(f"--out must be a path without ' for --tls over ssh, got {path}")
+            raise ConfigError(f"certificates (in --out) must have paths without ', got {path}")
 
 
 def _slurm(request: ClusterRequest, security: Security | None) -> SpecCluster:
@@ -271,10 +277,9 @@ def _lifetime(walltime: str | None) -> list[str]:
 @contextmanager
 def _security(request: ClusterRequest, out: Path) -> Iterator[Security | None]:
     """Yield the certificates; those that are made for this run are removed."""
-    if request.tls_files is not None:
-        yield security_of(request.tls_files)
-    elif request.kind == "local" or not request.tls:
-        yield None  # workers on this machine have certificates of their own
-    else:
+    given = chosen_security(request.tls, request.tls_files, elsewhere=request.kind != "local")
+    if request.kind in ("ssh", "slurm") and request.tls and given is None:
         with private_directory(out) as folder:
             yield security_of(make_certificates(folder))
+    else:
+        yield given  # workers on this machine have certificates of their own

@@ -16,6 +16,7 @@ from typing import Any
 import dask
 from dask.utils import parse_bytes
 
+from drakegrasp.cluster.certificates import chosen_security
 from drakegrasp.errors import ConfigError, MachineError
 
 #: Memory of a worker under SLURM, if neither the user nor jobqueue.yaml gives it.
@@ -24,10 +25,10 @@ WORKER_MEMORY = "2GB"
 LOOPBACK = "127.0.0.1"
 #: Options of a cluster on other machines. A cluster on this one has fewer, and a running scheduler,
 #: which has its own workers, none.
-_REMOTE = ("workers", "cores", "memory", "host", "interface", "tls")
+_REMOTE = ("workers", "cores", "memory", "host", "interface")
 #: By kind: least and largest number of words that follow it, what they are, and its options.
 _KINDS: dict[str, tuple[int, float, str, tuple[str, ...]]] = {
-    "local": (0, 0, "nothing", ("workers", "memory", "tls")),
+    "local": (0, 0, "nothing", ("workers", "memory")),
     "ssh": (1, math.inf, "the names of the hosts", _REMOTE),
     "slurm": (0, 0, "nothing", (*_REMOTE, "walltime")),
     "scheduler": (1, 1, "its address", ()),
@@ -53,9 +54,9 @@ class ClusterRequest:
         walltime: Time limit of each SLURM job, as SLURM writes it: [D-]HH:MM:SS.
         host: Address on which the scheduler listens.
         interface: Name of the network interface on which scheduler and workers listen.
-        tls: Whether to make certificates for this run; workers on this machine always have them.
+        tls: Whether connections need a certificate.
         tls_files: Files in PEM format that every machine sees: authority, certificate and
-            private key.
+            private key. Without them, workers that are started get some that are made for this run.
     """
 
     kind: str
@@ -66,7 +67,7 @@ class ClusterRequest:
     walltime: str | None = None
     host: str | None = None
     interface: str | None = None
-    tls: bool = False
+    tls: bool = True
     tls_files: tuple[Path, Path, Path] | None = None
 
 
@@ -95,11 +96,11 @@ def describe(request: ClusterRequest) -> list[str]:
             "slurm": f"{count} workers in SLURM jobs{_job_size(request)}",
         }.get(request.kind, f"the workers of {' '.join(request.where)}")
     ]
-    encrypted = request.kind == "local" or request.tls or request.tls_files is not None
-    lines.append(f"connections: {'TLS' if encrypted else 'not encrypted'}")
-    if not encrypted and _listens_beyond(request):
+    lines.append(f"connections: {'TLS' if request.tls else 'not encrypted'}")
+    if not request.tls and _listens_beyond(request):
         lines.append(
-            "warning: anybody who reaches the scheduler's port can run programs as you; give --tls"
+            "warning: anybody who reaches the scheduler's port can run programs as you; leave out "
+            "--no-tls"
         )
     return lines
 
@@ -256,12 +257,11 @@ def _refuse_contradictions(request: ClusterRequest) -> None:
         raise ConfigError(f"--cluster {request.kind} must be followed by {what}, got {got}")
     for name in (*_REMOTE, "walltime"):
         value = getattr(request, name)
-        if value not in (None, False) and name not in options:
+        if value is not None and name not in options:
             raise ConfigError(f"--{name} must not be given with --cluster {request.kind}")
         if name in ("workers", "cores") and value is not None and value < 1:
             raise ConfigError(f"{name} must be at least 1, got {value}")
-    if request.tls and request.tls_files is not None:
-        raise ConfigError("--tls makes certificates and must not be given with files of them")
+    chosen_security(request.tls, request.tls_files, elsewhere=request.kind != "local")
 
     # Sizes and times must be readable.
     if request.memory is not None:

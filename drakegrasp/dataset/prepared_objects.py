@@ -11,6 +11,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 
@@ -109,10 +110,18 @@ def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
         for name, (dtype, _) in ARRAYS.items():
             file.create_dataset(name, data=arrays[name], dtype=dtype)
         if candidates.postures is not None:
-            said = json.dumps(candidates.postures.said).encode()
-            given = {**vars(candidates.postures), "said": np.frombuffer(said, dtype=np.uint8)}
-            for name, (dtype, _) in POSTURE_ARRAYS.items():
-                file.create_dataset(name, data=given[name], dtype=dtype)
+            _save_postures(candidates.postures, file)
+
+
+def _save_postures(postures: GivenPostures, file: h5py.File) -> None:
+    """Write the arrays of postures; texts are JSON."""
+    for name, (dtype, _) in POSTURE_ARRAYS.items():
+        data = getattr(postures, name)
+        if name == "preshape" and not any(data):
+            continue
+        if isinstance(data, tuple):
+            data = np.frombuffer(json.dumps(data).encode(), dtype=np.uint8)
+        file.create_dataset(name, data=data, dtype=dtype)
 
 
 def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
@@ -171,8 +180,15 @@ def _given_postures(arrays: dict[str, AnyArray], path: Path) -> GivenPostures | 
     """Return the postures of a plan, or None if its palm poses come from samplers."""
     if not arrays:
         return None
+
+    def texts(name: str) -> tuple[str, ...]:
+        return tuple(map(str, json.loads(arrays.pop(name).tobytes())))
+
     try:
-        said = json.loads(arrays.pop("said").tobytes())
-        return GivenPostures(**arrays, said=tuple(map(str, said)))
+        count, said = len(arrays["row"]), texts("said")
+        preshape = texts("preshape") if "preshape" in arrays else ("",) * count
+        if len(preshape) != count:
+            raise ValueError(f"preshapes of {len(preshape)} rows of {count}")
+        return GivenPostures(**arrays, said=said, preshape=preshape)
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path}: must hold postures, got none: {one_line(error)}") from None

@@ -287,12 +287,12 @@ _LINEAGE = _new(
           "m^2 of surface and rad of roll; per m^3 rad^3 about the parent's; of a posture what its "
           "file says, NaN if nothing", some=True),
 )
-#: What `preshape` says of a posture, in which all fingers of a hand with preshapes close.
+#: What `preshape` says of a posture that is of none: all fingers of a hand with preshapes close.
 NO_PRESHAPE = 255
 # Fields of several tables.
 _PRESHAPE = _new(
     Field("preshape", "", "uint8", "-", "-",
-          "index of the hand file's preshape, 255 of a posture; 0 if the file has none",
+          "index of the hand file's preshape, 255 of a posture of none; 0 if the file has none",
           optional=True),
     Field("unused", "", "uint32", "-", "-",
           "fingers that the preshape leaves out, as bits: 1 for the first finger. They have no "
@@ -547,7 +547,7 @@ OBJECT_FIELDS: tuple[Field, ...] = (
 #: joints, contacts and lift are those of the first wrist pose.
 VERIFICATION_FIELDS: tuple[Field, ...] = (
     Field("object", "", "str", "-", "-", "name of the object", of="placed.model.name"),
-    Field("method", "", "str", "-", "-", "how it was verified: hand, or forces alone",
+    Field("method", "", "str", "-", "-", "how it was verified: hand, forces alone, or posture",
           of="method"),
     _verdict("outcome", [outcome for outcome in Outcome if not outcome.dataset_only]),
     Field("success", "", "bool", "-", "-",
@@ -590,12 +590,13 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
           "least friction coefficient at which forces within the hand's limit at the predicted "
           "contacts hold the object; inf if none does", of="smallest_friction"),
     *_measured(
-        "fit",
-        Field("X_OG", "12", "float64", "m, -", "O", "pose of the palm that was found"),
+        "pregrasp",
+        Field("X_OG", "12", "float64", "m, -", "O", "pose of the palm that was found, or given"),
         _SPREAD,
-        Field("closing", "k", "float64", "rad or m", "-",
-              "closing positions at which the fingertips meet the predicted points"),
     ),
+    Field("closing", "k", "float64", "rad or m", "-",
+          "closing positions at which the fingertips meet the predicted points",
+          of="fit.closing"),
     Field("fit_residual", "k", "float64", "m", "-",
           "distance of the predicted points from the fingertips then", of="fit.residual"),
     Field("fit_normal_error", "k", "float64", "rad", "-",

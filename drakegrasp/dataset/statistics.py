@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.config import Config
 from drakegrasp.dataset.assembly.survey import shards_sha256
 from drakegrasp.dataset.assembly.weights import effective_number
 from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_names
@@ -23,16 +24,20 @@ from drakegrasp.dataset.layout.opening import open_samples, open_trials
 from drakegrasp.dataset.layout.trial_files import NONE, shard_part
 from drakegrasp.dataset.manifest import read_manifest, refuse_older
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
-from drakegrasp.dataset.schema import SCHEMA_VERSION, SPLITS
+from drakegrasp.dataset.schema import NO_PRESHAPE, SCHEMA_VERSION, SPLITS
 from drakegrasp.dataset.trials import Trials
-from drakegrasp.errors import DataError
+from drakegrasp.errors import DataError, HandError
+from drakegrasp.hand.file_format import read_hand_file
+from drakegrasp.hand.files import hand_file
 from drakegrasp.outcomes import Outcome, Removal, Stage
 from drakegrasp.runtime.executor import Executor, run_here
 
+#: What stands for the name of a preshape of postures for which all fingers close.
+NO_NAME = "-"
 #: Columns of attempts that a funnel counts.
 _COUNTED = (
     *("object", "outcome", "removal", "generation", "standoff_index", "audited", "slip"),
-    *("precision", "stable"),
+    *("precision", "stable", "preshape"),
 )
 
 
@@ -54,6 +59,7 @@ class Funnel:
         refined: (m, 3), attempts, successes and samples of refined palm poses.
         audited: (m, 4), lifts, successes, stable ones and samples among audited attempts: they say
             how often lifts end so where others were chosen by their chance.
+        preshapes: (256, 4), attempts, successes, stable ones and samples by index of the preshape.
     """
 
     names: tuple[str, ...]
@@ -67,11 +73,26 @@ class Funnel:
     removals: npt.NDArray[np.int64]
     refined: npt.NDArray[np.int64]
     audited: npt.NDArray[np.int64]
+    preshapes: npt.NDArray[np.int64]
 
     @property
     def all_lifted(self) -> bool:
         """Whether each closed hand that may lift was lifted."""
         return not self.outcomes[:, Outcome.NOT_LIFTED].any()
+
+
+@dataclass(frozen=True)
+class PreshapeCount:
+    """Numbers of attempts, successes, stable ones and samples of a preshape, in the first round.
+
+    `preshape` is its name; `NO_NAME` of postures that are of none.
+    """
+
+    preshape: str
+    attempts: int
+    held: int
+    stable: int
+    samples: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,6 +215,7 @@ def funnel_of(trials: Trials) -> Funnel:
     removals = np.zeros((count, 1 + max(Removal)), dtype=np.int64)
     candidates, precision, stable = np.zeros((3, count), dtype=np.int64)
     refined, audited = np.zeros((count, 3), np.int64), np.zeros((count, 4), np.int64)
+    preshapes = np.zeros((1 + NO_PRESHAPE, 4), np.int64)
     for block in trials.blocks(_COUNTED):
         number, outcome, removal = (block[name] for name in ("object", "outcome", "removal"))
         held, sample = outcome == Outcome.SUCCESS, removal == Removal.KEPT
@@ -206,6 +228,10 @@ def funnel_of(trials: Trials) -> Funnel:
         _count(stable, number[first & block["stable"]])
         decided = first & (removal != NONE)
         _count(removals, (number[decided], removal[decided]))
+
+        held_by = (True, held, held & block["stable"], sample)
+        for column, counted in zip(preshapes.T, held_by, strict=True):
+            _count(column, block["preshape"][first & counted])
 
         # What was refined from it, and what became of those that were lifted in any case.
         for column, counted in zip(refined.T, (True, held, sample), strict=True):
@@ -226,7 +252,23 @@ def funnel_of(trials: Trials) -> Funnel:
         removals=removals,
         refined=refined,
         audited=audited,
+        preshapes=preshapes,
     )
+
+
+def preshapes_of(funnel: Funnel, config: Config) -> list[PreshapeCount]:
+    """Return the counts of each preshape of a dataset's hand, by its configuration.
+
+    There are none of a hand that has none, or whose file cannot be read any more.
+    """
+    try:
+        shapes = read_hand_file(hand_file(config.hand_source)).preshapes
+    except HandError:
+        return []
+    named = list(enumerate(shape.name for shape in shapes))
+    if named and funnel.preshapes[NO_PRESHAPE, 0]:
+        named.append((NO_PRESHAPE, NO_NAME))
+    return [PreshapeCount(name, *funnel.preshapes[i].tolist()) for i, name in named]
 
 
 def _count(counts: npt.NDArray[np.int64], cells: Any) -> None:
@@ -333,6 +375,7 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
     """
     unfinished = count_unfinished(out)
     funnel = count_funnel(out) if unfinished is None else unfinished.funnel
+    preshapes = preshapes_of(funnel, read_manifest(out).config)
 
     def labelled(members: type[Outcome] | type[Removal], counts: AnyArray) -> dict[str, int]:
         return {each.label: int(counts[each]) for each in members if counts[each]}
@@ -352,4 +395,5 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
     for split in splits:
         split["effective"] = split["effective"] if math.isfinite(split["effective"]) else None
     units = {"done": unfinished.done, "total": unfinished.total} if unfinished else None
-    return {"path": str(out), "unfinished": units, "objects": objects, "splits": splits}
+    counts = {"objects": objects, "preshapes": list(map(asdict, preshapes)), "splits": splits}
+    return {"path": str(out), "unfinished": units, **counts}

@@ -43,8 +43,8 @@ def read_dexgraspbench(path: Path, hand: Hand) -> Rows:
 
     # The root of the hand in the object's frame, in metres.
     grasp, pose = stored.postures["grasp"], stored.object_pose
-    X_WM = quaternion_poses(pose[:, :3], pose[:, 3:])
-    X_WL = quaternion_poses(grasp[:, :3], grasp[:, 3:7])
+    X_WM, no_object = quaternion_poses(pose[:, :3], pose[:, 3:])
+    X_WL, no_hand = quaternion_poses(grasp[:, :3], grasp[:, 3:7])
     return Rows(
         objects=[PurePosixPath(stored.object_path).name] * len(grasp),
         X_FL=multiply(invert_pose(X_WM), X_WL),
@@ -54,6 +54,7 @@ def read_dexgraspbench(path: Path, hand: Hand) -> Rows:
         joints=stored.joints,
         numbers={} if stored.exported else {"scale": stored.object_scale},
         said=[path.name] * len(grasp),
+        invalid=[one or other for one, other in zip(no_object, no_hand, strict=True)],
     )
 
 
@@ -75,37 +76,40 @@ def read_isaac_grasp(path: Path, hand: Hand) -> Rows:
     if not isinstance(grasps, dict) or not grasps:
         raise GraspError(f"{path}: grasps must be there, got none")
 
-    # Each grasp with the same joints.
-    first = next(iter(grasps.values()))
-    named = first.get("cspace_position") if isinstance(first, dict) else None
-    joints = list(named) if isinstance(named, dict) else []
-    places, q, said = list[Any](), dict[str, list[Any]](), list[str]()
-    for name, grasp in grasps.items():
-        place = f"{path}: {name}"
+    # Each grasp with the joints of the first that names some.
+    stages = [each.get("cspace_position") for each in grasps.values() if isinstance(each, dict)]
+    named = next((stage for stage in stages if isinstance(stage, dict) and stage), None)
+    if named is None:
+        raise GraspError(f"{path}: grasps must have cspace_position, joints by name, got none")
+    joints, invalid = [str(joint) for joint in named], [""] * len(grasps)
+    numbers = np.full((len(grasps), 7 + 2 * len(joints)), np.nan)
+    for i, (name, grasp) in enumerate(grasps.items()):
         try:
-            turn = grasp["orientation"]
-            places.append([*grasp["position"], turn["w"], *turn["xyz"]])
-            stages = {"grasp": grasp["cspace_position"]}
-            stages |= {"pregrasp": at} if (at := grasp.get("pregrasp_cspace_position")) else {}
-            for stage in ("grasp", "pregrasp"):
-                at = stages.get(stage, dict.fromkeys(joints, np.nan))
-                q.setdefault(stage, []).append([float(at[joint]) for joint in joints])
+            numbers[i] = _isaac_numbers(grasp, joints)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise GraspError(
-                f"{place} must have position, orientation and cspace_position of the joints "
-                f"{', '.join(map(str, joints))}, got none ({one_line(error)})"
-            ) from None
-        said.append(f"{name}, confidence {grasp.get('confidence')}")
-    try:
-        poses = np.array(places, dtype=float).reshape(len(grasps), 7)
-    except (TypeError, ValueError):
-        raise GraspError(f"{path}: position and orientation must be 3 and 4 numbers") from None
+            invalid[i] = (
+                f"{name} must have position, orientation and cspace_position of the joints "
+                f"{', '.join(joints)}, got none ({one_line(error)})"
+            )
+    X_FL, reasons = quaternion_poses(numbers[:, :3], numbers[:, 3:7])
     return Rows(
         objects=[path.stem] * len(grasps),
-        X_FL=quaternion_poses(poses[:, :3], poses[:, 3:]),
+        X_FL=X_FL,
         link=hand.palm_link,
         frame="object" if tree.get("created_with") == CREATED_WITH else "mesh",
-        q=q,
-        joints=[str(joint) for joint in joints],
-        said=said,
+        q=dict(zip(("grasp", "pregrasp"), np.split(numbers[:, 7:], 2, axis=1), strict=True)),
+        joints=joints,
+        said=[
+            f"{name}, confidence {grasp.get('confidence') if isinstance(grasp, dict) else None}"
+            for name, grasp in grasps.items()
+        ],
+        invalid=[one or other for one, other in zip(invalid, reasons, strict=True)],
     )
+
+
+def _isaac_numbers(grasp: Any, joints: list[str]) -> list[float]:
+    """Return position, quaternion, grasp and pregrasp of a grasp; NaN for a missing pregrasp."""
+    turn, before = grasp["orientation"], grasp.get("pregrasp_cspace_position")
+    q = [grasp["cspace_position"], before or dict.fromkeys(joints, np.nan)]
+    place = [*grasp["position"], turn["w"], *turn["xyz"]]
+    return [float(v) for v in (*place, *(stage[joint] for stage in q for joint in joints))]

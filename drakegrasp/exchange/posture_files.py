@@ -7,7 +7,8 @@ in one line that names the file and what is wrong. docs/how-to/postures.md lists
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
@@ -22,47 +23,70 @@ from drakegrasp.exchange.foreign_postures import read_dexgraspbench, read_isaac_
 from drakegrasp.exchange.posture_rows import Rows, quaternion_poses, table_of
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
-from drakegrasp.simulation.postures.table import PostureTable
+from drakegrasp.simulation.postures.table import PostureTable, join_tables
 
 #: Suffixes of the layouts.
 ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml", ".yml")
 #: Arrays are smaller, all together [bytes]: two million postures of a hand with 16 joints.
 MOST_BYTES = 1_000_000_000
 #: The arrays of our own layout that are neither poses nor joints.
-_TEXTS = ("object", "joints", "source", "frame", "link")
+_TEXTS = ("object", "joints", "source", "frame", "link", "preshape")
 _KNOWN = (
     *_TEXTS,
     *("X_FG", "position", "quaternion", "q_grasp", "q_pregrasp", "q_squeeze", "resting"),
-    *("log_density", "X_TC", "scale"),
+    *("log_density", "X_TC", "scale", "row", "confidence"),
 )
 
 
 def read_postures(path: Path, hand: Hand) -> PostureTable:
     """Return the postures of a file, or of all files of a folder.
 
+    A row that is none stays in the table, with the reason; in a folder a file may be none.
+
     Raises:
         GraspError: If it is no file of postures of this hand.
         MachineError: If a package is missing that the format needs.
     """
-    suffix = path.suffix.lower()
     if path.is_dir():
         return _of_folder(path, hand)
+    with named(path):
+        rows = read_rows(path, hand)
+        if rows.of_row is not None:
+            raise GraspError("row must be left out here, it is for predictions of a score; got it")
+        return table_of(hand, rows)
+
+
+def read_rows(path: Path, hand: Hand) -> Rows:
+    """Return what a file says of its postures, before it is compared with the hand.
+
+    Raises:
+        GraspError: If it is no file of postures.
+        MachineError: If a package is missing that the format needs.
+    """
+    suffix = path.suffix.lower()
     if not path.is_file():
         raise GraspError(f"postures must be a file or a folder of files, got {str(path)!r}")
-    try:
+    with named(path):
         if suffix in ARRAYS:
-            return table_of(hand, [_of_arrays(_read_arrays(path))])
+            return _of_arrays(_read_arrays(path))
         if suffix in TABLES:
-            return table_of(hand, [_of_columns(_read_columns(path))])
+            return _of_columns(*_read_columns(path))
         if suffix == ".npy":
-            return table_of(hand, [read_dexgraspbench(path, hand)])
+            return read_dexgraspbench(path, hand)
         if suffix in YAMLS:
-            return table_of(hand, [read_isaac_grasp(path, hand)])
+            return read_isaac_grasp(path, hand)
+        known = ", ".join((*ARRAYS, *TABLES, ".npy", *YAMLS))
+        raise GraspError(f"must be a file of postures ({known}), got another")
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Put the name of a file before errors about its postures, unless it is there."""
+    try:
+        yield
     except GraspError as error:
         text = str(error)
         raise GraspError(text if text.startswith(str(path)) else f"{path}: {text}") from None
-    known = ", ".join((*ARRAYS, *TABLES, ".npy", *YAMLS))
-    raise GraspError(f"{path}: must be a file of postures ({known}), got another")
 
 
 def holds_postures(path: Path) -> bool:
@@ -77,25 +101,39 @@ def holds_postures(path: Path) -> bool:
             with open_hdf5(path) as file:
                 return "q_grasp" in file
         if suffix in TABLES and path.is_file():
-            return "object" in _read_columns(path)
-    except (OSError, DataError, GraspError) as error:
+            return bool({"object", "qw"} & set(_column_names(path)))
+    except (OSError, ValueError, csv.Error, DataError, GraspError) as error:
         raise GraspError(f"{path}: {one_line(error)}") from None
     return suffix == ARRAYS[0] or suffix in YAMLS
+
+
+def has_rows(path: Path) -> bool:
+    """Return whether a file of postures says for which rows of a dataset they are.
+
+    Raises:
+        GraspError: If it cannot be read.
+    """
+    with named(path):
+        if path.suffix.lower() in ARRAYS:
+            return "row" in _read_arrays(path)
+        return path.suffix.lower() in TABLES and "row" in _column_names(path)
 
 
 def _of_folder(folder: Path, hand: Hand) -> PostureTable:
     """Return the postures of all files of one foreign layout in a folder and those below."""
     for pattern, read in (("*.npy", read_dexgraspbench), ("*.y*ml", read_isaac_grasp)):
-        paths = sorted(folder.rglob(pattern))
-        if paths:
-            try:
-                return table_of(hand, [read(path, hand) for path in paths])
-            except GraspError as error:
-                text = str(error)
-                raise GraspError(
-                    text if text.startswith(str(folder)) else f"{folder}: {text}"
-                ) from None
+        if paths := sorted(folder.rglob(pattern)):
+            return join_tables([_of_file(path, hand, read) for path in paths])
     raise GraspError(f"{folder}: must hold .npy or .yaml files of grasps, got none")
+
+
+def _of_file(path: Path, hand: Hand, read: Callable[[Path, Hand], Rows]) -> PostureTable | str:
+    """Return the postures of a file in a folder, or why it is none."""
+    try:
+        with named(path):
+            return table_of(hand, read(path, hand))
+    except GraspError as error:
+        return str(error)
 
 
 # Arrays
@@ -135,20 +173,21 @@ def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
     if unknown := [name for name in arrays if name not in _KNOWN]:
         raise GraspError(f"arrays must be some of {', '.join(_KNOWN)}, got {unknown[0]!r}")
     for name in ("object", "q_grasp"):
-        if name not in arrays:
+        if name not in arrays and not (name == "object" and "row" in arrays):
             raise GraspError(f"{name} must be there, got only {listed(sorted(arrays))}")
     texts = {name: _texts(arrays[name], name) for name in _TEXTS if name in arrays}
 
     # The palm's poses, in either form.
+    invalid = None
     if "X_FG" in arrays:
         X_FG = _stacked(arrays["X_FG"], "X_FG")
     elif {"position", "quaternion"} <= set(arrays):
-        X_FG = quaternion_poses(arrays["position"], arrays["quaternion"])
+        X_FG, invalid = quaternion_poses(arrays["position"], arrays["quaternion"])
     else:
         raise GraspError("X_FG, or position and quaternion, must be there, got none")
 
     return Rows(
-        objects=texts["object"],
+        objects=texts["object"] if "object" in texts else [""] * len(X_FG),
         X_FL=X_FG,
         link=_link(texts.get("link")),
         frame=_only(texts.get("frame"), "frame") or "object",
@@ -161,6 +200,10 @@ def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
         X_TC=None if "X_TC" not in arrays else _stacked(arrays["X_TC"], "X_TC"),
         numbers={n: arrays[n] for n in ("resting", "log_density", "scale") if n in arrays},
         said=texts.get("source"),
+        preshape=texts.get("preshape"),
+        invalid=invalid,
+        of_row=arrays.get("row"),
+        confidence=arrays.get("confidence"),
     )
 
 
@@ -205,14 +248,28 @@ def _stacked(value: Any, name: str) -> Array:
 # Tables
 
 
-def _read_columns(path: Path) -> dict[str, list[Any]]:
+def _column_names(path: Path) -> list[str]:
+    """Return the names of a table's columns; the first line of a CSV file, whatever it is."""
+    if path.suffix.lower() == ".parquet":
+        return list(_parquet().read_schema(path).names)
+    with path.open(encoding="utf-8", newline="") as file:
+        return next(csv.reader(file), [])
+
+
+def _parquet() -> Any:
+    try:
+        from pyarrow import parquet
+    except ImportError:
+        raise MachineError("Parquet needs pyarrow: pip install 'drakegrasp[hub]'") from None
+    return parquet
+
+
+def _read_columns(path: Path) -> tuple[dict[str, list[Any]], list[str]]:
+    """Return the columns of a table, and for each row why it is none, or an empty text."""
     if path.suffix.lower() == ".parquet":
         try:
-            from pyarrow import parquet
-        except ImportError:
-            raise MachineError("Parquet needs pyarrow: pip install 'drakegrasp[hub]'") from None
-        try:
-            return dict(parquet.read_table(path).to_pydict())
+            table = _parquet().read_table(path)
+            return dict(table.to_pydict()), [""] * table.num_rows
         except (OSError, ValueError) as error:
             raise GraspError(f"must be a Parquet file, got: {one_line(error)}") from None
 
@@ -220,28 +277,28 @@ def _read_columns(path: Path) -> dict[str, list[Any]]:
     try:
         with path.open(encoding="utf-8", newline="") as file:
             header, *rows = csv.reader(file)
-            if twice := [name for name in header if header.count(name) > 1]:
-                raise GraspError(f"columns must have different names, got {twice[0]} twice")
-            return {
-                name: list(column)
-                for name, column in zip(header, _columns(header, rows), strict=True)
-            }
     except (OSError, ValueError, csv.Error) as error:
         raise GraspError(f"must be a table with a header, got: {one_line(error)}") from None
+    if twice := [name for name in header if header.count(name) > 1]:
+        raise GraspError(f"columns must have different names, got {twice[0]} twice")
+    size = len(header)
+    invalid = [
+        "" if len(row) == size else f"the row must have {size} values, got {len(row)}"
+        for row in rows
+    ]
+    cells = [[*row, *[""] * size][:size] for row in rows]
+    return {name: [row[i] for row in cells] for i, name in enumerate(header)}, invalid
 
 
-def _columns(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[Sequence[str]]:
-    for i, row in enumerate(rows):
-        if len(row) != len(header):
-            raise ValueError(f"row {i} of {len(row)} values under a header of {len(header)}")
-    yield from zip(*rows, strict=True) if rows else ([] for _ in header)
-
-
-def _of_columns(columns: Mapping[str, list[Any]]) -> Rows:
+def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str]) -> Rows:
     """Return the rows of a plain table, with a column for each number."""
     place = [*("x", "y", "z"), *("qw", "qx", "qy", "qz")]
-    if missing := [name for name in ("object", *place) if name not in columns]:
+    needed = place if "row" in columns else ["object", *place]
+    if missing := [name for name in needed if name not in columns]:
         raise GraspError(f"columns must include {missing[0]}, got {listed(list(columns))}")
+
+    def told(name: str) -> list[str | None]:
+        return [v for v, none in zip(columns.get(name, ()), invalid, strict=False) if not none]
 
     # The joints of each stage, in the order of the grasp.
     q: dict[str, Any] = {}
@@ -252,31 +309,40 @@ def _of_columns(columns: Mapping[str, list[Any]]) -> Rows:
             joints = joints or names
             if set(names) != set(joints):
                 raise GraspError(f"{stage}_ columns must be of the joints of grasp_, got others")
-            q[stage] = np.column_stack([_floats(columns, f"{stage}_{n}") for n in joints])
+            q[stage] = np.column_stack([_floats(columns, f"{stage}_{n}", invalid) for n in joints])
     if "grasp" not in q:
         raise GraspError("columns must include one grasp_JOINT for each joint, got none")
 
-    numbers = np.column_stack([_floats(columns, name) for name in place])
+    numbers = np.column_stack([_floats(columns, name, invalid) for name in place])
+    scalars = [n for n in ("resting", "log_density", "scale") if n in columns]
+    known = {n: _floats(columns, n, invalid) for n in scalars}
+    X_FL, reasons = quaternion_poses(numbers[:, :3], numbers[:, 3:])
+    said = {n: _floats(columns, n, invalid) for n in ("row", "confidence") if n in columns}
+    whole = "row" in said and np.array_equal(said["row"], np.floor(said["row"]))
     return Rows(
-        objects=[str(name) for name in columns["object"]],
-        X_FL=quaternion_poses(numbers[:, :3], numbers[:, 3:]),
-        link=_link(columns.get("link")),
-        frame=_only(columns.get("frame"), "frame") or "object",
+        objects=[str(name) for name in columns.get("object", [""] * len(numbers))],
+        X_FL=X_FL,
+        link=_link(told("link")),
+        frame=_only(told("frame"), "frame") or "object",
         q=q,
         joints=joints,
-        numbers={
-            n: _floats(columns, n) for n in ("resting", "log_density", "scale") if n in columns
-        },
+        numbers=known,
         said=None if "source" not in columns else [str(text) for text in columns["source"]],
+        preshape=[str(name or "") for name in columns.get("preshape", ())] or None,
+        of_row=said["row"].astype(np.int64) if whole else said.get("row"),
+        confidence=said.get("confidence"),
+        invalid=[one or other for one, other in zip(invalid, reasons, strict=True)],
     )
 
 
-def _floats(columns: Mapping[str, list[Any]], name: str) -> npt.NDArray[np.float64]:
-    """Return a column as numbers; an empty cell is NaN."""
-    values = []
+def _floats(
+    columns: Mapping[str, list[Any]], name: str, invalid: list[str]
+) -> npt.NDArray[np.float64]:
+    """Return a column as numbers; an empty cell is NaN, and `invalid` says which are none."""
+    values = np.full(len(columns[name]), np.nan)
     for i, cell in enumerate(columns[name]):
         try:
-            values.append(np.nan if cell in (None, "") else float(cell))
+            values[i] = np.nan if cell in (None, "") else float(cell)
         except (TypeError, ValueError):
-            raise GraspError(f"row {i}: {name} must be a number, got {cell!r}") from None
-    return np.array(values)
+            invalid[i] = invalid[i] or f"{name} must be a number, got {cell!r}"
+    return values

@@ -18,8 +18,8 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.errors import GraspError, listed, one_line
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand
-from drakegrasp.simulation.postures.posture import joint_order
-from drakegrasp.simulation.postures.table import PostureTable, make_table
+from drakegrasp.simulation.postures.posture import joint_order, preshape_index
+from drakegrasp.simulation.postures.table import PostureTable, known_preshapes, make_table
 
 #: How far the length of a quaternion may be from one.
 UNIT_TOLERANCE = 1e-3
@@ -30,16 +30,20 @@ class Rows:
     """The n postures of one file.
 
     Attributes:
-        objects: (n,), names of the objects.
+        objects: (n,), names of the objects; empty where only `of_row` says it.
         X_FL: (n, 4, 4), pose of a link in the frame.
         link: Name of the palm link, whose pose it is; None: the palm frame G.
         frame: One of `TABLE_FRAMES`.
         q: Joint positions (n, m) [rad or m] by "grasp", "pregrasp" and "squeeze".
         joints: (m,), names of the joints; None: all, in the plant's order. A joint that the hand
-            file couples or keeps in its preshape may be missing.
+            file couples, or that the preshapes of all rows keep, may be missing.
         X_TC: (n, 4, 4), for the frame "camera".
         numbers: `resting`, `log_density` and `scale`, (n,) each, as far as they are known.
         said: (n,), where each comes from.
+        preshape: (n,), name of the hand's preshape; empty or None: all fingers close.
+        invalid: (n,), why a row is known to be none; None: no row is.
+        of_row: (n,), of predictions: the row of a dataset's split that each is for.
+        confidence: (n,), of predictions: greater is better.
     """
 
     objects: Sequence[str]
@@ -51,52 +55,33 @@ class Rows:
     X_TC: Array | None = None
     numbers: Mapping[str, Any] = field(default_factory=dict)
     said: Sequence[str] | None = None
+    preshape: Sequence[str | None] | None = None
+    invalid: Sequence[str] | None = None
+    of_row: Any = None
+    confidence: Any = None
 
 
-def table_of(hand: Hand, parts: Sequence[Rows]) -> PostureTable:
-    """Return the table of the postures of some files, one after the other.
+def table_of(hand: Hand, rows: Rows) -> PostureTable:
+    """Return the table of the postures of a file.
 
     Raises:
-        GraspError: If a part is none, or the parts are in different frames.
+        GraspError: If the file is none of this hand.
     """
-    frames = {part.frame for part in parts}
-    if len(frames) > 1:
-        raise GraspError(f"files must be in one frame, got {', '.join(sorted(frames))}")
-    counts = [len(part.objects) for part in parts]
-
-    def joined(values: Sequence[Any], shape: tuple[int, ...] = ()) -> Array:
-        return np.concatenate(
-            [
-                np.full((n, *shape), np.nan) if value is None else np.asarray(value, dtype=float)
-                for n, value in zip(counts, values, strict=True)
-            ]
-        )
-
-    q = [_in_order(hand, part) for part in parts]
-    joints = (len(hand.joint_names),)
+    q = _in_order(hand, rows)
     try:
         return make_table(
             hand,
-            [name for part in parts for name in part.objects],
-            joined([_palm_poses(hand, part) for part in parts]),
-            joined([each["grasp"] for each in q]),
-            q_pregrasp=joined([each.get("pregrasp") for each in q], joints),
-            q_squeeze=joined([each.get("squeeze") for each in q], joints),
-            resting=joined(
-                [
-                    part.numbers.get("resting", np.zeros(n))
-                    for n, part in zip(counts, parts, strict=True)
-                ]
-            ),
-            frame=frames.pop(),
-            X_TC=None if parts[0].X_TC is None else joined([part.X_TC for part in parts]),
-            scale=joined([part.numbers.get("scale") for part in parts]),
-            log_density=joined([part.numbers.get("log_density") for part in parts]),
-            said=[
-                text
-                for n, part in zip(counts, parts, strict=True)
-                for text in (part.said or [""] * n)
-            ],
+            rows.objects,
+            _palm_poses(hand, rows),
+            q["grasp"],
+            q_pregrasp=q.get("pregrasp"),
+            q_squeeze=q.get("squeeze"),
+            frame=rows.frame,
+            X_TC=rows.X_TC,
+            said=rows.said,
+            preshape=rows.preshape,
+            invalid=rows.invalid,
+            **rows.numbers,
         )
     except (TypeError, ValueError) as error:
         raise GraspError(one_line(error)) from None
@@ -130,18 +115,23 @@ def _in_order(hand: Hand, part: Rows) -> dict[str, Array]:
         for i in hand.motor_fingers
         for c in hand.followers(i)
     }
-    known = {*joints, *hand.preshape, *followers}
+    count = len(part.objects)
+    # A row whose preshape the hand lacks is told with the other bad ones.
+    names = known_preshapes(part.preshape, count, hand, [""] * count)
+    kept = [hand.at(preshape_index(hand, name or None)).preshape for name in names]
+    still = set(order).intersection(*kept)
+    known = {*joints, *still, *followers}
     if missing := [name for name in order if name not in known]:
         raise GraspError(f"joints must include {listed(missing)}, got {listed(joints)}")
     found = {}
     turning = [hand.joint_units[name] == "rad" for name in joints]
     for stage, values in part.q.items():
-        rows = _rows(values, len(joints), stage)
+        rows = _rows(values, (count, len(joints)), stage)
         _refuse_degrees(rows[:, turning], stage)
         columns = dict(zip(joints, rows.T, strict=True))
-        for name in order:
-            if name not in columns and name in hand.preshape:
-                columns[name] = np.where(np.isnan(rows[:, 0]), np.nan, hand.preshape[name])
+        given = ~np.isnan(rows[:, 0])
+        for name in still - columns.keys():
+            columns[name] = np.where(given, [of_row[name] for of_row in kept], np.nan)
         for name, (leader, ratio, offset) in followers.items():
             if name not in columns:
                 columns[name] = ratio * columns[leader] + offset
@@ -149,13 +139,13 @@ def _in_order(hand: Hand, part: Rows) -> dict[str, Array]:
     return found
 
 
-def _rows(values: Any, count: int, stage: str) -> Array:
+def _rows(values: Any, shape: tuple[int, int], stage: str) -> Array:
     try:
         rows = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
         raise GraspError(f"{stage} joints must be numbers, got something else") from None
-    if rows.ndim != 2 or rows.shape[1] != count:
-        raise GraspError(f"{stage} joints must be of shape (n, {count}), got {rows.shape}")
+    if rows.shape != shape:
+        raise GraspError(f"{stage} joints must be of shape {shape}, got {rows.shape}")
     return rows
 
 
@@ -169,11 +159,16 @@ def _refuse_degrees(rows: Array, stage: str) -> None:
         )
 
 
-def quaternion_poses(positions: npt.ArrayLike, quaternions: npt.ArrayLike) -> Array:
+def quaternion_poses(
+    positions: npt.ArrayLike, quaternions: npt.ArrayLike
+) -> tuple[Array, list[str]]:
     """Return poses (n, 4, 4) of positions (n, 3) [m] and quaternions (n, 4) w, x, y, z.
 
+    Returns:
+        The poses, NaN where there is none; and for each the reason, empty where there is one.
+
     Raises:
-        GraspError: If they are not finite numbers, or a quaternion is not of length 1.
+        GraspError: If they are no numbers, or of other shapes.
     """
     try:
         p, wxyz = np.asarray(positions, dtype=float), np.asarray(quaternions, dtype=float)
@@ -186,12 +181,17 @@ def quaternion_poses(positions: npt.ArrayLike, quaternions: npt.ArrayLike) -> Ar
         )
     length = np.linalg.norm(wxyz, axis=1)
     bad = ~np.isfinite(p).all(axis=1) | ~(np.abs(length - 1.0) <= UNIT_TOLERANCE)
-    if bad.any():
-        i = int(np.argmax(bad))
-        raise GraspError(
-            f"row {i}: position and quaternion must be finite, and the quaternion of length 1, "
-            f"got {p[i].tolist()} and {wxyz[i].tolist()}"
-        )
+    reasons = [
+        "position and quaternion must be finite, and the quaternion of length 1, got "
+        f"{p[i].tolist()} and {wxyz[i].tolist()}"
+        if none
+        else ""
+        for i, none in enumerate(bad.tolist())
+    ]
     # In single precision a quaternion is off by some 1e-7.
-    R = Rotation.from_quat(wxyz / length[:, None], scalar_first=True).as_matrix()
-    return np.array([make_pose(*each) for each in zip(R, p, strict=True)]).reshape(-1, 4, 4)
+    X = np.full((len(p), 4, 4), np.nan)
+    good = np.flatnonzero(~bad)
+    if good.size:
+        R = Rotation.from_quat(wxyz[good] / length[good, None], scalar_first=True).as_matrix()
+        X[good] = [make_pose(*each) for each in zip(R, p[good], strict=True)]
+    return X, reasons

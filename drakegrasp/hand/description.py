@@ -49,7 +49,7 @@ from drakegrasp.hand.file_format import (
 from drakegrasp.hand.files import find_packages, hand_file
 from drakegrasp.hand.folder import hand_folder
 from drakegrasp.hand.lift_chance import LiftChance, read_lift_chance
-from drakegrasp.hand.parsing import ModelFile, add_model
+from drakegrasp.hand.parsing import KEPT_HANDS, ModelFile, add_model
 from drakegrasp.hand.shapes import pad_surfaces
 
 #: Where one threshold serves closing joints of both kinds, a slide by so much counts as a turn by
@@ -82,6 +82,7 @@ class Hand:
     lift_chance: LiftChance | None  # of a sample, when it has closed; most hands have none
     #: The hand in each of its preshapes, with the fingers that close in it alone.
     preshapes: tuple[Hand, ...] = ()
+    preshape_names: tuple[str, ...] = ()
 
     @property
     def num_fingers(self) -> int:
@@ -176,8 +177,9 @@ def load_hand(source: HandSource = "barrett") -> Hand:
     # Use a hand that was loaded before, if its files did not change.
     path = hand_file(source)
     key = source if isinstance(source, CarriedHand) else path
-    known = _loaded.get(key)
+    known = _loaded.pop(key, None)
     if known is not None and known[0].model.stamp == _stamp(known[1]):
+        _loaded[key] = known
         return known[0]
 
     folder = hand_folder(source)
@@ -196,11 +198,17 @@ def load_hand(source: HandSource = "barrett") -> Hand:
         model = ModelFile(place, tuple(sorted(packages.items())), stamp)
         name = path.stem.removesuffix("_hand")
         hand = _build_hand(name, described, model)
-        hand = replace(hand, preshapes=_in_preshapes(name, described, model))
+        hand = replace(
+            hand,
+            preshapes=_in_preshapes(name, described, model),
+            preshape_names=tuple(preshape.name for preshape in described.preshapes),
+        )
         hand = replace(hand, lift_chance=read_lift_chance(path))
         _refuse_empty_pads(hand)
     except HandError as error:
         raise HandError(f"{path}: {error}") from None
+    while len(_loaded) >= KEPT_HANDS:
+        _loaded.pop(next(iter(_loaded)))
     _loaded[key] = hand, folder.sources
     return hand
 
@@ -221,7 +229,7 @@ def load_plain_hand(source: HandSource, where: str) -> Hand:
     return hand
 
 
-#: Loaded hands with their files: parsing takes 40 ms.
+#: Loaded hands with their files, the last used at the end: parsing takes 40 ms.
 _loaded: dict[Path | CarriedHand, tuple[Hand, Sequence[Path]]] = {}
 
 

@@ -9,7 +9,7 @@ geometry only, without a simulation. Closing angles are lengths where the closin
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,7 @@ from drakegrasp.frames import Array, invert_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.file_format import PAD_BAND, Finger
 from drakegrasp.hand.kinematics import coordinate_limits, link_poses
+from drakegrasp.hand.parsing import KEPT_HANDS
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
 from drakegrasp.mesh.surfaces import cover_triangles
@@ -177,7 +178,7 @@ def _gap(field: DistanceField, X_FbG: Array, p_GQ: Points) -> npt.NDArray[np.flo
     return np.asarray(field.nearest(x, y, z).min(axis=1))
 
 
-@cache
+@lru_cache(maxsize=KEPT_HANDS)
 def _tip_fields(hand: Hand) -> tuple[DistanceField, ...]:
     """Return the distance field of each fingertip in its own frame."""
     shapes, fields = link_shapes(hand), []
@@ -188,7 +189,7 @@ def _tip_fields(hand: Hand) -> tuple[DistanceField, ...]:
     return tuple(fields)
 
 
-@cache
+@lru_cache(maxsize=KEPT_HANDS)
 def link_points(hand: Hand) -> dict[str, Array]:
     """Return points on the surface of each link (n, 3) in its own frame [m]."""
     points = {}
@@ -199,7 +200,7 @@ def link_points(hand: Hand) -> dict[str, Array]:
     return points
 
 
-@cache
+@lru_cache(maxsize=KEPT_HANDS)
 def pad_points(hand: Hand) -> tuple[Array, ...]:
     """Return points on the pad of each fingertip (n, 3) in the fingertip link's frame [m]."""
     points = link_points(hand)

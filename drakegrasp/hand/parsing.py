@@ -6,6 +6,7 @@ and couplings come from the hand file.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -16,6 +17,17 @@ from pydrake.multibody.tree import ModelInstanceIndex
 
 from drakegrasp.errors import HandError, first_line
 from drakegrasp.runtime.environment import allow_network
+
+#: Hands of which a process keeps what it has computed: a build has one, in some preshapes.
+KEPT_HANDS = 32
+
+
+def _is_no_twin(record: logging.LogRecord) -> bool:
+    """Return whether a message of Drake says what no exception says again."""
+    return not record.getMessage().startswith("SDFormat Error")
+
+
+logging.getLogger("drake").addFilter(_is_no_twin)
 
 
 @dataclass(frozen=True)
@@ -76,7 +88,7 @@ def add_model(plant: MultibodyPlant, model: ModelFile) -> ModelInstanceIndex:
     return instance
 
 
-@lru_cache
+@lru_cache(maxsize=KEPT_HANDS)
 def position_order(model: ModelFile, palm_link: str) -> tuple[str, ...]:
     """Return the names of a model's joints in the order of its positions, that of every `q`.
 

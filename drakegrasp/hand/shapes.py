@@ -6,7 +6,7 @@ Every shape of a hand is convex (`models/README.md`), so its corners describe it
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,7 +27,7 @@ from drakegrasp.arithmetic import dot, norm, sin_cos
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.file_format import HalfSpace
-from drakegrasp.hand.parsing import ModelFile, add_model
+from drakegrasp.hand.parsing import KEPT_HANDS, ModelFile, add_model
 
 if TYPE_CHECKING:
     from drakegrasp.hand.description import Hand
@@ -49,7 +49,7 @@ def link_shapes(hand: Hand) -> dict[str, tuple[Array, ...]]:
     return _link_shapes(hand.model)
 
 
-@cache
+@lru_cache(maxsize=KEPT_HANDS)
 def _link_shapes(model: ModelFile) -> dict[str, tuple[Array, ...]]:
     plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
     plant.RegisterAsSourceForSceneGraph(scene_graph)

@@ -35,6 +35,8 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
 
 #: Parts of the names of extensions that change how a mesh looks, not its shape.
 _LOOKS = ("material", "texture", "light")
+#: Numbers of what places a node: trimesh makes a matrix of as many rows, however many there are.
+_PLACES = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
 #: Most nodes of a scene: trimesh takes a millisecond for each.
 MOST_NODES = 10_000
 
@@ -75,7 +77,7 @@ def parse_mesh(name: str, content: bytes) -> tuple[Array, Faces]:
     # Parsers raise all kinds of exceptions on foreign bytes.
     try:
         if suffix == ".glb":
-            _refuse_extensions(content)
+            _refuse_description(content)
         with np.errstate(all="ignore"):
             scene = trimesh.load_scene(
                 io.BytesIO(content), file_type=suffix[1:], process=False, skip_materials=True
@@ -94,11 +96,11 @@ def parse_mesh(name: str, content: bytes) -> tuple[Array, Faces]:
         raise MeshError(f"{name}: must be a valid {suffix} mesh, got: {got}") from error
 
 
-def _refuse_extensions(content: bytes) -> None:
-    """Refuse a GLB whose shape needs an extension or too many nodes: trimesh reads on without.
+def _refuse_description(content: bytes) -> None:
+    """Refuse a GLB that trimesh would read without what it needs, or would not end to read.
 
     Raises:
-        ValueError: If it does.
+        ValueError: If its shape needs an extension, it has too many nodes, or one has no place.
     """
     if content[:4] != b"glTF":
         return
@@ -107,8 +109,14 @@ def _refuse_extensions(content: bytes) -> None:
     shapes = [name for name in needed if not any(word in name for word in _LOOKS)]
     if shapes:
         raise ValueError(f"the extension {shapes[0]}, which is not read; export without it")
-    if isinstance(tree, dict) and len(tree.get("nodes", [])) > MOST_NODES:
-        raise ValueError(f"{len(tree['nodes']):,} nodes, more than {MOST_NODES:,}")
+    nodes = tree.get("nodes", []) if isinstance(tree, dict) else []
+    if len(nodes) > MOST_NODES:
+        raise ValueError(f"{len(nodes):,} nodes, more than {MOST_NODES:,}")
+    for node in nodes:
+        for key, count in _PLACES.items():
+            numbers = node.get(key, [0] * count)
+            if not isinstance(numbers, list) or len(numbers) != count:
+                raise ValueError(f"a node whose {key} is not {count} numbers")
 
 
 def clean_triangles(vertices: Array, faces: Faces, name: str) -> trimesh.Trimesh:

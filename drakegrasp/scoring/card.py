@@ -6,10 +6,12 @@ time and no number of workers is in it, so equal verdicts give equal cards.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from drakegrasp.errors import NAMED
 from drakegrasp.frames import Array
 from drakegrasp.scoring.bootstrap import LEVEL, RESAMPLES, Resampling, resample
 from drakegrasp.scoring.measures import (
@@ -143,7 +145,9 @@ def _set_of(
     reference = REFERENCES.get(judged.name)
     measured = estimates(judged, grouping, draws, oracle=oracle)
     return {
-        "what": reference.words if reference else "predictions",
+        "what": reference.words
+        if reference
+        else ("predictions", "postures")[any(r.table is not None for r in judged.ranked)],
         "files": [{"name": r.name, "sha256": r.sha256} for r in judged.ranked],
         "predictions": len(verdicts),
         "measures": {name: asdict(value) for name, value in measured.items()},
@@ -153,6 +157,7 @@ def _set_of(
         "coverage": coverage(judged, own, grouping),
         "calibration": calibration(judged),
         "outcomes": {name: sum(v.outcome == name for v in verdicts) for name in outcomes},
+        "invalid": dict(Counter(v.reason for v in verdicts if v.reason).most_common(NAMED)),
     }
 
 
@@ -271,6 +276,7 @@ def _more(card: Mapping[str, Any]) -> list[str]:
                 f"* {name}, confidence {group['confidence']:.3g}: {_percent(group['share'])} of "
                 f"{group['count']}"
             )
+        lines += [f"* {name}, {n} no grasp: {why}" for why, n in each["invalid"].items()]
     for name, others in card["above"].items():
         for other, value in others.items():
             lines.append(f"* {name} above {other}: {_interval(value)}")

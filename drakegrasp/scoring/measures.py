@@ -218,7 +218,7 @@ def coverage(judged: Judged, own: Mapping[int, Array], grouping: Grouping) -> fl
     counted: dict[int, list[Array]] = {}
     for ranked, verdicts in zip(judged.ranked, judged.verdicts, strict=True):
         for row, verdict in zip(ranked.rows.tolist(), verdicts, strict=True):
-            if verdict.counted:
+            if verdict.counted and verdict.contacts:
                 found = counted.setdefault(int(grouping.objects[place[row]]), [])
                 found.append(np.array(verdict.contacts).reshape(-1, 3))
 

@@ -17,7 +17,10 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
+from drakegrasp.exchange.posture_files import holds_postures
+from drakegrasp.exchange.predicted_postures import read_predicted_postures
 from drakegrasp.frames import Array, as_numbers
+from drakegrasp.simulation.postures.table import PostureTable
 from drakegrasp.verification.prediction import ROWS, read_predictions
 
 Rows = npt.NDArray[np.int64]
@@ -29,11 +32,12 @@ class Ranked:
 
     Attributes:
         name: Of the file, or of what made them.
-        grasps: (N, 6k), in the camera's frame.
+        grasps: (N, 6k), in the camera's frame; of postures (N, m) all their numbers.
         rows: (N,), the row of each.
         ranks: (N,), 0 for the best of a row.
         confidence: (N,), as stated, -inf for what is no finite number; None if it is not.
         sha256: Of the file, or of the numbers.
+        table: The postures; None for grasps of contacts.
     """
 
     name: str
@@ -42,6 +46,7 @@ class Ranked:
     ranks: Rows
     confidence: Array | None = None
     sha256: str
+    table: PostureTable | None = None
 
     def of_rows(self, rows: Sequence[int]) -> Ranked:
         """Return the predictions for some rows."""
@@ -53,6 +58,7 @@ class Ranked:
             ranks=self.ranks[kept],
             confidence=None if self.confidence is None else self.confidence[kept],
             sha256=self.sha256,
+            table=None if self.table is None else self.table.at(kept.tolist()),
         )
 
 
@@ -64,6 +70,7 @@ def rank(
     rows: npt.ArrayLike | None = None,
     confidence: npt.ArrayLike | None = None,
     sha256: str | None = None,
+    table: PostureTable | None = None,
 ) -> Ranked:
     """Return predictions in the order of rows and ranks.
 
@@ -76,6 +83,7 @@ def rank(
             the split in order if None.
         confidence: (n,) or (n, m), greater is better.
         sha256: Of the file; that of the numbers if None.
+        table: The postures (n,) whose numbers the grasps are.
 
     Raises:
         GraspError: If shapes do not fit each other, or a row does not exist.
@@ -110,6 +118,7 @@ def rank(
         ranks=np.arange(len(flat)) - np.repeat(starts, counts),
         confidence=None if stated is None else stated[order],
         sha256=sha256 or hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest(),
+        table=None if table is None else table.at(order.tolist()),
     )
 
 
@@ -155,6 +164,29 @@ def read_ranked(path: Path, *, length: int, split: str) -> Ranked:
     )
 
 
+def rank_postures(path: Path, data: GraspDataset) -> Ranked:
+    """Return the predicted postures of a file.
+
+    Args:
+        path: See `read_predicted_postures`; `confidence` ranks those of a row.
+        data: The split.
+
+    Raises:
+        GraspError: If the file holds anything else; the message names it.
+        ConfigError, HandError, DataError, MachineError: If dataset or hand cannot be used.
+    """
+    table, rows, confidence = read_predicted_postures(path, data)
+    return rank(
+        str(path),
+        table.numbers(),
+        length=len(data),
+        rows=rows,
+        confidence=confidence,
+        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        table=table,
+    )
+
+
 def ranked_sets(
     predictions: Any,
     data: GraspDataset,
@@ -189,7 +221,12 @@ def ranked_sets(
     # Files, each of a training seed.
     if rows is not None or confidence is not None:
         raise GraspError("rows and confidence must be in the files if files are given, got them")
-    found = tuple(read_ranked(Path(path), length=len(data), split=data.split) for path in paths)
+    found = tuple(
+        rank_postures(Path(path), data)
+        if holds_postures(Path(path))
+        else read_ranked(Path(path), length=len(data), split=data.split)
+        for path in paths
+    )
     names = [Path(path).name for path in paths]
     if len(found) < 2:
         return (names or [""])[0], found

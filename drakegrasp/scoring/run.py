@@ -10,6 +10,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -29,9 +30,13 @@ from drakegrasp.scoring.ranked import Ranked, rank
 from drakegrasp.scoring.references import REFERENCES, Scene
 from drakegrasp.scoring.verdict import Verdict, VerdictFile, verdict_key
 from drakegrasp.seeding import Stream, object_key
+from drakegrasp.simulation.postures.table import PostureTable
 
-#: Tries grasps (n, 6k) on rows (n,) and calls back with the place of each and its verdict.
-Verify: TypeAlias = Callable[[Array, Sequence[int], Callable[[int, Verdict], None]], object]
+#: Tries grasps (n, 6k), or n postures, on rows (n,) and calls back with the place of each and its
+#: verdict.
+Verify: TypeAlias = Callable[
+    [Array | PostureTable, Sequence[int], Callable[[int, Verdict], None]], object
+]
 #: Files of a score.
 CARD_JSON, CARD_TEXT, CARD_PICTURE, VERDICTS = "card.json", "card.md", "card.png", "verdicts.jsonl"
 
@@ -178,7 +183,7 @@ def _chosen_rows(request: Request) -> list[int]:
         raise GraspError(f"per_object must be 1 or more, got {request.per_object}")
     numbers = data.column("grasps").shape[1]
     for each in predictions:
-        if each.grasps.shape[1] != numbers:
+        if each.table is None and each.grasps.shape[1] != numbers:
             raise GraspError(
                 f"{each.name}: a grasp must be {numbers} numbers, got {each.grasps.shape[1]}"
             )
@@ -246,36 +251,57 @@ def _verdicts(
     content = f"{request.data.content} {request.data.camera}"
     keys = [
         [
-            verdict_key(settings, content, row, grasp)
+            verdict_key(settings, content + _frame(each), row, grasp)
             for row, grasp in zip(each.rows.tolist(), each.grasps, strict=True)
         ]
         for each in sets
     ]
     known = VerdictFile(None if folder is None else folder / VERDICTS)
-    missing: dict[str, tuple[Array, int]] = {}
+    missing: dict[str, tuple[Ranked, int]] = {}
     for each, own_keys in zip(sets, keys, strict=True):
-        for key, grasp, row in zip(own_keys, each.grasps, each.rows.tolist(), strict=True):
+        for i, key in enumerate(own_keys):
             if key not in known.verdicts:
-                missing.setdefault(key, (grasp, row))
+                missing.setdefault(key, (each, i))
 
     # Try it, object by object; each verdict is kept as soon as it is known.
     if missing:
         objects = request.data.column("object_props/object_name").tolist()
         resting = request.data.column("grasp_props/resting").tolist()
-        ordered = sorted(missing.items(), key=lambda each: _place(each[1][1], objects, resting))
-        names = [key for key, _ in ordered]
+        ordered = sorted(missing, key=lambda key: _place(_row(*missing[key]), objects, resting))
+        # Contacts of all sets together, postures file by file.
+        parts: dict[int, list[str]] = {}
+        for key in ordered:
+            own_table = missing[key][0].table
+            parts.setdefault(0 if own_table is None else id(own_table), []).append(key)
         try:
-            verify(
-                np.array([grasp for _, (grasp, _) in ordered]),
-                [row for _, (_, row) in ordered],
-                lambda index, verdict: known.add(names[index], verdict),
-            )
+            for part in parts.values():
+                chosen = [missing[key] for key in part]
+                table, places = chosen[0][0].table, [i for _, i in chosen]
+                verify(
+                    np.array([each.grasps[i] for each, i in chosen])
+                    if table is None
+                    else table.at(places),
+                    [_row(*each) for each in chosen],
+                    partial(_keep, known, part),
+                )
         finally:
             known.close()
     left = [key for key in missing if key not in known.verdicts]
     if left:
         raise MachineError(f"each prediction must have a verdict, got none for {len(left)}")
     return [tuple(known.verdicts[key] for key in each) for each in keys]
+
+
+def _row(ranked: Ranked, i: int) -> int:
+    return int(ranked.rows[i])
+
+
+def _frame(ranked: Ranked) -> str:
+    return "" if ranked.table is None else f" posture in {ranked.table.frame}"
+
+
+def _keep(known: VerdictFile, keys: Sequence[str], index: int, verdict: Verdict) -> None:
+    known.add(keys[index], verdict)
 
 
 def _place(row: int, objects: Sequence[str], resting: Sequence[int]) -> tuple[str, int, int]:

@@ -17,6 +17,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from drakegrasp.frames import Array
+from drakegrasp.outcomes import Outcome
 from drakegrasp.protocols.protocol import PostureVerdict
 from drakegrasp.runtime.json_text import parse_json
 from drakegrasp.verification.result import Verification
@@ -36,12 +37,14 @@ class Verdict:
         success: Held, with every contact within `verify.max_contact_error` of the asked one.
         held_any: Whether any of at most five wrist poses holds: an oracle chose among them.
         contact_error: Largest distance between asked and reached contacts [m]; None if a fingertip
-            did not touch.
+            did not touch; 0 for a posture that holds, which asks for no contacts.
         penetration: Largest after closing [m]; None if the hand did not close.
-        contacts: (3k,), the asked points in {O} [m]; empty for what is no grasp.
+        contacts: (3k,), the asked points in {O} [m], of a posture those after closing; empty for
+            what is no grasp.
         posture: Position [m], rotation vector [rad] and joints after closing in {O}; empty if the
             hand did not close.
         seconds: Wall-clock time [s].
+        reason: Why it is no grasp; empty for others.
     """
 
     outcome: str
@@ -56,6 +59,7 @@ class Verdict:
     contacts: tuple[float, ...]
     posture: tuple[float, ...]
     seconds: float
+    reason: str = ""
 
     @property
     def counted(self) -> bool:
@@ -65,8 +69,10 @@ class Verdict:
 
 def verdict_of(result: Verification) -> Verdict:
     """Return what a score keeps of a verification."""
-    first, farthest = result.first, result.farthest_contact
+    first, farthest, p_OQ = result.first, result.farthest_contact, result.p_OQ
     closed = None if first is None else first.trial.closed
+    if result.method == "posture" and closed is not None:
+        farthest, p_OQ = (0.0 if result.held else math.nan), closed.contacts.p_OQ
     return Verdict(
         outcome=result.outcome.label,
         success=result.success,
@@ -77,9 +83,10 @@ def verdict_of(result: Verification) -> Verdict:
         held_any=result.held_any,
         contact_error=_rounded(farthest) if math.isfinite(farthest) else None,
         penetration=None if closed is None else _rounded(np.nanmax(closed.contacts.penetration)),
-        contacts=_tuple(result.p_OQ),
+        contacts=_tuple(p_OQ),
         posture=() if closed is None or first is None else _posture(first.trial.X_OG, closed.q),
         seconds=sum(result.seconds.values()),
+        reason=result.reason if result.outcome is Outcome.INVALID else "",
     )
 
 
@@ -98,6 +105,7 @@ def protocol_verdict(grasp: PlacedGrasp, found: PostureVerdict) -> Verdict:
         contacts=_tuple(grasp.p_OQ),
         posture=(),
         seconds=0.0,
+        reason=found.reason.partition(": ")[2] if outcome == Outcome.INVALID.label else "",
     )
 
 
@@ -137,6 +145,7 @@ class VerdictFile:
     def _read(self, line: bytes) -> None:
         try:
             tree = parse_json(line)
+            tree.setdefault("reason", "")  # files of older versions
             values = {f.name: tree[f.name] for f in fields(Verdict)}
             as_tuples = {name: tuple(values[name]) for name in ("contacts", "posture")}
             self.verdicts[str(tree["key"])] = Verdict(**(values | as_tuples))

@@ -68,6 +68,7 @@ class GivenPostures:
         q_pregrasp, q_squeeze: Where the trial begins, and where motors press to; NaN: not given.
         row: (n,), row of each in its file.
         said: Where each comes from, in words; may be empty.
+        preshape: (n,), name of the hand's preshape; empty: all fingers close.
     """
 
     q_grasp: Array
@@ -75,6 +76,7 @@ class GivenPostures:
     q_squeeze: Array
     row: npt.NDArray[np.int64]
     said: tuple[str, ...]
+    preshape: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -108,21 +108,39 @@ def open_hand_collides(scene: Scene) -> bool:
     contact surfaces. A part that is wholly inside the object has none, so a point inside each part
     is tested against the object's volume as well.
     """
-    query = scene.plant.get_geometry_query_input_port().Eval(scene.context)
-    hand = hand_bodies(scene)
+    return bool(_meetings_of_hand(scene)) or is_inside(scene, _points_in_parts(scene))
 
-    # Intersections of the hand with another body.
+
+def open_hand_meets(scene: Scene) -> dict[str, list[str]]:
+    """Return which links of the hand intersect object or table, by "object" and "table"."""
+    names = {scene.object.index(): "object", scene.table.index(): "table"}
+    found: dict[str, set[str]] = {name: set() for name in names.values()}
+    hand, plant = hand_bodies(scene), scene.plant
+    for bodies in _meetings_of_hand(scene):
+        for other in bodies - hand:
+            found[names[other]] |= {plant.get_body(body).name() for body in bodies & hand}
+    for (geometry, _), point in zip(scene.parts, _points_in_parts(scene), strict=True):
+        if is_inside(scene, point[None]):
+            found["object"].add(plant.get_body(_body_of(scene, geometry)).name())
+    return {name: sorted(links) for name, links in found.items() if links}
+
+
+def _meetings_of_hand(scene: Scene) -> list[set[BodyIndex]]:
+    """Return the pairs of a link of the hand and another body that intersect."""
+    query = scene.plant.get_geometry_query_input_port().Eval(scene.context)
     surfaces, pairs = query.ComputeContactSurfacesWithFallback(
         HydroelasticContactRepresentation.kPolygon
     )
     meetings = [{_body_of(scene, s.id_M()), _body_of(scene, s.id_N())} for s in surfaces]
     meetings += [{_body_of(scene, p.id_A), _body_of(scene, p.id_B)} for p in pairs]
-    if any(bodies & hand and not bodies <= hand for bodies in meetings):
-        return True
+    hand = hand_bodies(scene)
+    return [bodies for bodies in meetings if bodies & hand and not bodies <= hand]
 
-    # Parts that are wholly inside the object.
-    points = [query.GetPoseInWorld(geometry) @ p for geometry, p in scene.parts]
-    return is_inside(scene, np.array(points))
+
+def _points_in_parts(scene: Scene) -> Array:
+    """Return a point (n, 3) inside each part of the hand in {W}, one of which tells if it is in."""
+    query = scene.plant.get_geometry_query_input_port().Eval(scene.context)
+    return np.array([query.GetPoseInWorld(geometry) @ p for geometry, p in scene.parts])
 
 
 def is_inside(scene: ObjectScene, p_WP: Array) -> bool:

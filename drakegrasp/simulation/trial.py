@@ -21,7 +21,12 @@ from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import JointPath, Pregrasp
-from drakegrasp.simulation.contacts import Contacts, open_hand_collides, read_contacts
+from drakegrasp.simulation.contacts import (
+    Contacts,
+    open_hand_collides,
+    open_hand_meets,
+    read_contacts,
+)
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.lift import Lift, lift
 from drakegrasp.simulation.randomization.conditions import Materials, usual_materials
@@ -202,6 +207,22 @@ def run_attempt(
     # A failed assertion within Drake arrives as SystemExit, everything else as RuntimeError.
     except (Exception, SystemExit) as error:
         return replace(start, outcome=Outcome.SOLVER_ERROR, message=first_line(error))
+
+
+def start_meetings(scene: Scene, X_TO: Array, attempt: Pregrasp) -> dict[str, list[str]]:
+    """Return which links of the hand intersect "object" or "table" where an attempt starts.
+
+    Args:
+        scene: Of the object and the hand.
+        X_TO: Resting pose of the object, (4, 4).
+        attempt: The attempt.
+    """
+    path, X_WO = attempt.path, multiply(X_WT, X_TO)
+    if path is not None and path.own_motors and scene.own_motors is not None:
+        scene = scene.own_motors()
+    q, X_WG = None if path is None else path.start, multiply(X_WO, attempt.X_OG)
+    reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing, q=q)
+    return open_hand_meets(scene)
 
 
 def _predict(scene: Scene, X_TO: Array, attempt: Pregrasp, config: Config) -> Prediction | None:

@@ -7,14 +7,14 @@ before anything is simulated; a row that is no grasp is none of them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.config import Config, RandomizeConfig
+from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
@@ -83,11 +83,9 @@ def place_on_rows(
     # Read all grasps before any object: a wrong number is reported at once.
     used = dataset_config(dataset, config, hand, overrides)
     read = _read(grasps, method, used)
-    chosen = _choose_rows(dataset, rows, len(read.invalid))
+    chosen = choose_rows(dataset, rows, len(read.invalid))
 
-    # The object, its resting pose, and the cameras of each row.
-    names = dataset.column("object_props/object_name")[chosen]
-    resting = dataset.column("grasp_props/resting")[chosen]
+    # The cameras of each row.
     X_TC = {
         camera: unpack_pose(dataset.column(f"object_props/frame_work2cam_{camera}")[chosen])
         for camera in CAMERAS
@@ -95,14 +93,10 @@ def place_on_rows(
     (other,) = set(CAMERAS) - {dataset.camera}
 
     # Each object in each resting pose once, with its grasps.
-    manifest, placed_grasps = read_manifest(dataset.path.parent), list[PlacedGrasp]()
-    in_camera = frame == "camera"
-    for name, k in dict.fromkeys(zip(names.tolist(), resting.tolist(), strict=True)):
-        prepared = load_prepared(dataset.path.parent, name, manifest.config_of(name))
-        X_TO = prepared.resting_poses[k]
-        indices = np.flatnonzero((names == name) & (resting == k))
+    placed_grasps, in_camera = list[PlacedGrasp](), frame == "camera"
+    for placed, indices in objects_of_rows(dataset, chosen):
         placed_grasps += _placed(
-            PlacedObject(model=prepared.model, X_TO=X_TO, config=manifest.config_of(name)),
+            placed,
             indices,
             read,
             frame=frame,
@@ -115,8 +109,26 @@ def place_on_rows(
 
     if config is not None:
         return placed_grasps
-    kept = overridden_keys(overrides)
-    return _as_tried(placed_grasps, dataset, chosen, manifest.config.randomize, kept)
+    return as_drawn(placed_grasps, dataset, chosen, overrides)
+
+
+def objects_of_rows(
+    dataset: GraspDataset, rows: npt.NDArray[np.int64]
+) -> Iterator[tuple[PlacedObject, npt.NDArray[np.int64]]]:
+    """Yield each object of some rows (n,) in each resting pose, and the indices of its rows.
+
+    Raises:
+        DataError: If the dataset's objects cannot be read.
+    """
+    out = dataset.path.parent
+    manifest = read_manifest(out)
+    names = dataset.column("object_props/object_name")[rows]
+    resting = dataset.column("grasp_props/resting")[rows]
+    for name, k in dict.fromkeys(zip(names.tolist(), resting.tolist(), strict=True)):
+        config = manifest.config_of(name)
+        prepared = load_prepared(out, name, config)
+        placed = PlacedObject(model=prepared.model, X_TO=prepared.resting_poses[k], config=config)
+        yield placed, np.flatnonzero((names == name) & (resting == k))
 
 
 def overridden_keys(overrides: Sequence[str]) -> set[str]:
@@ -226,12 +238,11 @@ def _placed(
     ]
 
 
-def _as_tried(
+def as_drawn(
     grasps: Sequence[PlacedGrasp],
     dataset: GraspDataset,
     rows: npt.NDArray[np.int64],
-    rules: RandomizeConfig,
-    overridden: set[str],
+    overrides: Sequence[str],
 ) -> list[PlacedGrasp]:
     """Return grasps with the friction and mass that were drawn for their rows.
 
@@ -239,9 +250,11 @@ def _as_tried(
         grasps: On the objects of a dataset.
         dataset: The data file.
         rows: (n,), the row of each grasp, by its index.
-        rules: What was drawn for the dataset.
-        overridden: Paths of keys that the caller sets, e.g. "physics.friction_hand".
+        overrides: What the caller sets, e.g. "physics.friction_hand=0.5".
     """
+    rules = read_manifest(dataset.path.parent).config.randomize
+    overridden = overridden_keys(overrides)
+
     # Use each row's drawn friction and mass; what the caller sets wins. Where one coefficient was
     # drawn, both are taken from the row.
     drawn_friction = rules.friction_hand is not None or rules.friction_table is not None
@@ -269,7 +282,7 @@ def _as_tried(
     return tried
 
 
-def _choose_rows(
+def choose_rows(
     dataset: GraspDataset, rows: Sequence[int] | None, count: int
 ) -> npt.NDArray[np.int64]:
     """Return the row (n,) of the dataset's split for each of `count` grasps.

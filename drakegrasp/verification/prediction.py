@@ -19,7 +19,7 @@ from drakegrasp.config import LARGEST
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.errors import GraspError, MachineError, first_line
 from drakegrasp.foreign_files import read_text, refuse_irregular
-from drakegrasp.frames import Array, as_numbers, invert_pose
+from drakegrasp.frames import FARTHEST, Array, as_numbers, invert_pose
 
 Frame = Literal["object", "camera", "workspace"]
 FRAMES: tuple[str, ...] = get_args(Frame)
@@ -28,8 +28,6 @@ FRAMES: tuple[str, ...] = get_args(Frame)
 NORMAL_TOLERANCE = 0.01
 #: A shorter normal has no direction.
 SHORTEST_NORMAL = 1e-6
-#: A point that is farther from the origin of its frame is none of any object [m].
-FARTHEST = 1e3
 #: Suffixes of files with grasps.
 HDF5_SUFFIXES = (".h5", ".hdf5")
 SUFFIXES = (".npy", ".csv", *HDF5_SUFFIXES, ".parquet")

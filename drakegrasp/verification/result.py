@@ -29,17 +29,18 @@ class PoseTrial:
     """One wrist pose for a grasp of k contacts, and its trial.
 
     Attributes:
-        fit: Palm pose and joints that bring the fingertips to the contacts.
+        fit: Palm pose and joints that bring the fingertips to the contacts; None for a posture,
+            which says them itself.
         pregrasp: Palm and opened fingers that the trial started from.
         trial: What happened in the simulator.
         contact_error: (k,), distance between the contact that was asked for and the one after
-            closing [m]; NaN for a fingertip that does not touch.
+            closing [m]; NaN for a fingertip that does not touch, and for a posture.
         normal_error: (k,), angle between their normals [rad]; NaN likewise.
         removal: The first filter of a dataset that would remove the grasp, `KEPT` if none does, see
             `verification.sample`; None if it does not hold.
     """
 
-    fit: WristFit
+    fit: WristFit | None
     pregrasp: Pregrasp
     trial: TrialRecord
     contact_error: Array
@@ -59,14 +60,14 @@ class Verification:
     The grasp is judged by its first wrist pose, the one that fits the contacts best.
 
     Attributes:
-        method: "hand" or "forces".
+        method: "hand", "forces" or "posture".
         outcome: How the trial of the first wrist pose ended; as in a dataset, or `invalid`, or with
             method `forces` `off_surface`.
         reason: Why, in one sentence without a full stop.
         placed: The object and its pose on the table.
         config: Hand, physics, lift and rules of the verification.
         p_OQ, nhat_Q_O: (k, 3), the contact points [m] and unit normals in {O} that were tried; NaN
-            where an invalid row has none.
+            where an invalid row or a posture has none.
         surface_distance: (k,), of the predicted points from the object's surface [m].
         normalised: Whether a predicted normal was not of unit length, and was normalised.
         snapped: Whether the points were moved to the nearest points of the surface.
@@ -100,7 +101,8 @@ class Verification:
     def success(self) -> bool:
         """Whether the first wrist pose holds, with every contact where it was asked for.
 
-        That is within `verify.max_contact_error`. With method `forces`: whether forces hold it.
+        That is within `verify.max_contact_error`. With method `forces`: whether forces hold it; of
+        a posture, which asks for no contacts: whether it holds.
         """
         return self.held and not self.farthest_contact > self.config.verify.max_contact_error
 
@@ -171,7 +173,7 @@ class Verification:
 
     @property
     def fit(self) -> WristFit | None:
-        """The first wrist pose, with its joints."""
+        """The first wrist pose that was fitted to contacts, with its joints."""
         return self.first.fit if self.first else None
 
     @property

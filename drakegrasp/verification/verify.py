@@ -1,10 +1,11 @@
-"""The verdict on one grasp of one object, from its contacts in {O}.
+"""The verdict on one grasp of one object, from its contacts in {O} or from its posture.
 
-In: a `PlacedGrasp`. Out: a `Verification`. Method `hand` finds palm poses that bring the fingertips
-to the points, and runs a trial from the best, as a build does; if that does not hold, from the
-others, too. Method `forces` asks whether forces at the surface's own contacts can lift the object.
-Every row of numbers that has contacts is tried, however wrong they look: what is measured is judged
-afterwards. A wrong prediction, a failed solver and a lost object are outcomes, not exceptions.
+In: a `PlacedGrasp`. Out: a `Verification`. A posture is tried as it is. Of contacts, method `hand`
+finds palm poses that bring the fingertips to the points, and runs a trial from the best, as a build
+does; if that does not hold, from the others, too. Method `forces` asks whether forces at the
+surface's own contacts can lift the object. Every row of numbers that has contacts is tried, however
+wrong they look: what is measured is judged afterwards. A wrong prediction, a failed solver and a
+lost object are outcomes, not exceptions.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.timing import timed
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.placement import PlacedObject
+from drakegrasp.simulation.postures.posture import Posture, start_of
+from drakegrasp.simulation.postures.trial import run_trial
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.contact_surface import fit_surface
@@ -66,7 +69,7 @@ class PlacedGrasp:
         placed: The object on the table.
         p_OQ, nhat_Q_O: (k, 3), contact points [m] and outward unit normals in {O}; NaN where the
             row is invalid.
-        method: "hand" or "forces".
+        method: "hand", "forces" or "posture".
         config: Hand, physics, lift and rules. What ends or avoids lifts (`lift.stop_when`,
             `lift.least_chance`, `lift.least_depth_variance`) is without effect: the verdict is that
             of a whole lift.
@@ -75,6 +78,7 @@ class PlacedGrasp:
         snap_points: Whether to move the points to the surface.
         X_OA: (4, 4), pose of the frame in which the numbers were given.
         X_OB: (4, 4), pose of the dataset's other camera; None if there is none.
+        posture: With method "posture": wrist and joints, in place of contacts; None if invalid.
     """
 
     index: int
@@ -88,6 +92,7 @@ class PlacedGrasp:
     snap_points: bool = False
     X_OA: Array | None = None
     X_OB: Array | None = None
+    posture: Posture | None = None
 
 
 @one_thread
@@ -106,6 +111,8 @@ def verify_placed(grasp: PlacedGrasp) -> Verification:
     )
     if grasp.invalid:
         return base
+    if grasp.posture is not None:
+        return _try_posture(base, grasp.posture)
 
     # How the contacts lie on the surface, and what forces at them alone can do.
     base = _on_surface(base, grasp)
@@ -122,8 +129,8 @@ def verify_placed(grasp: PlacedGrasp) -> Verification:
         return result
     with timed(base.seconds, "hints"):
         X_OA = np.eye(4) if grasp.X_OA is None else grasp.X_OA
-        hints = find_hints(base.placed.model, load_hand(base.config.hand_source),
-                           grasp.p_OQ, base.nhat_Q_O, X_OA=X_OA, X_OB=grasp.X_OB)  # fmt: skip
+        model, hand = base.placed.model, load_hand(base.config.hand_source)
+        hints = find_hints(model, hand, grasp.p_OQ, base.nhat_Q_O, X_OA=X_OA, X_OB=grasp.X_OB)
     return replace(result, hints=hints)
 
 
@@ -174,7 +181,27 @@ def _lift_by_hand(base: Verification) -> Verification:
         # within the object or the table: the first that is clear is the first pose.
         tries = _try_poses(base, fits, pass_collisions=hand.num_fingers == 2)
 
-    # The first decides.
+    return _judged(base, tries)
+
+
+def _try_posture(base: Verification, posture: Posture) -> Verification:
+    """Try a posture, which says wrist and joints itself."""
+    with timed(base.seconds, "simulate"):
+        trial = run_trial(base.placed, posture, base.config)
+    nothing = np.full(len(base.p_OQ), np.nan)
+    tried = PoseTrial(
+        fit=None,
+        pregrasp=start_of(posture, load_hand(base.config.hand_source)),
+        trial=trial,
+        contact_error=nothing,
+        normal_error=nothing,
+        removal=judge_sample(base.placed.model, trial, base.config),
+    )
+    return _judged(base, (tried,))
+
+
+def _judged(base: Verification, tries: tuple[PoseTrial, ...]) -> Verification:
+    """Return the verdict of the first trial, which decides."""
     trial = tries[0].trial
     reason = _REASONS[trial.outcome] + (f": {trial.message}" if trial.message else "")
     return replace(base, outcome=trial.outcome, reason=reason, tries=tries)

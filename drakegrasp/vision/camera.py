@@ -43,8 +43,10 @@ class Lens:
 
         With the vertical field of view φ and H rows, f = H / (2 tan(φ/2)).
         """
-        square = isinstance(config, CameraConfig)
-        width, height = (config.size,) * 2 if square else (config.width, config.height)
+        if isinstance(config, CameraConfig):
+            width = height = config.size
+        else:
+            width, height = config.width, config.height
         sine, cosine = sin_cos_deg(config.fov_y_deg / 2.0)
         focal = float(height * cosine / (2.0 * sine))
         K = [[focal, 0.0, (width - 1) / 2.0], [0.0, focal, (height - 1) / 2.0], [0.0, 0.0, 1.0]]

@@ -8,7 +8,6 @@ the table, wherever the object lies.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply, sin_cos, sin_cos_deg
 from drakegrasp.config import ScenesConfig
@@ -21,9 +20,7 @@ SINGLE = (45.0, 60.0, 0.7)
 FIXED_AIM = np.array([0.0, 0.0, 0.05])
 
 
-def look_at(
-    p_TA: npt.ArrayLike, distance: float, azimuth: float, sine: float, roll: float = 0.0
-) -> Array:
+def look_at(p_TA: Array, distance: float, azimuth: float, sine: float, roll: float = 0.0) -> Array:
     """Return X_TC (4, 4) of a camera that looks at a point from above the horizon.
 
     Args:
@@ -51,7 +48,7 @@ def fixed_viewpoints() -> Array:
     )
 
 
-def draw_viewpoint(stream: Stream, p_TO: npt.ArrayLike, config: ScenesConfig) -> Array:
+def draw_viewpoint(stream: Stream, p_TO: Array, config: ScenesConfig) -> Array:
     """Return X_TC (4, 4) of a camera that looks at an object from anywhere above the table.
 
     Azimuth, distance, roll, the point that it looks at, and the sine of the elevation are uniform:
@@ -66,7 +63,7 @@ def draw_viewpoint(stream: Stream, p_TO: npt.ArrayLike, config: ScenesConfig) ->
     low, high = sin_cos_deg(config.elevation_deg)[0]
     near, far = config.distance
     return look_at(
-        np.asarray(p_TO, dtype=float) + config.aim * (2.0 * u[4:] - 1.0),
+        p_TO + config.aim * (2.0 * u[4:] - 1.0),
         near + (far - near) * float(u[0]),
         2.0 * np.pi * float(u[2]),
         float(low + (high - low) * u[1]),

@@ -202,7 +202,9 @@ def draw_predicted(meshcat: Meshcat, p_OQ: Array | None, nhat_Q_O: Array | None)
     if p_OQ is None or nhat_Q_O is None:
         return
     colour = rgba(PREDICTED)
-    for i, (p, n) in enumerate(zip(p_OQ, nhat_Q_O, strict=True)):
+    # A posture asks for no contacts.
+    there = np.isfinite(p_OQ).all(axis=1)
+    for i, (p, n) in enumerate(zip(p_OQ[there], nhat_Q_O[there], strict=True)):
         path = f"{OBJECT_PATH}/predicted/{i + 1}"
         meshcat.SetTransform(path, pose_along(p, n))
         meshcat.SetObject(f"{path}/dot", Sphere(DOT), colour)

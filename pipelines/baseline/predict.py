@@ -27,6 +27,7 @@ from networks import (
     PostureSize,
 )
 from torch import Tensor
+from train import SEEN
 
 import drakegrasp as dg
 from drakegrasp.errors import DataError, DrakegraspError
@@ -107,7 +108,7 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
             weight, X_TG, q = proposals(network, hand, batch["points"], arguments.proposals)
             confidence = weight
             if judge is not None:
-                clouds = batch["points"].expand(len(X_TG), -1, -1)
+                clouds = batch["points"][:, :SEEN].expand(len(X_TG), -1, -1)
                 confidence = judge(clouds, X_TG, of_judge.coordinates(q))[:, 1].sigmoid()
 
             # Back to where the cloud was, and into the object's frame.

@@ -38,6 +38,10 @@ import drakegrasp as dg
 from drakegrasp.errors import DataError, DrakegraspError
 
 
+#: Points of a cloud that the classifier sees: it looks at each cloud once for each grasp.
+SEEN = 256
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the script; return its exit code."""
     parser = argparse.ArgumentParser(
@@ -139,7 +143,7 @@ TASKS = {
 def judged(network: GraspClassifier, hand: HandCoordinates, batch: Batch) -> tuple[Tensor, Tensor]:
     """Return logits and labels (n, 2), of held and sample, of all grasps of a batch."""
     grasps = batch["X_TG"].shape[1]
-    clouds = batch["points"].repeat_interleave(grasps, 0)
+    clouds = batch["points"][:, :SEEN].repeat_interleave(grasps, 0)
     logits = network(
         clouds, batch["X_TG"].flatten(0, 1), hand.coordinates(batch["q"].flatten(0, 1))
     )

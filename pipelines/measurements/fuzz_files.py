@@ -7,9 +7,9 @@ Each case spoils one file of a copy of OUT in one way: a bit is flipped, the end
 columns are made longer, a column is put in the place of another, JSON gets another value or another
 structure, another kind of file (a pipe, a device, a folder, a file of 1 TB) takes the place. Then
 the loaders, `stats` and `check` read the copy, each in a process of its own with 2 GB of memory and
-60 s; with `--all` every command that reads a dataset does. Prints a line of JSON for each finding:
-a traceback, a hang, memory, a signal, or other values without a word. The same seed spoils the same
-bytes of the same dataset. Exit code 1 if there is a finding.
+20 s of CPU time; with `--all` every command that reads a dataset does. Prints a line of JSON for
+each finding: a traceback, a hang, memory, a signal, or other values without a word. The same seed
+spoils the same bytes of the same dataset. Exit code 1 if there is a finding.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ import os
 import random
 import resource
 import shutil
+import signal
 import socket
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 import h5py
@@ -46,14 +47,15 @@ from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.runtime.progress import progress_bar
 
-#: What a process may take beside what this one has [byte], and how long it may run [s].
-MEMORY, SECONDS = 2**31, 60.0
+#: What a process may take beside what this one has [byte], how long it may compute [s of CPU time],
+#: and how long it may last on a machine that has other work [s].
+MEMORY, CPU_SECONDS, SECONDS = 2**31, 20, 120.0
 #: Files of a dataset that hold columns.
 COLUMNS = ("trials.hdf5", "grasping_oto.hdf5", "grasping_otm.hdf5")
 #: Rows that columns are made to claim.
 CLAIMS = (400_000_000, 2**50)
-#: Most lines of an error, with the last state of a progress bar; and the code of a traceback.
-LINES, UNEXPECTED = 3, 99
+#: Most lines of an error, and the code of a traceback.
+LINES, UNEXPECTED = 1, 99
 
 
 # --- Ways to spoil a file ---
@@ -110,6 +112,13 @@ def swap(path: Path, draw: random.Random) -> str:
 def restructure(path: Path, draw: random.Random) -> str:
     """Put another value somewhere into a JSON file."""
     tree = json.loads(path.read_text(encoding="utf-8"))
+    said = change_tree(tree, draw)
+    path.write_text(json.dumps(tree), encoding="utf-8")
+    return said
+
+
+def change_tree(tree: Any, draw: random.Random) -> str:
+    """Put another value somewhere into what JSON says."""
     values: list[Any] = [None, [], {}, "", -1, 1e300, True, "\x1b[31m", "../../x", [[]] * 3]
     value = draw.choice([*values, 2**70, "x" * 100_000])
     steps: list[Any] = []
@@ -122,7 +131,6 @@ def restructure(path: Path, draw: random.Random) -> str:
             node[steps[-1]] = value
             break
         node = child
-    path.write_text(json.dumps(tree), encoding="utf-8")
     return f"{'.'.join(map(str, steps))} set to {str(value)[:40]!r}"
 
 
@@ -229,6 +237,7 @@ def _child(run: Callable[[Path], object], out: Path, folder: Path) -> None:
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
     most = pages * resource.getpagesize() + MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS + 1))
     code = 0
     try:
         run(out)
@@ -276,19 +285,44 @@ def read(run: Callable[[Path], object], out: Path) -> Said:
         return Said(code=process.exitcode, **texts)
 
 
-def judge(said: Said, sound: Said) -> str | None:
-    """Return what is wrong with how a reader took a spoilt dataset; None if nothing is."""
-    lines = said.err.strip().splitlines()
+def preload(read_soundly: Iterable[Said]) -> None:
+    """Import here, once, what readers of sound files imported: a fork of this process has it.
+
+    Raises:
+        RuntimeError: If a sound file was not read.
+    """
+    for said in read_soundly:
+        if said.code != 0:
+            raise RuntimeError(
+                f"a sound file must be read, got {said.code}: {said.err or said.out}"
+            )
+        for module in sorted(set(said.modules.splitlines()) - set(sys.modules)):
+            with contextlib.suppress(Exception):
+                importlib.import_module(module)
+
+
+def judge(said: Said, sound: Said | None = None) -> str | None:
+    """Return what is wrong with how a reader took a spoilt file; None if nothing is.
+
+    Args:
+        said: What it said.
+        sound: What it said of the sound file, if it must say the same or refuse.
+    """
+    lines = [line for line in said.err.strip().splitlines() if "━" not in line]
     if said.code is None:
         return f"no end within {SECONDS:g} s"
+    if said.code == -signal.SIGXCPU:
+        return f"more than {CPU_SECONDS} s of CPU time"
     if said.code < 0:
         return f"signal {-said.code}"
     if "Traceback" in said.err or said.code == UNEXPECTED:
         return f"a traceback: {lines[-1][:200] if lines else ''}"
     if any(text in said.out + said.err for text in ("Unable to allocate", "MemoryError")):
         return f"memory: {(lines or [said.out])[-1][:200]}"
+    if "No module named" in said.out + said.err:
+        return f"a module that is not there: {(lines or [said.out])[-1][:200]}"
     if said.code == 0:
-        return None if said.out == sound.out else "other values without a word"
+        return None if sound is None or said.out == sound.out else "other values without a word"
     if len(lines) > LINES:
         return f"{len(lines)} lines: {said.err[:200]!r}"
     return None if said.out.strip() or lines else "an exit code without a word"
@@ -322,14 +356,7 @@ def fuzz(
         copy = Path(folder) / "OUT"
         shutil.copytree(out, copy)
         sound = {name: read(run, copy) for name, run in readers.items()}
-        wrong = {name: said.err for name, said in sound.items() if said.code != 0}
-        if wrong:
-            raise RuntimeError(f"a sound dataset must be read, got {wrong}")
-        # What the readers import is imported here, once: a fork of this process has it.
-        used = {name for said in sound.values() for name in said.modules.splitlines()}
-        for module in sorted(used - set(sys.modules)):
-            with contextlib.suppress(Exception):
-                importlib.import_module(module)
+        preload(sound.values())
         for number in range(first, first + count):
             draw = random.Random(f"{seed}/{number}")
             shutil.rmtree(copy)
@@ -349,6 +376,19 @@ def fuzz(
                 yield finding if finding["wrong"] else None
 
 
+def say_findings(cases: Iterator[dict[str, Any] | None], count: int) -> NoReturn:
+    """Print findings and how many there are, and end with code 1 if there are any."""
+    findings = 0
+    with progress_bar("fuzz", "reads") as progress:
+        for number, finding in enumerate(cases, 1):
+            progress(number, count)
+            if finding:
+                findings += 1
+                click.echo(json.dumps(finding))
+    click.echo(json.dumps({"reads": count, "findings": findings}))
+    sys.exit(bool(findings))
+
+
 @click.command(help=__doc__)
 @click.argument("out", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--count", default=300, show_default=True, help="Number of cases.")
@@ -357,16 +397,8 @@ def fuzz(
 @click.option("--all", "everything", is_flag=True, help="Read with every command.")
 def main(out: Path, count: int, first: int, seed: int, everything: bool) -> None:
     """Run the script."""
-    findings = 0
-    with progress_bar("fuzz", "reads") as progress:
-        cases = list(commands(everything))
-        for number, finding in enumerate(fuzz(out, count, seed, everything, first), 1):
-            progress(number, count * len(cases))
-            if finding:
-                findings += 1
-                click.echo(json.dumps(finding))
-    click.echo(json.dumps({"cases": count, "findings": findings}))
-    sys.exit(bool(findings))
+    cases = fuzz(out, count, seed, everything, first)
+    say_findings(cases, count * len(commands(everything)))
 
 
 if __name__ == "__main__":

@@ -8,6 +8,6 @@ set -euo pipefail
 cd "$(dirname "$0")/../.."
 
 python pipelines/submit_build.py \
-    --cluster slurm --workers "${WORKERS:-100}" --walltime "${WALLTIME:-04:00:00}" --tls \
+    --cluster slurm --workers "${WORKERS:-100}" --walltime "${WALLTIME:-04:00:00}" \
     --objects "${MESHES:-builtin}" --units "${UNITS:-m}" --out "${OUT:?directory of the dataset}" \
     "$@"

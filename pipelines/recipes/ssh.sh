@@ -10,6 +10,6 @@ cd "$(dirname "$0")/../.."
 read -r -a hosts <<<"${HOSTS:?names of the machines}"
 python pipelines/submit_build.py \
     --cluster ssh "${hosts[@]}" --cores "${CORES:?workers on each machine}" \
-    --interface "${NETWORK:?such as eth0}" --tls \
+    --interface "${NETWORK:?such as eth0}" \
     --objects "${MESHES:-builtin}" --units "${UNITS:-m}" --out "${OUT:?directory of the dataset}" \
     "$@"

@@ -354,7 +354,13 @@ def test_wrong_use_of_workers_is_refused(tmp_path: Path, small_meshes: Path) -> 
 @pytest.mark.cluster
 def test_scheduler_that_is_not_there_is_named(tmp_path: Path, small_meshes: Path) -> None:
     with pytest.raises(MachineError, match="must be a running Dask scheduler"):
+        build_dataset(small_meshes, tmp_path / "out", scheduler="tcp://127.0.0.1:9", tls=False)
+    with pytest.raises(ConfigError, match=r"begins with tls://, got tcp://127\.0\.0\.1:9: anybody"):
         build_dataset(small_meshes, tmp_path / "out", scheduler="tcp://127.0.0.1:9")
+    file = tmp_path / "open.json"
+    file.write_text('{"address": "tcp://127.0.0.1:9"}')
+    with pytest.raises(ConfigError, match="begins with tls://, got tcp"):
+        build_dataset(small_meshes, tmp_path / "out", scheduler_file=file)
     with pytest.raises(MachineError, match=r"none\.json: must be the file of a running Dask"):
         build_dataset(small_meshes, tmp_path / "out", scheduler_file=tmp_path / "none.json")
     for number, text in enumerate(("", "x", "{}", "[]", '{"address": 5}')):

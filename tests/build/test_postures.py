@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,14 +11,18 @@ import h5py
 import numpy as np
 import pytest
 from helpers.assertions import assert_same_arrays
+from helpers.hands import write_with_preshapes
 from helpers.objects import CUBE, STANDOFF, box_model, from_above, standing
 
+from drakegrasp.api.building import build_on
 from drakegrasp.build.pipeline import build, posture_config
 from drakegrasp.build.prepare import prepare
 from drakegrasp.build.replay import replay_trial
 from drakegrasp.config import Config
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.schema import NO_PRESHAPE
+from drakegrasp.dataset.statistics import NO_NAME, counts_as_dict
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import make_pose
@@ -34,7 +39,7 @@ from drakegrasp.simulation.postures.posture import joint_order
 from drakegrasp.simulation.postures.table import (
     PostureTable,
     make_table,
-    refuse_unknown_objects,
+    unknown_objects,
 )
 from drakegrasp.simulation.trial import run_attempt
 
@@ -109,7 +114,10 @@ def test_dataset_is_sound(dataset):
 
 @pytest.mark.parametrize("row", range(4))
 def test_trial_of_a_posture_is_replayed_from_the_dataset_alone(dataset, row):
-    assert replay_trial(dataset, row).same
+    again = replay_trial(dataset, row)
+    assert again.same
+    # The fingers of the third begin in the table.
+    assert list(again.meetings) == (["table"] if row == 2 else [])
 
 
 def test_plan_keeps_what_the_file_said(dataset, table):
@@ -143,21 +151,102 @@ def test_dataset_of_other_postures_is_not_continued(meshes, table, dataset, tmp_
         built(meshes, out, other)
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"resting": np.array([0, 0, 0, 1])}, r"row 3 \(1_box_a\): resting pose must be 0, the"),
-        ({"scale": np.array([1.0, 0.1, 1.0, 1.0])}, r"row 1 \(1_box_a\): scale must be that of"),
-    ],
-)
-def test_row_of_another_pose_or_scale_is_refused(meshes, table, tmp_path, changes, words):
-    with pytest.raises(GraspError, match=words):
-        built(meshes, tmp_path / "out", replace(table, **changes))
+def test_rows_that_are_no_posture_are_told_and_spoil_no_other(meshes, table, dataset, tmp_path):
+    """The good rows 0 and 3 of the file, with bad ones between and after them."""
+    bad = [0, 0, 0, 0, 0, 0]
+    rows = [0, *bad[:2], 3, *bad[2:], 0]
+    X_FG, q, objects = table.X_FG[rows], table.q_grasp[rows], [NAME] * len(rows)
+    q[1, 2] = np.nan
+    X_FG[2, :3, 3] = 1e6
+    X_FG[4, :3, :3] = 0.0
+    resting, scale = np.zeros(len(rows)), np.full(len(rows), np.nan)
+    resting[5], scale[6], resting[7], objects[8] = 1.0, 0.1, -1.0, "cup"
+    mixed = make_table(
+        *(HAND, objects, X_FG, q),
+        q_pregrasp=table.q_pregrasp[rows],
+        q_squeeze=table.q_squeeze[rows],
+        resting=resting,
+        scale=scale,
+    )
+    mixed = mixed.refuse(unknown_objects(mixed, [NAME]))
+    config = posture_config(load_config(), mixed)
+    report = build(find_meshes(meshes), tmp_path, config, run_here, postures=mixed, show=False)
+    trials, alone = Trials(tmp_path), Trials(dataset)
+    assert trials["posture_row"].tolist() == [0.0, 3.0]
+    for name in ("outcome", "closed_q", "slip"):
+        np.testing.assert_array_equal(trials[name], alone[name][[0, 3]])
+    (told,) = (each for each in report.notices if "postures" in each)
+    assert told.startswith("7 of 9 rows of the postures are not tried: row 1: q_grasp must be fin")
+    for part in (
+        "row 2: the palm's pose must be within 1000 m, got 1e+06 m",
+        "row 4: the palm's pose must hold a rotation",
+        "row 5: resting pose of 1_box_a must be 0, the only one",
+        "row 6: scale must be that of 1_box_a, 1",
+        "row 7: resting must be the index of a resting pose, got -1",
+        "row 8: object must be one of 1_box_a, got 'cup'",
+    ):
+        assert part in told
+    assert check_dataset(tmp_path) == []
 
 
-def test_row_of_an_unknown_object_is_refused(table):
-    with pytest.raises(GraspError, match="row 0: object must be one of cup, got '1_box_a'"):
-        refuse_unknown_objects(table, ["cup"])
+def test_file_without_any_posture_is_refused(meshes, table, tmp_path):
+    with pytest.raises(GraspError, match=r"4 of 4 rows .* row 0, 1, 2, 3: scale must be that of"):
+        built(meshes, tmp_path / "out", replace(table, scale=np.full(4, 0.1)))
+    with pytest.raises(
+        GraspError, match=r"must be of an object that is built: 4 of 4 rows .*got 'cup'"
+    ):
+        build_on(nullcontext(None), find_meshes(meshes), tmp_path, load_config(),
+                 postures=replace(table, objects=("cup",) * 4))  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def of_preshapes(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """The cube held by two fingers of three, given back once as of their preshape, once not."""
+    folder = tmp_path_factory.mktemp("shaped")
+    config = load_config(
+        overrides=[f"hand={write_with_preshapes(folder, all='F1 F2 F3', pair='F1 F3')}"]
+    )
+    hand, model = load_hand(config.hand), box_model(folder, [CUBE] * 3, NAME)
+    attempt, pair = from_above(model, STANDOFF), hand.at(1)
+    held = run_attempt(build_scene(model, config.physics, pair), standing(model), attempt, config)
+    assert held.outcome is Outcome.SUCCESS
+    start = joint_positions(pair, 0.0, np.zeros(2))
+    table = make_table(
+        hand,
+        [NAME] * 2,
+        [attempt.X_OG] * 2,
+        [held.closed.q] * 2,
+        q_pregrasp=[[start[name] for name in joint_order(hand)]] * 2,
+        preshape=["pair", ""],
+    )
+    return built(meshes, folder / "out", table, config), held.closed.q
+
+
+def test_a_posture_of_a_preshape_is_the_attempt_that_it_was(of_preshapes):
+    """Without one, the third finger closes as well."""
+    out, q = of_preshapes
+    trials = Trials(out)
+    assert trials["preshape"].tolist() == [1, NO_PRESHAPE]
+    assert trials["unused"].tolist() == [0b010, 0]
+    assert trials["outcome"].tolist() == [Outcome.SUCCESS] * 2
+    assert trials["closed_touching"].tolist() == [[True, False, True], [True] * 3]
+    np.testing.assert_allclose(trials["closed_q"][0], q, atol=1e-9)
+    assert not trials["own_motors"][0]
+
+
+def test_a_dataset_of_postures_of_preshapes_is_sound_and_replayed(of_preshapes):
+    out, _ = of_preshapes
+    assert check_dataset(out) == []
+    assert replay_trial(out, 0).same
+    counts = [(each["preshape"], each["held"]) for each in counts_as_dict(out)["preshapes"]]
+    assert counts == [("all", 0), ("pair", 1), (NO_NAME, 1)]
+
+
+def test_the_hash_of_postures_without_preshapes_is_as_before_there_were_any(table):
+    """Else no build of an older version went on."""
+    plain = make_table(HAND, ["cup"], [np.eye(4)], np.zeros((1, 8)))
+    assert plain.digest() == "553c8cce98b13896"
+    assert replace(plain, preshape=("pair",)).digest() != plain.digest()
 
 
 def test_settings_that_name_other_postures_are_refused(table):

@@ -56,3 +56,15 @@ def test_worker_reads_the_mesh_file_once_and_a_prepared_object_not_at_all(
     assert reads.count(task.source.path) == 1
     assert prepare_one(task) == ("1_box", entry)
     assert reads.count(task.source.path) == 1
+
+
+def test_mesh_that_is_no_solid_is_refused_with_its_reason(task: PrepareTask) -> None:
+    """The entry has the file's name already, so the reason begins behind it."""
+    path = task.source.path
+    path.write_bytes(b"solid nothing\nendsolid nothing\n")
+    digest = source_sha256(task.source)
+    name, entry = prepare_one(replace(task, mesh_sha256=digest))
+    assert isinstance(entry, RefusedMesh)
+    assert (name, entry.name, entry.mesh_sha256) == ("1_box", "1_box", digest)
+    assert entry.reason and not entry.reason.startswith(path.name)
+    assert not Path(task.out).exists()

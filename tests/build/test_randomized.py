@@ -16,6 +16,8 @@ from drakegrasp.build.pipeline import build
 from drakegrasp.build.replay import record_trial, replay_trial
 from drakegrasp.config import Config
 from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import CONDITION_FIELDS
 from drakegrasp.hand.settings import load_config
@@ -101,11 +103,15 @@ def test_images_differ_in_light_and_colour(randomized: Path) -> None:
 
 def test_grasps_are_verified_with_their_own_friction_and_mass(randomized: Path) -> None:
     data = GraspDataset(randomized / "grasping_oto.hdf5", split="train")
-    rows = [0, 1]
+    rows = [len(data) - 1, 0]
     grasps = np.array([data[row].grasp for row in rows])
+    usual = load_prepared(randomized, NAME, read_manifest(randomized).config).model
     for row, verdict in zip(rows, verify_rows(data, grasps, rows, method="forces"), strict=True):
         props, conditions = data[row].props, data[row].conditions
-        assert verdict.placed.model.mass == pytest.approx(float(props["work2mass"][0]))
+        model = verdict.placed.model
+        assert model.mass == pytest.approx(float(props["work2mass"][0]))
+        inertia = model.mass / usual.mass * usual.I_OOcm_O
+        np.testing.assert_allclose(model.I_OOcm_O, inertia, rtol=1e-9)
         physics = verdict.config.physics
         assert physics.friction_hand == pytest.approx(float(conditions["friction_hand"]))
         assert physics.friction_table == pytest.approx(float(conditions["friction_table"]))

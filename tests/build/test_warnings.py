@@ -62,6 +62,7 @@ def test_a_hand_without_a_payload_has_no_warning(tmp_path: Path) -> None:
         (["a", "b"], {}, ""),
         (["a", "b", "b"], {}, ""),
         (["a", "b"], {"train_classes": ("b",)}, ""),
+        (["a", "b"], {"train_classes": ()}, ""),
         (["a", "a"], {"train_classes": ("c",)}, "split.train_classes names none of the classes"),
     ],
 )

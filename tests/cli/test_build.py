@@ -259,14 +259,15 @@ def test_build_connects_with_the_certificates_that_it_is_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     @contextmanager
-    def connect(*_: Any, security: Security) -> Iterator[None]:
+    def connect(*_: Any, security: Security, tls: bool) -> Iterator[None]:
+        assert tls
         assert security.require_encryption
         for key in ("tls_client_cert", "tls_client_key", "tls_ca_file"):
             assert getattr(security, key) == str(tmp_path / key.split("_")[-1])
         raise MachineError("connected")
         yield
 
-    monkeypatch.setattr("drakegrasp.api.building.connect", connect)
+    monkeypatch.setattr("drakegrasp.api.workers.connect", connect)
     (tmp_path / "meshes").mkdir()
     trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "meshes" / "1_box.obj")
     build = ["build", "--objects", tmp_path / "meshes", "--out", tmp_path / "out"]

@@ -10,7 +10,7 @@ import pytest
 from helpers.datasets import OTO, make_dataset
 from helpers.hands import write_with_optional_fingers
 
-from drakegrasp.cli.verify.request import VerifyRequest, place_requested
+from drakegrasp.cli.verify.request import VerifyRequest, place_requested, requested_rows
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError, HandError
@@ -71,6 +71,65 @@ def test_a_given_configuration_draws_nothing(drawn: Path) -> None:
     assert {grasp.config for grasp in grasps} == {config}
     masses = [e.mass for e in read_manifest(drawn).objects]
     assert all(np.isclose(masses, grasp.placed.model.mass).any() for grasp in grasps)
+
+
+def posture_file(path: Path, data: GraspDataset, **columns: object) -> Path:
+    """Write open hands about the objects of the rows of a split."""
+    count = len(load_hand().joint_names)
+    X_FG = np.tile(np.eye(4), (len(data), 1, 1))
+    np.savez(path, X_FG=X_FG, q_grasp=np.zeros((len(data), count)), **columns)  # type: ignore[arg-type]
+    return path
+
+
+def test_postures_of_rows_are_tried_with_the_friction_and_mass_of_their_rows(
+    drawn: Path, tmp_path: Path
+) -> None:
+    data = GraspDataset(drawn / OTO, split="train")
+    rows = np.arange(len(data))[::-1]
+    path = posture_file(tmp_path / "p.npz", data, row=rows)
+    given = VerifyRequest(grasps=path, dataset=drawn / OTO, split="train")
+    grasps, _ = place_requested(given)
+    assert sorted(grasp.index for grasp in grasps) == list(range(len(data)))
+    for grasp in grasps:
+        row = data[int(rows[grasp.index])]
+        assert grasp.placed.model.name == row.props["object_name"]
+        assert grasp.placed.model.mass == pytest.approx(float(row.props["work2mass"][0]))
+        assert grasp.config.physics.friction_hand == pytest.approx(
+            float(row.conditions["friction_hand"])
+        )
+    told = requested_rows(given, len(grasps))
+    assert told is not None
+    assert told.row.tolist() == rows.tolist()
+
+
+def test_postures_without_rows_are_tried_on_the_objects_that_they_name(
+    drawn: Path, tmp_path: Path
+) -> None:
+    data = GraspDataset(drawn / OTO, split="train")
+    names = ["cup", *data.column("object_props/object_name")[1:]]
+    path = posture_file(tmp_path / "p.npz", data, object=names)
+    grasps, _ = place_requested(VerifyRequest(grasps=path, dataset=drawn / OTO))
+    found = {grasp.index: grasp for grasp in grasps}
+    assert [found[i].placed.model.name for i in range(len(data))] == names
+    assert found[0].invalid.startswith("object must be one of 1_box_a, 2_box_b, 3_brick, got 'cup'")
+    assert not any(found[i].invalid for i in range(1, len(data)))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"frame": "camera"}, "--frame must be left out with postures, got camera"),
+        ({"method": "forces"}, "--method must be left out with postures, got forces"),
+        ({"hand": "allegro"}, "--hand must be left out with postures and --dataset, got allegro"),
+        ({"mesh": Path("a.obj")}, "--object MESH or --dataset FILE must be given with postures"),
+    ],
+)
+def test_options_that_postures_answer_are_refused(
+    drawn: Path, tmp_path: Path, options: dict[str, object], words: str
+) -> None:
+    path = posture_file(tmp_path / "p.npz", GraspDataset(drawn / OTO, split="train"))
+    with pytest.raises(GraspError, match=words):
+        place_requested(VerifyRequest(**{"grasps": path, "dataset": drawn / OTO, **options}))  # type: ignore[arg-type]
 
 
 def test_a_hand_whose_files_have_changed_is_refused_unless_it_is_named(

@@ -177,7 +177,7 @@ def test_lost_scheduler_is_one_error(tmp_path: Path) -> None:
     try:
         while not file.exists():
             time.sleep(0.1)
-        with connect(scheduler_file=file) as client:
+        with connect(scheduler_file=file, tls=False) as client:
             client.wait_for_workers(1, timeout=60)
             results = DaskExecutor(client)(time.sleep, [0.0, 0.0, 600.0, 600.0])
             assert [next(results), next(results)] == [None, None]

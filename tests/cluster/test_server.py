@@ -144,7 +144,7 @@ def remote_processes() -> list[psutil.Process]:
 def test_slurm_builds_what_a_plain_loop_builds(
     slurm: dict[str, str], meshes: Path, built_here: Path, out: Path
 ) -> None:
-    options = ["--workers", "2", "--walltime", "00:30:00", "--tls"]
+    options = ["--workers", "2", "--walltime", "00:30:00"]
     submit(slurm, meshes, out, "--cluster", "slurm", *options)
     assert_same_dataset(built_here, out)
     wait_until(lambda: not queued_jobs(slurm), "the end of the jobs", out / "none")
@@ -158,7 +158,7 @@ def test_slurm_workers_have_their_settings_and_are_replaced(
     for name in ("SLURM_CONF", "SBATCH_EXPORT"):
         monkeypatch.setenv(name, slurm[name])
     monkeypatch.setattr(launch, "REFILL_SECONDS", 2.0)
-    request = ClusterRequest(kind="slurm", workers=3, cores=1, walltime="00:20:00")
+    request = ClusterRequest(kind="slurm", workers=3, cores=1, walltime="00:20:00", tls=False)
     # Over the defaults of dask-jobqueue, which another test's import may have read already.
     yaml = dask.config.collect(paths=[slurm["DASK_CONFIG"]], env={})
     settings_of_site = dask.config.merge(dask.config.config, yaml)
@@ -221,7 +221,7 @@ def test_slurm_refuses_a_job_in_one_line(
 def test_ssh_builds_what_a_plain_loop_builds(
     ssh: dict[str, str], meshes: Path, built_here: Path, out: Path
 ) -> None:
-    submit(ssh, meshes, out, "--cluster", "ssh", "127.0.0.1", "--workers", "2", "--tls")
+    submit(ssh, meshes, out, "--cluster", "ssh", "127.0.0.1", "--workers", "2")
     assert_same_dataset(built_here, out)
     wait_until(lambda: not remote_processes(), "the end of the workers", out / "none")
 
@@ -232,7 +232,7 @@ def test_ssh_workers_have_their_settings(
     monkeypatch.setenv("HOME", ssh["HOME"])
     for name in worker_environment():
         monkeypatch.delenv(name, raising=False)
-    request = ClusterRequest(kind="ssh", where=("127.0.0.1", "127.0.0.1"), workers=2, tls=True)
+    request = ClusterRequest(kind="ssh", where=("127.0.0.1", "127.0.0.1"), workers=2)
     with start_cluster(request, tmp_path) as client:
         client.wait_for_workers(2, timeout=PATIENCE)
         check_settings(client, 2, "tls")

@@ -10,7 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from drakegrasp.cluster import launch
 from drakegrasp.cluster.certificates import security_of
+from drakegrasp.cluster.request import ClusterRequest
+from drakegrasp.errors import MachineError
 
 pytest.importorskip("dask_jobqueue")
 
@@ -44,3 +47,21 @@ def test_paths_in_a_job_script_are_words_and_nothing_of_them_runs(tmp_path: Path
     assert [said[f"--tls-{key}"] for key in ("ca-file", "cert", "key")] == list(map(str, files))
     assert said["--lifetime"] == "60s"
     assert not list(tmp_path.rglob("ran"))
+
+
+def test_job_has_the_memory_of_all_its_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """SLURM reads it: three workers of 2 GB in a job of three cores."""
+    scripts: list[str] = []
+
+    def refuse(script: str) -> None:
+        scripts.append(script)
+        raise MachineError("no SLURM here")
+
+    monkeypatch.setattr(launch, "_refuse_bad_job", refuse)
+    request = ClusterRequest(kind="slurm", workers=6, cores=3, memory="2GB", host="127.0.0.1")
+    with pytest.raises(MachineError, match="no SLURM here"):
+        launch._slurm(request, None)
+    (script,) = scripts
+    lines = [line.removeprefix("#SBATCH ").split("=") for line in script.splitlines()]
+    said = {line[0]: line[1] for line in lines if len(line) == 2}
+    assert (said["--cpus-per-task"], said["--mem"]) == ("3", "6G")

@@ -27,6 +27,7 @@ from helpers.scripts import PIPELINES, load_script
 import drakegrasp
 from drakegrasp.build.pipeline import build
 from drakegrasp.cluster import connect as connecting
+from drakegrasp.cluster import launch
 from drakegrasp.cluster.admission import admitted_workers, worker_environment
 from drakegrasp.cluster.certificates import make_certificates, private_directory
 from drakegrasp.cluster.connect import connect, dask_settings
@@ -40,6 +41,8 @@ from drakegrasp.runtime.executor import run_here
 #: A build of a few seconds.
 TINY = ["candidates.max=8", "unit_candidates=4"]
 TINY_OPTIONS = ["--candidates", "8", "--set", "unit_candidates=4"]
+#: Options that give files as certificates.
+OWN = ["--tls-ca-file", __file__, "--tls-cert", __file__, "--tls-key", __file__]
 
 
 @pytest.fixture(scope="session")
@@ -83,9 +86,40 @@ def test_dry_run_says_what_would_run_and_makes_nothing(
 
 def test_open_port_is_warned_of(tmp_path: Path) -> None:
     ssh = ["--cluster", "ssh", "a", "--cores", "1", "--host", "10.0.0.1"]
-    assert "can run programs as you" in plan_only(tmp_path / "out", *ssh).stdout
-    assert "warning" not in plan_only(tmp_path / "out", *ssh, "--tls").stdout
-    assert "warning" not in plan_only(tmp_path / "out", "--workers", "1").stdout
+    said = plan_only(tmp_path / "out", *ssh, "--no-tls").stdout
+    assert "connections: not encrypted" in said
+    assert "can run programs as you" in said
+    for given in (ssh, [*ssh, "--tls"], ["--workers", "1"]):
+        said = plan_only(tmp_path / "out", *given).stdout
+        assert "connections: TLS" in said
+        assert "warning" not in said
+
+
+@pytest.mark.parametrize("kind", ["ssh", "slurm"])
+@pytest.mark.parametrize("choice", ["made", "own", "none"])
+def test_workers_elsewhere_need_a_certificate_unless_told_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, choice: str
+) -> None:
+    own = make_certificates(tmp_path) if choice == "own" else None
+
+    def start(_: ClusterRequest, security: Security | None) -> None:
+        if choice == "none":
+            assert security is None
+        else:
+            assert security is not None
+            assert security.require_encryption
+            kept = (tmp_path / "ca.pem") if own else next((tmp_path / "out").glob(".tls-*/ca.pem"))
+            assert security.tls_ca_file == str(kept)
+        raise MachineError("started")
+
+    monkeypatch.setattr(launch, f"_{kind}", start)
+    where = ("node",) if kind == "ssh" else ()
+    request = ClusterRequest(
+        kind=kind, where=where, workers=1, host="10.0.0.1", tls=choice != "none", tls_files=own
+    )
+    with pytest.raises(MachineError, match="started"), start_cluster(request, tmp_path / "out"):
+        pass
+    assert not list(tmp_path.glob("out/.tls-*"))
 
 
 @pytest.mark.parametrize(
@@ -110,6 +144,9 @@ def test_open_port_is_warned_of(tmp_path: Path) -> None:
         (["--cluster", "slurm", "--walltime", "soon", "--workers", "1"], "must be a time of SLURM"),
         (["--cluster", "slurm"], "--workers must be given"),
         (["--tls-cert", __file__], "must be given together"),
+        (["--no-tls"], "must not be given for workers on this machine"),
+        (["--cluster", "scheduler", "x", "--no-tls", *OWN], "must not be given with certificates"),
+        (["--cluster", "scheduler", "tcp://a:1"], "must have an address that begins with tls://"),
         (["--set", "lift.speed=1"], "lift.speed: must be a known key"),
     ],
 )
@@ -165,6 +202,20 @@ def test_keys_are_private_and_removed(tmp_path: Path) -> None:
     assert not out.exists()
 
 
+def test_script_makes_certificates_in_a_new_folder_of_its_own(tmp_path: Path) -> None:
+    arguments = [str(tmp_path / "keys")]
+    result = CliRunner().invoke(load_script("make_certificates").main, arguments)
+    assert result.exit_code == 0, result.output
+    assert stat.S_IMODE((tmp_path / "keys").stat().st_mode) == 0o700
+    files = [Path(line) for line in result.stdout.splitlines()]
+    assert [path.name for path in files] == ["ca.pem", "cert.pem", "key.pem"]
+    assert {stat.S_IMODE(path.stat().st_mode) for path in files} == {0o600}
+    again = CliRunner().invoke(load_script("make_certificates").main, arguments)
+    assert again.exit_code == 1
+    (line,) = again.stderr.splitlines()
+    assert "keys: must be a folder that can be made: " in line
+
+
 def test_nothing_that_is_read_can_run() -> None:
     """No pickles from the disk, and YAML only by its safe loader."""
     package = Path(drakegrasp.__file__).parent
@@ -218,7 +269,7 @@ def test_scheduler_with_tls_refuses_a_client_without_a_certificate(
         for other in (address, address.replace("tls://", "tcp://")):
             with (
                 pytest.raises(MachineError, match="must be a running Dask scheduler"),
-                connect(scheduler=other),
+                connect(scheduler=other, tls=other == address),
             ):
                 pass
         clients = [o for o in gc.get_objects() if issubclass(type(o), Client)]
@@ -290,15 +341,22 @@ def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
     file = tmp_path / "scheduler.json"
     plain = {k: v for k, v in os.environ.items() if k not in worker_environment()}
     flags = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
+    (tmp_path / "keys").mkdir()
+    files = make_certificates(tmp_path / "keys")
+    given = zip(("ca-file", "cert", "key"), map(str, files), strict=True)
+    tls = [word for name, path in given for word in (f"--tls-{name}", path)]
     scheduler = subprocess.Popen(
-        [*command, "distributed.cli.dask_scheduler", *flags, "--scheduler-file", str(file)],
+        [
+            *(*command, "distributed.cli.dask_scheduler", *flags, "--scheduler-file", str(file)),
+            *(*tls, "--protocol", "tls"),
+        ],
         env=plain,
         stderr=subprocess.DEVNULL,
     )
-    join = [*command, "distributed.cli.dask_worker", "--scheduler-file", str(file)]
+    join = [*command, "distributed.cli.dask_worker", *tls, "--scheduler-file", str(file)]
     worker = subprocess.Popen([*join, "--nthreads", "1"], env=plain, stderr=subprocess.DEVNULL)
     try:
-        request = ClusterRequest(kind="scheduler-file", where=(str(file),))
+        request = ClusterRequest(kind="scheduler-file", where=(str(file),), tls_files=files)
         while not file.exists():
             scheduler.poll()
             assert scheduler.returncode is None

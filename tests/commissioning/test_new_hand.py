@@ -188,6 +188,22 @@ def test_the_folder_is_complete_by_itself(tmp_path: Path) -> None:
     assert (moved / "LICENSE.txt").read_text() == "MIT"
 
 
+def test_a_licence_above_the_model_is_copied_and_told_of(tmp_path: Path) -> None:
+    """The nearest one, and none from above a repository."""
+    root = tmp_path / "repository"
+    vendor = root / "robots" / "hands"
+    vendor.mkdir(parents=True)
+    for folder, text in ((tmp_path, "another's"), (root, "MIT")):
+        (folder / "LICENSE").write_text(text)
+    (root / ".git").mkdir()
+    model = write_model(vendor, MITTEN)
+    drafted = draft_hand(model, tmp_path / "out")
+    assert (drafted.path.parent / "LICENSE").read_text() == "MIT"
+    assert f"{root / 'LICENSE'} is copied: see that the model is under it" in drafted.notes
+    (root / "LICENSE").unlink()
+    assert not (draft_hand(model, tmp_path / "bare").path.parent / "LICENSE").exists()
+
+
 def test_each_guess_has_a_comment(tmp_path: Path) -> None:
     text = draft(tmp_path, MITTEN).path.read_text()
     told = r"\s*(#.*|version:.*|model:.*|palm:|preshape:|- name:.*|- \{joint.*)?"

@@ -405,3 +405,15 @@ def test_a_pool_of_processes_says_what_a_task_raised(out: Path) -> None:
         pytest.raises(DataError, match="must be a complete shard, got none"),
     ):
         assemble(out, execute=execute)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_pose_of_the_object_in_the_world_is_that_of_its_trial(out: Path, camera: str) -> None:
+    """The table's frame is 0.65 m above the world's and not turned; the object is."""
+    with h5py.File(out / f"grasping_{camera}.hdf5") as data, h5py.File(out / TRIALS) as trials:
+        numbers = data["test/trial_id"][:].astype(int)
+        expected = unpack_pose(trials["trials/X_TO"][:][numbers])
+        assert np.abs(expected[:, :3, :3] - np.eye(3)).max() > 0.5
+        expected[:, 2, 3] += 0.65
+        found = unpack_pose(data["test/object_props/frame_world2obj"][:])
+        np.testing.assert_allclose(found, expected, atol=1e-6)

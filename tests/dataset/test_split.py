@@ -144,3 +144,11 @@ def test_by_object_what_has_no_samples_takes_no_place() -> None:
     objects = np.repeat([1, 4, 7], 5).astype(np.int32)
     split = split_samples(objects, names, names, names, SplitConfig(by="object"), 0)
     assert {name: len(rows) for name, rows in split.items()} == {"train": 5, "valid": 5, "test": 5}
+
+
+@pytest.mark.parametrize(("pool", "valid"), [(7, 1), (23, 2), (26, 3), (4, 0), (6, 1)])
+def test_share_of_validation_is_rounded_to_the_nearest(pool: int, valid: int) -> None:
+    objects = np.zeros(pool, dtype=np.int32)
+    config = SplitConfig(train_classes=("a",), valid_fraction=0.1)
+    split = split_samples(objects, ["a1"], ["a"], ["a1"], config, 0)
+    assert (len(split["train"]), len(split["valid"])) == (pool - valid, valid)

@@ -6,15 +6,21 @@ from pathlib import Path
 
 import h5py
 import pytest
-from helpers.datasets import MISSING, SLIPPED, SUCCESS, TRIALS, change
+from helpers.datasets import MISSING, SLIPPED, SUCCESS, TRIALS, change, make_dataset
+from helpers.hands import write_with_preshapes
 
 from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.schema import NO_PRESHAPE
 from drakegrasp.dataset.statistics import (
+    NO_NAME,
+    PreshapeCount,
     count_funnel,
     count_splits,
     count_unfinished,
+    preshapes_of,
     why_no_samples,
 )
+from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome, Removal
 
 
@@ -47,6 +53,25 @@ def test_audited_attempts_of_the_first_round_are_counted(out: Path) -> None:
         change(out, TRIALS, "trials/audited", row, lambda _: True)
     change(out, TRIALS, "trials/generation", 3, lambda _: 1)
     assert count_funnel(out).audited.tolist() == [[2, 1, 1, 1], [0] * 4, [0] * 4]
+
+
+def test_attempts_of_the_first_round_are_counted_by_preshape(out: Path, tmp_path: Path) -> None:
+    """Of the second preshape a success that is stable and one that is not, and a missed attempt."""
+    for row in (SUCCESS, 3, MISSING):
+        change(out, TRIALS, "trials/preshape", row, lambda _: 1)
+    change(out, TRIALS, "trials/stable", 3, lambda _: False)
+    change(out, TRIALS, "trials/preshape", SLIPPED, lambda _: NO_PRESHAPE)
+    funnel = count_funnel(out)
+    hand = write_with_preshapes(tmp_path, all="F1 F2 F3", pair="F1 F3")
+    counts = preshapes_of(funnel, load_config(overrides=[f"hand={hand}"]))
+    assert counts == [
+        PreshapeCount("all", 32, 7, 7, 7),
+        PreshapeCount("pair", 3, 2, 1, 2),
+        PreshapeCount(NO_NAME, 1, 0, 0, 0),
+    ]
+    assert preshapes_of(funnel, load_config()) == []
+    change(out, TRIALS, "trials/generation", 3, lambda _: 1)
+    assert count_funnel(out).preshapes[1].tolist() == [2, 1, 1, 1]
 
 
 def test_removals_are_counted_by_object(out: Path) -> None:
@@ -102,3 +127,11 @@ def test_object_without_samples_says_how_far_it_came(
         counts[1, list(row)] = list(row.values())
     assert list(why_no_samples(funnel)) == [funnel.names[1]]
     assert why_no_samples(funnel)[funnel.names[1]].startswith(why)
+
+
+def test_objects_of_one_class_are_one_class(tmp_path: Path) -> None:
+    """Two objects of three are boxes, and all three train."""
+    shares = ("split.by=object", "split.test_fraction=0", "split.valid_fraction=0")
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", *shares)
+    (train,) = (count for count in count_splits(out) if count.split == "train")
+    assert (train.samples, train.objects, train.classes) == (9, 3, 2)

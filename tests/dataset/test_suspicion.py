@@ -149,3 +149,15 @@ def test_normals_are_of_the_fingers_that_a_preshape_uses() -> None:
 
 def test_gravity_is_the_simulators() -> None:
     assert module.GRAVITY == settle.GRAVITY
+
+
+@pytest.mark.parametrize("fingers", [2, 3, 4])
+def test_sum_of_normals_is_per_finger_of_the_hand(fingers: int) -> None:
+    """All point the same way: the sum is as long as there are fingers, whatever their number."""
+    columns = {
+        name: np.repeat(values[:, :1], fingers, axis=1)
+        if values.ndim > 1 and values.shape[1] == 3
+        else values
+        for name, values in firm().items()
+    }
+    assert suspicion(columns).values["normal_sum"] == pytest.approx(1.0)

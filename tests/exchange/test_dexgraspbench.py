@@ -135,8 +135,8 @@ def test_objects_have_their_volume(folder: Path, grasps: list[ClosedGrasp]) -> N
         parts = [trimesh.load_mesh(p) for p in (folder / path / "urdf/meshes").glob("*.obj")]
         assert all(part.is_volume for part in parts)
         assert info["mass"] == pytest.approx(sum(part.volume for part in parts))
-        # The boxes of the dataset stand on the table with their centre as origin.
-        lowest = min(part.bounds[0][2] for part in parts)
+        # The boxes of the dataset lie on the table with their centre as origin.
+        lowest = min((part.vertices @ grasp.X_TO[2, :3]).min() for part in parts)
         assert lowest == pytest.approx(-grasp.X_TO[2, 3], abs=1e-3)
 
 

@@ -63,3 +63,13 @@ def test_an_object_may_have_any_name(dataset: Path, grasps: list[ClosedGrasp], n
     assert len(scene.graph.nodes_geometry) == len(links) + 1
     X, _ = scene.graph.get(f"object/{named.name}")
     assert invert_pose(X_UT) @ X == pytest.approx(grasps[0].X_TO, abs=1e-6)
+
+
+def test_scene_is_turned_and_no_mirror_image(folder: Path, grasps: list[ClosedGrasp]) -> None:
+    """The x of {T} stays x, z is up, and y, which is left of x seen from above, comes to -z."""
+    for grasp in grasps:
+        scene = trimesh.load_scene(folder / grasp.object_name / f"{grasp.trial_id}.glb")
+        X, _ = scene.graph.get(f"object/{grasp.object_name}")
+        x, y, z = grasp.X_TO[:3, :3]
+        np.testing.assert_allclose(np.array(X)[:3, :3], [x, z, -y], atol=1e-6)
+        assert np.linalg.det(np.array(X)[:3, :3]) == pytest.approx(1.0)

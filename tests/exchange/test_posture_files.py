@@ -19,6 +19,7 @@ from drakegrasp.exchange.posture_files import read_postures
 from drakegrasp.exchange.posture_rows import quaternion_poses
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.simulation.postures.posture import joint_order
 from drakegrasp.simulation.postures.table import PostureTable
 
@@ -72,6 +73,46 @@ def columns() -> dict[str, list[Any]]:
         for joint, values in zip(ORDER, q.T, strict=True):
             table[f"{stage}_{joint}"] = values.tolist()
     return table | {"resting": [0, 2], "log_density": [-1.0, None], "source": ["net 7", ""]}
+
+
+@pytest.mark.parametrize("suffix", ["npz", "h5", "csv"])
+def test_rows_of_a_preshape_need_not_name_the_joints_that_it_keeps(tmp_path, suffix):
+    """Those of fingers that it leaves out; an empty name is no preshape."""
+    hand = load_hand("allegro_four")
+    tripod = hand.at(hand.preshape_names.index("tripod"))
+    joints = [f.closing_joint for f in tripod.fingers]
+    path, objects = tmp_path / f"p.{suffix}", ["mug", "can"]
+    if suffix == "csv":
+        heads = ["object", *"xyz", "qw", "qx", "qy", "qz", *(f"grasp_{j}" for j in joints)]
+        lines = [f"{name},0,0,0,1,0,0,0,.1,.2,.3,tripod" for name in objects]
+        path.write_text("\n".join([",".join([*heads, "preshape"]), *lines]))
+    else:
+        content = {
+            "object": objects, "X_FG": [np.eye(4)] * 2, "joints": joints,
+            "q_grasp": [[0.1, 0.2, 0.3]] * 2, "preshape": ["tripod"] * 2,
+        }  # fmt: skip
+        if suffix == "npz":
+            np.savez(path, **content)
+        else:
+            with h5py.File(path, "w") as file:
+                for name, value in content.items():
+                    file[name] = value
+    table = read_postures(path, hand)
+    assert table.preshape == ("tripod", "tripod")
+    expected = joint_positions(tripod, 0.0, [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(table.q_grasp[1], [expected[name] for name in joint_order(hand)])
+
+
+def test_a_row_of_a_preshape_that_the_hand_lacks_spoils_no_other(tmp_path):
+    hand = load_hand("allegro_four")
+    path, known = tmp_path / "p.npz", hand.preshape_names[0]
+    q = np.zeros((3, len(joint_order(hand))))
+    names = ["mug"] * 3
+    np.savez(path, object=names, X_FG=[np.eye(4)] * 3, q_grasp=q, preshape=[known, "fist", ""])
+    table = read_postures(path, hand)
+    assert table.preshape == (known, "", "")
+    assert [bool(reason) for reason in table.invalid] == [False, True, False]
+    assert f"preshape must be one of {known}" in table.invalid[1] and "'fist'" in table.invalid[1]
 
 
 def write_csv(folder: Path) -> Path:
@@ -144,11 +185,14 @@ def test_arrays_larger_than_any_postures_are_refused(tmp_path, write, monkeypatc
         read_postures(write(tmp_path), HAND)
 
 
-def test_quaternion_of_another_length_is_refused_and_a_rounded_one_is_not():
-    with pytest.raises(GraspError, match="row 1: position and quaternion must be finite"):
-        quaternion_poses(np.zeros((2, 3)), [[1.0, 0.0, 0.0, 0.0], [1.002, 0.0, 0.0, 0.0]])
-    (X,) = quaternion_poses([[1.0, 2.0, 3.0]], [[0.9995, 0.0, 0.0, 0.0]])
-    np.testing.assert_allclose(X, make_pose(np.eye(3), [1.0, 2.0, 3.0]), atol=1e-15)
+def test_quaternion_of_another_length_is_none_and_a_rounded_one_is():
+    lengths = np.array([0.9995, 1.002, 0.0, np.nan])
+    wxyz = np.outer(lengths, [1.0, 0.0, 0.0, 0.0])
+    X, reasons = quaternion_poses(np.tile([1.0, 2.0, 3.0], (4, 1)), wxyz)
+    np.testing.assert_allclose(X[0], make_pose(np.eye(3), [1.0, 2.0, 3.0]), atol=1e-15)
+    assert np.isnan(X[1:]).all()
+    assert [bool(reason) for reason in reasons] == [False, True, True, True]
+    assert reasons[1].endswith("of length 1, got [1.0, 2.0, 3.0] and [1.002, 0.0, 0.0, 0.0]")
 
 
 # Formats of others
@@ -241,6 +285,86 @@ def test_palm_link_named_palm_is_no_palm_frame_in_files_of_others(tmp_path):
     np.testing.assert_allclose(table.X_FG[0], X @ leap.X_BG, atol=1e-9)
 
 
+# Rows that are no postures
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"q_grasp": [np.nan, 1.0]}, "q_grasp must be finite numbers, got others"),
+        ({"X_FG": [2.0, 1.0]}, "the palm's pose must have 0 0 0 1 as its last row"),
+        ({"resting": np.array([0.5, 2.0])}, "resting must be the index of a resting pose, got 0.5"),
+        ({"log_density": np.array([np.inf, 0.0])}, "log_density must be finite numbers"),
+    ],
+)
+def test_bad_row_of_arrays_has_its_reason_and_spoils_no_other(tmp_path, changes, reason):
+    content, good = arrays(), read_postures(write_npz(tmp_path), HAND)
+    for name, value in changes.items():
+        factor = np.reshape(value, (2, *[1] * (content[name].ndim - 1)))
+        content[name] = content[name] * factor if isinstance(value, list) else value
+    np.savez(tmp_path / "p.npz", **content)
+    table = read_postures(tmp_path / "p.npz", HAND)
+    assert table.invalid[0].startswith(reason)
+    assert table.invalid[1] == ""
+    np.testing.assert_array_equal(table.X_FG[1], good.X_FG[1])
+    np.testing.assert_array_equal(table.q_grasp[1], good.q_grasp[1])
+
+
+def test_bad_line_of_a_table_has_its_reason_and_spoils_no_other(tmp_path):
+    path = write_csv(tmp_path)
+    header, first, second = path.read_text(encoding="utf-8").splitlines()
+    words = first.split(",")
+    lines = {
+        "the row must have 59 values, got 1": "mug",
+        "the row must have 59 values, got 60": first + ",1",
+        f"grasp_{ORDER[0]} must be a number, got 'x'": ",".join([*words[:8], "x", *words[9:]]),
+        "position and quaternion must be finite, and": ",".join(
+            [*words[:4], "0", "0", "0", "0", *words[8:]]
+        ),
+    }
+    path.write_text("\n".join([header, *lines.values(), second]), encoding="utf-8")
+    table = read_postures(path, HAND)
+    assert len(table) == 5
+    for reason, found in zip([*lines, ""], table.invalid, strict=True):
+        assert found.startswith(reason)
+    assert table.invalid[-1] == ""
+    assert table.objects[-1] == "can"
+    np.testing.assert_array_equal(table.q_grasp[-1], GRASP[1])
+
+
+def test_file_in_a_folder_that_is_no_grasp_is_a_row_of_its_own(tmp_path):
+    write_dictionary(tmp_path / "0.npy", dexgraspbench(0))
+    (tmp_path / "1.npy").write_text("junk", encoding="utf-8")
+    write_dictionary(tmp_path / "2.npy", dexgraspbench(1, grasp_qpos=np.zeros(23)))
+    short = {key: np.zeros(10) for key in ("pregrasp_qpos", "grasp_qpos", "squeeze_qpos")}
+    write_dictionary(tmp_path / "3.npy", dexgraspbench(1, **short))
+    write_dictionary(tmp_path / "4.npy", dexgraspbench(1))
+    table = read_postures(tmp_path, HAND)
+    assert table.row.tolist() == [0, 1, 2, 3, 4]
+    assert [bool(reason) for reason in table.invalid] == [False, True, True, True, False]
+    assert table.invalid[1].startswith(f"{tmp_path / '1.npy'}: must be a .npy file")
+    assert "position and quaternion" in table.invalid[2]
+    assert "grasp joints must be of shape (1, 16), got (1, 3)" in table.invalid[3]
+    assert_both(table.at([0, 4]))
+
+
+def test_grasp_of_isaac_grasp_that_is_none_is_a_row_of_its_own(tmp_path):
+    place = {"position": [0.0, 0.0, 0.1], "orientation": {"w": 1.0, "xyz": [0.0, 0.0, 0.0]}}
+    whole = {**place, "cspace_position": dict.fromkeys(ORDER, 0.1)}
+    grasps = {
+        "a": 5,
+        "b": {**whole, "position": [0.0]},
+        "c": whole,
+        "d": {**whole, "orientation": {"w": 0.0, "xyz": [0.0, 0.0, 0.0]}},
+    }
+    tree = {"format": "isaac_grasp", "format_version": 1.0, "grasps": grasps}
+    (tmp_path / "mug.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
+    table = read_postures(tmp_path / "mug.yaml", HAND)
+    assert [bool(reason) for reason in table.invalid] == [True, True, False, True]
+    assert table.invalid[1].startswith("b must have position, orientation and cspace_position")
+    np.testing.assert_array_equal(table.q_grasp[2], 0.1)
+
+
 # Refusals
 
 
@@ -287,11 +411,8 @@ def test_pickles_of_every_protocol_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"q_grasp": GRASP * np.nan}, "row 0: q_grasp must be finite numbers"),
-        ({"q_grasp": GRASP[:, :3]}, r"grasp joints must be of shape \(n, 16\), got \(2, 3\)"),
+        ({"q_grasp": GRASP[:, :3]}, r"grasp joints must be of shape \(2, 16\), got \(2, 3\)"),
         ({"X_FG": POSES[:1]}, r"must be of shape \(2, 4, 4\)"),
-        ({"X_FG": 2.0 * POSES}, "row 0: the palm's pose must have 0 0 0 1"),
-        ({"resting": np.array([0.5, 0])}, "resting must be indices"),
         ({"frame": np.array("palm")}, "frame must be one of object, table, camera, world, mesh"),
         ({"frame": np.array("camera")}, "X_TC must be given with the frame camera"),
         ({"link": np.array("wrist")}, "link must be 'palm' for the palm frame, or 'base'"),
@@ -312,7 +433,6 @@ def test_arrays_that_are_no_postures_are_refused_in_a_line(tmp_path, changes, wo
     ("changes", "words"),
     [
         ({"grasp_qpos": "a"}, "grasp_qpos must be numbers"),
-        ({"grasp_qpos": np.zeros(23)}, "row 0: position and quaternion"),
         ({"joint_names": [1, 2]}, "joint_names must be a list of texts"),
         ({"obj_pose": np.zeros(3)}, "obj_pose must be rows of 7 numbers or more"),
         ({"obj_pose": np.zeros(8)}, r"obj_pose must be 7 numbers for 1 or 1, got \(1, 8\)"),
@@ -331,14 +451,13 @@ def test_dictionaries_that_are_no_grasps_are_refused_in_a_line(tmp_path, changes
     [
         ("a.csv", "x,y\n1,2\n", "columns must include object, got x, y"),
         ("a.csv", "x,x\n1,2\n", "columns must have different names, got x twice"),
-        ("a.csv", "object,x\nmug\n", "row 0 of 1 values under a header of 2"),
         ("a.npz", "junk", "must be a readable file of arrays"),
         ("a.npz", "", "must be a readable file of arrays"),
         ("a.npz", "PK\3\4", "must be a readable file of arrays"),
         (
             "a.yaml",
             "{format: isaac_grasp, format_version: 1, grasps: {a: {cspace_position: 5}}}",
-            "a must have position, orientation and cspace_position",
+            "grasps must have cspace_position, joints by name, got none",
         ),
         ("a.npy", "junk", r"must be a \.npy file"),
         ("a.yaml", "format: other", "format must be isaac_grasp"),

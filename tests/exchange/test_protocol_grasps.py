@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from helpers.commands import error_line, run
@@ -57,13 +58,28 @@ def test_postures_and_contacts_are_tried_and_a_bad_row_is_invalid(
     far[2, 3] += 0.3
     np.savez(
         tmp_path / "own.npz",
-        object=np.array(["a", "a"]),
-        X_FG=np.array([record.X_OG, far]),
-        q_grasp=np.array([end.q, end.q]),
+        object=np.array(["a", "a", "a"]),
+        X_FG=np.array([record.X_OG, 0.0 * far, far]),
+        q_grasp=np.array([end.q, end.q, end.q]),
     )
-    held, lost = lines_of(tmp_path / "own.npz", "--object", mesh)
+    held, none, lost = lines_of(tmp_path / "own.npz", "--object", mesh)
     assert held["success"] and held["file"].endswith("own.npz")
+    assert none["reason"].startswith("invalid: the palm's pose must have 0 0 0 1")
     assert lost["reason"] == "moved"
+
+    # The same by the lift in Drake, in files.
+    given = ("verify", tmp_path / "own.npz", "--object", mesh, "--workers", 1)
+    result = run(*given, "--out", tmp_path / "lift", "--json")
+    assert result.exit_code == 0, result.output
+    held, none, lost = map(json.loads, result.stdout.splitlines())
+    assert held["held"] and held["success"] and held["method"] == "posture"
+    np.testing.assert_allclose(held["closed"]["q"], end.q, atol=1e-3)
+    np.testing.assert_allclose(held["X_OG"], np.asarray(record.X_OG), atol=1e-5)
+    assert none["outcome"] == "invalid"
+    assert none["reason"].startswith("the palm's pose must have 0 0 0 1")
+    assert lost["outcome"] == "missing_fingertip"
+    with h5py.File(tmp_path / "lift.h5") as file:
+        assert file["grasps/success"][:].tolist() == [True, False, False]
 
     grasp = pack_grasp(end.contacts.p_OQ, end.contacts.nhat_Q_O)
     np.save(tmp_path / "18.npy", np.array([np.full(18, np.nan), grasp]))
@@ -86,7 +102,7 @@ def test_files_say_what_the_posture_says(tmp_path: Path, grasps: list[ClosedGras
 
     content = np.load(path, allow_pickle=True).item()
     place, root = (
-        quaternion_poses(v[None, :3], v[None, 3:7])[0]
+        quaternion_poses(v[None, :3], v[None, 3:7])[0][0]
         for v in (content["obj_pose"], content["grasp_qpos"])
     )
     np.testing.assert_allclose(invert_pose(place) @ root @ HAND.X_BG, X_OG, atol=1e-12)
@@ -107,7 +123,7 @@ def test_what_a_file_holds_is_told_from_its_content(tmp_path: Path) -> None:
     ("options", "why"),
     [
         ([], "--object MESH or --dataset FILE must be given with postures"),
-        (["--frame", "camera"], "--frame must not be used with protocol dexgraspbench and post"),
+        (["--frame", "camera"], "--frame must be left out with postures, got camera"),
     ],
 )
 def test_options_that_postures_answer(tmp_path: Path, options: list[str], why: str) -> None:

@@ -23,6 +23,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array
+from drakegrasp.hand import description
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.file_format import Coupling
 from drakegrasp.hand.files import MODELS
@@ -227,6 +228,23 @@ def test_a_hand_whose_files_have_changed_is_another(tmp_path: Path) -> None:
         trimesh.creation.box([0.02, edge, 0.09]).export(tmp_path / "bar.obj")
         shape = link_shapes(load_hand(path))["right"][0]
         assert np.ptp(shape, axis=0) == pytest.approx([0.02, edge, 0.09])
+
+
+def test_a_process_keeps_the_hands_that_it_used_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that drafts many hands or loads many datasets does not grow with them."""
+    monkeypatch.setattr(description, "KEPT_HANDS", 2)
+    monkeypatch.setattr(description, "_loaded", {})
+    paths = [tmp_path / name for name in "abc"]
+    for path in paths:
+        path.mkdir()
+    one, other = (load_hand(write_pincer(path)) for path in paths[:2])
+    assert load_hand(one.model.path.with_name("pincer_hand.yaml")) is one
+    load_hand(write_pincer(paths[2]))
+    assert load_hand(one.model.path.with_name("pincer_hand.yaml")) is one
+    assert load_hand(other.model.path.with_name("pincer_hand.yaml")) is not other
+    assert len(description._loaded) == 2
 
 
 def test_an_unknown_hand_is_refused_with_the_hands_there_are() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from drakegrasp.hand.carried import carry_hand
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.folder import hand_digest, hand_folder, is_hand
+from drakegrasp.hand.lift_chance import read_lift_chance
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.shapes import link_shapes
 
@@ -252,3 +254,14 @@ def test_an_include_in_a_model_comes_along(tmp_path: Path) -> None:
     (tmp_path / "part.sdf").write_text("<sdf/>")
     folder = hand_folder(path)
     assert folder.content("part.sdf") == b"<sdf/>" and folder.digest != before
+
+
+def test_weights_of_a_hand_are_copied_and_counted(tmp_path: Path) -> None:
+    """The copy of the Barrett Hand knows the chance of a lift; other weights are another hand."""
+    folder = hand_folder("barrett")
+    assert folder.files["barrett_chance.yaml"] == MODELS / "barrett_chance.yaml"
+    copy = carried_source(tmp_path / "out", load_config())
+    known = read_lift_chance("barrett")
+    assert known is not None and read_lift_chance(copy) == known
+    chance = replace(folder, files=folder.files | {"barrett_chance.yaml": MODELS / "table.sdf"})
+    assert chance.digest != folder.digest

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,11 @@ from click.testing import CliRunner
 from helpers.vendors import JAWS, JAWS_MJCF, fixed, link, write_model
 
 from drakegrasp.cli.main import main
+from drakegrasp.errors import HandError
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.vendor.parsing import read_model
+from drakegrasp.hand.vendor.source import read_source
 
 MIMIC = '<mimic joint="left_slide"/>'
 JAW = '<geometry><box size="0.02 0.012 0.06"/></geometry>'
@@ -264,3 +270,17 @@ def test_a_sound_model_is_not_refused(tmp_path: Path, monkeypatch: pytest.Monkey
         assert result.exit_code == 0, result.output
         assert len(list(out.glob("*.urdf"))) == 1
     assert len(drawn) == 2
+
+
+def test_fault_of_an_sdformat_file_is_said_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in ("allegro_hand.sdf", "allegro_hand.yaml", "allegro_fingertip.obj"):
+        shutil.copyfile(MODELS / name, tmp_path / name)
+    model = tmp_path / "allegro_hand.sdf"
+    model.write_text(model.read_text().replace("<pose>0 ", "<pose>", 1))
+    with pytest.raises(HandError, match="Error reading element <pose>"):
+        load_hand(tmp_path / "allegro_hand.yaml")
+    with pytest.raises(HandError, match="Error reading element <pose>"):
+        read_model(read_source(model, {}))
+    assert caplog.text == ""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.vendors import JAWS, JAWS_MJCF, write_mesh, write_model
+from trimesh.transformations import translation_matrix
 
 from drakegrasp.errors import HandError
 from drakegrasp.hand.vendor.model import VendorModel
@@ -148,6 +150,21 @@ def test_a_collision_mesh_is_a_hull_of_few_corners(tmp_path: Path) -> None:
     assert len(shape.vertices) <= 70
     np.testing.assert_allclose(np.linalg.norm(shape.vertices, axis=1), 0.02, atol=1e-6)
     assert trimesh.Trimesh(shape.vertices, shape.faces).volume > 0.9 * ball.volume
+
+
+def test_a_hull_that_fills_a_hollow_is_told_of(tmp_path: Path) -> None:
+    """A cup of 52 mm width and depth is; one of 8 mm depth, and a box, are not."""
+    import trimesh
+
+    told = []
+    for depth in (0.052, 0.008):
+        outer = trimesh.creation.cylinder(0.03, depth + 0.004)
+        hole = trimesh.creation.cylinder(0.026, depth, transform=translation_matrix([0, 0, 0.002]))
+        outer.difference(hole, engine="manifold").export(tmp_path / "cup.stl")
+        told.append(read(write_model(tmp_path, with_mesh("cup.stl", "collision"))).notes)
+    ((note,), none) = told
+    assert re.match(r"link left_jaw: the hull that collides reaches up to 2\d mm beyond its", note)
+    assert none == ()
 
 
 def test_a_link_without_collision_shapes_gets_those_of_its_pictures(tmp_path: Path) -> None:

@@ -1,4 +1,8 @@
-"""A small dataset of boxes that is sound by construction, and ways to spoil it."""
+"""A small dataset of boxes that is sound by construction, and ways to spoil it.
+
+Nothing in it agrees by coincidence: the boxes lie on their side, turned about the vertical, and no
+quantity of the closed hand is that of the lifted one.
+"""
 
 from __future__ import annotations
 
@@ -92,8 +96,19 @@ def see(
     return image, mask
 
 
-def contacts(model: ObjectModel, touching: np.ndarray, z: float = 0.0) -> dict[str, Any]:
-    """Return contacts of three fingertips in the middle of three sides, or above it [m]."""
+def lying(model: ObjectModel) -> Array:
+    """Return the pose X_TO of a box on its side, yawed by 30 degrees: its y axis points up."""
+    R_TO = rotation_about([0, 0, 1], np.pi / 6.0) @ rotation_about([1, 0, 0], np.pi / 2.0)
+    return make_pose(R_TO, [0.0, 0.0, model.half_extents[1]])
+
+
+def contacts(
+    model: ObjectModel, touching: np.ndarray, z: float = 0.0, load: float = 1.0
+) -> dict[str, Any]:
+    """Return contacts of three fingertips in the middle of three sides, or above it [m].
+
+    `load` scales forces, areas and depths.
+    """
     x, y, _ = model.half_extents
     n = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0]])
     gone = ~touching[:, None]
@@ -101,9 +116,9 @@ def contacts(model: ObjectModel, touching: np.ndarray, z: float = 0.0) -> dict[s
         "touching": touching,
         "p_OQ": np.where(gone, np.nan, n * [[x], [x], [y]] + [0.0, 0.0, z]),
         "nhat_Q_O": np.where(gone, np.nan, n),
-        "f_Q_O": np.where(gone, 0.0, -10.0 * n),
-        "area": np.where(touching, 1e-5, 0.0),
-        "penetration": np.where(touching, 1e-4, 0.0),
+        "f_Q_O": np.where(gone, 0.0, -10.0 * load * n),
+        "area": np.where(touching, 1e-5 * load, 0.0),
+        "penetration": np.where(touching, 1e-4 * load, 0.0),
         "q": np.full(SIZES["j"], 0.5),
     }
 
@@ -127,11 +142,12 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
     """Return what `/trials` says of an attempt, by its number among the object's."""
     outcome = OUTCOMES[number]
     # The palm is above the box, turned about the vertical and tilted.
-    yaw, tilt, height = 0.5 * number, 0.25, 0.10 + model.half_extents[2]
-    R_OG = (
+    yaw, tilt, height = 0.5 * number, 0.25, 0.10 + X_TO[2, 3]
+    R_TG = (
         trimesh.transformations.rotation_matrix(yaw, [0, 0, 1])
         @ trimesh.transformations.rotation_matrix(np.pi + tilt, [1, 0, 0])
     )[:3, :3]
+    X_TG = make_pose(R_TG, X_TO[:3, 3] - height * R_TG[:, 2])
     row: dict[str, Any] = {
         "candidate": number // 3,
         "standoff_index": number % 3,
@@ -140,7 +156,7 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
         "log_density": 0.0,
         "outcome": outcome,
         "X_TO": pack_pose(X_TO),
-        "X_OG": pack_pose(make_pose(R_OG, -height * R_OG[:, 2])),
+        "X_OG": pack_pose(invert_pose(X_TO) @ X_TG),
         **draw_conditions(model, config, number // 3, number % 3).values(),
     }
     after_lift = number == AFTER_LIFT
@@ -155,11 +171,12 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
     if stage >= Stage.LIFTED:
         touch = touch & (outcome is not Outcome.DROPPED)
         touch[0] &= outcome is not Outcome.SLIPPED
-        row |= {f"lifted_{k}": v for k, v in contacts(model, touch, SLIP).items()}
+        row |= {f"lifted_{k}": v for k, v in contacts(model, touch, SLIP, 1.25).items()}
         row["lifted_q"] = np.full(SIZES["j"], 0.6)
         row |= {"time_lift": 1.0, "lifted_object_on_table": after_lift}
-        row |= {"X_TO_lifted": pack_pose(X_TO), "surface_distance": np.zeros(3)}
-        row |= {"normal_angle": np.zeros(3), **hold(row)}
+        row |= {"surface_distance": np.zeros(3), "normal_angle": np.zeros(3), **hold(row)}
+        raised = make_pose(np.eye(3), [0.0, 0.0, 0.25]) @ X_TG
+        row["X_TO_lifted"] = pack_pose(raised @ invert_pose(unpack_pose(row["X_OG_lifted"])))
     # A quantity that has no story here is 1, from its stage on.
     told = {
         f.name: 1.0
@@ -262,7 +279,7 @@ def _make(out: Path, meshes: Path, overrides: tuple[str, ...]) -> Path:
         path = meshes / f"{name}.stl"
         trimesh.creation.box(extents).export(path)
         model = prepare_object(MeshSource(name=name, class_name=class_name, path=path))
-        X_TO = make_pose(np.eye(3), [0.0, 0.0, model.half_extents[2]])
+        X_TO = lying(model)
         prepared = resting(model, X_TO)
         save_prepared(prepared, out, config)
         entries.append(prepared.entry())

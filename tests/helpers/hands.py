@@ -156,10 +156,22 @@ def write_tongs(folder: Path) -> Path:
 
 def write_with_optional_fingers(folder: Path, *fingers: int) -> Path:
     """Write the Barrett Hand's YAML with fingers that need not touch, and return its path."""
-    tree = yaml.safe_load(hand_file("barrett").read_text())
-    tree["model"] = str(load_hand("barrett").model.path)
+    tree = _barrett()
     for k in fingers:
         tree["fingers"][k]["required"] = False
     path = folder / "optional_hand.yaml"
     path.write_text(yaml.safe_dump(tree))
     return path
+
+
+def write_with_preshapes(folder: Path, **preshapes: str) -> Path:
+    """Write the Barrett Hand's YAML with preshapes by the names of their fingers: `"F1 F3"`."""
+    shapes = [{"name": name, "fingers": fingers.split()} for name, fingers in preshapes.items()]
+    path = folder / "shaped_hand.yaml"
+    path.write_text(yaml.safe_dump(_barrett() | {"preshapes": shapes}))
+    return path
+
+
+def _barrett() -> dict[str, Any]:
+    tree: dict[str, Any] = yaml.safe_load(hand_file("barrett").read_text())
+    return tree | {"model": str(load_hand("barrett").model.path)}

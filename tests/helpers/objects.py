@@ -10,7 +10,7 @@ import numpy.typing as npt
 import trimesh
 
 from drakegrasp.config import Config
-from drakegrasp.frames import make_pose
+from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.simulation.candidates import (
@@ -40,8 +40,12 @@ def box_model(folder: Path, extents: npt.ArrayLike, name: str = "1_box_a") -> Ob
 
 
 def standing(model: ObjectModel) -> npt.NDArray[np.float64]:
-    """Return X_TO of an object that stands on the table as its mesh file has it."""
-    return make_pose(np.eye(3), [0.0, 0.0, float(model.half_extents[2])])
+    """Return X_TO of an object that stands on the table as its mesh file has it, but yawed.
+
+    By 30 degrees, so that no number in {O} is by chance that in {T} or {W}.
+    """
+    yaw = rotation_about([0.0, 0.0, 1.0], np.pi / 6.0)
+    return make_pose(yaw, [0.0, 0.0, float(model.half_extents[2])])
 
 
 def drawn_attempts(

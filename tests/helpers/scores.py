@@ -71,6 +71,7 @@ class FakeVerify:
             self.asked += 1
             held = self.holds(grasp)
             found: Any = SimpleNamespace(
+                method="hand",
                 outcome=SimpleNamespace(label="success" if held else "dropped"),
                 success=held,
                 held=held,

@@ -122,6 +122,11 @@ REFUSED = {
     "latin": ("a.obj", b"# caf\xe9 \xff\xfe\nv 0 0 0\n", "(text that is not UTF-8|no faces)"),
     "draco": ("a.glb", needing("KHR_draco_mesh_compression"), "the extension KHR_draco_mesh_comp"),
     "instances": ("a.glb", crowded(10_001), "10,001 nodes, more than 10,000"),
+    "long place": (
+        "a.glb",
+        packed_glb(lambda tree: tree["nodes"][-1].update(translation=[0.0] * 100_000)),
+        "a node whose translation is not 3 numbers",
+    ),
     "moebius": ("a.obj", moebius(), "must have two sides"),
 }  # fmt: skip
 

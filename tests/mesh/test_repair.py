@@ -266,3 +266,37 @@ def test_welding_in_parts_changes_no_bit(monkeypatch, limit):
     for one, other in zip(whole, parts, strict=True):
         np.testing.assert_array_equal(one, other)
         assert one.dtype == other.dtype
+
+
+def test_share_of_a_solid_that_changed_is_of_its_volume():
+    """A quarter of a box far from the origin is cut off."""
+    low, size = np.array([0.3, -0.7, 0.2]), np.array([0.1, 0.2, 0.4])
+
+    def share(height: float) -> float:
+        solid = trimesh.creation.box(bounds=[low, low + size * [1.0, 1.0, height]])
+        whole = trimesh.creation.box(bounds=[low, low + size])
+        candidate = solid.vertices, solid.faces
+        return drakegrasp.mesh.union._changed_share(candidate, whole.vertices, whole.faces)
+
+    assert share(1.0) == 0.0
+    assert share(0.75) == pytest.approx(0.25, abs=0.01)
+
+
+def test_triangle_that_is_a_needle_is_collapsed_and_told():
+    """An edge of a box is parted a nanometre from its end, in both faces beside it."""
+    solid = trimesh.creation.box([0.1, 0.2, 0.4])
+    (one, two), (a, b) = solid.face_adjacency[0], solid.face_adjacency_edges[0]
+    vertices = np.vstack([solid.vertices, solid.vertices[a]])
+    vertices[-1] += 1e-9 * (vertices[b] - vertices[a])
+    m, faces = len(vertices) - 1, [list(face) for face in solid.faces]
+    for face in (faces[one].copy(), faces[two].copy()):
+        faces.remove(face)
+        faces += [[m if v == end else v for v in face] for end in (a, b)]
+    notes: list[str] = []
+    united = drakegrasp.mesh.union.unite([(vertices, np.array(faces))], 0.5, notes)
+    assert notes == ["degenerate triangles were collapsed"]
+    assert signed_volume(*united) == pytest.approx(0.008)
+
+    notes.clear()
+    drakegrasp.mesh.union.unite([(solid.vertices, solid.faces)], 0.5, notes)
+    assert notes == []

@@ -5,12 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.meshes import G3DB, assert_sound, box, needs_g3db, write
 
 from drakegrasp.errors import MeshError
 from drakegrasp.objects.model import prepare_object
-from drakegrasp.objects.sources import find_mesh, find_meshes, load_source, source_sha256
+from drakegrasp.objects.sources import (
+    UPRIGHT,
+    find_mesh,
+    find_meshes,
+    load_source,
+    source_sha256,
+)
 
 
 @pytest.mark.parametrize(
@@ -198,3 +205,11 @@ def test_triangles_and_digest_are_of_one_read(tmp_path, monkeypatch):
     assert reads == [source.path] * 2  # one each
     assert len(mesh.faces) == 12
     assert loaded == digest != model.mesh_sha256
+
+
+@pytest.mark.parametrize("up", sorted(UPRIGHT))
+def test_axis_that_is_up_in_a_file_is_turned_to_z(up: str) -> None:
+    axis = (1.0 if up[0] == "+" else -1.0) * np.eye(3)["xyz".index(up[1])]
+    R = np.array(UPRIGHT[up], dtype=float)
+    assert (R @ axis).tolist() == [0.0, 0.0, 1.0]
+    assert np.array_equal(R @ R.T, np.eye(3)) and np.linalg.det(R) == pytest.approx(1.0)

@@ -228,3 +228,17 @@ def test_vanishing_counts_in_every_step(step: str, deaths: int) -> None:
         assert history.verdict(step) is None
         history.add(step, 0, b"")
     assert history.verdict(step) is Verdict.VANISHED
+
+
+@pytest.mark.parametrize(
+    ("marks", "verdict", "deaths"),
+    [(b"Timeout (0:00:01)!", Verdict.HUNG, 2), (b"Fatal Python error", Verdict.CRASHED, 2)],
+)
+def test_each_way_to_die_has_its_number_of_deaths(
+    marks: bytes, verdict: Verdict, deaths: int
+) -> None:
+    history = _History()
+    for _ in range(deaths):
+        assert history.verdict("try 4") is None
+        history.add("try 4", 0, marks)
+    assert history.verdict("try 4") is verdict

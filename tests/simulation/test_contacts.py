@@ -29,7 +29,7 @@ EVERYWHERE: tuple[HalfSpace, ...] = ()
 
 @pytest.fixture(scope="module")
 def closed(cube: ObjectModel, config: Config, hand: Hand) -> Scene:
-    """A scene of its own, which no test changes: the hand closed on the cube."""
+    """A scene of its own, which no test changes: the hand closed on the cube, which is yawed."""
     scene, X_WO = build_scene(cube, config.physics, hand), X_WT @ standing(cube)
     reset_attempt(scene, X_WO, X_WO @ from_above(cube, STANDOFF).X_OG, spread=0.0)
     advance(scene, 2.4)
@@ -172,11 +172,14 @@ def test_point_and_normal_are_weighted_by_pressure(
 
 
 def test_contact_point_is_where_drakes_force_acts(closed: Scene) -> None:
-    """On a plane, force and moment about the patch's centroid tell the centre of pressure."""
+    """On a plane, force and moment about the patch's centroid tell the centre of pressure.
+
+    The force is told in {O}, which is turned against {W}.
+    """
     results = closed.plant.get_contact_results_output_port().Eval(closed.context)
     tips, found = [body.index() for body in closed.fingertips], read_contacts(closed)
     X_OW = invert_pose(closed.pose(closed.object))
-    seen = set()
+    seen, forces = set(), np.zeros((3, 3))
     for i in range(results.num_hydroelastic_contacts()):
         info = results.hydroelastic_contact_info(i)
         surface = info.contact_surface()
@@ -192,7 +195,10 @@ def test_contact_point_is_where_drakes_force_acts(closed: Scene) -> None:
         point = centroid_O + np.cross(n_O, tau_O) / (n_O @ f_O)
         np.testing.assert_allclose(found.p_OQ[k], point, atol=2e-5)
         seen.add(k)
+        on_M = contacts_module._body_of(closed, surface.id_M()) == closed.object.index()
+        forces[k] += f_O if on_M else -f_O
     assert seen == {0, 1, 2}
+    np.testing.assert_allclose(found.f_Q_O, forces, atol=1e-9)
 
 
 def test_depth_of_a_fingertip_is_how_far_it_is_in_the_cube(closed: Scene) -> None:

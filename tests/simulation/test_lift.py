@@ -377,3 +377,45 @@ def test_wrist_starts_after_the_release_time_and_keeps_its_limits(scene, cube, c
     distance = np.linalg.norm(motion.p_end - motion.p_start)
     assert motion.duration == pytest.approx(lift_duration(float(distance), config))
     assert motion.p_end - X_WT[:3, 3] == pytest.approx(config.lift.p_TG)
+
+
+def test_what_moved_at_the_last_look_before_the_wrist_is_told_apart(
+    scene, cube, config, monkeypatch
+):
+    """The n-th look finds a slip of n um: the looks are counted from the release to the end."""
+    looks, begins = [], []
+    plan, update = lifting._plan_motion, lifting._Monitor.update
+
+    def planned(*arguments):
+        begins.append(plan(*arguments))
+        return begins[0]
+
+    def count(monitor, current, *arguments):
+        looks.append(current.time)
+        return update(monitor, current, *arguments)
+
+    monkeypatch.setattr(lifting, "_plan_motion", planned)
+    monkeypatch.setattr(lifting._Monitor, "update", count)
+    close(scene, cube)
+    start = lifting._object_in_hand(scene)
+    motion = lifting._motion
+    monkeypatch.setattr(
+        lifting,
+        "_motion",
+        lambda before, now: (
+            (1e-6 * len(looks), 2e-6 * len(looks))
+            if np.array_equal(before, start)
+            else motion(before, now)
+        ),
+    )
+    result = lift(scene, start_limits(config), config)
+    times = np.array(looks)
+    waited = int((times <= begins[0].begin + 1e-9).sum())
+    assert 1 < waited < len(looks)
+    assert (result.slip, result.turn) == pytest.approx((1e-6 * len(looks), 2e-6 * len(looks)))
+    assert (result.slip_released, result.turn_released) == pytest.approx(
+        (1e-6 * waited, 2e-6 * waited)
+    )
+    # The target is held: the motion and the time of holding come after the release.
+    held = begins[0].duration + config.lift.hold_time
+    assert times[-1] == pytest.approx(begins[0].begin + held, abs=1e-6)

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.assertions import refused
+from helpers.hands import write_with_preshapes
 from helpers.objects import STANDOFF, from_above, standing
 
 from drakegrasp.errors import GraspError
 from drakegrasp.frames import X_WT, make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits, joint_positions
+from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.drive import disengage, engage
 from drakegrasp.simulation.placement import PlacedObject
@@ -239,6 +242,30 @@ def test_hand_that_stays_short_of_the_object_touches_nothing(scene, cube, config
     record = run_attempt(scene, standing(cube), start, config)
     assert record.outcome is Outcome.MISSING_FINGERTIP
     np.testing.assert_allclose(record.closed.q, start.path.squeeze, atol=0.01)
+
+
+@pytest.mark.sim
+def test_public_trial_closes_the_fingers_of_the_preshape(cube, given, tmp_path):
+    path = write_with_preshapes(tmp_path, all="F1 F2 F3", pair="F1 F3")
+    config = load_config(overrides=[f"hand={path}"])
+    placed = PlacedObject(model=cube, X_TO=standing(cube), config=config)
+    assert len(run_trial(placed, replace(given, preshape="all")).closed.contacts.touching) == 3
+    # The second finger stays open.
+    q, order = given.q_grasp.copy(), joint_order(load_hand(path))
+    q[[order.index(name) for name in ("finger2_proximal_joint", "finger2_distal_joint")]] = 0.0
+    trial = run_trial(placed, replace(given, q_grasp=q, preshape="pair"))
+    assert trial.closed.contacts.touching.tolist() == [True, True]
+
+
+def test_a_preshape_that_the_hand_lacks_is_refused(tmp_path):
+    shaped = load_hand(write_with_preshapes(tmp_path, pair="F1 F3"))
+    q = np.zeros(8)
+    assert "preshape must be left out for the hand barrett, got 'pair'" in refused(
+        make_posture, load_hand(), X, q, preshape="pair"
+    )
+    assert "preshape must be one of pair for the hand shaped, got 'all'" in refused(
+        start_of, Posture(X, q, preshape="all"), shaped
+    )
 
 
 @pytest.mark.sim

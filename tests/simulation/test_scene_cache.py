@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.hands import write_with_preshapes
 from helpers.objects import CUBE, STANDOFF, box_model, from_above, standing
 
 from drakegrasp.config import CameraConfig, Config
@@ -105,11 +106,13 @@ def test_few_diagrams_are_kept_and_scenes_go_with_theirs(cube: ObjectModel, conf
     assert len(plants) == len(scene_cache._diagrams) == DIAGRAMS
 
 
-def test_scenes_of_all_preshapes_are_kept(cube: ObjectModel, config: Config) -> None:
+def test_scenes_of_all_preshapes_are_kept(
+    cube: ObjectModel, config: Config, tmp_path: Path
+) -> None:
     """Attempts take them in turns: each would be built again."""
-    count = len(load_hand("allegro_four").preshapes)
-    every = (None, *range(count))
-    first = [cached_scene(cube, config.physics, "allegro_four", i) for i in every]
-    again = [cached_scene(cube, config.physics, "allegro_four", i) for i in every]
-    assert count == 3
+    shapes = {name: "F1 F3" for name in ("one", "two", "three", "four")}
+    path, every = str(write_with_preshapes(tmp_path, **shapes)), (None, *range(len(shapes)))
+    first = [cached_scene(cube, config.physics, path, i) for i in every]
+    again = [cached_scene(cube, config.physics, path, i) for i in every]
+    assert len(every) > max(KEPT, DIAGRAMS)
     assert all(one is other for one, other in zip(first, again, strict=True))

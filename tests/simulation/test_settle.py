@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -294,3 +295,33 @@ def test_pose_on_the_grid_is_the_pose_to_a_microradian():
         assert found[:2, 3].tolist() == [0.0, 0.0]
         assert found[2, 3] == pytest.approx(X_TO[2, 3], abs=2.0**-21)
         assert (found[2, 3] * 2.0**20) % 1.0 == 0.0
+
+
+@pytest.mark.parametrize(
+    ("speeds", "checks"),
+    [
+        ("ssss", 4),  # 0.2 s of rest, a check each 0.05 s
+        ("fssss", 5),
+        ("sssfssss", 8),
+        ("sfssfsssfssss", 13),
+    ],
+)
+def test_rest_begins_again_when_the_object_moves_again(
+    speeds: str, checks: int, config: Config, monkeypatch: pytest.MonkeyPatch
+):
+    """The speeds at the checks are scripted: slow or fast."""
+    rules = override_config(config, ["settle.rest_time=0.19", "settle.max_time=10"])
+    scene = SimpleNamespace(model=SimpleNamespace(name="1_thing_a"), time=0.0)
+    script, seen = iter(speeds), []
+
+    def look(_: Any) -> tuple[float, float]:
+        seen.append(scene.time)
+        return (0.0, 0.0) if next(script) == "s" else (0.0, 1.0)
+
+    def move(_: Any, seconds: float) -> None:
+        scene.time += seconds
+
+    monkeypatch.setattr(settle_module, "advance", move)
+    monkeypatch.setattr(settle_module, "_speeds", look)
+    assert settle_module._wait_for_rest(scene, rules) is False
+    np.testing.assert_allclose(seen, 0.05 * np.arange(1, checks + 1))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ from drakegrasp.simulation.scene import (
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.settle import settle
 from drakegrasp.simulation.trajectory import lift_duration
-from drakegrasp.simulation.trial import TrialRecord, run_attempt
+from drakegrasp.simulation.trial import TrialRecord, run_attempt, start_meetings
 from drakegrasp.vision.camera import camera_pose_oto
 
 pytestmark = pytest.mark.sim
@@ -205,6 +206,18 @@ def test_open_hand_that_meets_the_object_collides(scene, cube, config):
     record = run_attempt(scene, standing(cube), from_above(cube, 0.001), config)
     assert record.outcome is Outcome.START_COLLISION
     assert record.closed is None
+
+
+def test_it_can_be_told_which_links_meet_what_where_an_attempt_starts(scene, cube, config):
+    """The palm on the cube, the fingers beside it in the air; beside the cube, all on the table."""
+    X_TO, attempt = standing(cube), from_above(cube, 0.001)
+    assert start_meetings(scene, X_TO, attempt) == {"object": ["base"]}
+    beside = attempt.X_OG.copy()
+    beside[0, 3], beside[2, 3] = 0.4, 0.0
+    met = start_meetings(scene, X_TO, replace(attempt, X_OG=beside))
+    assert list(met) == ["table"]
+    assert {"finger1_distal", "finger3_distal"} <= set(met["table"])
+    assert start_meetings(scene, X_TO, from_above(cube, 0.25)) == {}
 
 
 @pytest.mark.parametrize("mode", ["on", "off"])
@@ -475,7 +488,8 @@ def test_slip_and_turn_are_how_the_object_lags_behind_the_palm(cube, config, han
     p_TG = (standing(cube) @ from_above(cube, STANDOFF).X_OG)[:3, 3]
     carried = standing(cube)[:3, 3] + np.array(config.lift.p_TG) - p_TG
     slip = np.linalg.norm(record.lift.X_TO[:3, 3] - carried)
-    turn = np.arccos((np.trace(record.lift.X_TO[:3, :3]) - 1.0) / 2.0)
+    turned = standing(cube)[:3, :3].T @ record.lift.X_TO[:3, :3]
+    turn = np.arccos((np.trace(turned) - 1.0) / 2.0)
     assert slip > 1e-3 and turn > 1e-3
     assert record.lift.slip == pytest.approx(slip, abs=1e-4)
     assert record.lift.turn == pytest.approx(turn, abs=1e-3)
@@ -562,3 +576,12 @@ def test_closing_ends_at_the_first_look_at_which_the_fingers_stand(
     known = prediction(None, clear=True)
     record = run_attempt(scene, standing(cube), from_above(cube, 0.3), patient, known)
     assert record.closed.duration == pytest.approx(looks * config.close.check_period, abs=8e-3)
+
+
+def test_limit_is_of_the_threads_own_computing_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the clocks on the wall say meanwhile."""
+    clocks = dict.fromkeys(("time", "monotonic", "perf_counter", "process_time"), 1e9)
+    others = {name: lambda value=value: value for name, value in clocks.items()}
+    monkeypatch.setattr(stepping, "time", SimpleNamespace(thread_time=lambda: 5.0, **others))
+    limits = stepping.start_limits(load_config(overrides=["attempt_seconds=3"]))
+    assert limits.deadline == pytest.approx(8.0)

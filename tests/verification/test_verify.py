@@ -369,3 +369,16 @@ def test_fingers_are_opened_until_the_hand_is_clear(
     np.testing.assert_allclose(opened, np.maximum(expected, 0.0), atol=1e-12)
     assert trial.outcome is (Outcome.START_COLLISION if collisions == 2 else Outcome.SUCCESS)
     np.testing.assert_array_equal(pregrasp.X_OG, held.fit.X_OG)
+
+
+def test_settings_of_the_lift_are_those_of_the_trial(
+    held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """The target is held for longer, and no worm keeps the fingers from being pushed open."""
+    hold = CONFIG.lift.hold_time + 0.24
+    config = override_config(CONFIG, [f"lift.hold_time={hold}", "lift.drive=torque"])
+    found = verify(cube, *grasp, config=config)
+    assert found.trial is not None and held.trial is not None
+    longer = found.trial.lift.duration - held.trial.lift.duration
+    assert longer == pytest.approx(0.24, abs=1e-3)
+    assert found.trial.lift.slip > 3.0 * held.trial.lift.slip

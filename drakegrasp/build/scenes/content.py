@@ -189,8 +189,8 @@ def _views(
             }
 
             # What it sees of the contacts.
-            contacts = (grasps[key][own] for key in ("p_TQ", "nhat_Q_T"))
-            visible["visible"].append(visible_contacts(*contacts, X_TC, lens.K, depth))
+            p_TQ, nhat_Q_T = (grasps[key][own] for key in ("p_TQ", "nhat_Q_T"))
+            visible["visible"].append(visible_contacts(p_TQ, nhat_Q_T, X_TC, lens.K, depth))
             visible["view"].append(np.full(len(own), len(numbers["scene"])))
             visible["grasp"].append(own)
             for key, values in numbers.items():
@@ -216,11 +216,12 @@ def _picture(
 ) -> npt.NDArray[np.uint16]:
     """Render a view, add its packed images to lists, and return its depth image."""
     seen = capture(renderer, lens, X_TO, X_TC)
-    depth = np.where(np.isfinite(seen.depth), np.rint(seen.depth / DEPTH_UNIT), 0)
-    stored = {"rgb": seen.rgb, "depth": depth.astype(np.uint16), "mask": seen.mask}
+    far = np.where(np.isfinite(seen.depth), np.rint(seen.depth / DEPTH_UNIT), 0)
+    depth = far.astype(np.uint16)
+    stored = {"rgb": seen.rgb, "depth": depth, "mask": seen.mask}
     for key, image in stored.items():
         images[key].append(packed_chunk(np.ascontiguousarray(image)[None], 1))
-    return stored["depth"]
+    return depth
 
 
 def _conditions(look: Conditions, camera: Stream) -> dict[str, Any]:

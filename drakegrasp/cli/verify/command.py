@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import PATH, shared
+from drakegrasp.cli.options import PATH, chosen_workers, connection_options, shared
 from drakegrasp.cli.verify.protocol import (
     PLACES,
     ProtocolRequest,
@@ -106,14 +106,11 @@ if TYPE_CHECKING:
     metavar="NAME",
     help="Write NAME.jsonl and NAME.h5 instead of printing lines of JSON.",
 )
-@shared("--workers", "--scheduler", "--scheduler-file")
+@connection_options
 @shared("--quiet", help="Show neither progress nor the table.")
 @shared("--json", help="Print the lines of JSON also with --out, and nothing else.")
 def verify(
     out: Path | None,
-    workers: int | None,
-    scheduler: str | None,
-    scheduler_file: Path | None,
     quiet: bool,
     as_json: bool,
     protocol: str,
@@ -131,9 +128,12 @@ def verify(
     points in metres, then the unit normals out of the object, in the order of the hand's
     fingers.
 
-    With another protocol than lift, GRASPS may also be a file of postures as `build --postures`
-    reads it; of contacts the first wrist pose that fits them is tried. Or GRASPS is a .npy file of
-    DexGraspBench or a folder of such files, and --hand an MJCF, whose world is the hand's root.
+    GRASPS may also be a file of postures as `build --postures` reads it, on --object or on the
+    objects of --dataset that it names, or that its `row` says.
+
+    With another protocol than lift, the first wrist pose that fits contacts is tried. There GRASPS
+    may be a .npy file of DexGraspBench or a folder of such files, and --hand an MJCF, whose world
+    is the hand's root.
 
     If GRASPS is a data file of a dataset, and neither --object nor --dataset is given, the
     command tries the grasps of that dataset.
@@ -144,16 +144,17 @@ def verify(
     """
     from drakegrasp.cli.verify.request import VerifyRequest
 
+    workers = chosen_workers(options)
     if not is_lift(protocol, simulator):
         grasps = {name: options.pop(name) for name in PLACES}
-        refuse_options(protocol, scheduler=scheduler, scheduler_file=scheduler_file, **options)
+        number = workers.pop("workers")
+        refuse_options(protocol, **workers, **options)
         request = ProtocolRequest(protocol=protocol, assets=assets, **grasps)
-        verify_by_protocol(request, out, workers, as_json=as_json, quiet=quiet)
+        verify_by_protocol(request, out, number, as_json=as_json, quiet=quiet)
     elif assets is not None:
         raise click.UsageError("--assets must be used with another --protocol than lift")
     else:
-        connected = {"workers": workers, "scheduler": scheduler, "scheduler_file": scheduler_file}
-        _verify_by_lift(VerifyRequest(**options, out=out), connected, as_json, quiet or as_json)
+        _verify_by_lift(VerifyRequest(**options, out=out), workers, as_json, quiet or as_json)
 
 
 def _verify_by_lift(

@@ -75,10 +75,11 @@ def refuse_options(protocol: str, **options: Any) -> None:
     Raises:
         click.UsageError: If one is given.
     """
-    usual = {"method": "hand", "overrides": (), "snap_points": False}
+    usual = {"method": "hand", "overrides": (), "snap_points": False, "tls": True}
+    names = {"mesh": "object", "overrides": "set", "tls": "no-tls", "tls_files": "tls-ca-file"}
     for name, value in options.items():
         if value is not None and value != usual.get(name):
-            option = {"mesh": "object", "overrides": "set"}.get(name, name.replace("_", "-"))
+            option = names.get(name, name.replace("_", "-"))
             raise click.UsageError(f"--{option} must not be used with protocol {protocol}")
 
 
@@ -152,41 +153,13 @@ def _grasp_files(
 def _own_grasps(request: ProtocolRequest) -> tuple[Hand, list[PlacedPosture]]:
     """Return postures of a file, or those that predictions of contacts mean, and their hand."""
     from drakegrasp.cli.verify.request import VerifyRequest, place_requested
-    from drakegrasp.dataset.manifest import read_manifest
-    from drakegrasp.errors import GraspError
-    from drakegrasp.exchange.posture_files import holds_postures, read_postures
-    from drakegrasp.exchange.protocol_grasps import (
-        fitted_postures,
-        postures_on_dataset,
-        postures_on_object,
-    )
+    from drakegrasp.exchange.protocol_grasps import fitted_postures
     from drakegrasp.hand.description import load_hand
-    from drakegrasp.hand.settings import load_config, override_config
-    from drakegrasp.simulation.placement import place_object
 
-    if not holds_postures(request.grasps):
-        options = {name: getattr(request, name) for name in PLACES}
-        placed, config = place_requested(VerifyRequest(**options))
-        return load_hand(config.hand_source), list(fitted_postures(placed))
-
-    # Postures say their frame and their object themselves.
-    said = {name: getattr(request, name) for name in ("split", "frame", "camera")}
-    refuse_options(f"{request.protocol} and postures", **said)
-    if (request.mesh is None) == (request.dataset is None):
-        raise GraspError("--object MESH or --dataset FILE must be given with postures, one of them")
-    if request.dataset is not None:
-        out = request.dataset.parent if request.dataset.is_file() else request.dataset
-        config = read_manifest(out).config
-    else:
-        config = load_config()
-    if request.hand is not None:
-        config = override_config(config, [], hand=request.hand)
-    hand = load_hand(config.hand_source)
-    table = read_postures(request.grasps, hand)
-    if request.mesh is None:
-        return hand, postures_on_dataset(table, out)
-    placed_object = place_object(request.mesh, units=request.units, config=config)
-    return hand, postures_on_object(table, placed_object)
+    options = {name: getattr(request, name) for name in PLACES}
+    placed, config = place_requested(VerifyRequest(**options))
+    placed.sort(key=lambda grasp: grasp.index)
+    return load_hand(config.hand_source), list(fitted_postures(placed))
 
 
 def _print_line(line: str) -> None:

@@ -13,14 +13,23 @@ import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.layout.predicted_rows import PredictedRows
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, GraspError
+from drakegrasp.exchange.posture_files import has_rows, holds_postures, read_postures
+from drakegrasp.exchange.predicted_postures import read_predicted_postures
 from drakegrasp.frames import Array
+from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.simulation.placement import place_object
 from drakegrasp.verification.placed_grasp import dataset_config, place_on_object, place_on_rows
+from drakegrasp.verification.placed_postures import (
+    place_postures_on_dataset,
+    place_postures_on_object,
+    place_postures_on_rows,
+)
 from drakegrasp.verification.prediction import (
     HDF5_SUFFIXES,
     read_grasps,
@@ -74,10 +83,17 @@ def requested_rows(request: VerifyRequest, count: int) -> PredictedRows | None:
         request: That `place_requested` has accepted.
         count: Number of its grasps.
     """
+    split = request.split or DEFAULT_SPLIT
+    if holds_postures(request.grasps):
+        if request.dataset is None or not has_rows(request.grasps):
+            return None
+        data = GraspDataset(request.dataset, split=split)
+        return PredictedRows.of(
+            request.dataset, split, read_predicted_postures(request.grasps, data)[1]
+        )
     path = _dataset_path(request)
     if path is None:
         return None
-    split = request.split or DEFAULT_SPLIT
     rows = read_predictions(request.grasps, split=split).rows
     return PredictedRows.of(path, split, np.arange(count) if rows is None else rows.ravel())
 
@@ -86,6 +102,8 @@ def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
     # Refuse results that could not be written, and options without effect.
     if request.out is not None:
         refuse_unwritable(request.out)
+    if holds_postures(request.grasps):
+        return _place_postures(request)
     path = _dataset_path(request)
     _refuse_idle(request, path)
 
@@ -133,6 +151,48 @@ def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
         overrides=overrides,
     )
     return placed, config
+
+
+def _place_postures(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
+    """Return the postures of a file on their objects, and the configuration."""
+    # They say their frame themselves, and need no fit.
+    idle: dict[str, object] = {"--frame": request.frame, "--camera": request.camera}
+    idle["--method"] = None if request.method == "hand" else request.method
+    idle["--snap-points"] = request.snap_points or None
+    for name, value in idle.items():
+        if value is not None:
+            raise GraspError(f"{name} must be left out with postures, got {value}")
+    if (request.mesh is None) == (request.dataset is None):
+        raise GraspError("--object MESH or --dataset FILE must be given with postures, one of them")
+    if request.dataset is not None:
+        return _postures_on(request.dataset, request)
+    if request.split is not None:
+        raise GraspError(f"--split must be given with --dataset only, got {request.split}")
+    config = load_config(request.config, request.overrides)
+    config = config if request.hand is None else override_config(config, [], hand=request.hand)
+    table = read_postures(request.grasps, load_hand(config.hand_source))
+    thing = place_object(request.mesh, units=request.units, config=config)
+    return place_postures_on_object(table, thing), config
+
+
+def _postures_on(dataset: Path, request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
+    """Return postures on the rows of a dataset, or without `row` on the objects that they name."""
+    given = {"--units": request.units, "--hand": request.hand, "--config": request.config}
+    for name, value in given.items():
+        if value is not None:
+            raise GraspError(f"{name} must be left out with postures and --dataset, got {value}")
+    if has_rows(request.grasps):
+        data = GraspDataset(dataset, split=request.split or DEFAULT_SPLIT)
+        table, rows, _ = read_predicted_postures(request.grasps, data)
+        placed = place_postures_on_rows(table, data, rows.tolist(), overrides=request.overrides)
+        return placed, dataset_config(data, overrides=request.overrides)
+    if request.split is not None:
+        raise GraspError(f"--split must be given with `row` in the postures, got {request.split}")
+    out = dataset.parent if dataset.is_file() else dataset
+    config = override_config(read_manifest(out).config, request.overrides)
+    table = read_postures(request.grasps, load_hand(config.hand_source))
+    own = config if request.overrides else None
+    return place_postures_on_dataset(table, out, own), config
 
 
 def _refuse_no_grasps(path: Path, grasps: Array, config: Config) -> None:

@@ -45,6 +45,8 @@ POSTURES = 24
 WORST = 2.4
 #: Files of a vendor that say what may be done with the model.
 LICENCES = ("LICENSE*", "LICENCE*", "COPYING*", "NOTICE*")
+#: So many folders above the model's may have them.
+MOST_ABOVE = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,11 +97,27 @@ def draft_hand(
         out.rmdir()
     with atomic_folder(out) as folder:
         written = _write(best, folder, path)
-        licences = chain.from_iterable(path.resolve().parent.glob(name) for name in LICENCES)
-        for licence in filter(Path.is_file, licences):
+        licences = _licences(path.resolve().parent)
+        for licence in licences:
             shutil.copyfile(licence, folder / licence.name)
-    notes = (*model.notes, *unused_parts(model, best.grip, answers))
-    return NewHand(path=out / written.name, notes=notes, findings=findings)
+    far = {str(each) for each in licences if each.parent != path.resolve().parent}
+    notes = [f"{each} is copied: see that the model is under it" for each in sorted(far)]
+    notes = [*model.notes, *unused_parts(model, best.grip, answers), *notes]
+    return NewHand(path=out / written.name, notes=tuple(notes), findings=findings)
+
+
+def _licences(folder: Path) -> list[Path]:
+    """Return the licence files of the nearest folder that has some, from that of a model upwards.
+
+    A repository often has one at its root. What is above that, or far above, is another's.
+    """
+    for above in (folder, *folder.parents[:MOST_ABOVE]):
+        found = chain.from_iterable(above.glob(name) for name in LICENCES)
+        if files := sorted({file for file in found if file.is_file()}):
+            return files
+        if (above / ".git").exists() or above == Path.home():
+            break
+    return []
 
 
 def _find_best(

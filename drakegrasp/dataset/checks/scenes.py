@@ -202,7 +202,9 @@ def resting_scene(scene: Batch, dataset: Dataset, name: str) -> Iterator[Violati
     entry = next(entry for entry in dataset.manifest.objects if entry.name == name)
     resting = int(scene["resting"][0, 0])
     known = resting < len(entry.resting)
-    yield from scene.broken("resting must be one of its object's", np.array([not known]), [resting])
+    yield from scene.broken(
+        "resting must be one of its object's", np.array([not known]), scene["resting"][:, 0]
+    )
     if known:
         # Upright direction and height stay.
         due = np.array(entry.resting[resting].X_TO)[8:]

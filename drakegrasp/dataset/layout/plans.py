@@ -23,12 +23,13 @@ ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "source": ("int64", ("n",)),
     "log_density": ("float64", ("n",)),
 }
-#: Those of a plan of postures from outside, in addition; `j` stands for the number of joints, and
-#: `said` is a list of texts as JSON.
+#: Those of a plan of postures from outside, in addition; `j` stands for the number of joints.
+#: `said` and `preshape` are lists of texts as JSON; `preshape` is left out where all are empty.
 POSTURE_ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
     **{name: ("float64", ("n", "j")) for name in ("q_grasp", "q_pregrasp", "q_squeeze")},
     "row": ("int64", ("n",)),
     "said": ("uint8", ("m",)),
+    "preshape": ("uint8", ("p",)),
 }
 _ATTRIBUTES = {
     **dict.fromkeys(("model_sha256", "config_hash", "mesh_sha256"), TEXT),
@@ -52,6 +53,8 @@ def _other_arrays(file: h5py.File) -> Iterator[str]:
     postures = POSTURE_ARRAYS if "q_grasp" in file else {}
     for name, (dtype, axes) in (ARRAYS | postures).items():
         dataset = file.get(name)
+        if dataset is None and name == "preshape":
+            continue
         if not isinstance(dataset, h5py.Dataset):
             yield f"/{name}: the dataset must be there, got none"
             continue

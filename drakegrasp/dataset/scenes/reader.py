@@ -195,15 +195,15 @@ class SceneDataset:
         item |= self._grasps_of(view, self._drawn(scene, stream), X_AT)
         scenes = self._tables["scenes"]
         item |= {
-            key: np.float32(scenes[key][scene, 0])
+            key: np.asarray(scenes[key][scene, 0], dtype=np.float32)
             for key in ("mass", "friction_hand", "friction_table")
         }
         return item | {
             "X_TC": X_TC.astype(np.float32),
             "X_AO": (X_AT @ unpack_pose(scenes["X_TO"][scene, 0])).astype(np.float32),
-            "view": np.int64(view),
-            "scene": np.int64(scene),
-            "object": np.int64(scenes["object"][scene, 0]),
+            "view": np.asarray(view, dtype=np.int64),
+            "scene": np.asarray(scene, dtype=np.int64),
+            "object": np.asarray(scenes["object"][scene, 0], dtype=np.int64),
         }
 
     def __iter__(self) -> Iterator[dict[str, AnyArray]]:
@@ -333,7 +333,7 @@ class SceneDataset:
 
     def _cloud(self, view: int, X_AT: Array, stream: Stream) -> dict[str, AnyArray]:
         """Return the points of an item: some that follow each other in what is kept of the view."""
-        pool, n = self._kept_of(view), self._points
+        pool, n = self._kept_of(view), self._points or 0
         rows = (int(stream.integers(len(pool["uv"]), 1)[0]) + np.arange(n)) % len(pool["uv"])
         f_u, f_v, c_u, c_v = self._tables["views"]["K"][view][[0, 4, 2, 5]].astype(np.float32)
         z, uv = pool["depth"][rows], pool["uv"][rows].astype(np.float32)

@@ -41,6 +41,8 @@ from drakegrasp.hand.vendor.source import FORMATS, Source
 
 #: A hand is so large [m], with its arm if it has one; else its units are others.
 SIZES = (0.03, 3.0)
+#: A hull that reaches farther beyond its mesh [m] is told of: own choice, half of a fingertip.
+HOLLOW = 0.01
 #: Mass [kg] and radius [m] of a link that has neither mass nor shape but moves.
 BARE_MASS, BARE_RADIUS = 1e-3, 0.016
 
@@ -248,11 +250,13 @@ def _weld(members: Sequence[tuple[_Body, Array]]) -> tuple[Link, list[str]]:
     """Return the link of bodies with their poses in its frame, and notes of what was put in."""
     # Shapes; what only is drawn collides, too, if nothing else does.
     name, notes = max((body for body, _ in members), key=lambda body: body.weight).name, []
-    collisions = [s.carried(X).hull() for body, X in members for s in body.collisions]
+    solids = [s.carried(X) for body, X in members for s in body.collisions]
     visuals = [s.carried(X) for body, X in members for s in body.visuals]
-    if not collisions and visuals:
-        collisions = [shape.hull() for shape in visuals]
+    if not solids and visuals:
+        solids = visuals
         notes.append(f"link {name}: the model has no collision shapes; hulls of its pictures")
+    collisions = [shape.hull() for shape in solids]
+    notes += _hollows(name, solids, collisions)
 
     # Inertias add up about the link's origin.
     total: SpatialInertia | None = None
@@ -275,6 +279,17 @@ def _weld(members: Sequence[tuple[_Body, Array]]) -> tuple[Link, list[str]]:
         total = with_mass(likely, total.get_mass())
     link = Link(name=name, inertia=total, collisions=tuple(collisions), visuals=tuple(visuals))
     return link, notes
+
+
+def _hollows(name: str, shapes: Sequence[Shape], hulls: Sequence[Shape]) -> Iterator[str]:
+    """Yield a note of each mesh of a link whose hull fills what is hollow."""
+    for shape, hull in zip(shapes, hulls, strict=True):
+        beyond = 0.0 if shape.vertices is None else hull.reach_beyond(shape)
+        if beyond > HOLLOW:
+            yield (
+                f"link {name}: the hull that collides reaches up to {1e3 * beyond:.0f} mm beyond "
+                "its mesh, and what is hollow there is solid: cut the mesh into convex parts"
+            )
 
 
 def _joints(

@@ -24,6 +24,7 @@ from pydrake.geometry import (
     Sphere,
 )
 from pydrake.multibody.tree import CalcSpatialInertia, SpatialInertia, UnitInertia
+from scipy.spatial import cKDTree
 
 from drakegrasp.arithmetic import dot
 from drakegrasp.frames import Array, transform_points
@@ -35,6 +36,8 @@ from drakegrasp.mesh.surfaces import Faces
 CORNERS = 64
 #: What is thinner than this [m] is made as thick: a plane has no hull.
 THIN = 4e-4
+#: Points on a hull that are compared with ten times as many of its mesh: some 3 mm apart on a palm.
+SAMPLES = 1000
 #: Mean density of links whose model gives no mass [kg/m^3]: own choice, that of solid plastic.
 DENSITY = 1200.0
 
@@ -80,6 +83,14 @@ class Shape:
         farthest = np.unique([int(np.argmax(dot(points, d))) for d in directions])
         solid = trimesh.convex.convex_hull(points[farthest])
         return replace(self, vertices=np.array(solid.vertices), faces=np.array(solid.faces))
+
+    def reach_beyond(self, mesh: Shape) -> float:
+        """Return how far the surface of a hull is from that of its mesh at most [m]."""
+        (own, _), (other, _) = (
+            trimesh.sample.sample_surface(trimesh.Trimesh(s.vertices, s.faces), count, seed=0)
+            for s, count in ((self, SAMPLES), (mesh, 10 * SAMPLES))
+        )
+        return float(cKDTree(other).query(own)[0].max())
 
 
 def read_shape(

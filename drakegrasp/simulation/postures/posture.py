@@ -9,7 +9,7 @@ of its own, which goes from the pregrasp to the grasp and on to the squeeze.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -51,12 +51,14 @@ class Posture:
         q_grasp: (j,), when the fingers hold the object [rad or m].
         q_pregrasp: (j,), where the trial begins; None: the grasp, opened by 20 degrees.
         q_squeeze: (j,), the target of motors that press; None: beyond the grasp.
+        preshape: Name of the hand's preshape, whose fingers alone close and must touch; None: all.
     """
 
     X_OG: Array
     q_grasp: Array
     q_pregrasp: Array | None = None
     q_squeeze: Array | None = None
+    preshape: str | None = None
 
 
 def make_posture(
@@ -70,6 +72,7 @@ def make_posture(
     X_TO: npt.ArrayLike | None = None,
     X_TC: npt.ArrayLike | None = None,
     joints: Sequence[str] | None = None,
+    preshape: str | None = None,
 ) -> Posture:
     """Return a posture whose palm pose is given in one of four frames.
 
@@ -83,11 +86,13 @@ def make_posture(
         X_TO: Pose of the object on the table, (4, 4), for any frame but "object".
         X_TC: Pose of the camera in the table-top frame, (4, 4), for the frame "camera".
         joints: Names of the joints in the order of the vectors; the plant's order if None.
+        preshape: Name of one of the hand's preshapes; None: all fingers close.
 
     Raises:
         GraspError: If a pose is none, a vector has another length or is not finite, a joint is
-            missing, or the frame is unknown or lacks its pose.
+            missing, the hand has no such preshape, or the frame is unknown or lacks its pose.
     """
+    preshape_index(hand, preshape)
     vectors = {"q_grasp": q_grasp, "q_pregrasp": q_pregrasp, "q_squeeze": q_squeeze}
     order = None if joints is None else _places(joint_order(hand), joints)
     size = len(hand.joint_names) if joints is None else len(joints)
@@ -104,7 +109,21 @@ def make_posture(
     X_OF = _frame_in_object(frame, X_TO, X_TC)
     X_OG = multiply(X_OF, exact_pose(X_FG, "the palm's pose"))
     assert q["q_grasp"] is not None
-    return Posture(X_OG, q["q_grasp"], q["q_pregrasp"], q["q_squeeze"])
+    return Posture(X_OG, q["q_grasp"], q["q_pregrasp"], q["q_squeeze"], preshape)
+
+
+def preshape_index(hand: Hand, name: str | None) -> int | None:
+    """Return the index of a preshape by its name; None for None.
+
+    Raises:
+        GraspError: If the hand has no such preshape.
+    """
+    if name is None:
+        return None
+    if name not in hand.preshape_names:
+        known = f"one of {', '.join(hand.preshape_names)}" if hand.preshapes else "left out"
+        raise GraspError(f"preshape must be {known} for the hand {hand.name}, got {name!r}")
+    return hand.preshape_names.index(name)
 
 
 def _frame_in_object(frame: str, X_TO: npt.ArrayLike | None, X_TC: npt.ArrayLike | None) -> Array:
@@ -164,8 +183,18 @@ def start_of(posture: Posture, hand: Hand) -> Pregrasp:
 
     The rule: the hand file's motors close the fingers if in every given vector each coupled joint
     is where its finger's closing joint puts it, and all spread joints agree, within 1 degree. Else
-    each joint has a motor of its own.
+    each joint has a motor of its own. Fingers that its preshape leaves out have none.
+
+    Raises:
+        GraspError: If the hand has no such preshape.
     """
+    preshape = preshape_index(hand, posture.preshape)
+    start = _start_of(posture, hand.at(preshape))
+    return replace(start, preshape=preshape, unused=hand.unused_in(preshape))
+
+
+def _start_of(posture: Posture, hand: Hand) -> Pregrasp:
+    """Return what the trial of a posture starts from, of a hand all of whose fingers close."""
     given = [q for q in (posture.q_pregrasp, posture.q_grasp, posture.q_squeeze) if q is not None]
     start = opened(posture.q_grasp, hand) if posture.q_pregrasp is None else posture.q_pregrasp
     own_motors = not all(follows_couplings(q, hand) for q in given)

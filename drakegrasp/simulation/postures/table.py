@@ -1,8 +1,8 @@
 """Many postures of several objects, as a file gives them, and the palm poses of a build from them.
 
-In: rows of a file, checked, with their joints in the plant's order. Out: a `PostureTable`, which
-is plain data and can be sent to another process; of an object its `Candidates`; and the `Attempt`
-of each.
+In: rows of a file with their joints in the plant's order. Out: a `PostureTable`, which is plain
+data and can be sent to another process; of an object its `Candidates`; and the `Attempt` of each. A
+row that is no posture stays in the table, with the reason, and spoils no other.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
-from drakegrasp.errors import GraspError, listed
-from drakegrasp.frames import X_WT, Array, invert_pose
+from drakegrasp.errors import NAMED, GraspError, listed
+from drakegrasp.frames import FARTHEST, X_WT, Array, invert_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
@@ -30,11 +30,13 @@ from drakegrasp.simulation.candidates import (
     Source,
     is_audited,
 )
-from drakegrasp.simulation.postures.posture import Posture, exact_pose, start_of
+from drakegrasp.simulation.postures.posture import Posture, exact_pose, preshape_index, start_of
 
 #: Frames of a table: those of a posture, and {M}, the axes and the origin of the mesh file.
 TableFrame = Literal["object", "table", "camera", "world", "mesh"]
 TABLE_FRAMES: tuple[str, ...] = get_args(TableFrame)
+#: No object has so many resting poses.
+MOST_POSES = 1e6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,7 +54,9 @@ class PostureTable:
         scale: (n,), metres per unit of length of the mesh file that the posture is for; NaN: any.
         log_density: (n,), logarithm of the density of the draw; NaN: not known.
         said: (n,), where it comes from, in words.
+        preshape: (n,), name of the hand's preshape; empty: all fingers close.
         row: (n,), row in the file.
+        invalid: (n,), why a row is no posture; empty where it is one.
     """
 
     objects: tuple[str, ...]
@@ -66,14 +70,24 @@ class PostureTable:
     scale: Array
     log_density: Array
     said: tuple[str, ...]
+    preshape: tuple[str, ...]
     row: npt.NDArray[np.int64]
+    invalid: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.objects)
 
     def of_object(self, name: str) -> PostureTable:
-        """Return the rows of an object, in their order."""
-        rows = [i for i, each in enumerate(self.objects) if each == name]
+        """Return the rows of an object that are postures, in their order."""
+        rows = [
+            i
+            for i, (each, reason) in enumerate(zip(self.objects, self.invalid, strict=True))
+            if each == name and not reason
+        ]
+        return self.at(rows)
+
+    def at(self, rows: Sequence[int]) -> PostureTable:
+        """Return some rows, in the given order."""
         chosen: dict[str, Any] = {
             f.name: tuple(value[i] for i in rows) if isinstance(value, tuple) else value[rows]
             for f in fields(self)
@@ -81,11 +95,69 @@ class PostureTable:
         }
         return replace(self, **chosen)
 
+    def posture(self, i: int, X_TO: Array, X_OM: Array | None = None) -> Posture:
+        """Return the posture of a row.
+
+        Args:
+            i: Place of the row in the table.
+            X_TO: Pose (4, 4) of its object on the table.
+            X_OM: Pose (4, 4) of the mesh file's frame in {O}, for the frame "mesh".
+
+        Raises:
+            GraspError: If the frame is "mesh" and its pose is not known.
+        """
+        X_OG = multiply(self._frame_in_object(i, X_TO, X_OM), self.X_FG[i])
+        before, after = _given(self.q_pregrasp[i]), _given(self.q_squeeze[i])
+        return Posture(X_OG, self.q_grasp[i], before, after)
+
+    def _frame_in_object(self, i: int, X_TO: Array, X_OM: Array | None) -> Array:
+        """Return the pose (4, 4) of the frame of a row in {O}."""
+        if self.frame == "object":
+            return np.eye(4)
+        if self.frame == "mesh":
+            if X_OM is None:
+                raise GraspError("frame must be object, table, camera or world here, got mesh")
+            return X_OM
+        X_OT = invert_pose(X_TO)
+        if self.frame == "table":
+            return X_OT
+        return multiply(X_OT, invert_pose(X_WT) if self.X_TC is None else self.X_TC[i])
+
+    def numbers(self) -> Array:
+        """Return all numbers (n, m) that say what each posture is, NaN where it lacks some."""
+        X = [X for X in (self.X_FG, self.X_TC) if X is not None]
+        q = [self.q_grasp, self.q_pregrasp, self.q_squeeze]
+        return np.column_stack([*(each.reshape(len(self), 16) for each in X), *q])
+
+    def refuse(self, reasons: Sequence[str]) -> PostureTable:
+        """Return the table with more reasons (n,) why rows are no postures."""
+        both = (one or other for one, other in zip(self.invalid, reasons, strict=True))
+        return replace(self, invalid=tuple(both))
+
+    @property
+    def refused(self) -> str:
+        """How many rows are no postures, and which, in a line; empty if all are."""
+        rows: dict[str, list[str]] = {}
+        for row, reason in zip(self.row.tolist(), self.invalid, strict=True):
+            if reason:
+                rows.setdefault(reason, []).append(str(row))
+        if not rows:
+            return ""
+        count = sum(map(len, rows.values()))
+        why = [f"row {listed(same)}: {reason}" for reason, same in rows.items()]
+        more = f"; and {len(why) - NAMED:,} other reasons" if len(why) > NAMED else ""
+        told = "; ".join(why[:NAMED])
+        return f"{count:,} of {len(self):,} rows of the postures are not tried: {told}{more}"
+
     def digest(self) -> str:
         """Return a hash (16 hex digits) of all that the table says."""
         digest = hashlib.sha256()
         for f in fields(self):
             value = getattr(self, f.name)
+            # Why a row is none follows from the others, and from the meshes. A table without
+            # preshapes has the hash that it had before there were any.
+            if f.name == "invalid" or (f.name == "preshape" and not any(value)):
+                continue
             is_array = isinstance(value, np.ndarray)
             digest.update(value.tobytes() if is_array else json.dumps(value).encode())
         return digest.hexdigest()[:16]
@@ -105,8 +177,10 @@ def make_table(
     scale: npt.ArrayLike | None = None,
     log_density: npt.ArrayLike | None = None,
     said: Sequence[str] | None = None,
+    preshape: Sequence[str | None] | None = None,
+    invalid: Sequence[str] | None = None,
 ) -> PostureTable:
-    """Return a table of postures, after checking every row.
+    """Return a table of postures, after checking every row by itself.
 
     Args:
         hand: The hand.
@@ -121,10 +195,11 @@ def make_table(
         scale: (n,), metres per unit of length of the mesh file.
         log_density: (n,), of the draws.
         said: (n,), where each comes from.
+        preshape: (n,), names of the hand's preshapes; empty: all fingers close.
+        invalid: (n,), why a row is known to be no posture; empty where it may be one.
 
     Raises:
-        GraspError: If there is no row, the arrays differ in length, or a row is no posture; the
-            message names the first.
+        GraspError: If there is no row, or the arrays differ in length.
     """
     count, joints = len(objects), len(hand.joint_names)
     if not count:
@@ -135,33 +210,68 @@ def make_table(
         raise GraspError("X_TC must be given with the frame camera, and only then")
 
     # Numbers that every row must have, and those that a row may lack.
-    where = np.zeros(count) if resting is None else _numbers(resting, (count,), "resting")
-    if not np.array_equal(where, where.astype(np.int64)) or (where < 0).any():
-        raise GraspError("resting must be indices of resting poses, got other numbers")
+    bad = [""] * count if invalid is None else list(invalid)
+    where = np.zeros(count) if resting is None else _numbers(resting, (count,), "resting", bad)
+    for i in np.flatnonzero(~((where >= 0) & (where < MOST_POSES) & (where == np.floor(where)))):
+        bad[i] = bad[i] or f"resting must be the index of a resting pose, got {where[i]:g}"
     pregrasp, squeeze = (
-        _numbers(q, (count, joints), name, some=True)
+        _numbers(q, (count, joints), name, bad, some=True)
         for name, q in (("q_pregrasp", q_pregrasp), ("q_squeeze", q_squeeze))
     )
     return PostureTable(
         objects=tuple(objects),
-        resting=where.astype(np.int64),
-        X_FG=_poses(X_FG, count, "the palm's pose"),
-        q_grasp=_numbers(q_grasp, (count, joints), "q_grasp"),
+        X_FG=_poses(X_FG, count, "the palm's pose", bad),
+        q_grasp=_numbers(q_grasp, (count, joints), "q_grasp", bad),
         q_pregrasp=pregrasp,
         q_squeeze=squeeze,
         frame=frame,
-        X_TC=None if X_TC is None else _poses(X_TC, count, "X_TC"),
-        scale=_numbers(scale, (count,), "scale", some=True),
-        log_density=_numbers(log_density, (count,), "log_density", some=True),
+        X_TC=None if X_TC is None else _poses(X_TC, count, "X_TC", bad),
+        scale=_numbers(scale, (count,), "scale", bad, some=True),
+        log_density=_numbers(log_density, (count,), "log_density", bad, some=True),
         said=("",) * count if said is None else tuple(said),
+        preshape=known_preshapes(preshape, count, hand, bad),
         row=np.arange(count, dtype=np.int64),
+        resting=np.where([not reason for reason in bad], where, 0).astype(np.int64),
+        invalid=tuple(bad),
     )
 
 
+def join_tables(parts: Sequence[PostureTable | str]) -> PostureTable:
+    """Return the rows of some tables, one after the other.
+
+    Args:
+        parts: Tables of one hand; a text says why a file is none, and becomes one row.
+
+    Raises:
+        GraspError: If no part is a table, or they are in different frames.
+    """
+    tables = [part for part in parts if isinstance(part, PostureTable)]
+    if not tables:
+        raise GraspError(str(parts[0]))
+    if len(frames := {table.frame for table in tables}) > 1:
+        raise GraspError(f"files must be in one frame, got {', '.join(sorted(frames))}")
+
+    # Whatever the numbers of a row are that is none: nobody reads them.
+    nothing = replace(tables[0].at([0]), objects=("",), said=("",), preshape=("",))
+    whole = [p if isinstance(p, PostureTable) else replace(nothing, invalid=(p,)) for p in parts]
+    joined: dict[str, Any] = {}
+    for f in fields(PostureTable):
+        values = [getattr(part, f.name) for part in whole]
+        if isinstance(values[0], tuple):
+            joined[f.name] = tuple(each for value in values for each in value)
+        elif isinstance(values[0], np.ndarray):
+            joined[f.name] = np.concatenate(values)
+    return replace(tables[0], **{**joined, "row": np.arange(len(joined["row"]), dtype=np.int64)})
+
+
 def _numbers(
-    value: npt.ArrayLike | None, shape: tuple[int, ...], name: str, *, some: bool = False
-) -> Array:
-    """Return an array of a shape; one row of it is all finite, or all NaN where `some`."""
+    value: npt.ArrayLike | None, shape: tuple[int, ...], name: str, bad: list[str], *,
+    some: bool = False,
+) -> Array:  # fmt: skip
+    """Return an array of a shape; `bad` gets the reason for each row of it that is not finite.
+
+    Where `some` are enough, a row may be all NaN.
+    """
     if value is None:
         return np.full(shape, np.nan)
     try:
@@ -171,29 +281,84 @@ def _numbers(
     if array.shape != shape:
         raise GraspError(f"{name} must be of shape {shape}, got {array.shape}")
     rows = array.reshape(len(array), -1)
-    bad = ~np.isfinite(rows).all(axis=1) & ~(some & np.isnan(rows).all(axis=1))
-    if bad.any():
-        raise GraspError(f"row {int(np.argmax(bad))}: {name} must be finite numbers, got others")
+    for i in np.flatnonzero(~np.isfinite(rows).all(axis=1) & ~(some & np.isnan(rows).all(axis=1))):
+        bad[i] = bad[i] or f"{name} must be finite numbers, got others"
     return np.ascontiguousarray(array)
 
 
-def _poses(value: npt.ArrayLike, count: int, name: str) -> Array:
-    array = _numbers(value, (count, 4, 4), name)
-    return np.array([exact_pose(X, f"row {i}: {name}") for i, X in enumerate(array)])
+def known_preshapes(
+    names: Sequence[str | None] | None, count: int, hand: Hand, bad: list[str]
+) -> tuple[str, ...]:
+    """Return the names of the preshapes of some rows, empty where there is none.
 
-
-def refuse_unknown_objects(table: PostureTable, names: Sequence[str]) -> None:
-    """Refuse postures of objects that are not there.
+    Args:
+        names: (n,), names as they are given; None: no row has one.
+        count: Number of rows.
+        hand: The hand.
+        bad: (n,), gets the reason for each row whose preshape the hand lacks.
 
     Raises:
-        GraspError: If there is one; the message names the first row.
+        GraspError: If they are of another number of rows.
     """
-    known = set(names)
-    for i, name in enumerate(table.objects):
-        if name not in known:
-            raise GraspError(
-                f"postures, row {i}: object must be one of {listed(list(names))}, got {name!r}"
+    if names is None:
+        return ("",) * count
+    if len(names) != count:
+        raise GraspError(f"preshape must be of {count} rows, got {len(names)}")
+    found = [name or "" for name in names]
+    for i, name in enumerate(found):
+        try:
+            preshape_index(hand, name or None)
+        except GraspError as error:
+            bad[i], found[i] = bad[i] or str(error), ""
+    return tuple(found)
+
+
+def _poses(value: npt.ArrayLike, count: int, name: str, bad: list[str]) -> Array:
+    """Return poses (n, 4, 4); `bad` gets the reason for each that is none."""
+    array = _numbers(value, (count, 4, 4), name, bad).copy()
+    for i, X in enumerate(array):
+        if bad[i]:
+            continue
+        try:
+            array[i] = exact_pose(X, name)
+            if (far := np.abs(X[:3, 3]).max()) > FARTHEST:
+                bad[i] = f"{name} must be within {FARTHEST:g} m, got {far:g} m"
+        except GraspError as error:
+            bad[i] = str(error)
+    return array
+
+
+def unknown_objects(table: PostureTable, names: Sequence[str]) -> list[str]:
+    """Return for each row why there is no such object; empty where there is."""
+    known, must = set(names), f"object must be one of {listed(list(names))}"
+    return ["" if each in known else f"{must}, got {each!r}" for each in table.objects]
+
+
+def misfits(table: PostureTable, name: str, scale: float, resting: int) -> list[str]:
+    """Return for each row why it does not fit an object that it is of; empty where it does.
+
+    Args:
+        table: Rows, of any objects.
+        name: The object.
+        scale: Metres per unit of length of its mesh file.
+        resting: How many resting poses it has.
+    """
+    must = f"0 to {resting - 1}" if resting > 1 else "0, the only one"
+    found = [""] * len(table)
+    for i, each in enumerate(table.objects):
+        if each != name:
+            continue
+        if table.resting[i] >= resting:
+            found[i] = (
+                f"resting pose of {name} must be {must} (objects.resting_poses drops more), "
+                f"got {table.resting[i]}"
             )
+        elif np.isfinite(table.scale[i]) and not np.isclose(table.scale[i], scale, rtol=1e-3):
+            found[i] = (
+                f"scale must be that of {name}, {scale:g} (objects.yaml states it), "
+                f"got {table.scale[i]:g}"
+            )
+    return found
 
 
 def given_candidates(
@@ -201,37 +366,22 @@ def given_candidates(
 ) -> Candidates:
     """Return the postures of an object as its palm poses, up to `candidates.max` of them.
 
+    Rows for a resting pose or a scale that the object does not have are left out.
+
     Args:
         model: The object.
         X_TO: Its resting poses, (r, 4, 4).
         table: Its rows.
         X_OM: Pose of its mesh file's frame in {O}, (4, 4).
         config: All the rules.
-
-    Raises:
-        GraspError: If a row is for a resting pose or a scale that the object does not have.
     """
-    # Each row must be of a pose and a scale that the object has.
+    # Its rows, in {O}.
+    table = table.refuse(misfits(table, model.name, model.scale, len(X_TO))).of_object(model.name)
     count = min(len(table), config.candidates.max)
-    for i in range(count):
-        place = f"postures, row {table.row[i]} ({model.name})"
-        if table.resting[i] >= len(X_TO):
-            must = f"0 to {len(X_TO) - 1}" if len(X_TO) > 1 else "0, the only one"
-            raise GraspError(
-                f"{place}: resting pose must be {must} (objects.resting_poses drops more), "
-                f"got {table.resting[i]}"
-            )
-        if np.isfinite(table.scale[i]) and not np.isclose(table.scale[i], model.scale, rtol=1e-3):
-            raise GraspError(
-                f"{place}: scale must be that of the object, {model.scale:g} (objects.yaml states "
-                f"it), got {table.scale[i]:g}"
-            )
+    X_OG = [table.posture(i, X_TO[table.resting[i]], X_OM).X_OG for i in range(count)]
 
-    # All palm poses in {O}.
-    frames = [_frame_in_object(table, i, X_TO[table.resting[i]], X_OM) for i in range(count)]
-    poses = [multiply(X_OF, X) for X_OF, X in zip(frames, table.X_FG, strict=False)]
     return Candidates(
-        X_OG=np.array(poses).reshape(-1, 4, 4),
+        X_OG=np.array(X_OG).reshape(-1, 4, 4),
         distance=np.full(count, np.nan),
         resting=table.resting[:count],
         source=np.full(count, Source.POSTURES, dtype=np.int64),
@@ -245,20 +395,14 @@ def given_candidates(
             q_squeeze=table.q_squeeze[:count],
             row=table.row[:count],
             said=table.said[:count],
+            preshape=table.preshape[:count],
         ),
     )
 
 
-def _frame_in_object(table: PostureTable, i: int, X_TO: Array, X_OM: Array) -> Array:
-    """Return the pose (4, 4) of the frame of a row in {O}."""
-    if table.frame == "object":
-        return np.eye(4)
-    if table.frame == "mesh":
-        return X_OM
-    X_OT = invert_pose(X_TO)
-    if table.frame == "table":
-        return X_OT
-    return multiply(X_OT, invert_pose(X_WT) if table.X_TC is None else table.X_TC[i])
+def _given(q: Array) -> Array | None:
+    """Return joint positions (j,), or None for a stage that a row lacks."""
+    return None if np.isnan(q).any() else q
 
 
 def posture_attempts(
@@ -276,13 +420,10 @@ def posture_attempts(
     given = candidates.postures
     assert given is not None
 
-    # A stage that a row lacks is NaN in the plan.
     for i in indices:
+        before, after = _given(given.q_pregrasp[i]), _given(given.q_squeeze[i])
         posture = Posture(
-            candidates.X_OG[i],
-            given.q_grasp[i],
-            None if np.isnan(given.q_pregrasp[i]).any() else given.q_pregrasp[i],
-            None if np.isnan(given.q_squeeze[i]).any() else given.q_squeeze[i],
+            candidates.X_OG[i], given.q_grasp[i], before, after, given.preshape[i] or None
         )
         start = start_of(posture, hand)
         yield Attempt(
@@ -292,6 +433,8 @@ def posture_attempts(
             spread=start.spread,
             closing=start.closing,
             path=start.path,
+            preshape=start.preshape,
+            unused=start.unused,
             X_OG=posture.X_OG,
             seed=Stream(seed, object_key(name), i).key,
             resting=int(candidates.resting[i]),

@@ -20,7 +20,8 @@ def run_trial(placed: PlacedObject, posture: Posture, config: Config | None = No
     """Close a simulated hand by a posture, lift the object, and return what happened.
 
     The object is simulated at `PlacedObject.X_TO_simulated`. A closed hand that may lift always
-    does, and until it is certain whether it holds, whatever `lift` says.
+    does, and until it is certain whether it holds, whatever `lift` says. Contacts are those of the
+    fingers of the posture's preshape.
 
     Args:
         placed: The object on the table, see `place_object`.
@@ -39,11 +40,10 @@ def run_trial(placed: PlacedObject, posture: Posture, config: Config | None = No
     config = with_whole_lifts(config_for(placed, config))
     refuse_other_objects(config, placed.config, "as the object was placed with")
     hand = load_hand(config.hand_source)
-    posture = make_posture(
-        hand, posture.X_OG, posture.q_grasp, posture.q_pregrasp, posture.q_squeeze
-    )
-    scene = cached_scene(placed.model, config.physics, config.hand_source)
-    trial = run_attempt(scene, placed.X_TO_simulated, start_of(posture, hand), config)
+    vectors = posture.q_grasp, posture.q_pregrasp, posture.q_squeeze
+    start = start_of(make_posture(hand, posture.X_OG, *vectors, preshape=posture.preshape), hand)
+    scene = cached_scene(placed.model, config.physics, config.hand_source, start.preshape)
+    trial = run_attempt(scene, placed.X_TO_simulated, start, config)
 
     # A scene in which Drake failed is never used again.
     if trial.outcome.inconclusive:

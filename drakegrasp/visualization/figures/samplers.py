@@ -63,11 +63,12 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
     # The datasets by method.
     manifest = read_manifest(out)
     config = manifest.config
-    method = config.candidates.method
-    if isinstance(method, tuple) or method not in METHODS or config.objects.resting_poses > 1:
+    method, most = config.candidates.method, config.objects.resting_poses
+    if isinstance(method, tuple) or method not in METHODS or most > 1:
+        named = " and ".join(method) if isinstance(method, tuple) else method
         raise DataError(
-            f"{out}: must be of one sampler ({' or '.join(METHODS)}) "
-            "and one resting pose, got others"
+            f"{out}: must be of candidates.method {' or '.join(METHODS)} and "
+            f"objects.resting_poses 1, got {named} and {most}"
         )
     datasets: dict[str, Path] = {method: out}
     if other is not None:

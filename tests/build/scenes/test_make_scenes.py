@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from drakegrasp.build.scenes.make import make_scenes, split_objects
 from drakegrasp.build.scenes.visible import visible_contacts
+from drakegrasp.cli.main import main
+from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import ConfigError
 from drakegrasp.frames import unpack_pose
@@ -23,8 +27,6 @@ pytestmark = pytest.mark.sim
 
 @pytest.fixture(scope="module")
 def scenes(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    import shutil
-
     out = Path(shutil.copytree(sound, tmp_path_factory.mktemp("scenes") / "out"))
     return make_scenes(out).path
 
@@ -115,3 +117,18 @@ def test_what_is_before_a_contact_hides_it_and_so_does_its_normal() -> None:
     seen = visible_contacts(np.array(p_TQ), np.array(nhat), X_TC, K, depth)
     assert seen.tolist() == [True, False, False, True, False, False]
     assert not visible_contacts(np.full((1, 3), np.nan), np.array([up]), X_TC, K, depth).any()
+
+
+def test_assemble_makes_them_where_the_configuration_says_so(out: Path) -> None:
+    arguments = ["assemble", str(out), "--workers", "1"]
+    assert CliRunner().invoke(main, arguments).exit_code == 0
+    assert not (out / "scenes.hdf5").exists()
+    wanted = ["--set", "scenes.when=assembled", "--set", "scenes.views=2"]
+    assert CliRunner().invoke(main, [*arguments, *wanted]).exit_code == 0
+    assert check_dataset(out) == []
+    with h5py.File(out / "scenes.hdf5") as file:
+        assert len(file["views/scene"]) == 2 + 2 * 5
+    # The next one, which is made of the same manifest, makes them again.
+    (out / "scenes.hdf5").unlink()
+    assert CliRunner().invoke(main, arguments).exit_code == 0
+    assert (out / "scenes.hdf5").exists()

@@ -151,3 +151,16 @@ def test_two_fingertips_hold_by_patches_what_points_let_swing(box: ObjectModel) 
     found = judged(box, config, p, N[[0, 2]])
     assert found.deciding is found.patches
     assert found.points.share == np.inf and np.isfinite(found.patches.share)
+
+
+@pytest.mark.parametrize(
+    "setting",
+    ["lift.drive=torque", "physics.friction_hand=0.2", "lift.max_acceleration=90"],
+)
+def test_each_setting_alone_decides(box: ObjectModel, setting: str) -> None:
+    """Finger 1, whose worm holds three times what its motor gives, opposes the other two."""
+    heavy, order = replace(box, mass=3.0 * box.mass), [2, 0, 1]
+    fast = "lift.max_speed=100"
+    usual, other = (load_config(overrides=[fast, *more]) for more in ([], [setting]))
+    assert judged(heavy, usual, P[order], N[order]).held
+    assert not judged(heavy, other, P[order], N[order]).held

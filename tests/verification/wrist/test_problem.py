@@ -26,6 +26,7 @@ from drakegrasp.verification.wrist.problem import (
     CLOSING_WEIGHT,
     NORMAL_WEIGHT,
     POSE,
+    POSTURE_WEIGHT,
     WristProblem,
     evaluate,
 )
@@ -271,3 +272,14 @@ def test_a_finger_closed_against_its_contact_leaves_little(name: str) -> None:
     )
     assert np.all(right < 1.0)
     assert np.all(wrong > 1.7)
+
+
+def test_posture_counts_a_slide_in_tenths_of_a_metre(name: str) -> None:
+    """A motor that is off by 0.1 m weighs as much as one that is off by a radian."""
+    problem, x = random_problem(name, 3)
+    hand = hand_of(name)
+    slides = np.array([hand.fingers[i].slides for i in hand.motor_fingers])
+    off = np.r_[1.0, np.where(slides, 0.1, 1.0)]
+    x[POSE:] = problem.posture + off
+    posture = evaluate(problem, x).residuals[terms(hand)["posture"]]
+    np.testing.assert_allclose(posture, POSTURE_WEIGHT)

@@ -66,6 +66,15 @@ def test_datasets_must_differ_by_the_sampler_alone(sound: Path, tmp_path: Path) 
         compare_samplers(sound, rough)
 
 
+def test_a_dataset_of_two_samplers_is_refused_and_says_what_it_is(out: Path) -> None:
+    manifest = read_manifest(out)
+    rules = manifest.config.candidates.model_copy(update={"method": ("normals", "rotations")})
+    config = manifest.config.model_copy(update={"candidates": rules})
+    write_manifest(replace(manifest, config=config), out)
+    with pytest.raises(DataError, match=r"resting_poses 1, got normals and rotations and 1$"):
+        compare_samplers(out)
+
+
 def test_rays_end_on_the_surface(sound: Path) -> None:
     poses = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (3, 1, 1))
     poses[:, 2, 3] = [0.3, 0.4, 0.5]

@@ -1,0 +1,151 @@
+"""Predicted postures: read for rows of a split, ranked, and tried as what they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.datasets import OTO, make_dataset
+
+from drakegrasp.api.scoring import score
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import GraspError
+from drakegrasp.frames import invert_pose, unpack_pose
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.scoring.ranked import rank_postures
+from drakegrasp.scoring.run import VERDICTS
+from drakegrasp.simulation.postures.posture import joint_order
+from drakegrasp.verification.placed_postures import place_postures_on_rows
+
+HAND = load_hand()
+
+
+def own_postures(data: GraspDataset, rows: np.ndarray) -> dict[str, Any]:
+    """The samples of some rows as arrays of a file of predicted postures, in {O}."""
+    trials = Trials(data.path.parent)
+    chosen = data.column("trial_id")[rows]
+    opened = [joint_positions(HAND, s, np.zeros(3)) for s in trials["spread"][chosen]]
+    return {
+        "row": rows,
+        "X_FG": unpack_pose(trials["X_OG"][chosen]),
+        "q_grasp": trials["closed_q"][chosen],
+        "q_pregrasp": np.array([[q[name] for name in joint_order(HAND)] for q in opened]),
+    }
+
+
+def camera_poses(data: GraspDataset, rows: np.ndarray) -> np.ndarray:
+    """X_OC of the camera of some rows."""
+    X_TC = unpack_pose(data.column(f"object_props/frame_work2cam_{data.camera}")[rows])
+    X_TO = unpack_pose(Trials(data.path.parent)["X_TO"][data.column("trial_id")[rows]])
+    return np.asarray(invert_pose(X_TO) @ X_TC)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> GraspDataset:
+    folder = tmp_path_factory.mktemp("scored")
+    out = make_dataset(folder / "out", folder / "meshes", "split.by=class")
+    return GraspDataset(out / OTO, split="test")
+
+
+def test_postures_of_rows_are_ranked_and_bad_ones_keep_their_reason(
+    data: GraspDataset, tmp_path: Path
+) -> None:
+    given = own_postures(data, np.array([2, 0, 2, 1]))
+    given["q_grasp"][2, 0] = np.nan
+    names = data.column("object_props/object_name")[given["row"]]
+    np.savez(
+        tmp_path / "p.npz",
+        **given,
+        confidence=[0.2, 0.5, 0.9, 0.1],
+        object=[names[0], names[1], names[2], "cup"],
+    )
+    ranked = rank_postures(tmp_path / "p.npz", data)
+    assert ranked.rows.tolist() == [0, 1, 2, 2]
+    assert ranked.ranks.tolist() == [0, 0, 0, 1]
+    assert ranked.table is not None
+    assert ranked.table.row.tolist() == [1, 3, 2, 0]
+    assert ranked.table.invalid[0] == ranked.table.invalid[3] == ""
+    assert ranked.table.invalid[1] == f"object must be that of row 1, {names[3]}, got cup"
+    assert ranked.table.invalid[2] == "q_grasp must be finite numbers, got others"
+    few = ranked.of_rows([2])
+    assert few.table is not None
+    assert few.table.row.tolist() == [2, 0]
+
+
+def test_posture_in_the_frame_of_the_rows_camera_is_that_in_the_objects(
+    data: GraspDataset, tmp_path: Path
+) -> None:
+    rows = np.arange(len(data))
+    given = own_postures(data, rows)
+    X_CG = invert_pose(camera_poses(data, rows)) @ given["X_FG"]
+    np.savez(tmp_path / "p.npz", **(given | {"X_FG": X_CG}), frame="camera")
+    table = rank_postures(tmp_path / "p.npz", data).table
+    assert table is not None
+    placed = sorted(place_postures_on_rows(table, data, rows.tolist()), key=lambda g: g.index)
+    for grasp, X_OG, row in zip(placed, given["X_FG"], rows.tolist(), strict=True):
+        assert grasp.posture is not None
+        np.testing.assert_allclose(grasp.posture.X_OG, X_OG, atol=1e-5)
+        assert grasp.placed.model.name == data.value("object_props/object_name", row)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"row": np.array([0, 99])}, "rows must be 0 to .*, got 99"),
+        ({"row": np.array([0.5, 1.0])}, "rows must be whole numbers"),
+        ({"X_TC": np.tile(np.eye(4), (2, 1, 1))}, "X_TC must be left out: the camera is that of"),
+        ({"confidence": np.zeros(3)}, r"confidence must be \(2,\), one per grasp"),
+    ],
+)
+def test_what_belongs_to_no_row_is_refused(
+    data: GraspDataset, tmp_path: Path, changes: dict[str, Any], words: str
+) -> None:
+    np.savez(tmp_path / "p.npz", **(own_postures(data, np.array([0, 1])) | changes))
+    with pytest.raises(GraspError, match=words) as caught:
+        rank_postures(tmp_path / "p.npz", data)
+    assert str(caught.value).startswith(str(tmp_path / "p.npz"))
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_own_samples_given_back_as_postures_come_out_as_stored(
+    small_dataset: Path, tmp_path: Path
+) -> None:
+    data = GraspDataset(small_dataset / OTO, split="test")
+    rows = np.arange(min(len(data), 3))
+    assert len(rows) > 1
+    given = own_postures(data, rows)
+    # A better one by its confidence is no posture, and there is another for the first row.
+    bad = {name: np.concatenate([value, value[:1]]) for name, value in given.items()}
+    bad["X_FG"][-1, :3, 3] = 1e6
+    np.savez(tmp_path / "net.npz", **bad, confidence=[*np.zeros(len(rows)), 1.0])
+    made = score(tmp_path / "net.npz", data, references=["own"], out=tmp_path / "card", workers=1)
+    (judged, _) = made.sets
+    first, *others = (verdict for verdict in judged.verdicts[0])
+    assert first.outcome == "invalid"
+    assert first.reason == "the palm's pose must be within 1000 m, got 1e+06 m"
+    stored = Trials(small_dataset)
+    chosen = data.column("trial_id")[rows]
+    assert all(verdict.held and verdict.sample and verdict.success for verdict in others)
+    assert [verdict.stable for verdict in others] == stored["stable"][chosen].tolist()
+    reached = np.array([verdict.contacts for verdict in others]).reshape(len(rows), -1, 3)
+    np.testing.assert_allclose(reached, stored["closed_p_OQ"][chosen], atol=2e-4)
+
+    card = made.card["sets"]["net.npz"]
+    assert made.card["sets"]["own"]["what"].startswith("the rows' own")
+    assert card["what"] == "postures"
+    assert card["invalid"] == {first.reason: 1}
+    assert card["measures"]["success@2"]["value"] == 1.0
+    assert card["measures"]["headline"]["value"] < 1.0
+    assert f"1 no grasp: {first.reason}" in made.text
+    assert card["coverage"] == 1.0
+
+    # Verdicts that are there are not tried again.
+    lines = (tmp_path / "card" / VERDICTS).read_bytes()
+    again = score(tmp_path / "net.npz", data, references=["own"], out=tmp_path / "card")
+    assert again.card == made.card
+    assert (tmp_path / "card" / VERDICTS).read_bytes() == lines
