@@ -37,7 +37,6 @@ from torch.nn import functional
 import drakegrasp as dg
 from drakegrasp.errors import DataError, DrakegraspError
 
-
 #: Points of a cloud that the classifier sees: it looks at each cloud once for each grasp.
 SEEN = 256
 
