@@ -8,12 +8,12 @@ hand is not its mirror image.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader
+from torch.utils.data import ConcatDataset, DataLoader
 
 import drakegrasp as dg
 
@@ -35,12 +35,12 @@ def object_points(points: np.ndarray, on_object: np.ndarray, count: int = POINTS
 
 
 def cloud_batches(
-    data: dg.SceneDataset, size: int, epoch: int, *, augment: bool, seed: int
+    data: Sequence[dg.SceneDataset], size: int, epoch: int, *, augment: bool, seed: int
 ) -> Iterator[Batch]:
     """Yield batches of clouds with grasps, of one epoch; same arguments, same batches.
 
     Args:
-        data: Scenes, in the frame "table".
+        data: Scenes of one file or more, of the same hand, in the frame "table".
         size: Views of a batch.
         epoch: Number of the epoch.
         augment: Whether clouds are turned and shaken, and views come in random order.
@@ -50,11 +50,13 @@ def cloud_batches(
         `points` (b, n, 3) in {T}; `X_TG` (b, g, 4, 4), `q` (b, g, j), `q_open`, and `held`,
         `sample`, `tested` (b, g) of the grasps; `shift` (b, 3), what was taken from all points.
     """
-    data.epoch = epoch
+    for each in data:
+        each.epoch = epoch
+    views = ConcatDataset(data)
     draw = torch.Generator().manual_seed(1_000_003 * seed + epoch)
-    order = torch.randperm(len(data), generator=draw) if augment else torch.arange(len(data))
+    order = torch.randperm(len(views), generator=draw) if augment else torch.arange(len(views))
     for start in range(0, len(order), size):
-        items = [data[int(i)] for i in order[start : start + size]]
+        items = [views[int(i)] for i in order[start : start + size]]
         batch = {
             "points": _stack([object_points(i["points"], i["on_object"]) for i in items]),
             "X_TG": _stack([i["X_AG"] for i in items]),
@@ -85,16 +87,15 @@ def centred(batch: Batch) -> Batch:
 
 
 def image_batches(
-    data: dg.GraspDataset, size: int, epoch: int, *, augment: bool, seed: int
+    data: Sequence[dg.GraspDataset], size: int, epoch: int, *, augment: bool, seed: int
 ) -> Iterator[Batch]:
     """Yield batches of `images` (b, 4, S, S), in -1..1 but for noise, and their `grasps` (b, 6k).
 
     Images are not turned or mirrored: their camera stands behind the palm of their grasp.
     """
     draw = torch.Generator().manual_seed(1_000_003 * seed + epoch)
-    loader = DataLoader(
-        data.to_torch(["images", "grasps"]), batch_size=size, shuffle=augment, generator=draw
-    )
+    samples = ConcatDataset([each.to_torch(["images", "grasps"]) for each in data])
+    loader = DataLoader(samples, batch_size=size, shuffle=augment, generator=draw)
     for batch in loader:
         images = as_input(batch["images"])
         if augment:

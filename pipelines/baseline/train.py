@@ -4,13 +4,15 @@
   python pipelines/baseline/train.py classifier OUT/scenes.hdf5 classifier.pt
   python pipelines/baseline/train.py contacts OUT/grasping_oto.hdf5 contacts.pt --heads 5
 
-The checkpoint holds the weights that validated best, all settings, a hash of the dataset's samples
-and the versions. The same command gives the same weights on the same machine and versions.
+Several files of one hand train together. The checkpoint holds the weights that validated best, all
+settings, hashes of the files and the versions. The same command gives the same weights on the same
+machine and versions.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import hashlib
 import platform
 import sys
@@ -47,7 +49,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("task", choices=TASKS)
-    parser.add_argument("data", type=Path, help="scenes.hdf5, or a data file for contacts")
+    parser.add_argument(
+        "data", type=Path, nargs="+", help="files scenes.hdf5, or data files for contacts"
+    )
     parser.add_argument("checkpoint", type=Path, help="where to write")
     parser.add_argument("--epochs", type=int, default=60, help="at most  [default: 60]")
     parser.add_argument("--patience", type=int, default=10, help="[default: 10]")
@@ -73,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def train_postures(arguments: argparse.Namespace) -> dict[str, Any]:
     """Train the network that proposes postures, on samples."""
-    train, valid = _scenes(arguments, negatives="none")
+    train, valid = _scenes(arguments, "none")
     hand = hand_of(train)
     torch.manual_seed(arguments.seed)
     size = PostureSize(closing=len(hand.directions))
@@ -85,13 +89,13 @@ def train_postures(arguments: argparse.Namespace) -> dict[str, Any]:
         return network.loss(batch["points"], X_TG[:, :3, 3], X_TG[:, :3, :3], hand.coordinates(q))
 
     history = _fit(arguments, network, loss, train, valid, cloud_batches)
-    _save(arguments, network, history, train, size=asdict(size), hand=hand.as_dict())
+    _save(arguments, network, history, size=asdict(size), hand=hand.as_dict())
     return history
 
 
 def train_classifier(arguments: argparse.Namespace) -> dict[str, Any]:
     """Train the network that judges postures, on lifts to a verdict, and calibrate it."""
-    train, valid = _scenes(arguments, negatives="tested")
+    train, valid = _scenes(arguments, "tested")
     hand = hand_of(train)
     torch.manual_seed(arguments.seed)
     network = GraspClassifier(len(hand.directions))
@@ -106,26 +110,29 @@ def train_classifier(arguments: argparse.Namespace) -> dict[str, Any]:
         if pairs:
             logits, labels = (torch.cat(each) for each in zip(*pairs, strict=True))
             network.temperature.copy_(temperature(logits, labels))
-    _save(arguments, network, history, train, hand=hand.as_dict())
+    _save(arguments, network, history, hand=hand.as_dict())
     return history
 
 
 def train_contacts(arguments: argparse.Namespace) -> dict[str, Any]:
     """Train the network of the paper's task: contacts from one image."""
-    train, valid = (dg.GraspDataset(arguments.data, split=split) for split in ("train", "valid"))
-    grasps = torch.from_numpy(train.column("grasps"))
-    if not len(grasps):
-        raise DataError(f"{arguments.data}: train must have samples, got none")
+    train, valid = (
+        [data for path in arguments.data if len(data := dg.GraspDataset(path, split=split))]
+        for split in ("train", "valid")
+    )
+    if not train:
+        raise DataError(f"{arguments.data[0]}: train must have samples, got none")
+    grasps = torch.from_numpy(np.concatenate([data.column("grasps") for data in train]))
     torch.manual_seed(arguments.seed)
     scale = grasps.std(0, correction=0).clamp(min=1e-3)
     network = ContactNetwork(grasps.shape[1], arguments.heads, grasps.mean(0), scale)
-    network(torch.zeros(1, 4, train.image_size, train.image_size))  # the lazy layer's size
+    network(torch.zeros(1, 4, train[0].image_size, train[0].image_size))  # the lazy layer's size
 
     def loss(batch: Batch) -> Tensor:
         return network.loss(batch["images"], batch["grasps"])
 
     history = _fit(arguments, network, loss, train, valid, image_batches)
-    _save(arguments, network, history, train, heads=arguments.heads)
+    _save(arguments, network, history, heads=arguments.heads)
     return history
 
 
@@ -164,30 +171,31 @@ def temperature(logits: Tensor, labels: Tensor) -> Tensor:
     return tried[losses.argmin(0)]
 
 
-def hand_of(data: dg.SceneDataset) -> HandCoordinates:
+def hand_of(train: Sequence[dg.SceneDataset]) -> HandCoordinates:
     """Return the coordinates of the hand, from the samples of the training part."""
-    grasps = data.tables["grasps"]
-    rows = np.flatnonzero(grasps["sample"] & np.isin(grasps["scene"], scenes_of(data)))
-    if len(rows) < 2:
-        raise DataError(f"{data.path}: train must have two samples or more, got {len(rows)}")
-    return HandCoordinates.fit(*(torch.from_numpy(grasps[key][rows]) for key in ("q", "q_open")))
-
-
-def scenes_of(data: dg.SceneDataset) -> np.ndarray:
-    """Return the rows of /scenes that items of a dataset are of."""
-    return np.unique(data.tables["views"]["scene"][data.views])
+    found: dict[str, list[np.ndarray]] = {"q": [], "q_open": []}
+    for data in train:
+        grasps, scenes = data.tables["grasps"], data.tables["views"]["scene"][data.views]
+        for name, values in found.items():
+            values.append(grasps[name][grasps["sample"] & np.isin(grasps["scene"], scenes)])
+    closed, opened = (torch.from_numpy(np.concatenate(found[name])) for name in found)
+    if len(closed) < 2:
+        raise DataError(f"{train[0].path}: train must have two samples or more, got {len(closed)}")
+    return HandCoordinates.fit(closed, opened)
 
 
 def _scenes(
     arguments: argparse.Namespace, negatives: Any
-) -> tuple[dg.SceneDataset, dg.SceneDataset | None]:
+) -> tuple[list[dg.SceneDataset], list[dg.SceneDataset]]:
     """Return the parts that train and validate; a small dataset may have nothing that validates."""
     options = {"negatives": negatives, "seed": arguments.seed}
-    train = dg.SceneDataset(arguments.data, split="train", **options)
-    try:
-        valid = dg.SceneDataset(arguments.data, split="valid", balance="view", **options)
-    except DataError:
-        return train, None
+    train = [dg.SceneDataset(path, split="train", **options) for path in arguments.data]
+    if len({data.joints for data in train}) > 1:
+        raise DataError(f"{arguments.data[-1]}: must be of the same hand as the others")
+    valid = []
+    for path in arguments.data:
+        with contextlib.suppress(DataError):
+            valid.append(dg.SceneDataset(path, split="valid", balance="view", **options))
     return train, valid
 
 
@@ -202,14 +210,14 @@ def _fit(
     """Fit a network with the settings of the command line."""
     draw = partial(batches, train, arguments.batch, augment=True, seed=arguments.seed)
     still = partial(_valid_batches, arguments, valid, batches)
-    steps = -(-len(train) // arguments.batch)
+    steps = -(-sum(map(len, train)) // arguments.batch)
     return fit(network, loss, draw, still, steps, arguments)
 
 
 def _valid_batches(
     arguments: argparse.Namespace, valid: Any, batches: Any = cloud_batches
 ) -> Iterator[Batch]:
-    if valid is not None and len(valid):
+    if valid:
         yield from batches(valid, arguments.batch, 0, augment=False, seed=arguments.seed)
 
 
@@ -217,16 +225,15 @@ def _save(
     arguments: argparse.Namespace,
     network: nn.Module,
     history: dict[str, Any],
-    data: Any,
     **more: Any,
 ) -> None:
     """Write the checkpoint, whole or not at all."""
     content = {
         "task": arguments.task,
         "weights": network.state_dict(),
-        "settings": {k: v for k, v in vars(arguments).items() if not isinstance(v, Path)},
+        "settings": {k: v for k, v in vars(arguments).items() if k not in ("data", "checkpoint")},
         "history": history,
-        "data": hashlib.sha256(arguments.data.read_bytes()).hexdigest(),
+        "data": [hashlib.sha256(path.read_bytes()).hexdigest() for path in arguments.data],
         "versions": {"torch": str(torch.__version__), "python": platform.python_version()},
         **more,
     }
