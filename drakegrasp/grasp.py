@@ -49,6 +49,20 @@ def unused_fingers(bits: npt.ArrayLike, fingers: int) -> npt.NDArray[np.bool_]:
     return np.asarray(np.asarray(bits, dtype=np.int64)[..., None] >> place & 1, dtype=np.bool_)
 
 
+def for_all_fingers(values: Array, unused: int, fingers: int, fill: float = np.nan) -> Array:
+    """Return values (k, ...) of values (m, ...) of the fingers that a grasp does not leave out.
+
+    Args:
+        values: Of these fingers, in their order.
+        unused: The others, as bits: 1 for the first finger.
+        fingers: Number of fingers, k.
+        fill: What the others get.
+    """
+    spread = np.full((fingers, *values.shape[1:]), fill, dtype=values.dtype)
+    spread[~unused_fingers(unused, fingers)] = values
+    return spread
+
+
 def transform_grasp(X_AB: npt.ArrayLike, grasp_B: npt.ArrayLike) -> Array:
     """Return the grasp vector (6k,) in frame A of one in frame B, under X_AB (4, 4).
 

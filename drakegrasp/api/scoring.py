@@ -96,7 +96,7 @@ def score(
         raise ConfigError(f"scheduler must be None with protocol {stored}, got one")
     request = Request(
         data=dataset,
-        train=GraspDataset(dataset.path, split="train") if train is None else train,
+        train=type(dataset)(dataset.path, split="train") if train is None else train,
         predictions=ranked,
         name=name,
         references=tuple(references),

@@ -170,10 +170,8 @@ def verify_rows(
             "data must be a GraspDataset, which has a file and a split, "
             f"got a {type(data).__name__}"
         )
-    placed = place_on_rows(
-        predictions, data, rows, frame=frame, hand=hand, method=method, snap_points=snap_points,
-        config=config,
-    )  # fmt: skip
+    how: dict[str, Any] = {"frame": frame, "method": method, "snap_points": snap_points}
+    placed = place_on_rows(predictions, data, rows, hand=hand, config=config, **how)
 
     # The object of a verdict can verify more grasps.
     things = {id(grasp.placed): grasp.placed for grasp in placed}

@@ -103,6 +103,7 @@ def figures(
     objects        successes of each object
     distributions  slip, turn, forces
     approaches     from where successes came
+    views          views of scenes with a sample of each, if there are scenes
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.foreign_files import refuse_link
     from drakegrasp.runtime.progress import progress_bar

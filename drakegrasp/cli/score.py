@@ -26,7 +26,8 @@ DEFAULT_FOLDER = Path("score")
     type=PATH,
     required=True,
     metavar="FILE",
-    help="The data file OUT/grasping_oto.hdf5 or _otm, whose rows the predictions are for.",
+    help="The data file OUT/grasping_oto.hdf5 or _otm, or OUT/scenes.hdf5, whose rows or views the "
+    "predictions are for.",
 )
 @click.option(
     "--split",
@@ -98,7 +99,7 @@ def score(
     from drakegrasp.api.scoring import score as score_predictions
     from drakegrasp.cli.tables import make_console, score_table
     from drakegrasp.dataset.manifest import read_manifest
-    from drakegrasp.dataset.reader import GraspDataset
+    from drakegrasp.dataset.scenes.rows import open_rows
     from drakegrasp.errors import DataError, GraspError
     from drakegrasp.scoring.references import REFERENCES
 
@@ -107,8 +108,8 @@ def score(
     # A bad dataset is wrong usage, as for `verify`.
     try:
         read_manifest(dataset.parent)
-        data = GraspDataset(dataset, split=split)
-        trained = None if train is None else GraspDataset(train, split="train")
+        data = open_rows(dataset, split=split)
+        trained = None if train is None else open_rows(train, split="train")
     except DataError as error:
         raise GraspError(str(error)) from None
     again = _command(

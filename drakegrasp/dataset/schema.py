@@ -607,7 +607,7 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
     Field("tries", "", "uint16", "-", "-", "number of wrist poses that were tried",
           of="num_tries"),
     Field("closing_start", "k", "float64", "rad or m", "-",
-          "closing positions from which the simulated fingers close", of="pregrasp.closing"),
+          "closing positions from which the simulated fingers close", of="closing_start"),
     *_since(
         Stage.CLOSED,
         _TIME_CLOSE,

@@ -200,10 +200,10 @@ def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
         X_TC=None if "X_TC" not in arrays else _stacked(arrays["X_TC"], "X_TC"),
         numbers={n: arrays[n] for n in ("resting", "log_density", "scale") if n in arrays},
         said=texts.get("source"),
-        preshape=texts.get("preshape"),
         invalid=invalid,
         of_row=arrays.get("row"),
         confidence=arrays.get("confidence"),
+        preshape=texts.get("preshape"),
     )
 
 
@@ -328,10 +328,10 @@ def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str]) -> Rows:
         joints=joints,
         numbers=known,
         said=None if "source" not in columns else [str(text) for text in columns["source"]],
-        preshape=[str(name or "") for name in columns.get("preshape", ())] or None,
         of_row=said["row"].astype(np.int64) if whole else said.get("row"),
         confidence=said.get("confidence"),
         invalid=[one or other for one, other in zip(invalid, reasons, strict=True)],
+        preshape=[str(name or "") for name in columns.get("preshape", ())] or None,
     )
 
 

@@ -40,10 +40,10 @@ class Rows:
         X_TC: (n, 4, 4), for the frame "camera".
         numbers: `resting`, `log_density` and `scale`, (n,) each, as far as they are known.
         said: (n,), where each comes from.
-        preshape: (n,), name of the hand's preshape; empty or None: all fingers close.
         invalid: (n,), why a row is known to be none; None: no row is.
         of_row: (n,), of predictions: the row of a dataset's split that each is for.
         confidence: (n,), of predictions: greater is better.
+        preshape: (n,), name of the hand's preshape; empty or None: all fingers close.
     """
 
     objects: Sequence[str]
@@ -55,10 +55,10 @@ class Rows:
     X_TC: Array | None = None
     numbers: Mapping[str, Any] = field(default_factory=dict)
     said: Sequence[str] | None = None
-    preshape: Sequence[str | None] | None = None
     invalid: Sequence[str] | None = None
     of_row: Any = None
     confidence: Any = None
+    preshape: Sequence[str | None] | None = None
 
 
 def table_of(hand: Hand, rows: Rows) -> PostureTable:
@@ -79,8 +79,8 @@ def table_of(hand: Hand, rows: Rows) -> PostureTable:
             frame=rows.frame,
             X_TC=rows.X_TC,
             said=rows.said,
-            preshape=rows.preshape,
             invalid=rows.invalid,
+            preshape=rows.preshape,
             **rows.numbers,
         )
     except (TypeError, ValueError) as error:
@@ -116,9 +116,14 @@ def _in_order(hand: Hand, part: Rows) -> dict[str, Array]:
         for c in hand.followers(i)
     }
     count = len(part.objects)
-    # A row whose preshape the hand lacks is told with the other bad ones.
-    names = known_preshapes(part.preshape, count, hand, [""] * count)
-    kept = [hand.at(preshape_index(hand, name or None)).preshape for name in names]
+    bad = [""] * count
+    names = known_preshapes(part.preshape or [None] * count, count, hand, bad)
+    kept = [
+        dict.fromkeys(order, np.nan)
+        if none
+        else hand.at(preshape_index(hand, name or None)).preshape
+        for name, none in zip(names, bad, strict=True)
+    ]
     still = set(order).intersection(*kept)
     known = {*joints, *still, *followers}
     if missing := [name for name in order if name not in known]:

@@ -140,6 +140,20 @@ class Hand:
         return found
 
     @property
+    def own_motors(self) -> dict[str, int]:
+        """The joints that move where each has a motor of its own, and the finger of each.
+
+        They are those from the palm to a fingertip, but for the spread, and for one that slides
+        where its finger's closing joint turns, or turns where it slides.
+        """
+        found: dict[str, int] = {}
+        for i, (finger, chain) in enumerate(zip(self.fingers, self.chains, strict=True)):
+            for name, slides in zip(chain.joints, chain.slides.tolist(), strict=True):
+                if name not in self.spread.joints and slides == finger.slides:
+                    found.setdefault(name, i)
+        return found
+
+    @property
     def closing_unit(self) -> Array:
         """(k,), how far each closing joint moves for what counts as a radian [rad or m].
 

@@ -42,28 +42,53 @@ PAGE = 24
 
 
 @dataclass(frozen=True, kw_only=True)
-class Query:
-    """What is asked for; an empty text asks for anything.
+class GalleryQuery:
+    """What all galleries can be asked for; an empty text asks for anything.
 
     Attributes:
-        object_name, class_name, outcome, split, hold, removal, decision: The filters.
+        object_name, class_name, outcome: Filters.
         ranges: Least and largest value of quantities, in the units that are shown.
-        sort: One of SORTS.
+        sort: Name of an order.
         ascending: Whether the smallest come first.
         page: Number of the gallery's page, from 1.
     """
 
     object_name: str = ""
     class_name: str = ""
+    outcome: str = ""
+    ranges: Mapping[str, Limits] = field(default_factory=dict)
+    sort: str = ""
+    ascending: bool = False
+    page: int = 1
+
+    @property
+    def shared(self) -> dict[str, object]:
+        """The values by the names of their parameters, without ranges."""
+        return {
+            "object": self.object_name,
+            "class": self.class_name,
+            "outcome": self.outcome,
+            "sort": self.sort,
+            "order": "up" if self.ascending else "",
+            "page": self.page,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Query(GalleryQuery):
+    """What is asked for.
+
+    Attributes:
+        split, hold, removal, decision: More filters.
+        sort: One of SORTS.
+    """
+
     outcome: str = "success"
     split: str = ""
     hold: str = ""
     removal: str = ""
     decision: str = ""
-    ranges: Mapping[str, Limits] = field(default_factory=dict)
     sort: str = "suspicion"
-    ascending: bool = False
-    page: int = 1
 
     def params(self, **changes: object) -> str:
         """Return the query as part of an address, with some values changed; defaults are left out.
@@ -71,18 +96,9 @@ class Query:
         Args:
             changes: Values by the names of the parameters.
         """
-        values: dict[str, object] = {
-            "object": self.object_name,
-            "class": self.class_name,
-            "outcome": self.outcome or "any",
-            "split": self.split,
-            "hold": self.hold,
-            "removal": self.removal,
-            "decision": self.decision,
-            "sort": self.sort,
-            "order": "up" if self.ascending else "",
-            "page": self.page,
-        }
+        names = ("split", "hold", "removal", "decision")
+        own = {"outcome": self.outcome or "any", **{name: getattr(self, name) for name in names}}
+        values = self.shared | own
         default = {"outcome": "success", "sort": "suspicion", "page": 1}
         return address_of(values, self.ranges, changes, default)
 
@@ -106,24 +122,15 @@ def parse_query(params: Mapping[str, str]) -> Query:
         "removal": tuple(r.label for r in Removal),
         "decision": DECISIONS,
         "sort": SORTS,
-        "order": ("up", "down"),
     }
-    refuse_other_choices(params, choices)
-
-    outcome = params.get("outcome", "") or "success"
-    return Query(
-        object_name=params.get("object", ""),
-        class_name=params.get("class", ""),
-        outcome="" if outcome == "any" else outcome,
-        split=params.get("split", ""),
-        hold=params.get("hold", ""),
-        removal=params.get("removal", ""),
-        decision=params.get("decision", ""),
-        ranges=read_ranges(params, RANGES),
-        sort=params.get("sort", "") or "suspicion",
-        ascending=params.get("order", "") == "up",
-        page=read_page(params),
-    )
+    shared = read_shared(params, choices, RANGES)
+    outcome = shared["outcome"] or "success"
+    own = {name: params.get(name, "") for name in ("split", "hold", "removal", "decision")}
+    changed = {
+        "outcome": "" if outcome == "any" else outcome,
+        "sort": shared["sort"] or "suspicion",
+    }
+    return Query(**(shared | own | changed))
 
 
 # What the queries of all galleries share.
@@ -149,6 +156,31 @@ def address_of(
             all_values[f"{bound}_{name}"] = "" if value is None else f"{value:g}"
     all_values |= changes
     return urlencode({k: v for k, v in all_values.items() if v != "" and v != default.get(k)})
+
+
+def read_shared(
+    params: Mapping[str, str], choices: Mapping[str, Sequence[str]], ranges: Sequence[str]
+) -> dict[str, Any]:
+    """Return what every gallery can be asked for, by the names of `GalleryQuery`.
+
+    Args:
+        params: Of the address.
+        choices: By the names of parameters what they can be.
+        ranges: Quantities that have a range.
+
+    Raises:
+        DataError: If a value is none that can be asked for.
+    """
+    refuse_other_choices(params, {**choices, "order": ("up", "down")})
+    return {
+        "object_name": params.get("object", ""),
+        "class_name": params.get("class", ""),
+        "outcome": params.get("outcome", ""),
+        "ranges": read_ranges(params, ranges),
+        "sort": params.get("sort", ""),
+        "ascending": params.get("order", "") == "up",
+        "page": read_page(params),
+    }
 
 
 def refuse_other_choices(params: Mapping[str, str], choices: Mapping[str, Sequence[str]]) -> None:

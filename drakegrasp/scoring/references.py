@@ -137,12 +137,16 @@ def _descriptor(data: GraspDataset, row: int) -> Array:
     """Return the descriptor (2 * CELLS^2,) of a row's image."""
     depth = np.asarray(data.value("images", row)[3], dtype=float)
     mask = np.asarray(data.value("masks", row), dtype=float)
-    edges = np.linspace(0, len(depth), min(CELLS, len(depth)) + 1).astype(int)[:-1]
-    area = np.diff([*edges, len(depth)])
+    down, across = (
+        np.linspace(0, size, min(CELLS, size) + 1).astype(int)[:-1] for size in depth.shape
+    )
+    high, wide = (
+        np.diff([*edges, size]) for edges, size in zip((down, across), depth.shape, strict=True)
+    )
     cells = []
     for image in (depth, MASK_DEPTH * mask):
-        sums = np.add.reduceat(np.add.reduceat(image, edges, axis=0), edges, axis=1)
-        cells.append((sums / np.outer(area, area)).ravel())
+        sums = np.add.reduceat(np.add.reduceat(image, down, axis=0), across, axis=1)
+        cells.append((sums / np.outer(high, wide)).ravel())
     return np.concatenate(cells)
 
 

@@ -504,7 +504,7 @@ def _add_actuation(
 def _add_own_motors(
     plant: MultibodyPlant, hand: Hand, instance: ModelInstanceIndex
 ) -> dict[str, Any]:
-    """Add a motor for every joint from the palm to a fingertip but those of the spread.
+    """Add a motor for every joint from the palm to a fingertip that can have one.
 
     With the position q of the joint and the position q_d and speed of its path, a motor gives
 
@@ -512,31 +512,23 @@ def _add_own_motors(
         K = τ_max / (`SOFT` u), D = K `LAG`,
 
     with effort limit, holding effort, rotor and gear of the finger's closing joint; fingers of one
-    motor have equal shares of its efforts. A joint that slides where this one turns, or turns where
-    it slides, has no motor.
+    motor have equal shares of its efforts. `Hand.own_motors` says which joints have one.
 
     Returns:
         The attributes of `Scene` that say of the motors.
     """
     motors: list[Motor] = []
-    fingers, units = list[Finger](), list[float]()
-    for i, chain in enumerate(hand.chains):
+    fingers, own = list[Finger](), hand.own_motors
+    for name, i in own.items():
         finger = _with_share(hand, i)
-        for name, slides in zip(chain.joints, chain.slides.tolist(), strict=True):
-            joint = plant.GetJointByName(name, instance)
-            taken = any(motor.actuators[0].joint() is joint for motor in motors)
-            if taken or name in hand.spread.joints or slides != finger.slides:
-                continue
-            p = finger.effort_limit / (SOFT * hand.closing_unit[i])
-            gains = PdControllerGains(p=p, d=LAG * p)
-            actuator = _add_motor(plant, f"{finger.name}/{name}", joint, finger, gains)
-            motors.append(Motor(actuators=(actuator,)))
-            fingers.append(finger)
-            units.append(hand.closing_unit[i])
-    moved = {motor.actuators[0].joint().name() for motor in motors}
-    still = tuple(name for name in hand.joint_names if name not in moved)
+        p = finger.effort_limit / (SOFT * hand.closing_unit[i])
+        gains, joint = PdControllerGains(p=p, d=LAG * p), plant.GetJointByName(name, instance)
+        actuator = _add_motor(plant, f"{finger.name}/{name}", joint, finger, gains)
+        motors.append(Motor(actuators=(actuator,)))
+        fingers.append(finger)
+    still = tuple(name for name in hand.joint_names if name not in own)
     driven = [{motor.actuators[0].joint(): 1.0} for motor in motors]
-    return _of_motors(motors, driven, fingers, np.array(units), still)
+    return _of_motors(motors, driven, fingers, hand.closing_unit[list(own.values())], still)
 
 
 def _with_share(hand: Hand, i: int) -> Finger:

@@ -88,9 +88,10 @@ def place_on_rows(
     # The cameras of each row.
     X_TC = {
         camera: unpack_pose(dataset.column(f"object_props/frame_work2cam_{camera}")[chosen])
-        for camera in CAMERAS
+        for camera in {dataset.camera, *(CAMERAS if dataset.camera in CAMERAS else ())}
     }
-    (other,) = set(CAMERAS) - {dataset.camera}
+    # The cameras of scenes stand alone.
+    other = next(iter(X_TC.keys() - {dataset.camera}), None)
 
     # Each object in each resting pose once, with its grasps.
     placed_grasps, in_camera = list[PlacedGrasp](), frame == "camera"
@@ -101,7 +102,7 @@ def place_on_rows(
             read,
             frame=frame,
             X_TC=_camera_poses(X_TC[dataset.camera][indices]) if in_camera else None,
-            X_TC_other=_camera_poses(X_TC[other][indices]) if in_camera else None,
+            X_TC_other=_camera_poses(X_TC[other][indices]) if in_camera and other else None,
             method=method,
             snap_points=snap_points,
             config=used,

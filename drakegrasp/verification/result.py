@@ -10,6 +10,7 @@ import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.frames import Array
+from drakegrasp.grasp import for_all_fingers
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
@@ -180,6 +181,14 @@ class Verification:
     def pregrasp(self) -> Pregrasp | None:
         """Palm and opened fingers that the first trial started from."""
         return self.first.pregrasp if self.first else None
+
+    @property
+    def closing_start(self) -> Array | None:
+        """(k,), where the closing joints began; NaN for fingers that a preshape leaves out."""
+        start = self.pregrasp
+        if start is None or start.closing is None:
+            return None
+        return for_all_fingers(start.closing, start.unused, len(self.p_OQ))
 
     @property
     def trial(self) -> TrialRecord | None:

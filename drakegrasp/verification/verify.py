@@ -12,17 +12,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.frames import Array
+from drakegrasp.grasp import for_all_fingers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.timing import timed
 from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.postures.posture import Posture, start_of
 from drakegrasp.simulation.postures.trial import run_trial
@@ -188,16 +191,37 @@ def _try_posture(base: Verification, posture: Posture) -> Verification:
     """Try a posture, which says wrist and joints itself."""
     with timed(base.seconds, "simulate"):
         trial = run_trial(base.placed, posture, base.config)
+    start = start_of(posture, load_hand(base.config.hand_source))
     nothing = np.full(len(base.p_OQ), np.nan)
     tried = PoseTrial(
         fit=None,
-        pregrasp=start_of(posture, load_hand(base.config.hand_source)),
-        trial=trial,
+        pregrasp=start,
+        trial=_of_all_fingers(trial, start.unused, len(base.p_OQ)),
         contact_error=nothing,
         normal_error=nothing,
         removal=judge_sample(base.placed.model, trial, base.config),
     )
     return _judged(base, (tried,))
+
+
+def _of_all_fingers(trial: TrialRecord, unused: int, fingers: int) -> TrialRecord:
+    """Return a trial with contacts of all fingers; those that a preshape leaves out have none."""
+    fills = {**dict.fromkeys(("p_OQ", "nhat_Q_O"), np.nan), "touching": False}
+    fills |= dict.fromkeys(("f_Q_O", "area", "penetration"), 0.0)
+
+    def filled(contacts: Contacts) -> Contacts:
+        values: dict[str, Any] = {
+            name: for_all_fingers(getattr(contacts, name), unused, fingers, fill)
+            for name, fill in fills.items()
+        }
+        return replace(contacts, **values)
+
+    closed, lifted = trial.closed, trial.lift
+    return replace(
+        trial,
+        closed=closed and replace(closed, contacts=filled(closed.contacts)),
+        lift=lifted and replace(lifted, contacts=filled(lifted.contacts)),
+    )
 
 
 def _judged(base: Verification, tries: tuple[PoseTrial, ...]) -> Verification:

@@ -80,28 +80,43 @@ def draw_contacts(axes: Axes, sample: Sample, K: Array, *, scale: float = 1.0) -
         # A finger that the grasp leaves out has no contact.
         if not sample.fingers[i]:
             continue
-        colour = FINGER_COLOURS[i % len(FINGER_COLOURS)]
         # Something nearer than the contact, at its pixel, hides it.
         column, row = np.clip(np.rint(dot), 0, size - 1).astype(int)
         hidden = p_CQ[i, 2] > sample.image[3, row, column] + HIDDEN
-
-        # The arrow along the normal, then the dot over its tail.
-        white = [withStroke(linewidth=3.0 * scale, foreground="white")]
-        axes.plot(
-            *np.column_stack([dot, end]), color=colour, linewidth=1.6 * scale,
-            solid_capstyle="round", path_effects=white, zorder=3,
-        )  # fmt: skip
-        axes.plot(
-            *dot, marker="o", markersize=5.2 * scale, markeredgewidth=1.0 * scale,
-            markerfacecolor="white" if hidden else colour,
-            markeredgecolor=colour if hidden else "white",
-            linestyle="none", zorder=4, gid=f"contact {i}",
-            path_effects=[withStroke(linewidth=1.6 * scale, foreground="white")] if hidden else [],
-        )  # fmt: skip
+        mark_contact(axes, i, dot, end, hidden=bool(hidden), scale=scale)
 
     # Contacts outside the image must not change what the axes show.
     axes.set_xlim(-0.5, size[0] - 0.5)
     axes.set_ylim(size[1] - 0.5, -0.5)
+
+
+def mark_contact(
+    axes: Axes, finger: int, dot: Array, end: Array, *, hidden: bool, scale: float = 1.0
+) -> None:
+    """Draw a contact at a pixel (2,), with an arrow along its normal to another.
+
+    Args:
+        axes: That show the image.
+        finger: Index of the finger.
+        dot: Where the arrow begins (2,) [px].
+        end: Where it ends (2,) [px].
+        hidden: Whether the camera does not see the contact: the dot is hollow.
+        scale: Size of dot and line.
+    """
+    # The arrow, then the dot over its tail.
+    colour = FINGER_COLOURS[finger % len(FINGER_COLOURS)]
+    white = [withStroke(linewidth=3.0 * scale, foreground="white")]
+    axes.plot(
+        *np.column_stack([dot, end]), color=colour, linewidth=1.6 * scale,
+        solid_capstyle="round", path_effects=white, zorder=3,
+    )  # fmt: skip
+    axes.plot(
+        *dot, marker="o", markersize=5.2 * scale, markeredgewidth=1.0 * scale,
+        markerfacecolor="white" if hidden else colour,
+        markeredgecolor=colour if hidden else "white",
+        linestyle="none", zorder=4, gid=f"contact {finger}",
+        path_effects=[withStroke(linewidth=1.6 * scale, foreground="white")] if hidden else [],
+    )  # fmt: skip
 
 
 def read_far(path: Path) -> float:

@@ -20,12 +20,13 @@ from drakegrasp.build.prepare import prepare
 from drakegrasp.build.replay import replay_trial
 from drakegrasp.config import Config
 from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.schema import NO_PRESHAPE
 from drakegrasp.dataset.statistics import NO_NAME, counts_as_dict
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError, GraspError
-from drakegrasp.frames import make_pose
+from drakegrasp.frames import make_pose, unpack_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config
@@ -33,6 +34,7 @@ from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
+from drakegrasp.scoring.verdict import verdict_of
 from drakegrasp.simulation.candidates import Source
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.postures.posture import joint_order
@@ -42,6 +44,9 @@ from drakegrasp.simulation.postures.table import (
     unknown_objects,
 )
 from drakegrasp.simulation.trial import run_attempt
+from drakegrasp.verification.placed_postures import place_postures_on_dataset
+from drakegrasp.verification.result_files import write_results
+from drakegrasp.verification.verify import verify_placed
 
 pytestmark = pytest.mark.sim
 
@@ -232,6 +237,27 @@ def test_a_posture_of_a_preshape_is_the_attempt_that_it_was(of_preshapes):
     assert trials["closed_touching"].tolist() == [[True, False, True], [True] * 3]
     np.testing.assert_allclose(trials["closed_q"][0], q, atol=1e-9)
     assert not trials["own_motors"][0]
+
+
+def test_verdict_on_a_posture_of_a_preshape_has_a_place_for_every_finger(of_preshapes, tmp_path):
+    out, q = of_preshapes
+    config = read_manifest(out).config
+    hand = load_hand(config.hand_source)
+    row = Trials(out)[[0]]
+    table = make_table(
+        *(hand, [NAME] * 2, [unpack_pose(row["X_OG"][0])] * 2, [q] * 2),
+        preshape=["pair", "fist"],
+    )
+    held, none = map(verify_placed, place_postures_on_dataset(table, out))
+    assert held.held
+    assert none.outcome is Outcome.INVALID
+    assert none.reason.startswith("preshape must be one of all, pair for the hand")
+    assert held.closed.touching.tolist() == [True, False, True]
+    assert (held.closed.f_Q_O[1] == 0.0).all()
+    np.testing.assert_allclose(held.closed.p_OQ, row["closed_p_OQ"][0], atol=1e-3)
+    assert np.isnan(held.closing_start).tolist() == [False, True, False]
+    write_results([held, none], tmp_path / "v.h5", config)
+    assert not verdict_of(held).contacts
 
 
 def test_a_dataset_of_postures_of_preshapes_is_sound_and_replayed(of_preshapes):

@@ -110,7 +110,7 @@ def test_a_row_of_a_preshape_that_the_hand_lacks_spoils_no_other(tmp_path):
     names = ["mug"] * 3
     np.savez(path, object=names, X_FG=[np.eye(4)] * 3, q_grasp=q, preshape=[known, "fist", ""])
     table = read_postures(path, hand)
-    assert table.preshape == (known, "", "")
+    assert table.preshape == (known, "fist", "")
     assert [bool(reason) for reason in table.invalid] == [False, True, False]
     assert f"preshape must be one of {known}" in table.invalid[1] and "'fist'" in table.invalid[1]
 

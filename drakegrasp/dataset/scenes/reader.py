@@ -117,6 +117,9 @@ class SceneDataset:
             unknown, or the split has no grasp to draw.
     """
 
+    #: Whether a split may have no grasp to draw.
+    may_be_empty = False
+
     def __init__(
         self,
         path: str | Path,
@@ -168,7 +171,7 @@ class SceneDataset:
         self._number()
         self._choose(negatives, positives)
         self.views, self._order = self._order_of(balance)
-        if not len(self.views):
+        if not len(self.views) and not self.may_be_empty:
             raise DataError(f"{self.path}: {split} must have grasps to draw, got none")
 
     def __len__(self) -> int:
@@ -231,6 +234,16 @@ class SceneDataset:
         first, last = self._bounds[self._scene_of[view] : self._scene_of[view] + 2]
         X_AT = invert_pose(self._X_TC[view]) if frame == "camera" else np.eye(4)
         return self._grasps_of(view, np.arange(first, last), X_AT)
+
+    def grasp_of(self, view: int, stream: Stream) -> dict[str, AnyArray]:
+        """Return grasps of a view that a stream draws, in {C}, as those of an item."""
+        rows = self._drawn(int(self._scene_of[view]), stream)
+        return self._grasps_of(view, rows, invert_pose(self._X_TC[view]))
+
+    @property
+    def far(self) -> float:
+        """Far plane of the cameras [m]."""
+        return self._lens.far
 
     def surface(self, object: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
         """Return points p_OS (4096, 3) [m] on an object, by its row, and their unit normals."""
@@ -352,7 +365,7 @@ class SceneDataset:
         """
         if view in self._pools:
             return self._pools[view]
-        kept = self._images(view)
+        kept = self.images(view)
         if self._points is not None:
             pixels = self._pixels(kept["depth"], kept["mask"], POOL * self._points, view)
             v, u = np.divmod(pixels, kept["depth"].shape[1])
@@ -386,8 +399,8 @@ class SceneDataset:
         ]
         return np.concatenate(chosen)[stream.permutation(count)]
 
-    def _images(self, view: int) -> dict[str, AnyArray]:
-        """Return the images of a view and its camera matrix."""
+    def images(self, view: int) -> dict[str, AnyArray]:
+        """Return the images of a view and its camera matrix, by the keys of an item."""
         views = self._tables["views"]
         with self._opened() as file:
             rgb, stored, mask = (file["views"][name][view] for name in ("rgb", "depth", "mask"))

@@ -7,20 +7,18 @@ it selects.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.inspection.predictions.results import QUANTITIES, VERDICTS, Predictions
 from drakegrasp.inspection.query import (
-    Limits,
+    GalleryQuery,
     address_of,
     in_ranges,
     of_objects,
-    read_page,
-    read_ranges,
-    refuse_other_choices,
+    read_shared,
 )
 from drakegrasp.outcomes import Outcome
 
@@ -31,37 +29,20 @@ SORTS = ("worst", *QUANTITIES, "row")
 
 
 @dataclass(frozen=True, kw_only=True)
-class PredictionQuery:
-    """What is asked for; an empty text asks for anything.
+class PredictionQuery(GalleryQuery):
+    """What is asked for.
 
     Attributes:
-        object_name, class_name, verdict, outcome: The filters.
-        ranges: Least and largest value of quantities, in the units that are shown.
+        verdict: Another filter.
         sort: One of SORTS.
-        ascending: Whether the smallest come first.
-        page: Number of the gallery's page, from 1.
     """
 
-    object_name: str = ""
-    class_name: str = ""
     verdict: str = ""
-    outcome: str = ""
-    ranges: Mapping[str, Limits] = field(default_factory=dict)
     sort: str = "worst"
-    ascending: bool = False
-    page: int = 1
 
     def params(self, **changes: object) -> str:
         """Return the query as part of an address, with some values changed; see `address_of`."""
-        values: dict[str, object] = {
-            "object": self.object_name,
-            "class": self.class_name,
-            "verdict": self.verdict,
-            "outcome": self.outcome,
-            "sort": self.sort,
-            "order": "up" if self.ascending else "",
-            "page": self.page,
-        }
+        values = {**self.shared, "verdict": self.verdict}
         return address_of(values, self.ranges, changes, {"sort": "worst", "page": 1})
 
 
@@ -71,23 +52,11 @@ def parse_prediction_query(params: Mapping[str, str]) -> PredictionQuery:
     Raises:
         DataError: If a value is none that can be asked for.
     """
-    choices = {
-        "verdict": VERDICTS,
-        "outcome": tuple(o.label for o in Outcome),
-        "sort": SORTS,
-        "order": ("up", "down"),
-    }
-    refuse_other_choices(params, choices)
-    return PredictionQuery(
-        object_name=params.get("object", ""),
-        class_name=params.get("class", ""),
-        verdict=params.get("verdict", ""),
-        outcome=params.get("outcome", ""),
-        ranges=read_ranges(params, RANGES),
-        sort=params.get("sort", "") or "worst",
-        ascending=params.get("order", "") == "up",
-        page=read_page(params),
-    )
+    outcomes = tuple(outcome.label for outcome in Outcome)
+    choices = {"verdict": VERDICTS, "outcome": outcomes, "sort": SORTS}
+    shared = read_shared(params, choices, RANGES)
+    shared["sort"] = shared["sort"] or "worst"
+    return PredictionQuery(verdict=params.get("verdict", ""), **shared)
 
 
 def select_predictions(predictions: Predictions, query: PredictionQuery) -> npt.NDArray[np.int32]:

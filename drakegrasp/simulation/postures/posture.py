@@ -216,7 +216,9 @@ def _start_of(posture: Posture, hand: Hand) -> Pregrasp:
 
     # Joints that no motor moves are locked where the grasp has them.
     start = start.copy()
-    for name in _without_motor(hand) if own_motors else hand.locked_joints:
+    moved = hand.own_motors
+    idle = tuple(name for name in hand.joint_names if name not in moved)
+    for name in idle if own_motors else hand.locked_joints:
         start[index[name]] = posture.q_grasp[index[name]]
     # No hand is beyond its limits.
     limits = dict(zip(hand.joint_names, hand.joint_limits, strict=True))
@@ -230,17 +232,6 @@ def _start_of(posture: Posture, hand: Hand) -> Pregrasp:
         closing=closing,
         path=JointPath(start=start, grasp=grasp, squeeze=squeeze, own_motors=own_motors),
     )
-
-
-def _without_motor(hand: Hand) -> list[str]:
-    """Return the joints that stay where they are when each has a motor of its own, as the scene."""
-    moved = {
-        name
-        for finger, chain in zip(hand.fingers, hand.chains, strict=True)
-        for name, slides in zip(chain.joints, chain.slides.tolist(), strict=True)
-        if slides == finger.slides and name not in hand.spread.joints
-    }
-    return [name for name in hand.joint_names if name not in moved]
 
 
 def follows_couplings(q: Array, hand: Hand) -> bool:

@@ -108,7 +108,7 @@ class PostureTable:
         """
         X_OG = multiply(self._frame_in_object(i, X_TO, X_OM), self.X_FG[i])
         before, after = _given(self.q_pregrasp[i]), _given(self.q_squeeze[i])
-        return Posture(X_OG, self.q_grasp[i], before, after)
+        return Posture(X_OG, self.q_grasp[i], before, after, self.preshape[i] or None)
 
     def _frame_in_object(self, i: int, X_TO: Array, X_OM: Array | None) -> Array:
         """Return the pose (4, 4) of the frame of a row in {O}."""
@@ -153,9 +153,9 @@ class PostureTable:
         """Return a hash (16 hex digits) of all that the table says."""
         digest = hashlib.sha256()
         for f in fields(self):
+            # Why a row is none follows from the others, and from the meshes; a table without
+            # preshapes is as before there were any.
             value = getattr(self, f.name)
-            # Why a row is none follows from the others, and from the meshes. A table without
-            # preshapes has the hash that it had before there were any.
             if f.name == "invalid" or (f.name == "preshape" and not any(value)):
                 continue
             is_array = isinstance(value, np.ndarray)
@@ -177,8 +177,8 @@ def make_table(
     scale: npt.ArrayLike | None = None,
     log_density: npt.ArrayLike | None = None,
     said: Sequence[str] | None = None,
-    preshape: Sequence[str | None] | None = None,
     invalid: Sequence[str] | None = None,
+    preshape: Sequence[str | None] | None = None,
 ) -> PostureTable:
     """Return a table of postures, after checking every row by itself.
 
@@ -195,8 +195,8 @@ def make_table(
         scale: (n,), metres per unit of length of the mesh file.
         log_density: (n,), of the draws.
         said: (n,), where each comes from.
-        preshape: (n,), names of the hand's preshapes; empty: all fingers close.
         invalid: (n,), why a row is known to be no posture; empty where it may be one.
+        preshape: (n,), names of the hand's preshapes; empty: all fingers close.
 
     Raises:
         GraspError: If there is no row, or the arrays differ in length.
@@ -229,7 +229,7 @@ def make_table(
         scale=_numbers(scale, (count,), "scale", bad, some=True),
         log_density=_numbers(log_density, (count,), "log_density", bad, some=True),
         said=("",) * count if said is None else tuple(said),
-        preshape=known_preshapes(preshape, count, hand, bad),
+        preshape=("",) * count if preshape is None else known_preshapes(preshape, count, hand, bad),
         row=np.arange(count, dtype=np.int64),
         resting=np.where([not reason for reason in bad], where, 0).astype(np.int64),
         invalid=tuple(bad),
@@ -252,7 +252,7 @@ def join_tables(parts: Sequence[PostureTable | str]) -> PostureTable:
         raise GraspError(f"files must be in one frame, got {', '.join(sorted(frames))}")
 
     # Whatever the numbers of a row are that is none: nobody reads them.
-    nothing = replace(tables[0].at([0]), objects=("",), said=("",), preshape=("",))
+    nothing = replace(tables[0].at([0]), objects=("",), said=("",))
     whole = [p if isinstance(p, PostureTable) else replace(nothing, invalid=(p,)) for p in parts]
     joined: dict[str, Any] = {}
     for f in fields(PostureTable):
@@ -265,9 +265,13 @@ def join_tables(parts: Sequence[PostureTable | str]) -> PostureTable:
 
 
 def _numbers(
-    value: npt.ArrayLike | None, shape: tuple[int, ...], name: str, bad: list[str], *,
+    value: npt.ArrayLike | None,
+    shape: tuple[int, ...],
+    name: str,
+    bad: list[str],
+    *,
     some: bool = False,
-) -> Array:  # fmt: skip
+) -> Array:
     """Return an array of a shape; `bad` gets the reason for each row of it that is not finite.
 
     Where `some` are enough, a row may be all NaN.
@@ -287,30 +291,23 @@ def _numbers(
 
 
 def known_preshapes(
-    names: Sequence[str | None] | None, count: int, hand: Hand, bad: list[str]
+    names: Sequence[str | None], count: int, hand: Hand, bad: list[str]
 ) -> tuple[str, ...]:
-    """Return the names of the preshapes of some rows, empty where there is none.
+    """Return the names of the preshapes of rows, empty where there is none.
 
-    Args:
-        names: (n,), names as they are given; None: no row has one.
-        count: Number of rows.
-        hand: The hand.
-        bad: (n,), gets the reason for each row whose preshape the hand lacks.
+    `bad` gets the reason for each row whose preshape the hand lacks.
 
     Raises:
         GraspError: If they are of another number of rows.
     """
-    if names is None:
-        return ("",) * count
     if len(names) != count:
         raise GraspError(f"preshape must be of {count} rows, got {len(names)}")
-    found = [name or "" for name in names]
-    for i, name in enumerate(found):
+    for i, name in enumerate(names):
         try:
             preshape_index(hand, name or None)
         except GraspError as error:
-            bad[i], found[i] = bad[i] or str(error), ""
-    return tuple(found)
+            bad[i] = bad[i] or str(error)
+    return tuple(name or "" for name in names)
 
 
 def _poses(value: npt.ArrayLike, count: int, name: str, bad: list[str]) -> Array:
@@ -422,9 +419,8 @@ def posture_attempts(
 
     for i in indices:
         before, after = _given(given.q_pregrasp[i]), _given(given.q_squeeze[i])
-        posture = Posture(
-            candidates.X_OG[i], given.q_grasp[i], before, after, given.preshape[i] or None
-        )
+        shape = given.preshape[i] or None
+        posture = Posture(candidates.X_OG[i], given.q_grasp[i], before, after, shape)
         start = start_of(posture, hand)
         yield Attempt(
             candidate=i,

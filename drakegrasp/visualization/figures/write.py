@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from drakegrasp.dataset.manifest import Manifest, read_manifest
-from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.statistics import Funnel, count_funnel
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.outcomes import Outcome, Removal
@@ -41,6 +41,7 @@ from drakegrasp.visualization.figures.held_grasps import HeldGrasps, read_approa
 from drakegrasp.visualization.figures.palm_poses import caption, palm_poses_figure
 from drakegrasp.visualization.figures.phases import phases_figure
 from drakegrasp.visualization.figures.samplers import METHODS, compare_samplers, palm_rays
+from drakegrasp.visualization.figures.scene_views import scene_views
 
 #: Resolution of the pictures [pixels per inch].
 DPI = 150
@@ -116,7 +117,11 @@ def write_figures(
         "objects": lambda: _objects(data),
         "distributions": lambda: _distributions(data),
         "approaches": lambda: _approaches(data),
+        "views": lambda: _views(data),
     }
+    known = {*drawings}
+    if not (out / SCENES_FILE).exists():
+        del drawings["views"]  # most datasets have no scenes
 
     # What was asked for by an option must be drawn; all else as far as there is something.
     asked = {"palm_poses": compare is not None, "phases": trial_id is not None}
@@ -135,7 +140,7 @@ def write_figures(
         progress(i + 1, len(drawings))
 
     # Delete figures of an earlier run that this run did not draw; a sheet of classes has pages.
-    names = {*drawings, *(path.stem for path in folder.glob("classes_[0-9]*.*"))}
+    names = {*known, *(path.stem for path in folder.glob("classes_[0-9]*.*"))}
     for name in names.difference(written.names):
         for suffix in (".png", ".svg"):
             (folder / f"{name}{suffix}").unlink(missing_ok=True)
@@ -196,6 +201,11 @@ def _phases(data: _Dataset, trial_id: int | None) -> _Drawn:
 def _classes(data: _Dataset) -> _Drawn:
     pages, trials = class_sheets(data.out / DATA_FILES["oto"])
     return {f"classes_{i + 1}": page for i, page in enumerate(pages)}, {"trial_ids": trials}
+
+
+def _views(data: _Dataset) -> _Drawn:
+    figure, drawn = scene_views(data.out / SCENES_FILE)
+    return {"views": figure}, drawn
 
 
 def _outcomes(data: _Dataset) -> _Drawn:

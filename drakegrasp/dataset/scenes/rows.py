@@ -1,0 +1,162 @@
+"""Views of scenes as rows of a data file, so that predictions for them are verified and scored.
+
+In: scenes.hdf5, in the directory of its dataset. Out: a `GraspDataset` whose rows are the views of
+scenes that have a sample. Imports h5py and NumPy only.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.dataset.layout.opening import opened
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.scenes.reader import SceneDataset
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import DataError
+from drakegrasp.frames import X_WT, invert_pose, pack_pose, unpack_pose
+from drakegrasp.grasp import pack_grasp
+from drakegrasp.seeding import Stream
+
+#: The camera of such rows.
+CAMERA = "view"
+#: First number of the place of the streams that choose own grasps.
+_OWN = 4
+
+
+def open_rows(path: Path, *, split: str) -> GraspDataset:
+    """Return a split of a data file, or of scenes.hdf5, by what the file holds.
+
+    Raises:
+        DataError: See `GraspDataset` and `SceneDataset`.
+    """
+    with opened(path, "a data file or scenes of drakegrasp") as file:
+        of_scenes = "scenes" in file
+    return SceneRows(path, split=split) if of_scenes else GraspDataset(path, split=split)
+
+
+class _Views(SceneDataset):
+    may_be_empty = True
+
+
+class SceneRows(GraspDataset):
+    """The views of a split as rows; what scoring and verification ask of `GraspDataset` is there.
+
+    A row is a view of a scene that has a sample, in the order of `SceneDataset.views` with
+    `negatives="none"`. Its own grasp is one of these samples, drawn by their weights. All is in the
+    view's camera frame. Verdicts are of the object where it rested in its trials, so the camera
+    (`frame_work2cam_view`) is turned and moved back with it.
+
+    Args:
+        path: OUT/scenes.hdf5; OUT/trials.hdf5 must be beside it.
+        split: `train`, `valid` or `test`.
+
+    Attributes:
+        views: (n,), rows of /views.
+
+    Raises:
+        DataError: If a file is missing or damaged, they are not of one state, or a sample leaves
+            fingers out.
+    """
+
+    def __init__(self, path: str | Path, *, split: str = "train") -> None:
+        self.path, self.split, self.camera = Path(path), split, CAMERA
+        self._file: h5py.File | None = None
+        self._fields, self._process = {}, -1
+        self._data = data = _Views(
+            path, points=None, split=split, negatives="none", balance="view", grasps=1
+        )
+        self.views = data.views
+        self._length = len(self.views)
+
+        # An own grasp of each view, and its trial.
+        trials, ids = Trials(self.path.parent), np.zeros(self._length, dtype=np.int64)
+        self._refuse_other_state(trials)
+        grasps = []
+        for i, view in enumerate(self.views.tolist()):
+            own = data.grasp_of(view, Stream(0, _OWN, view))
+            ids[i] = own["trial_id"][0]
+            grasps.append(pack_grasp(own["p_AQ"][0], own["nhat_Q_A"][0]))
+        numbers = 6 * data.tables["grasps"]["p_TQ"].shape[1]
+        packed = np.array(grasps, dtype=np.float32).reshape(-1, numbers)
+        if not np.isfinite(packed).all():
+            raise DataError(
+                f"{path}: {split} must have contacts of all fingers, got samples that leave some "
+                "out: commands need a hand whose preshapes close all fingers"
+            )
+
+        views = data.tables["views"]
+        scene = views["scene"][self.views]
+        objects = data.tables["scenes"]["object"][scene, 0]
+        trial = trials[ids].columns(("X_TO", "mass", "friction_hand", "friction_table"))
+        # Where the camera would be if the object had stayed where it rested.
+        X_TO = unpack_pose(trial["X_TO"])
+        X_OC = multiply(
+            invert_pose(unpack_pose(data.tables["scenes"]["X_TO"][scene, 0])),
+            unpack_pose(views["X_TC"][self.views]),
+        )
+        self._columns: dict[str, npt.NDArray[Any]] = {
+            "grasps": packed,
+            "trial_id": ids,
+            "grasp_props/resting": data.tables["scenes"]["resting"][scene, 0],
+            "object_props/object_name": np.array(data.names, dtype=object)[objects],
+            "object_props/class_name": np.array(data.classes, dtype=object)[objects],
+            "object_props/work2mass": trial["mass"][:, None],
+            f"object_props/frame_work2cam_{CAMERA}": pack_pose(multiply(X_TO, X_OC)),
+            "object_props/frame_world2work": np.tile(pack_pose(X_WT), (self._length, 1)),
+            "object_props/frame_world2obj": pack_pose(multiply(X_WT, X_TO)),
+            "conditions/friction_hand": trial["friction_hand"],
+            "conditions/friction_table": trial["friction_table"],
+        }
+
+        # All cameras have one lens.
+        self.K = views["K"][0].reshape(3, 3)
+        digest = hashlib.sha256(str(trials.attributes["signature"]).encode())
+        for values in (ids, self.views, views["X_TC"][self.views]):
+            digest.update(np.ascontiguousarray(values).tobytes())
+        self.content = digest.hexdigest()
+
+    def column(self, name: str) -> npt.NDArray[Any]:
+        """Return all rows (n, ...) of a field that scoring needs.
+
+        Raises:
+            DataError: If there is no such field; images are read one by one.
+        """
+        if name not in self._columns:
+            known = ", ".join(self._columns)
+            raise DataError(f"field of a row of scenes must be one of {known}, got {name!r}")
+        return self._columns[name]
+
+    def rows(self, name: str, start: int, stop: int) -> npt.NDArray[Any]:
+        """Return the rows `start` to `stop` - 1 of a field, see `column`."""
+        return self.column(name)[start:stop]
+
+    def value(self, name: str, row: int) -> Any:
+        """Return a field of one row; `images` (4, h, w) and `masks` (h, w) as in data files.
+
+        Raises:
+            DataError: See `column`.
+        """
+        if name not in ("images", "masks"):
+            return self.column(name)[row]
+        seen = self._data.images(int(self.views[row]))
+        if name == "masks":
+            return (seen["mask"] > 0).astype(np.uint8)
+        depth = np.where(seen["depth"] > 0.0, seen["depth"], np.float32(self._data.far))
+        colour = np.moveaxis(seen["rgb"], 2, 0) / np.float32(255.0)
+        return np.concatenate([colour, depth[None]])
+
+    def _refuse_other_state(self, trials: Trials) -> None:
+        with opened(self.path, "the scenes of a dataset") as file:
+            for key in ("shards", "signature"):
+                if str(file.attrs.get(key)) != str(trials.attributes.get(key)):
+                    raise DataError(
+                        f"{self.path}: must be of the trials beside it, got one of others; run "
+                        "`drakegrasp scenes` again"
+                    )

@@ -1,0 +1,83 @@
+"""Views of scenes as rows: grasps come back to where they were in their trials, references look."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers.datasets import OTO, make_dataset
+
+from drakegrasp.build.scenes.make import make_scenes
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.scenes.rows import SceneRows, open_rows
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import DataError
+from drakegrasp.frames import transform_points
+from drakegrasp.scoring.references import REFERENCES, Scene
+from drakegrasp.scoring.run import own_contacts
+from drakegrasp.verification.placed_grasp import place_on_rows
+
+pytestmark = pytest.mark.sim
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes")
+    out = make_dataset(folder / "out", folder / "meshes", "split.by=class")
+    return make_scenes(out, overrides=["scenes.views=3"]).path
+
+
+def test_a_row_is_a_view_of_a_scene_with_a_sample(path: Path) -> None:
+    rows = open_rows(path, split="test")
+    assert isinstance(rows, SceneRows) and len(rows) == 5 * len(
+        set(rows.column("object_props/object_name"))
+    )
+    sample = Trials(path.parent)[rows.column("trial_id")]["removal"]
+    assert not sample.any()
+    assert isinstance(open_rows(path.parent / OTO, split="test"), GraspDataset)
+
+
+def test_own_grasps_come_back_to_the_contacts_of_their_trials(path: Path) -> None:
+    rows = open_rows(path, split="test")
+    due = Trials(path.parent)[rows.column("trial_id")].columns(("closed_p_OQ", "X_TO"))
+    placed = place_on_rows(rows.column("grasps"), rows)
+    order = [grasp.index for grasp in placed]
+    found = np.array([grasp.p_OQ for grasp in placed])
+    np.testing.assert_allclose(found, due["closed_p_OQ"][order], atol=1e-6)
+    own = np.array(own_contacts(rows, range(len(rows)))).reshape(-1, 3, 3)
+    np.testing.assert_allclose(own, due["closed_p_OQ"], atol=1e-6)
+
+
+def test_images_show_the_object_where_the_grasp_is(path: Path) -> None:
+    rows = open_rows(path, split="test")
+    scene = Scene(data=rows, rows=range(len(rows)), train=open_rows(path, split="train"))
+    for row, contacts in enumerate(own_contacts(rows, scene.rows)):
+        with h5py.File(path) as file:
+            X_TO = file["scenes/X_TO"][file["views/scene"][rows.views[row]], 0].reshape(3, 4)
+            X_TC = file["views/X_TC"][rows.views[row]].reshape(3, 4)
+        p_TQ = transform_points(np.vstack([X_TO, [0, 0, 0, 1]]), contacts.reshape(-1, 3))
+        seen = transform_points(np.vstack([X_TC, [0, 0, 0, 1]]), scene.visible(row).points)
+        apart = np.linalg.norm(p_TQ.mean(axis=0) - seen.mean(axis=0))
+        assert apart < 0.06
+        assert rows.value("images", row).shape == (4, 240, 320)
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_every_reference_can_be_made_on_views(path: Path, name: str) -> None:
+    rows = open_rows(path, split="test")
+    train = open_rows(path, split="train")
+    made = REFERENCES[name].make(Scene(data=rows, rows=range(len(rows)), train=train))
+    assert made.shape == (len(rows), 18)
+    lengths = np.linalg.norm(made[:, 9:].reshape(-1, 3, 3), axis=-1)
+    np.testing.assert_allclose(lengths, 1.0, atol=1e-6)
+
+
+def test_scenes_of_other_trials_are_refused(path: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(path.parent, tmp_path / "out"))
+    with h5py.File(out / "scenes.hdf5", "r+") as file:
+        file.attrs["shards"] = "0" * 64
+    with pytest.raises(DataError, match="run `drakegrasp scenes` again"):
+        open_rows(out / "scenes.hdf5", split="test")
