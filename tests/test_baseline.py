@@ -166,9 +166,9 @@ def test_from_scenes_to_predictions(out: Path) -> None:
     judge = ("--judge", out / "classifier one.pt", "--proposals", 2)
     done = script("predict.py", out / "postures one.pt", scenes, out / "p.h5", *judge)
     assert done.returncode == 0, done.stderr
-    views = SceneDataset(scenes, split="test", balance="view").views
+    views = SceneDataset(scenes, split="test", negatives="none", balance="view").views
     with h5py.File(out / "p.h5") as file:
-        assert file["view"][:].tolist() == np.repeat(views, 2).tolist()
+        assert file["row"][:].tolist() == np.repeat(range(len(views)), 2).tolist()
         confidence = file["confidence"][:].reshape(-1, 2)
     assert (confidence[:, 0] >= confidence[:, 1]).all()
     done = script("predict.py", out / "contacts one.pt", oto, out / "c.h5")

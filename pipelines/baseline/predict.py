@@ -4,7 +4,7 @@
   python pipelines/baseline/predict.py postures.pt OUT/scenes.hdf5 judged.h5 --judge classifier.pt
   python pipelines/baseline/predict.py contacts.pt OUT/grasping_oto.hdf5 predicted.h5
 
-Postures are written as `drakegrasp build --postures` reads them, with the view that each is for.
+Postures are written as `drakegrasp build --postures` reads them, with the row of the split that each is for.
 """
 
 from __future__ import annotations
@@ -96,12 +96,15 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
         of_judge = HandCoordinates(**said["hand"])
     network.eval()
 
-    data = dg.SceneDataset(arguments.data, split=arguments.split, balance="view")
+    # The views that `drakegrasp score` counts, in its order.
+    data = dg.SceneDataset(
+        arguments.data, split=arguments.split, negatives="none", balance="view", grasps=1
+    )
     found: dict[str, list[Any]] = {key: [] for key in COLUMNS}
     chosen = _views(data, arguments.views)
     with progress_bar("predict", "view") as progress:
         for done, index in enumerate(chosen):
-            item = data[int(index)]
+            item = data[index]
             points = torch.from_numpy(object_points(item["points"], item["on_object"]))[None]
             none = torch.eye(4)[None, None]
             batch = centred({"points": points, "X_TG": none})
@@ -119,7 +122,7 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
             rows = {
                 "object": [data.names[int(item["object"])]] * len(order),
                 "resting": [int(data.tables["scenes"]["resting"][scene, 0])] * len(order),
-                "view": [int(item["view"])] * len(order),
+                "row": [index] * len(order),
                 "X_FG": X_OG[order].numpy(),
                 "q_grasp": q[order].numpy(),
                 "q_pregrasp": hand.opened(q)[order].numpy(),
@@ -133,7 +136,7 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
     return arrays | {"frame": "object", "joints": np.array(data.joints, dtype=h5py.string_dtype())}
 
 
-COLUMNS = ("object", "resting", "view", "X_FG", "q_grasp", "q_pregrasp", "confidence")
+COLUMNS = ("object", "resting", "row", "X_FG", "q_grasp", "q_pregrasp", "confidence")
 
 
 def proposals(
