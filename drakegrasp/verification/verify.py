@@ -53,6 +53,7 @@ _REASONS = {
     Outcome.SUCCESS: "every fingertip touches it at the end of the lift, clear of the table",
     Outcome.BELOW_TABLE: "the palm would be below the table",
     Outcome.START_COLLISION: "the opened hand would be inside the object or the table",
+    Outcome.SCREENED: "geometry shows that not every fingertip can reach the object",
     Outcome.MISSING_FINGERTIP: "a fingertip closes without touching the object",
     Outcome.HAND_CONTACT: "a part of the hand that is not a fingertip touches the object",
     Outcome.TABLE_CONTACT: "the closing hand or the lifted object touches the table",
