@@ -4,8 +4,8 @@
   python pipelines/baseline/predict.py postures.pt OUT/scenes.hdf5 judged.h5 --judge classifier.pt
   python pipelines/baseline/predict.py contacts.pt OUT/grasping_oto.hdf5 predicted.h5
 
-Postures are written as `drakegrasp build --postures` reads them, with the row of the split that each
-is for.
+Postures are written as `drakegrasp build --postures` reads them, with the row of the split that
+each is for.
 """
 
 from __future__ import annotations
