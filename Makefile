@@ -17,8 +17,8 @@ DEV    := $(VENV)/.installed-dev
 export LP_NUM_THREADS := 0
 export DRAKE_ALLOW_NETWORK := none
 
-.PHONY: FORCE help install demo test test-fast test-browser test-cluster lint format docs docs-pages \
-	package clean
+.PHONY: FORCE help install demo test test-fast test-browser test-torch test-cluster lint format \
+	docs docs-pages package clean
 
 help:            ## what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -75,6 +75,11 @@ test-browser: $(DEV)  ## the pages in Chromium, which it installs as root on Deb
 	  echo "Chromium is not here, and only root can install it: its tests skip"; \
 	fi
 	$(BIN)/python -m pytest -m browser tests/inspection
+
+# torch is large: only this target installs it, and without it the tests that it runs skip.
+test-torch: $(DEV)  ## the baseline and the loaders for torch, which it installs
+	$(BIN)/python -m pip install --quiet --editable '.[torch]'
+	DRAKEGRASP_TORCH=1 $(BIN)/python -m pytest tests/test_baseline.py tests/dataset/loaders
 
 test-cluster: $(DEV)  ## with a real SLURM and a real sshd, which it installs; as root, on Debian
 	apt-get update -qq

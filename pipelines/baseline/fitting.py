@@ -1,0 +1,100 @@
+"""Fit a network: batches in, the weights that were best on validation out, a line per epoch."""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import math
+from collections.abc import Callable, Iterator
+from time import perf_counter
+from typing import Any
+
+import torch
+from batches import Batch
+from torch import Tensor, nn
+
+#: Share of the steps over which the learning rate rises; then it falls as a cosine.
+WARM = 0.05
+#: Weight decay of AdamW, and the largest norm of a step's gradient.
+DECAY, LARGEST_GRADIENT = 1e-2, 5.0
+
+
+def fit(
+    network: nn.Module,
+    loss: Callable[[Batch], Tensor],
+    train: Callable[[int], Iterator[Batch]],
+    valid: Callable[[], Iterator[Batch]],
+    steps: int,
+    settings: argparse.Namespace,
+) -> dict[str, Any]:
+    """Fit a network in its place, and leave it with the weights that validated best, else the last.
+
+    Args:
+        network: The network; `loss` uses it.
+        loss: Of a batch, its mean.
+        train: Batches of an epoch, by its number: the same number gives the same batches.
+        valid: Batches of the validation part, the same each time.
+        steps: Batches of an epoch.
+        settings: Those of the command line: `epochs` at most, `patience` in epochs without a
+            better validation, learning `rate`, and `task`, what the lines begin with.
+
+    Returns:
+        The losses `train` and `valid` of each epoch, the `best` one, `seconds` and the share of
+        them that went into `loading`.
+    """
+    optimizer = torch.optim.AdamW(network.parameters(), settings.rate, weight_decay=DECAY)
+    total: int = max(steps * settings.epochs, 1)
+
+    def rate(step: int) -> float:
+        falling = 0.5 * (1 + math.cos(math.pi * min(step / total, 1.0)))
+        return min((step + 1) / max(WARM * total, 1.0), 1.0) * falling
+
+    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, rate)
+    best, weights = 0, copy.deepcopy(network.state_dict())
+    losses: dict[str, list[float]] = {"train": [], "valid": []}
+    start, waited = perf_counter(), 0.0
+
+    for epoch in range(settings.epochs):
+        # One pass over the training part.
+        network.train()
+        values, asked = [], perf_counter()
+        for batch in train(epoch):
+            waited += perf_counter() - asked
+            value = loss(batch)
+            optimizer.zero_grad()
+            value.backward()
+            nn.utils.clip_grad_norm_(network.parameters(), LARGEST_GRADIENT)
+            optimizer.step()
+            scheduler.step()
+            values.append(value.item())
+            asked = perf_counter()
+        losses["train"].append(sum(values) / len(values))
+
+        # What it says of objects that it did not see.
+        losses["valid"].append(mean_loss(network, loss, valid()))
+        if not losses["valid"][-1] > min(losses["valid"]):  # or there is nothing to validate with
+            best, weights = epoch, copy.deepcopy(network.state_dict())
+        seconds = perf_counter() - start
+        print(  # noqa: T201
+            f"{settings.task}: epoch {epoch + 1}/{settings.epochs}  "
+            f"train {losses['train'][-1]:.3f}  valid {losses['valid'][-1]:.3f}  best {best + 1}  "
+            f"{(epoch + 1) * steps / seconds:.1f} batches/s  "
+            f"at most {(settings.epochs - epoch - 1) * seconds / (epoch + 1) / 60:.1f} min left",
+            flush=True,
+        )
+        if epoch - best >= settings.patience:
+            break
+
+    network.load_state_dict(weights)
+    network.eval()
+    return {**losses, "best": best, "seconds": seconds, "loading": waited / seconds}
+
+
+def mean_loss(
+    network: nn.Module, loss: Callable[[Batch], Tensor], batches: Iterator[Batch]
+) -> float:
+    """Return the mean loss of batches, which is NaN without any."""
+    network.eval()
+    with torch.no_grad():
+        values = [loss(batch).item() for batch in batches]
+    return sum(values) / len(values) if values else math.nan

@@ -1,0 +1,288 @@
+"""The networks of the baseline: postures from a cloud, verdicts on them, contacts from an image.
+
+Plain PyTorch, made to be changed. All poses and points are in metres; angles in radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+def mlp(*sizes: int) -> nn.Sequential:
+    """Return linear layers of the given sizes with a ReLU between each two."""
+    layers: list[nn.Module] = []
+    for width_in, width_out in pairwise(sizes):
+        layers += [nn.Linear(width_in, width_out), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+# The cloud
+
+
+def farthest_points(points: Tensor, count: int) -> Tensor:
+    """Return indices (b, count) of points (b, n, 3), each the farthest from those before it.
+
+    The first is the first of the cloud, so the choice draws nothing.
+    """
+    chosen = torch.zeros(len(points), count, dtype=torch.long, device=points.device)
+    nearest = torch.full(points.shape[:2], torch.inf, device=points.device)
+    for k in range(1, count):
+        last = points.gather(1, chosen[:, k - 1, None, None].expand(-1, 1, 3))
+        nearest = torch.minimum(nearest, (points - last).square().sum(-1))
+        chosen[:, k] = nearest.argmax(1)
+    return chosen
+
+
+class PointEncoder(nn.Module):
+    """One level of set abstraction, as PointNet++ has it, and a feature of the whole cloud.
+
+    Source: Qi et al., PointNet++ (NeurIPS 2017).
+
+    Args:
+        seeds: Number of points that get a feature.
+        neighbours: Number of points that each feature sees.
+        width: Length of a feature.
+        scale: Length by which coordinates are divided [m].
+    """
+
+    def __init__(self, seeds: int, neighbours: int, width: int, scale: float = 0.05) -> None:
+        super().__init__()
+        self.seeds, self.neighbours, self.scale = seeds, neighbours, scale
+        self.local = mlp(3, 32, 64, width)
+        self.whole = mlp(width + 3, width, 2 * width)
+
+    def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the seeds (b, s, 3) of clouds (b, n, 3), and features (b, s, 3 + 3 width)."""
+        chosen = farthest_points(points, self.seeds)
+        centres = points.gather(1, chosen[..., None].expand(-1, -1, 3))
+
+        # What each seed sees around it, and what all of them see.
+        near = torch.cdist(centres, points).topk(self.neighbours, largest=False).indices
+        patches = points[torch.arange(len(points))[:, None, None], near] - centres[:, :, None]
+        local = self.local(patches / self.scale).amax(2)
+        places = centres / self.scale
+        whole = self.whole(torch.cat([places, local], -1)).amax(1, keepdim=True)
+        return centres, torch.cat([places, local, whole.expand(-1, self.seeds, -1)], -1)
+
+
+# Postures
+
+
+@dataclass(frozen=True)
+class PostureSize:
+    """Sizes of a posture network.
+
+    Attributes:
+        closing: Number of coordinates of the closed hand.
+        seeds: Points of the cloud that propose postures.
+        modes: Postures that each proposes.
+        neighbours: Points that each seed sees.
+        width: Length of a feature.
+    """
+
+    closing: int
+    seeds: int = 64
+    modes: int = 4
+    neighbours: int = 32
+    width: int = 128
+
+
+class PostureNetwork(nn.Module):
+    """Postures from the cloud of one view: a mixture density with a few modes at each seed.
+
+    A mode has a palm position p_TG about its seed, a rotation as two columns that are made
+    orthonormal (Zhou et al., CVPR 2019), and coordinates of the closed hand. The widths of the
+    three are shared by all modes, and learned.
+
+    Args:
+        size: Sizes of the network.
+    """
+
+    def __init__(self, size: PostureSize) -> None:
+        super().__init__()
+        self.size = size
+        self.encoder = PointEncoder(size.seeds, size.neighbours, size.width)
+        self.head = mlp(3 + 3 * size.width, 256, 256, size.modes * (10 + size.closing))
+        # Of position [m], rotation [rad] and coordinates: wide before anything is learned.
+        self.log_width = nn.Parameter(torch.log(torch.tensor([0.05, 0.5, 0.5])))
+
+    def forward(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the modes of a cloud (b, n, 3) in {T}: m = seeds x modes of them.
+
+        Returns:
+            Logarithms of the weights (b, m); positions p_TG (b, m, 3) [m]; rotations R_TG
+            (b, m, 3, 3); coordinates of the closed hand (b, m, c), of unit variance.
+        """
+        centres, features = self.encoder(points)
+        out = self.head(features).unflatten(-1, (self.size.modes, -1))
+        weight = functional.log_softmax(out[..., 0].flatten(1), -1)
+        position = centres[:, :, None] + 0.1 * out[..., 1:4]
+        rotation = orthonormal(out[..., 4:10].unflatten(-1, (2, 3)))
+        return weight, position.flatten(1, 2), rotation.flatten(1, 2), out[..., 10:].flatten(1, 2)
+
+    def loss(self, points: Tensor, p_TG: Tensor, R_TG: Tensor, closing: Tensor) -> Tensor:
+        """Return the negative log-likelihood of one posture per cloud, the mean of a batch.
+
+        Args:
+            points: (b, n, 3) in {T}.
+            p_TG: (b, 3).
+            R_TG: (b, 3, 3).
+            closing: (b, c), coordinates of the closed hand.
+        """
+        weight, position, rotation, coordinates = self(points)
+        # |R - R'|^2 = 8 sin^2(angle / 2), hence half of it is near to the squared angle.
+        squares = torch.stack(
+            [
+                (position - p_TG[:, None]).square().sum(-1),
+                (rotation - R_TG[:, None]).square().sum((-1, -2)) / 2,
+                (coordinates - closing[:, None]).square().sum(-1),
+            ],
+            -1,
+        )
+        widths = self.log_width.clamp(min=-4.6)  # 10 mm, 0.6 deg: never a spike
+        sizes = torch.tensor([3.0, 3.0, self.size.closing], device=points.device)
+        density = -(0.5 * squares * torch.exp(-2 * widths) + sizes * widths).sum(-1)
+        return -(weight + density).logsumexp(-1).mean()
+
+
+def orthonormal(columns: Tensor) -> Tensor:
+    """Return rotation matrices (..., 3, 3) whose first axes lie along two vectors (..., 2, 3)."""
+    x = functional.normalize(columns[..., 0, :], dim=-1)
+    y = columns[..., 1, :]
+    y = functional.normalize(y - (x * y).sum(-1, keepdim=True) * x, dim=-1)
+    return torch.stack([x, y, torch.linalg.cross(x, y)], -1)
+
+
+# Verdicts
+
+
+class GraspClassifier(nn.Module):
+    """Whether a posture holds, and becomes a sample: a PointNet on the cloud that the palm sees.
+
+    The cloud and the table are given in the palm's frame {G}, so the network need not learn that
+    both may be turned together. `temperature` divides the logits; calibration sets it.
+
+    Source: Qi et al., PointNet (CVPR 2017); Guo et al., On Calibration (ICML 2017).
+
+    Args:
+        closing: Number of coordinates of the closed hand.
+    """
+
+    def __init__(self, closing: int, width: int = 128) -> None:
+        super().__init__()
+        self.points = mlp(3, 64, 128, 2 * width)
+        self.head = nn.Sequential(nn.Dropout(0.2), mlp(2 * width + 4 + closing, 256, 128, 2))
+        self.register_buffer("temperature", torch.ones(2))
+
+    def forward(self, cloud: Tensor, X_TG: Tensor, closing: Tensor) -> Tensor:
+        """Return logits (b, 2) of held and sample.
+
+        Args:
+            cloud: (b, n, 3), points in {T}.
+            X_TG: (b, 4, 4), pose of the palm.
+            closing: (b, c), coordinates of the closed hand.
+        """
+        R_TG, p_TG = X_TG[:, :3, :3], X_TG[:, :3, 3]
+        cloud_G = (cloud - p_TG[:, None]) @ R_TG
+        table = torch.cat([R_TG[:, 2], p_TG[:, 2:] / 0.1], -1)  # normal in {G}; height [0.1 m]
+        seen = self.points(cloud_G / 0.1).amax(1)
+        return self.head(torch.cat([seen, table, closing], -1)) / self.temperature
+
+
+# The paper's task
+
+
+class ContactNetwork(nn.Module):
+    """Contact points and normals from one RGB-D image, by one or several heads.
+
+    One head regresses to the mean of what may be right. Of several the best learns from a sample,
+    and the network says how likely each is (Rupprecht et al., ICCV 2017).
+
+    Args:
+        length: Numbers of a grasp: 6 per finger.
+        heads: Number of heads.
+        mean, scale: (length,), of the grasps of the training part.
+    """
+
+    def __init__(self, length: int, heads: int, mean: Tensor, scale: Tensor) -> None:
+        super().__init__()
+        self.length, self.heads = length, heads
+        layers: list[nn.Module] = []
+        for width_in, width_out in ((4, 16), (16, 32), (32, 64), (64, 128), (128, 128)):
+            layers += [
+                nn.Conv2d(width_in, width_out, 3, 2, 1),
+                nn.GroupNorm(8, width_out),
+                nn.ReLU(),
+            ]
+        self.image = nn.Sequential(*layers, nn.Flatten(), nn.LazyLinear(256), nn.ReLU())
+        self.head = nn.Linear(256, heads * (length + 1))
+        self.register_buffer("mean", mean)
+        self.register_buffer("scale", scale)
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Return grasps (b, h, length) for images (b, 4, S, S), and log chances (b, h)."""
+        out = self.head(self.image(images)).unflatten(-1, (self.heads, self.length + 1))
+        return self.mean + self.scale * out[..., 1:], functional.log_softmax(out[..., 0], -1)
+
+    def loss(self, images: Tensor, grasp: Tensor) -> Tensor:
+        """Return the mean of the best head's error and the surprise that it is the best."""
+        grasps, chance = self(images)
+        error = ((grasps - grasp[:, None]) / self.scale).square().mean(-1)
+        best = error.argmin(-1)
+        # The others follow a little, or a head that never is the best would never learn.
+        return (0.95 * error.amin(-1) + 0.05 * error.mean(-1)).mean() + 0.1 * functional.nll_loss(
+            chance, best
+        )
+
+
+# The hand
+
+
+@dataclass(frozen=True, eq=False)
+class HandCoordinates:
+    """Few coordinates of a closed hand of j joints: what couplings leave free, found in the data.
+
+    Joints that are coupled move together in every row, so the directions in which closed hands
+    differ are as many as the hand has motors. A posture made of them keeps the couplings.
+
+    Attributes:
+        mean: (j,), of the closed joints.
+        directions: (c, j); a hand is mean + coordinates @ directions.
+        open: (j,), of the open hand; NaN for joints that are set before closing, as the spread.
+    """
+
+    mean: Tensor
+    directions: Tensor
+    open: Tensor
+
+    @classmethod
+    def fit(cls, closed: Tensor, opened: Tensor) -> HandCoordinates:
+        """Return the coordinates of closed and open hands (n, j) each [rad or m]."""
+        mean = closed.mean(0)
+        _, values, rows = torch.linalg.svd(closed - mean, full_matrices=False)
+        deviations = values / max(len(closed) - 1, 1) ** 0.5
+        kept = deviations > 0.02 * deviations[0]
+        still = opened.std(0, correction=0) < 1e-3
+        return cls(mean, rows[kept] * deviations[kept, None], opened[0].where(still, torch.nan))
+
+    def coordinates(self, q: Tensor) -> Tensor:
+        """Return coordinates (n, c), of unit variance, of joints (n, j)."""
+        square = self.directions.square().sum(1)
+        return (q - self.mean) @ self.directions.T / square
+
+    def closed(self, coordinates: Tensor) -> Tensor:
+        """Return joints (n, j) [rad or m] of coordinates (n, c)."""
+        return self.mean + coordinates @ self.directions
+
+    def opened(self, q: Tensor) -> Tensor:
+        """Return the open hand (n, j) from which closed joints (n, j) are reached."""
+        return self.open.where(~self.open.isnan(), q)
+
+    def as_dict(self) -> dict[str, Tensor]:
+        """Return what a checkpoint keeps."""
+        return asdict(self)

@@ -1,0 +1,206 @@
+"""Predict with a checkpoint of `train.py`, into a file for `drakegrasp score`, `verify` or `build`.
+
+  python pipelines/baseline/predict.py postures.pt OUT/scenes.hdf5 predicted.h5
+  python pipelines/baseline/predict.py postures.pt OUT/scenes.hdf5 judged.h5 --judge classifier.pt
+  python pipelines/baseline/predict.py contacts.pt OUT/grasping_oto.hdf5 predicted.h5
+
+Postures are written as `drakegrasp build --postures` reads them, with the row of the split that
+each is for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+from batches import as_input, centred, object_points
+from networks import (
+    ContactNetwork,
+    GraspClassifier,
+    HandCoordinates,
+    PostureNetwork,
+    PostureSize,
+)
+from torch import Tensor
+from train import SEEN
+
+import drakegrasp as dg
+from drakegrasp.errors import DataError, DrakegraspError
+from drakegrasp.runtime.progress import progress_bar
+
+#: Two proposals are one if palms are nearer than both [m, rad].
+SAME = (0.01, np.deg2rad(15))
+#: Views or images at a time.
+BATCH = 32
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the script; return its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("data", type=Path, help="scenes.hdf5, or a data file for contacts")
+    parser.add_argument("out", type=Path, help="HDF5 file to write")
+    parser.add_argument("--split", default="test", help="[default: test]")
+    parser.add_argument("--judge", type=Path, help="checkpoint of the classifier that ranks")
+    parser.add_argument("--proposals", type=int, default=5, help="of each view  [default: 5]")
+    parser.add_argument("--views", type=int, help="of each scene  [default: all]")
+    arguments = parser.parse_args(argv)
+    try:
+        checkpoint = load(arguments.checkpoint, "postures", "contacts")
+        with torch.no_grad():
+            arrays = PREDICT[checkpoint["task"]](checkpoint, arguments)
+    except DrakegraspError as error:
+        print(f"error: {error}", file=sys.stderr)  # noqa: T201
+        return 2
+
+    partial_file = arguments.out.with_suffix(".part")
+    with h5py.File(partial_file, "w") as file:
+        for name, values in arrays.items():
+            file[name] = values
+    partial_file.replace(arguments.out)
+    print(f"{arguments.out}: {len(arrays['confidence'])} rows")  # noqa: T201
+    return 0
+
+
+def load(path: Path, *tasks: str) -> dict[str, Any]:
+    """Return the content of a checkpoint of one of some tasks."""
+    try:
+        content: dict[str, Any] = torch.load(path, weights_only=True)
+        task = content["task"]
+    except Exception as error:  # whatever a damaged archive raises
+        raise DataError(f"{path}: must be a checkpoint of train.py, got {error!r:.80}") from error
+    if task not in tasks:
+        raise DataError(f"{path}: must be a checkpoint of {' or '.join(tasks)}, got {task}")
+    return content
+
+
+# Postures
+
+
+def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return postures for the views of a split, best first, as a file of postures has them."""
+    network = PostureNetwork(PostureSize(**checkpoint["size"]))
+    network.load_state_dict(checkpoint["weights"])
+    hand, judge = HandCoordinates(**checkpoint["hand"]), None
+    if arguments.judge:
+        said = load(arguments.judge, "classifier")
+        judge = GraspClassifier(len(said["hand"]["directions"])).eval()
+        judge.load_state_dict(said["weights"])
+        of_judge = HandCoordinates(**said["hand"])
+    network.eval()
+
+    # The views that `drakegrasp score` counts, in its order.
+    data = dg.SceneDataset(
+        arguments.data, split=arguments.split, negatives="none", balance="view", grasps=1
+    )
+    found: dict[str, list[Any]] = {key: [] for key in COLUMNS}
+    chosen = _views(data, arguments.views)
+    with progress_bar("predict", "view") as progress:
+        for done, index in enumerate(chosen):
+            item = data[index]
+            points = torch.from_numpy(object_points(item["points"], item["on_object"]))[None]
+            none = torch.eye(4)[None, None]
+            batch = centred({"points": points, "X_TG": none})
+            weight, X_TG, q = proposals(network, hand, batch["points"], arguments.proposals)
+            confidence = weight
+            if judge is not None:
+                clouds = batch["points"][:, :SEEN].expand(len(X_TG), -1, -1)
+                confidence = judge(clouds, X_TG, of_judge.coordinates(q))[:, 1].sigmoid()
+
+            # Back to where the cloud was, and into the object's frame.
+            X_TG[:, :3, 3] += batch["shift"]
+            X_OG = torch.linalg.inv(torch.from_numpy(item["X_AO"]).double()) @ X_TG.double()
+            order = confidence.argsort(descending=True, stable=True)
+            scene = int(item["scene"])
+            rows = {
+                "object": [data.names[int(item["object"])]] * len(order),
+                "resting": [int(data.tables["scenes"]["resting"][scene, 0])] * len(order),
+                "row": [index] * len(order),
+                "X_FG": X_OG[order].numpy(),
+                "q_grasp": q[order].numpy(),
+                "q_pregrasp": hand.opened(q)[order].numpy(),
+                "confidence": confidence[order].numpy(),
+            }
+            for key, values in rows.items():
+                found[key].extend(values)
+            progress(done + 1, len(chosen))
+    arrays: dict[str, Any] = {key: np.array(values) for key, values in found.items()}
+    arrays["object"] = np.array(found["object"], dtype=h5py.string_dtype())
+    return arrays | {"frame": "object", "joints": np.array(data.joints, dtype=h5py.string_dtype())}
+
+
+COLUMNS = ("object", "resting", "row", "X_FG", "q_grasp", "q_pregrasp", "confidence")
+
+
+def proposals(
+    network: PostureNetwork, hand: HandCoordinates, points: Tensor, count: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the modes of a cloud (1, n, 3) with the largest weights, no two of them the same.
+
+    Returns:
+        Weights (m,), poses X_TG (m, 4, 4) and closed joints (m, j), m <= count.
+    """
+    weight, position, rotation, coordinates = (each[0] for each in network(points))
+    kept: list[int] = []
+    for mode in weight.argsort(descending=True, stable=True).tolist():
+        near = (position[kept] - position[mode]).norm(dim=-1) < SAME[0]
+        cosine = ((rotation[kept] * rotation[mode]).sum((-1, -2)) - 1) / 2
+        if not (near & (cosine > np.cos(SAME[1]))).any():
+            kept.append(mode)
+        if len(kept) == count:
+            break
+    X_TG = torch.eye(4).repeat(len(kept), 1, 1)
+    X_TG[:, :3, :3], X_TG[:, :3, 3] = rotation[kept], position[kept]
+    # Beyond what was seen in training a hand may not be one.
+    return weight[kept].exp(), X_TG, hand.closed(coordinates[kept].clamp(-3, 3))
+
+
+def _views(data: dg.SceneDataset, per_scene: int | None) -> list[int]:
+    """Return indices of items: the first views of each scene."""
+    seen: dict[int, int] = {}
+    chosen = []
+    for index, view in enumerate(data.views):
+        scene = int(data.tables["views"]["scene"][view])
+        seen[scene] = seen.get(scene, 0) + 1
+        if per_scene is None or seen[scene] <= per_scene:
+            chosen.append(index)
+    return chosen
+
+
+# Contacts
+
+
+def predict_contacts(checkpoint: dict[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return `grasps` (n, h, 6k) and `confidence` (n, h) for the samples of a split."""
+    data = dg.GraspDataset(arguments.data, split=arguments.split)
+    weights = checkpoint["weights"]
+    network = ContactNetwork(
+        len(weights["mean"]), checkpoint["heads"], weights["mean"], weights["scale"]
+    )
+    network(torch.zeros(1, 4, data.image_size, data.image_size))
+    network.load_state_dict(weights)
+    network.eval()
+
+    found = []
+    with progress_bar("predict", "image") as progress:
+        for start in range(0, len(data), BATCH):
+            rows = range(start, min(start + BATCH, len(data)))
+            images = np.stack([data.value("images", data.row_of(i)) for i in rows])
+            found.append(network(as_input(torch.from_numpy(images))))
+            progress(rows.stop, len(data))
+    grasps, chances = (torch.cat(each).numpy() for each in zip(*found, strict=True))
+    return {"grasps": grasps, "confidence": np.exp(chances)}
+
+
+PREDICT = {"postures": predict_postures, "contacts": predict_contacts}
+
+if __name__ == "__main__":
+    sys.exit(main())

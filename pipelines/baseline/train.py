@@ -1,0 +1,246 @@
+"""Train a network of the baseline on a dataset: postures, a classifier of postures, or contacts.
+
+  python pipelines/baseline/train.py postures OUT/scenes.hdf5 postures.pt
+  python pipelines/baseline/train.py classifier OUT/scenes.hdf5 classifier.pt
+  python pipelines/baseline/train.py contacts OUT/grasping_oto.hdf5 contacts.pt --heads 5
+
+Several files of one hand train together. The checkpoint holds the weights that validated best, all
+settings, hashes of the files and the versions. The same command gives the same weights on the same
+machine and versions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import hashlib
+import platform
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from batches import Batch, cloud_batches, image_batches
+from fitting import fit
+from networks import (
+    ContactNetwork,
+    GraspClassifier,
+    HandCoordinates,
+    PostureNetwork,
+    PostureSize,
+)
+from torch import Tensor, nn
+from torch.nn import functional
+
+import drakegrasp as dg
+from drakegrasp.errors import DataError, DrakegraspError
+
+#: Points of a cloud that the classifier sees: it looks at each cloud once for each grasp.
+SEEN = 256
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the script; return its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("task", choices=TASKS)
+    parser.add_argument(
+        "data", type=Path, nargs="+", help="files scenes.hdf5, or data files for contacts"
+    )
+    parser.add_argument("checkpoint", type=Path, help="where to write")
+    parser.add_argument("--epochs", type=int, default=60, help="at most  [default: 60]")
+    parser.add_argument("--patience", type=int, default=10, help="[default: 10]")
+    parser.add_argument("--rate", type=float, default=1e-3, help="learning rate  [default: 0.001]")
+    parser.add_argument("--batch", type=int, default=32, help="[default: 32]")
+    parser.add_argument("--seed", type=int, default=0, help="[default: 0]")
+    parser.add_argument("--heads", type=int, default=5, help="of contacts  [default: 5]")
+    arguments = parser.parse_args(argv)
+    try:
+        history = TASKS[arguments.task](arguments)
+    except DrakegraspError as error:
+        print(f"error: {error}", file=sys.stderr)  # noqa: T201
+        return 2
+    print(  # noqa: T201
+        f"{arguments.checkpoint}: epoch {history['best'] + 1} of {len(history['train'])}, "
+        f"{history['seconds'] / 60:.1f} min, {history['loading']:.1%} of it loading"
+    )
+    return 0
+
+
+# The tasks
+
+
+def train_postures(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Train the network that proposes postures, on samples."""
+    train, valid = _scenes(arguments, "none")
+    hand = hand_of(train)
+    torch.manual_seed(arguments.seed)
+    size = PostureSize(closing=len(hand.directions))
+    network = PostureNetwork(size)
+
+    def loss(batch: Batch) -> Tensor:
+        # One of the drawn grasps of each view.
+        X_TG, q = batch["X_TG"][:, 0], batch["q"][:, 0]
+        return network.loss(batch["points"], X_TG[:, :3, 3], X_TG[:, :3, :3], hand.coordinates(q))
+
+    history = _fit(arguments, network, loss, train, valid, cloud_batches)
+    _save(arguments, network, history, size=asdict(size), hand=hand.as_dict())
+    return history
+
+
+def train_classifier(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Train the network that judges postures, on lifts to a verdict, and calibrate it."""
+    train, valid = _scenes(arguments, "tested")
+    hand = hand_of(train)
+    torch.manual_seed(arguments.seed)
+    network = GraspClassifier(len(hand.directions))
+
+    def loss(batch: Batch) -> Tensor:
+        logits, labels = judged(network, hand, batch)
+        return functional.binary_cross_entropy_with_logits(logits, labels)
+
+    history = _fit(arguments, network, loss, train, valid, cloud_batches)
+    with torch.no_grad():
+        pairs = [judged(network, hand, batch) for batch in _valid_batches(arguments, valid)]
+        if pairs:
+            logits, labels = (torch.cat(each) for each in zip(*pairs, strict=True))
+            network.temperature.copy_(temperature(logits, labels))
+    _save(arguments, network, history, hand=hand.as_dict())
+    return history
+
+
+def train_contacts(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Train the network of the paper's task: contacts from one image."""
+    train, valid = (
+        [data for path in arguments.data if len(data := dg.GraspDataset(path, split=split))]
+        for split in ("train", "valid")
+    )
+    if not train:
+        raise DataError(f"{arguments.data[0]}: train must have samples, got none")
+    grasps = torch.from_numpy(np.concatenate([data.column("grasps") for data in train]))
+    torch.manual_seed(arguments.seed)
+    scale = grasps.std(0, correction=0).clamp(min=1e-3)
+    network = ContactNetwork(grasps.shape[1], arguments.heads, grasps.mean(0), scale)
+    network(torch.zeros(1, 4, train[0].image_size, train[0].image_size))  # the lazy layer's size
+
+    def loss(batch: Batch) -> Tensor:
+        return network.loss(batch["images"], batch["grasps"])
+
+    history = _fit(arguments, network, loss, train, valid, image_batches)
+    _save(arguments, network, history, heads=arguments.heads)
+    return history
+
+
+TASKS = {
+    "postures": train_postures,
+    "classifier": train_classifier,
+    "contacts": train_contacts,
+}
+
+
+# What they share
+
+
+def judged(network: GraspClassifier, hand: HandCoordinates, batch: Batch) -> tuple[Tensor, Tensor]:
+    """Return logits and labels (n, 2), of held and sample, of all grasps of a batch."""
+    grasps = batch["X_TG"].shape[1]
+    clouds = batch["points"][:, :SEEN].repeat_interleave(grasps, 0)
+    logits = network(
+        clouds, batch["X_TG"].flatten(0, 1), hand.coordinates(batch["q"].flatten(0, 1))
+    )
+    labels = torch.stack([batch["held"], batch["sample"]], -1).flatten(0, 1)
+    return logits, labels.float()
+
+
+def temperature(logits: Tensor, labels: Tensor) -> Tensor:
+    """Return the temperatures (2,) that make logits (n, 2) say how often labels (n, 2) are true."""
+    tried = torch.logspace(-1, 1, 81)
+    losses = torch.stack(
+        [
+            functional.binary_cross_entropy_with_logits(logits / t, labels, reduction="none").mean(
+                0
+            )
+            for t in tried
+        ]
+    )
+    return tried[losses.argmin(0)]
+
+
+def hand_of(train: Sequence[dg.SceneDataset]) -> HandCoordinates:
+    """Return the coordinates of the hand, from the samples of the training part."""
+    found: dict[str, list[np.ndarray]] = {"q": [], "q_open": []}
+    for data in train:
+        grasps, scenes = data.tables["grasps"], data.tables["views"]["scene"][data.views]
+        for name, values in found.items():
+            values.append(grasps[name][grasps["sample"] & np.isin(grasps["scene"], scenes)])
+    closed, opened = (torch.from_numpy(np.concatenate(found[name])) for name in found)
+    if len(closed) < 2:
+        raise DataError(f"{train[0].path}: train must have two samples or more, got {len(closed)}")
+    return HandCoordinates.fit(closed, opened)
+
+
+def _scenes(
+    arguments: argparse.Namespace, negatives: Any
+) -> tuple[list[dg.SceneDataset], list[dg.SceneDataset]]:
+    """Return the parts that train and validate; a small dataset may have nothing that validates."""
+    options = {"negatives": negatives, "seed": arguments.seed}
+    train = [dg.SceneDataset(path, split="train", **options) for path in arguments.data]
+    if len({data.joints for data in train}) > 1:
+        raise DataError(f"{arguments.data[-1]}: must be of the same hand as the others")
+    valid = []
+    for path in arguments.data:
+        with contextlib.suppress(DataError):
+            valid.append(dg.SceneDataset(path, split="valid", balance="view", **options))
+    return train, valid
+
+
+def _fit(
+    arguments: argparse.Namespace,
+    network: nn.Module,
+    loss: Any,
+    train: Any,
+    valid: Any,
+    batches: Any,
+) -> dict[str, Any]:
+    """Fit a network with the settings of the command line."""
+    draw = partial(batches, train, arguments.batch, augment=True, seed=arguments.seed)
+    still = partial(_valid_batches, arguments, valid, batches)
+    steps = -(-sum(map(len, train)) // arguments.batch)
+    return fit(network, loss, draw, still, steps, arguments)
+
+
+def _valid_batches(
+    arguments: argparse.Namespace, valid: Any, batches: Any = cloud_batches
+) -> Iterator[Batch]:
+    if valid:
+        yield from batches(valid, arguments.batch, 0, augment=False, seed=arguments.seed)
+
+
+def _save(
+    arguments: argparse.Namespace,
+    network: nn.Module,
+    history: dict[str, Any],
+    **more: Any,
+) -> None:
+    """Write the checkpoint, whole or not at all."""
+    content = {
+        "task": arguments.task,
+        "weights": network.state_dict(),
+        "settings": {k: v for k, v in vars(arguments).items() if k not in ("data", "checkpoint")},
+        "history": history,
+        "data": [hashlib.sha256(path.read_bytes()).hexdigest() for path in arguments.data],
+        "versions": {"torch": str(torch.__version__), "python": platform.python_version()},
+        **more,
+    }
+    partial_file = arguments.checkpoint.with_suffix(".part")
+    torch.save(content, partial_file)
+    partial_file.replace(arguments.checkpoint)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

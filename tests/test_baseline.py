@@ -1,0 +1,177 @@
+"""The baseline in pipelines/baseline: its networks, and its commands from scenes to predictions."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers.commands import run
+
+from drakegrasp.dataset.scenes.reader import SceneDataset
+
+# Where torch is said to be there, a test that skips is a failure.
+if os.environ.get("DRAKEGRASP_TORCH") != "1":
+    pytest.importorskip("torch")
+import torch
+from batches import centred, object_points, turned
+from networks import (
+    ContactNetwork,
+    HandCoordinates,
+    PostureNetwork,
+    PostureSize,
+    farthest_points,
+    orthonormal,
+)
+from predict import proposals
+from train import temperature
+
+BASELINE = Path(__file__).resolve().parents[1] / "pipelines" / "baseline"
+SMALL = PostureSize(closing=2, seeds=8, modes=2, neighbours=4, width=16)
+
+
+def made_up(seed: int = 0) -> dict[str, torch.Tensor]:
+    """Return a batch of two clouds with three grasps each."""
+    draw = torch.Generator().manual_seed(seed)
+    X_TG = torch.eye(4).repeat(2, 3, 1, 1)
+    X_TG[..., :3, :3] = orthonormal(torch.randn(2, 3, 2, 3, generator=draw))
+    X_TG[..., :3, 3] = torch.randn(2, 3, 3, generator=draw)
+    return {"points": torch.randn(2, 64, 3, generator=draw), "X_TG": X_TG}
+
+
+def test_augmentation_moves_clouds_with_their_grasps() -> None:
+    """What the palm sees stays, but for the noise; the table stays below."""
+    before = made_up()
+    after = centred(turned(before, torch.Generator().manual_seed(1)))
+    for batch in (before, after):
+        R, p = batch["X_TG"][..., :3, :3], batch["X_TG"][..., :3, 3]
+        batch["seen"] = (batch["points"][:, None] - p[:, :, None]) @ R
+    assert (after["seen"] - before["seen"]).abs().max() < 6e-3
+    assert (after["points"][..., 2] - before["points"][..., 2]).abs().max() < 6e-3
+    assert (after["points"] - before["points"]).abs().max() > 0.1
+    assert after["points"].mean(1)[:, :2].abs().max() < 1e-6
+    moved = after["points"] + after["shift"][:, None]
+    assert (moved.norm(dim=-1) - before["points"].norm(dim=-1)).abs().max() < 6e-3
+
+
+def test_points_of_the_network_are_on_the_object() -> None:
+    points, on_object = np.arange(30.0).reshape(10, 3), np.arange(10) % 2 == 0
+    assert set(object_points(points, on_object, 8)[:, 0]) == {0.0, 6.0, 12.0, 18.0, 24.0}
+    assert len(object_points(points, np.zeros(10, dtype=bool), 8)) == 8
+
+
+def test_farthest_points_spread() -> None:
+    line = torch.tensor([0.0, 1.0, 2.0, 9.0, 10.0])
+    points = torch.stack([line, 0 * line, 0 * line], -1)[None]
+    assert farthest_points(points, 3).tolist() == [[0, 4, 2]]
+
+
+def test_a_posture_at_a_mode_is_likelier_than_one_beside_it() -> None:
+    torch.manual_seed(0)
+    network, points = PostureNetwork(SMALL), made_up()["points"]
+    weight, p, R, closing = network(points)
+    assert torch.allclose(weight.exp().sum(1), torch.ones(2))
+    assert torch.allclose(R.mT @ R, torch.eye(3).expand_as(R), atol=1e-5)
+    assert torch.allclose(torch.linalg.det(R), torch.ones(R.shape[:2]), atol=1e-5)
+    best = weight.argmax(1)
+    rows = torch.arange(2)
+    mode = p[rows, best], R[rows, best], closing[rows, best]
+    turn = orthonormal(torch.tensor([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0]]))
+    least = network.loss(points, *mode)
+    assert least < network.loss(points, mode[0] + 0.1, *mode[1:])
+    assert least < network.loss(points, mode[0], mode[1] @ turn, mode[2])
+    assert least < network.loss(points, *mode[:2], mode[2] + 1.0)
+
+
+def test_proposals_are_ranked_and_differ() -> None:
+    torch.manual_seed(0)
+    hand = HandCoordinates(torch.zeros(3), torch.eye(3)[:2], torch.zeros(3))
+    cloud = made_up()["points"][:1]
+    weight, X_TG, q = proposals(PostureNetwork(SMALL), hand, cloud, 4)
+    assert (weight[:-1] >= weight[1:]).all() and len(weight) == len(X_TG) == len(q) == 4
+    gaps = torch.cdist(X_TG[:, :3, 3], X_TG[:, :3, 3]) + torch.eye(4)
+    turned_by = (X_TG[:, None, :3, :3] * X_TG[None, :, :3, :3]).sum((-1, -2)) < 1 + 2 * 0.9659
+    assert ((gaps > 0.01) | turned_by).all()
+
+
+def test_coordinates_of_a_hand_keep_its_couplings() -> None:
+    draw = torch.Generator().manual_seed(0)
+    motors = torch.rand(50, 2, generator=draw)
+    closed = torch.stack([motors[:, 0], motors[:, 0] / 3, motors[:, 1]], 1)
+    opened = torch.stack([torch.zeros(50), torch.zeros(50), motors[:, 1]], 1)
+    hand = HandCoordinates.fit(closed, opened)
+    coordinates = hand.coordinates(closed)
+    assert coordinates.shape == (50, 2)
+    assert torch.allclose(hand.closed(coordinates), closed, atol=1e-5)
+    assert torch.allclose(coordinates.std(0), torch.ones(2), atol=1e-3)
+    some = hand.closed(torch.tensor([[0.3, -2.0]]))
+    assert torch.allclose(some[:, 1] * 3, some[:, 0], atol=1e-5)
+    # The third joint is set before closing, as a spread is.
+    assert torch.equal(hand.opened(some), torch.tensor([[0.0, 0.0, float(some[0, 2])]]))
+
+
+def test_several_heads_learn_two_answers_and_one_their_mean() -> None:
+    torch.manual_seed(0)
+    images = torch.zeros(8, 4, 32, 32)
+    grasps = torch.tensor([[-1.0] * 6, [1.0] * 6]).repeat(4, 1)
+    found = {}
+    for heads in (1, 2):
+        network = ContactNetwork(6, heads, torch.zeros(6), torch.ones(6))
+        network(images)
+        optimizer = torch.optim.Adam(network.parameters(), 0.01)
+        for _ in range(60):
+            optimizer.zero_grad()
+            network.loss(images, grasps).backward()
+            optimizer.step()
+        found[heads] = network(images)[0][0].mean(-1).sort().values
+    assert found[1].abs().max() < 0.2
+    assert torch.allclose(found[2], torch.tensor([-1.0, 1.0]), atol=0.3)
+
+
+def test_temperature_makes_confident_logits_honest() -> None:
+    draw = torch.Generator().manual_seed(0)
+    logits = torch.randn(4000, 2, generator=draw)
+    labels = (torch.rand(4000, 2, generator=draw) < logits.sigmoid()).float()
+    assert torch.allclose(temperature(3 * logits, labels), torch.tensor([3.0, 3.0]), rtol=0.2)
+
+
+def script(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-W", "error", BASELINE / name, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_from_scenes_to_predictions(out: Path) -> None:
+    made = run("scenes", out, "--quiet")
+    assert made.exit_code == 0, made.output
+    scenes, oto = out / "scenes.hdf5", out / "grasping_oto.hdf5"
+    for task, data in (("postures", scenes), ("classifier", scenes), ("contacts", oto)):
+        for name in ("one", "again") if task == "postures" else ("one",):
+            path = out / f"{task} {name}.pt"
+            done = script("train.py", task, data, path, "--epochs", 2, "--batch", 8)
+            assert done.returncode == 0, done.stderr
+            assert "epoch 2/2" in done.stdout
+    weights = [torch.load(out / f"postures {k}.pt")["weights"] for k in ("one", "again")]
+    assert all(torch.equal(weights[0][k], weights[1][k]) for k in weights[0])
+
+    judge = ("--judge", out / "classifier one.pt", "--proposals", 2)
+    done = script("predict.py", out / "postures one.pt", scenes, out / "p.h5", *judge)
+    assert done.returncode == 0, done.stderr
+    views = SceneDataset(scenes, split="test", negatives="none", balance="view").views
+    with h5py.File(out / "p.h5") as file:
+        assert file["row"][:].tolist() == np.repeat(range(len(views)), 2).tolist()
+        confidence = file["confidence"][:].reshape(-1, 2)
+    assert (confidence[:, 0] >= confidence[:, 1]).all()
+    done = script("predict.py", out / "contacts one.pt", oto, out / "c.h5")
+    assert done.returncode == 0, done.stderr
+    wrong = script("predict.py", out / "classifier one.pt", scenes, out / "p.h5")
+    assert wrong.returncode == 2 and "must be a checkpoint of postures" in wrong.stderr
