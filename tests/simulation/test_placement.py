@@ -118,7 +118,7 @@ MISTAKES: dict[str, tuple[Any, str, str]] = {
     "number": (lambda _: 3, "m", "a trimesh.Trimesh or a placed object, got int"),
     "scene": (lambda _: box().scene(), "m", "a trimesh.Trimesh or a placed object, got Scene"),
     "empty": (lambda _: trimesh.Trimesh(), "m", "mesh: must hold triangles, got no faces"),
-    "nan": (not_finite, "m", "mesh: vertices must be finite, got NaN or inf"),
+    "nan": (not_finite, "m", "mesh: vertices must be finite, got NaN, inf or more than"),
     "too large": (lambda _: box(1000.0), "m", "mesh: the diagonal of the bounding box must be"),
     "too small": (lambda _: box(), "mm", "got 0.0001414 m with 1 unit = 0.001 m"),
     "sheet": (

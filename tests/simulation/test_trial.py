@@ -20,7 +20,7 @@ from helpers.objects import (
 )
 
 from drakegrasp.errors import BlankImageError
-from drakegrasp.frames import X_WT, invert_pose, make_pose
+from drakegrasp.frames import X_WT, invert_pose, make_pose, transform_points
 from drakegrasp.hand.file_format import PAD_BAND
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import prepare_object
@@ -239,7 +239,7 @@ def test_points_inside_of_a_real_mesh_with_needles_are_found(name, g3db, config)
     reset_object(scene, X_WT @ standing(model))
     rng = np.random.default_rng(0)
     p_OP = rng.uniform(-1.0, 1.0, (400, 3)) * model.half_extents
-    p_WP = p_OP + (X_WT @ standing(model))[:3, 3]
+    p_WP = transform_points(X_WT @ standing(model), p_OP)
     found = np.array([is_inside(scene, p[None]) for p in p_WP])
     by_rays = model.collision.contains(p_OP)
     assert 0 < found.sum() < len(found)

@@ -50,9 +50,14 @@ def test_objects_are_turned_and_moved_and_cameras_differ_by_split(scenes: Path) 
         X_TO = unpack_pose(file["scenes/X_TO"][:, 0])
         split, X_TC = file["scenes/split"][:], unpack_pose(file["views/X_TC"][:])
         scene, kind = file["views/scene"][:], file["views/kind"][:]
+        names = file["objects/name"].asstr()[file["scenes/object"][:, 0]]
     assert len(np.unique(X_TO[:, :2, 3])) == 6 and np.abs(X_TO[:, :2, 3]).max() <= 0.1
-    # The boxes of the dataset stand upright, unturned.
-    assert np.abs(X_TO[:, 0, 1]).min() > 0.01
+    # Each is turned about Tz from where it rested.
+    entries = {entry.name: entry for entry in read_manifest(scenes.parent).objects}
+    for name, X in zip(names, X_TO, strict=True):
+        rested = unpack_pose(np.array(entries[name].resting[0].X_TO))
+        turn = X[:3, :3] @ rested[:3, :3].T
+        assert abs(turn[0, 1]) > 0.01 and abs(turn[2, 2] - 1.0) < 1e-9
     for number, own in enumerate(split):
         poses, kinds = X_TC[scene == number], kind[scene == number]
         if own == 0:
