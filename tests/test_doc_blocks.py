@@ -52,6 +52,7 @@ NOT_RUN = {
     "drakegrasp bench-set ": "simulates for hours; tests/scoring/test_benchmark.py",
     "drakegrasp hand new ": "a model that may not be shipped; tests/commissioning/test_new_hand.py",
     "drakegrasp hand check ": "tests/commissioning/test_tutorial_hand.py runs it",
+    "drakegrasp verify FILE ": "wants a file of postures; tests/cli/test_verify_request.py",
     "drakegrasp verify GRASPS --protocol ": "wants an MJCF; tests/protocols",
 }
 #: A page whose commands measure for minutes to hours; test_docs.py knows their options.
