@@ -23,9 +23,9 @@ def main() -> None:
         client.write_scheduler_file("example/scheduler.json")
         overrides = ["candidates.max=8", "unit_candidates=4", "refine.children=0"]
         config = dg.load_config("fast", overrides=overrides)
-        report = dg.build_dataset(
-            "example/meshes", "example/vase", config=config, scheduler_file="example/scheduler.json"
-        )
+        # This scheduler listens on this machine only; others need a certificate (tls_files).
+        reach = {"scheduler_file": "example/scheduler.json", "tls": False}
+        report = dg.build_dataset("example/meshes", "example/vase", config=config, **reach)
         print(report.simulated, "work units simulated on", cluster.scheduler_address)
 
         # Verification takes the client itself. The dataset's own grasps stand for predictions.
