@@ -13,6 +13,8 @@ import pytest
 from helpers.commands import run
 
 from drakegrasp.dataset.scenes.reader import SceneDataset
+from drakegrasp.exchange.posture_files import read_postures
+from drakegrasp.hand.description import load_hand
 
 # Where torch is said to be there, a test that skips is a failure.
 if os.environ.get("DRAKEGRASP_TORCH") != "1":
@@ -171,6 +173,8 @@ def test_from_scenes_to_predictions(out: Path) -> None:
         assert file["row"][:].tolist() == np.repeat(range(len(views)), 2).tolist()
         confidence = file["confidence"][:].reshape(-1, 2)
     assert (confidence[:, 0] >= confidence[:, 1]).all()
+    # A build takes them as they are.
+    assert not any(read_postures(out / "p.h5", load_hand()).invalid)
     done = script("predict.py", out / "contacts one.pt", oto, out / "c.h5")
     assert done.returncode == 0, done.stderr
     wrong = script("predict.py", out / "classifier one.pt", scenes, out / "p.h5")

@@ -58,7 +58,7 @@ def connection(
             is empty, or the choice of TLS contradicts itself.
     """
     if scheduler is not None and not scheduler.strip():
-        raise ConfigError(f"scheduler must be an address like tcp://host:8786, got {scheduler!r}")
+        raise ConfigError(f"scheduler must be an address like tls://host:8786, got {scheduler!r}")
     if workers is not None and (scheduler or scheduler_file):
         raise ConfigError("workers must not be given with a scheduler, which has its own")
     count_workers(workers)

@@ -41,18 +41,21 @@ _KNOWN = (
 def read_postures(path: Path, hand: Hand) -> PostureTable:
     """Return the postures of a file, or of all files of a folder.
 
-    A row that is none stays in the table, with the reason; in a folder a file may be none.
+    A row that is none stays in the table, with the reason; in a folder a file may be none. What a
+    file says for a score, `row` and `confidence`, is not asked.
 
     Raises:
-        GraspError: If it is no file of postures of this hand.
+        GraspError: If it is no file of postures of this hand, or names no object.
         MachineError: If a package is missing that the format needs.
     """
     if path.is_dir():
         return _of_folder(path, hand)
     with named(path):
         rows = read_rows(path, hand)
-        if rows.of_row is not None:
-            raise GraspError("row must be left out here, it is for predictions of a score; got it")
+        if rows.of_row is not None and not any(rows.objects):
+            raise GraspError(
+                "postures must name an object in each row, got rows of a dataset alone"
+            )
         return table_of(hand, rows)
 
 

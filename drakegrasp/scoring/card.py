@@ -144,10 +144,9 @@ def _set_of(
     outcomes = sorted({v.outcome for v in verdicts})
     reference = REFERENCES.get(judged.name)
     measured = estimates(judged, grouping, draws, oracle=oracle)
+    of_postures = any(ranked.table is not None for ranked in judged.ranked)
     return {
-        "what": reference.words
-        if reference
-        else ("predictions", "postures")[any(r.table is not None for r in judged.ranked)],
+        "what": reference.words if reference else "postures" if of_postures else "predictions",
         "files": [{"name": r.name, "sha256": r.sha256} for r in judged.ranked],
         "predictions": len(verdicts),
         "measures": {name: asdict(value) for name, value in measured.items()},

@@ -4,9 +4,9 @@
   python pipelines/baseline/train.py classifier OUT/scenes.hdf5 classifier.pt
   python pipelines/baseline/train.py contacts OUT/grasping_oto.hdf5 contacts.pt --heads 5
 
-Several files of one hand train together. The checkpoint holds the weights that validated best, all
-settings, hashes of the files and the versions. The same command gives the same weights on the same
-machine and versions.
+Several files of one hand train together, and the first validates. The checkpoint holds the weights
+that validated best, all settings, hashes of the files and the versions. The same command gives the
+same weights on the same machine and versions.
 """
 
 from __future__ import annotations
@@ -187,15 +187,18 @@ def hand_of(train: Sequence[dg.SceneDataset]) -> HandCoordinates:
 def _scenes(
     arguments: argparse.Namespace, negatives: Any
 ) -> tuple[list[dg.SceneDataset], list[dg.SceneDataset]]:
-    """Return the parts that train and validate; a small dataset may have nothing that validates."""
+    """Return the parts that train and validate.
+
+    Only the first file validates: what was fed back is of objects that train there. A small dataset
+    may have nothing that validates.
+    """
     options = {"negatives": negatives, "seed": arguments.seed}
     train = [dg.SceneDataset(path, split="train", **options) for path in arguments.data]
     if len({data.joints for data in train}) > 1:
         raise DataError(f"{arguments.data[-1]}: must be of the same hand as the others")
     valid = []
-    for path in arguments.data:
-        with contextlib.suppress(DataError):
-            valid.append(dg.SceneDataset(path, split="valid", balance="view", **options))
+    with contextlib.suppress(DataError):
+        valid.append(dg.SceneDataset(arguments.data[0], split="valid", balance="view", **options))
     return train, valid
 
 

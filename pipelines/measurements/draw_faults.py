@@ -35,7 +35,7 @@ _TELLING = {
 #: How many imports may lie between a module and a test, in its room and elsewhere.
 NEAR, NEAR_ELSEWHERE = 2, 1
 #: At most so many files of tests for a fault.
-MOST_TESTS = 8
+MOST_TESTS = 16
 #: An option of pytest that leaves slow tests out.
 QUICK = "-mnot server and not slow"
 _OPERATORS: dict[type[ast.AST], str] = {

@@ -18,6 +18,7 @@ from drakegrasp.api.building import build_on
 from drakegrasp.build.pipeline import build, posture_config
 from drakegrasp.build.prepare import prepare
 from drakegrasp.build.replay import replay_trial
+from drakegrasp.build.scenes.make import make_scenes
 from drakegrasp.config import Config
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
@@ -204,9 +205,13 @@ def test_file_without_any_posture_is_refused(meshes, table, tmp_path):
                  postures=replace(table, objects=("cup",) * 4))  # fmt: skip
 
 
+#: Closing positions at which the fingers of a posture begin [rad].
+BEGUN = 0.05
+
+
 @pytest.fixture(scope="module")
 def of_preshapes(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
-    """The cube held by two fingers of three, given back once as of their preshape, once not."""
+    """The cube held by two fingers, given back with its preshape, without, and begun."""
     folder = tmp_path_factory.mktemp("shaped")
     config = load_config(
         overrides=[f"hand={write_with_preshapes(folder, all='F1 F2 F3', pair='F1 F3')}"]
@@ -215,14 +220,14 @@ def of_preshapes(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
     attempt, pair = from_above(model, STANDOFF), hand.at(1)
     held = run_attempt(build_scene(model, config.physics, pair), standing(model), attempt, config)
     assert held.outcome is Outcome.SUCCESS
-    start = joint_positions(pair, 0.0, np.zeros(2))
+    starts = [joint_positions(pair, 0.0, np.full(2, at)) for at in (0.0, 0.0, BEGUN)]
     table = make_table(
         hand,
-        [NAME] * 2,
-        [attempt.X_OG] * 2,
-        [held.closed.q] * 2,
-        q_pregrasp=[[start[name] for name in joint_order(hand)]] * 2,
-        preshape=["pair", ""],
+        [NAME] * 3,
+        [attempt.X_OG] * 3,
+        [held.closed.q] * 3,
+        q_pregrasp=[[start[name] for name in joint_order(hand)] for start in starts],
+        preshape=["pair", "", "pair"],
     )
     return built(meshes, folder / "out", table, config), held.closed.q
 
@@ -231,10 +236,11 @@ def test_a_posture_of_a_preshape_is_the_attempt_that_it_was(of_preshapes):
     """Without one, the third finger closes as well."""
     out, q = of_preshapes
     trials = Trials(out)
-    assert trials["preshape"].tolist() == [1, NO_PRESHAPE]
-    assert trials["unused"].tolist() == [0b010, 0]
-    assert trials["outcome"].tolist() == [Outcome.SUCCESS] * 2
-    assert trials["closed_touching"].tolist() == [[True, False, True], [True] * 3]
+    assert trials["preshape"].tolist() == [1, NO_PRESHAPE, 1]
+    assert trials["unused"].tolist() == [0b010, 0, 0b010]
+    assert trials["outcome"].tolist() == [Outcome.SUCCESS] * 3
+    two = [True, False, True]
+    assert trials["closed_touching"].tolist() == [two, [True] * 3, two]
     np.testing.assert_allclose(trials["closed_q"][0], q, atol=1e-9)
     assert not trials["own_motors"][0]
 
@@ -265,7 +271,19 @@ def test_a_dataset_of_postures_of_preshapes_is_sound_and_replayed(of_preshapes):
     assert check_dataset(out) == []
     assert replay_trial(out, 0).same
     counts = [(each["preshape"], each["held"]) for each in counts_as_dict(out)["preshapes"]]
-    assert counts == [("all", 0), ("pair", 1), (NO_NAME, 1)]
+    assert counts == [("all", 0), ("pair", 2), (NO_NAME, 1)]
+
+
+def test_scenes_have_the_hand_from_which_a_posture_of_a_preshape_closed(of_preshapes, tmp_path):
+    out = Path(shutil.copytree(of_preshapes[0], tmp_path / "out"))
+    with h5py.File(make_scenes(out).path) as file:
+        by_trial = np.argsort(file["grasps/trial_id"][:])
+        q_open = file["grasps/q_open"][:][by_trial]
+    pair = load_hand(read_manifest(out).config.hand_source).at(1)
+    order = joint_order(pair)
+    for row, at in ((0, 0.0), (2, BEGUN)):
+        start = joint_positions(pair, 0.0, np.full(2, at))
+        np.testing.assert_allclose(q_open[row], [start[name] for name in order], atol=1e-6)
 
 
 def test_the_hash_of_postures_without_preshapes_is_as_before_there_were_any(table):

@@ -251,7 +251,7 @@ def test_empty_address_of_a_scheduler_is_refused(
     }
     result = run(command, *arguments[command], "--scheduler", address)
     assert result.exit_code == 2
-    assert f"scheduler must be an address like tcp://host:8786, got {address!r}" in result.stderr
+    assert f"scheduler must be an address like tls://host:8786, got {address!r}" in result.stderr
     assert not (tmp_path / "out").exists()
 
 

@@ -75,6 +75,16 @@ def columns() -> dict[str, list[Any]]:
     return table | {"resting": [0, 2], "log_density": [-1.0, None], "source": ["net 7", ""]}
 
 
+def test_a_file_for_a_score_is_built_by_the_objects_that_it_names(tmp_path):
+    scored = arrays() | {"row": np.array([7, 3]), "confidence": np.array([0.9, 0.1])}
+    np.savez(tmp_path / "p.npz", **scored)
+    assert read_postures(tmp_path / "p.npz", HAND).objects == tuple(OBJECTS)
+    del scored["object"]
+    np.savez(tmp_path / "p.npz", **scored)
+    with pytest.raises(GraspError, match="must name an object in each row, got rows of a dataset"):
+        read_postures(tmp_path / "p.npz", HAND)
+
+
 @pytest.mark.parametrize("suffix", ["npz", "h5", "csv"])
 def test_rows_of_a_preshape_need_not_name_the_joints_that_it_keeps(tmp_path, suffix):
     """Those of fingers that it leaves out; an empty name is no preshape."""

@@ -301,8 +301,9 @@ def _given_start(
     attempt = find_attempt(prepared, **identity, config=task.config)
     if attempt.path is not None:
         return attempt.path.start
-    closing = np.zeros(hand.num_fingers) if attempt.closing is None else attempt.closing
-    return _positions(task, hand, attempt.spread, closing)
+    shaped = hand.at(attempt.preshape)
+    closing = np.zeros(shaped.num_fingers) if attempt.closing is None else attempt.closing
+    return _positions(task, shaped, attempt.spread, closing)
 
 
 def _positions(task: SceneTask, hand: Hand, spread: float, closing: Array) -> Array:
