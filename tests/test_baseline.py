@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import subprocess
 import sys
@@ -10,6 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import yaml
 from helpers.commands import run
 
 from drakegrasp.dataset.scenes.reader import SceneDataset
@@ -20,7 +23,9 @@ from drakegrasp.hand.description import load_hand
 if os.environ.get("DRAKEGRASP_TORCH") != "1":
     pytest.importorskip("torch")
 import torch
+from assess import assessment, auc
 from batches import centred, object_points, turned
+from model_card import card_text
 from networks import (
     ContactNetwork,
     HandCoordinates,
@@ -177,5 +182,67 @@ def test_from_scenes_to_predictions(out: Path) -> None:
     assert not any(read_postures(out / "p.h5", load_hand()).invalid)
     done = script("predict.py", out / "contacts one.pt", oto, out / "c.h5")
     assert done.returncode == 0, done.stderr
+    assert_assessed(out, scenes)
+    assert_described(out, scenes)
     wrong = script("predict.py", out / "classifier one.pt", scenes, out / "p.h5")
     assert wrong.returncode == 2 and "must be a checkpoint of postures" in wrong.stderr
+
+
+def assert_assessed(out: Path, scenes: Path) -> None:
+    """Each lifted grasp of the split is judged once, and the picture is one."""
+    judge = out / "classifier one.pt"
+    done = script("assess.py", judge, scenes, out / "curve.png", "--split", "train")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    data = SceneDataset(scenes, split="train", negatives="tested")
+    grasps, ours = data.tables["grasps"], data.tables["views"]["scene"][data.views]
+    held = grasps["held"][grasps["tested"] & np.isin(grasps["scene"], ours)]
+    assert found["grasps"] == len(held) == sum(b["grasps"] for b in found["held"]["curve"])
+    assert found["held"]["share"] == pytest.approx(held.mean(), abs=1e-4)
+    assert (out / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def assert_described(out: Path, scenes: Path) -> None:
+    """A model card says what the file and the score say, and refuses another file as a score."""
+    arguments = ("model_card.py", out / "postures one.pt", out / "README.md")
+    done = script(*arguments)
+    assert done.returncode == 0, done.stderr
+    text = (out / "README.md").read_text()
+    assert hashlib.sha256(scenes.read_bytes()).hexdigest() in text and "Nothing was scored" in text
+    assert yaml.safe_load(text.split("---")[1])["library_name"] == "pytorch"
+    done = script(*arguments, "--score", scenes)
+    assert done.returncode == 2 and "must be a card of drakegrasp score" in done.stderr
+
+
+def test_auc_counts_pairs_and_halves_ties() -> None:
+    label = np.array([False, True, False, True])
+    assert auc(np.array([0.1, 0.9, 0.2, 0.8]), label) == 1.0
+    assert auc(np.array([0.1, 0.1, 0.2, 0.3]), label) == 2.5 / 4
+    assert np.isnan(auc(np.array([0.1, 0.2]), np.array([True, True])))
+
+
+def test_reliability_bins_have_what_is_said_and_what_is_true() -> None:
+    chance = np.arange(20) / 20
+    found = assessment(chance, chance >= 0.5, np.repeat(range(5), 4))
+    assert found["curve"][0] == {"said": 0.025, "true": 0.0, "grasps": 2}
+    assert found["curve"][-1] == {"said": 0.925, "true": 1.0, "grasps": 2}
+    assert found["auc"][0] == 1.0 and found["brier"] == round(
+        float(np.square(chance - (chance >= 0.5)).mean()), 4
+    )
+
+
+def test_a_model_card_has_the_scores_that_it_was_given() -> None:
+    history = {"train": [1.0, 0.5], "valid": [2.0, 3.0], "best": 0, "parts": {"train": 7}}
+    checkpoint = {
+        "task": "postures", "weights": {"w": torch.zeros(3, 4)}, "history": history, "data": ["ab"],
+        "settings": {"seed": 1}, "versions": {"torch": "2"},
+    }  # fmt: skip
+    score = {
+        "form": "drakegrasp-score-1", "measures": {"headline": "a sample"}, "objects": 3, "rows": 9,
+        "dataset": {"file": "scenes.hdf5", "rows_sha256": "c" * 64}, "settings": {},
+        "sets": {"p": {"measures": {"headline": {"value": 0.256, "low": 0.1, "high": 0.4}}}},
+        "warnings": ["few objects"],
+    }  # fmt: skip
+    text = card_text("p", checkpoint, [score], "cc-by-4.0")
+    assert "| p | 25.6 | 10.0 to 40.0 |" in text and "> few objects" in text
+    assert "12 numbers" in text and "Epoch 1 of 2 is kept: loss 1.000" in text

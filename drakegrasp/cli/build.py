@@ -218,7 +218,8 @@ def print_stats(out: Path) -> None:
         for line in barren_lines(funnel):
             say(line)
         samples = {row.split: row.samples for row in splits}
-        if any(samples.values()) and not samples["train"]:
+        chosen = read_manifest(out).config.split.train_classes
+        if any(samples.values()) and not samples["train"] and chosen is None:
             say(
                 "no sample is for training: by class, a class trains if two of its objects have "
                 "samples, or if split.train_classes names it; --set split.by=object trains on any"

@@ -9,16 +9,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import differences, read_manifest
-from drakegrasp.dataset.paths import BUILTIN_FOLDER
+from drakegrasp.dataset.paths import BUILTIN_FOLDER, DATA_FILES
+from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, MeshError
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MANIFEST_NAME
@@ -48,7 +50,7 @@ def new_classes() -> list[str]:
 
 
 def published() -> dict[str, Any]:
-    """Return what is published of the benchmark: versions, and a hash of each object's mesh."""
+    """Return what is published of the benchmark: versions, hashes of meshes and of all rows."""
     text = resources.files("drakegrasp.scoring").joinpath("bench1.json").read_text("utf-8")
     found: dict[str, Any] = json.loads(text)
     return found
@@ -63,6 +65,13 @@ def material_of(item: BuiltinObject) -> tuple[float, float]:
     mass = Stream(SEED, object_key(NAME), object_key(item.name)).integers(len(MASSES), 1)[0]
     start = Stream(SEED, object_key(NAME), object_key(item.object_class.name)).integers(3, 1)[0]
     return MASSES[int(mass)], FRICTIONS[int(start + item.index) % len(FRICTIONS)]
+
+
+def rows_digest(data: GraspDataset, rows: Sequence[int]) -> str:
+    """Return a hash of some rows of a split: of their trials and grasps, to the last bit."""
+    grasps = np.ascontiguousarray(data.column("grasps")[list(rows)], dtype=np.float32)
+    trials = np.ascontiguousarray(data.column("trial_id")[list(rows)], dtype=np.int64)
+    return hashlib.sha256(trials.tobytes() + grasps.tobytes()).hexdigest()
 
 
 def write_objects(
@@ -125,7 +134,7 @@ def read_benchmark(out: Path, config: Config, versions: Mapping[str, str]) -> di
             what is returned, because simulated values may then differ.
 
     Raises:
-        DataError: If its file is damaged.
+        DataError: If its file, or the data file beside it, is damaged.
     """
     path = out / BUILTIN_FOLDER / FILE_NAME
     if not path.is_file():
@@ -136,6 +145,12 @@ def read_benchmark(out: Path, config: Config, versions: Mapping[str, str]) -> di
         built = read_manifest(out).config
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}: must be the file of a benchmark, got another: {error}") from None
+
+    # Whether its rows are the published ones: with other versions some may come out otherwise.
+    if (data_file := out / DATA_FILES["oto"]).is_file():
+        test, known = GraspDataset(data_file, split="test"), published()["rows"]
+        found["rows"], found["published_rows"] = len(test), known["count"]
+        found["rows_as_published"] = rows_digest(test, range(len(test))) == known["sha256"]
 
     # What differs from the published benchmark: in how grasps are tried, and in what was built,
     # which a score cannot set back.

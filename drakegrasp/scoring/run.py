@@ -6,7 +6,6 @@ verdicts become a card. Who does the work is the caller's choice (`Verify`).
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from drakegrasp.errors import GraspError, MachineError
 from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
 from drakegrasp.grasp import unpack_grasp
 from drakegrasp.runtime.files import write_atomic
-from drakegrasp.scoring.benchmark import read_benchmark
+from drakegrasp.scoring.benchmark import read_benchmark, rows_digest
 from drakegrasp.scoring.card import Origin, card_of, card_text
 from drakegrasp.scoring.measures import Grouping, Judged, seconds
 from drakegrasp.scoring.ranked import Ranked, rank
@@ -318,14 +317,12 @@ def _texts(data: GraspDataset, name: str) -> set[str]:
 
 def _described(data: GraspDataset, rows: Sequence[int]) -> dict[str, Any]:
     """Return what a card says of the dataset. The hashes tell whether values differ."""
-    grasps = np.ascontiguousarray(data.column("grasps")[list(rows)], dtype=np.float32)
-    trials = np.ascontiguousarray(data.column("trial_id")[list(rows)], dtype=np.int64)
     return {
         "file": data.path.name,
         "split": data.split,
         "split_rows": len(data),
         "content": data.content,
-        "rows_sha256": hashlib.sha256(trials.tobytes() + grasps.tobytes()).hexdigest(),
+        "rows_sha256": rows_digest(data, rows),
     }
 
 

@@ -74,10 +74,11 @@ def fit(
         losses["valid"].append(mean_loss(network, loss, valid()))
         if not losses["valid"][-1] > min(losses["valid"]):  # or there is nothing to validate with
             best, weights = epoch, copy.deepcopy(network.state_dict())
-        seconds = perf_counter() - start
+        seconds, checked = perf_counter() - start, losses["valid"][-1]
+        told = "none validates" if math.isnan(checked) else f"valid {checked:.3f}  best {best + 1}"
         print(  # noqa: T201
             f"{settings.task}: epoch {epoch + 1}/{settings.epochs}  "
-            f"train {losses['train'][-1]:.3f}  valid {losses['valid'][-1]:.3f}  best {best + 1}  "
+            f"train {losses['train'][-1]:.3f}  {told}  "
             f"{(epoch + 1) * steps / seconds:.1f} batches/s  "
             f"at most {(settings.epochs - epoch - 1) * seconds / (epoch + 1) / 60:.1f} min left",
             flush=True,

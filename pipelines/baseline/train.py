@@ -214,7 +214,8 @@ def _fit(
     draw = partial(batches, train, arguments.batch, augment=True, seed=arguments.seed)
     still = partial(_valid_batches, arguments, valid, batches)
     steps = -(-sum(map(len, train)) // arguments.batch)
-    return fit(network, loss, draw, still, steps, arguments)
+    history = fit(network, loss, draw, still, steps, arguments)
+    return history | {"parts": {"train": sum(map(len, train)), "valid": sum(map(len, valid))}}
 
 
 def _valid_batches(
