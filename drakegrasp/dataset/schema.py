@@ -418,6 +418,26 @@ DATA_FIELDS: tuple[Field, ...] = (
     Field("object_props/frame_world2work", "12", "float32", "m, -", "W", "X_WT, the table top"),
 )
 
+#: How much a lifted attempt bears; see `drakegrasp.simulation.robustness`. Files of builds that do
+#: not certify lack these, see `stored_fields`.
+HOLD_FIELDS: tuple[Field, ...] = tuple(
+    replace(field, stage=Stage.LIFTED, some=True, since=4, optional=True)
+    for field in (
+        Field("p_hold_samples", "", "uint16", "-", "-",
+              "k: disturbed repeats (section `certify`) that would be samples by the default "
+              "filters, but for those of pictures and outliers"),
+        Field("p_hold_held", "", "uint16", "-", "-", "disturbed repeats that hold"),
+        Field("p_hold_repeats", "", "uint16", "-", "-",
+              "n: disturbed repeats with a verdict; 0 of an attempt that was not drawn"),
+        Field("p_hold_half_step", "", "float64", "-", "-",
+              "whether it would be a sample, undisturbed, at half the time step: 1 or 0; NaN if "
+              "that was not tried or has no verdict"),
+        Field("p_hold_probability", "", "float64", "-", "-",
+              "probability with which an attempt of its kind was drawn for repeats; NaN if it was "
+              "not drawn"),
+    )
+)
+
 #: A row per attempt, whatever its outcome, in `/trials` of trials.hdf5 and of every shard.
 TRIAL_FIELDS: tuple[Field, ...] = (
     Field("trial_id", "", "int64", "-", "-", "the row's own number"),
@@ -481,6 +501,7 @@ TRIAL_FIELDS: tuple[Field, ...] = (
         *_RELEASED,
         *_measured("trial", *_WORDS),
     ),
+    *HOLD_FIELDS,
 )
 
 #: How robust a success is; see `drakegrasp.simulation.robustness`.

@@ -36,7 +36,7 @@ from drakegrasp.verification.forces.quality import force_margin
 from drakegrasp.verification.forces.verdict import hand_contacts, judge_forces
 from drakegrasp.verification.hints import FAR, find_hints
 from drakegrasp.verification.result import PoseTrial, Verification
-from drakegrasp.verification.sample import judge_sample
+from drakegrasp.build.sample import judge_sample
 from drakegrasp.verification.wrist.solver import WristFit, fit_wrist
 
 METHODS = ("hand", "forces")

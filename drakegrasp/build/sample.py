@@ -7,6 +7,8 @@ passed; `unjudged` names those filters.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from drakegrasp.arithmetic import multiply
@@ -26,7 +28,9 @@ from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, intrinsics
 
 
-def judge_sample(model: ObjectModel, trial: TrialRecord, config: Config) -> Removal | None:
+def judge_sample(
+    model: ObjectModel, trial: TrialRecord, config: Config, *, views: bool = True
+) -> Removal | None:
     """Return the first filter that removes a held grasp, `KEPT` if none does.
 
     The cameras are where a build puts them without randomisation.
@@ -35,6 +39,8 @@ def judge_sample(model: ObjectModel, trial: TrialRecord, config: Config) -> Remo
         model: The object.
         trial: Of the grasp.
         config: With the filters and the camera.
+        views: Whether the filters of the view of a camera count: where it is, and whether it sees
+            the contacts. They do not where the palm is off, as the picture was taken before.
 
     Returns:
         The filter; None for a trial that is no success.
@@ -49,6 +55,9 @@ def judge_sample(model: ObjectModel, trial: TrialRecord, config: Config) -> Remo
         object=0,
         K=intrinsics(config.camera),
     )
+    if not views:
+        height = np.full(1, np.inf)
+        successes = replace(successes, in_view=np.ones(1, dtype=np.bool_), camera_height=height)
     (removal,) = judge_successes(successes, rules, removed_by_own=np.zeros(1, dtype=np.bool_))
     return Removal(int(removal))
 
