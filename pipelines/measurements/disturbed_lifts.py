@@ -25,9 +25,15 @@ import numpy as np
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.build.attempts import find_attempt
-from drakegrasp.build.sample import judge_sample
+from drakegrasp.build.columns import judge_sample
 from drakegrasp.config import Config, with_whole_lifts
-from drakegrasp.dataset.holding import COLUMNS, MUCH, area_under_roc, predictors, wilson_interval
+from drakegrasp.dataset.card.holding import (
+    COLUMNS,
+    MUCH,
+    area_under_roc,
+    predictors,
+    wilson_interval,
+)
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.trials import Trials

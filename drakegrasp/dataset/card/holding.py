@@ -175,6 +175,22 @@ class Holding:
     predictor: tuple[str, float] | None
 
 
+def holding_lines(holding: Holding) -> list[str]:
+    """Return how much the grasps of a dataset bear, in sentences without a full stop."""
+    lines = [
+        f"p_hold of {name}: {100 * each.samples:.0f} % of the disturbed repeats would be samples "
+        f"({100 * each.low:.0f} to {100 * each.high:.0f} %), {100 * each.held:.0f} % hold; "
+        f"half or more of their repeats would be samples of {each.much:,} of {each.drawn:,}"
+        for name, each in holding.groups.items()
+    ]
+    if holding.predictor is not None:
+        name, area = holding.predictor
+        lines.append(
+            f"of what is stored of the first lift, {name} ranks these samples best (AUC {area:.2f})"
+        )
+    return lines
+
+
 def holding_of(trials: Trials) -> Holding | None:
     """Return how much the grasps of a dataset bear; None if none was repeated."""
     names = [*(field.name for field in HOLD_FIELDS), "removal"]
@@ -188,9 +204,9 @@ def holding_of(trials: Trials) -> Holding | None:
     groups = {name: each for name, each in found.items() if each is not None}
     if not groups:
         return None
-    (rows,) = np.nonzero(sample & (columns["p_hold_repeats"] > 0))
-    much = columns["p_hold_samples"][rows] >= MUCH * columns["p_hold_repeats"][rows]
-    scores = predictors(trials[rows].columns(COLUMNS)) if len(rows) else {}
+    repeated = sample & (columns["p_hold_repeats"] > 0)
+    much = (columns["p_hold_samples"] >= MUCH * columns["p_hold_repeats"])[repeated]
+    scores = predictors(trials[repeated].columns(COLUMNS))
     ranked = {name: area_under_roc(values, much) for name, values in scores.items()}
     known = {name: area for name, area in ranked.items() if np.isfinite(area)}
     best = max(known, key=lambda name: known[name]) if known else None
