@@ -375,6 +375,9 @@ def test_certificates_come_with_the_grasps_and_change_none(
 ) -> None:
     """Of the last object, whose attempts do not depend on the others."""
     certified = ["certify.repeats=2", "certify.friction_steps=1", "certify.share_others=1"]
+    # Each object is likely to be tested, and no other sample would be drawn.
+    certified += ["certify.share=0", "certify.share_tested=1"]
+    certified += ["split.test_fraction=0.9", "split.valid_fraction=0.09"]
     config = override_config(small_config, certified)
     build([find_meshes(small_meshes)[-1]], tmp_path / "out", config, run_here, show=False)
     with (

@@ -48,14 +48,14 @@ def test_repeats_are_checked(certified: Path) -> None:
     for column, value in (("held", 5), ("samples", 6), ("half_step", 0.5)):
         change(certified, TRIALS, f"trials/p_hold_{column}", 0, lambda _, value=value: value)
     change(certified, TRIALS, "trials/p_hold_repeats", 3, lambda _: 9)
-    change(certified, TRIALS, "trials/p_hold_probability", 6, lambda _: 1.5)
+    change(certified, TRIALS, "trials/p_hold_probability", 12, lambda _: 1.5)
     must_find_without_shards(
         certified,
         (TRIALS, "/trials", 0, "p_hold_held must be at most p_hold_repeats"),
         (TRIALS, "/trials", 0, "p_hold_samples must be at most p_hold_held"),
         (TRIALS, "/trials", 0, "p_hold_half_step must be 0, 1 or NaN"),
         (TRIALS, "/trials", 3, "p_hold_repeats must be at most"),
-        (TRIALS, "/trials", 6, "p_hold_probability must be NaN or in 0..1"),
+        (TRIALS, "/trials", 12, "p_hold_probability must be NaN or in 0..1"),
     )
 
 
@@ -104,5 +104,5 @@ def test_interval_stands_beside_k_of_n_and_the_predictor_beside_p_hold(certified
     assert "% of the disturbed repeats would be samples (" in said
     assert f"ranks these samples best (AUC {holding.predictor[1]:.2f})" in said
     card = json.loads((certified / "DATACARD.json").read_text(encoding="utf-8"))
-    assert card["p_hold"]["groups"]["samples"]["drawn"] == 8
+    assert card["p_hold"]["groups"]["samples"]["drawn"] == 9
     assert "## How much a grasp bears" in (certified / "DATACARD.md").read_text(encoding="utf-8")
