@@ -101,6 +101,9 @@ lift:
   least_depth_variance: 0.0005
 certify:
   repeats: 5
+  share: 0.5
+  share_others: 0.25
+  share_tested: 0.75
   palm_noise: 0.001
   palm_noise_deg: 2.0
   friction_noise: 0.2

@@ -252,6 +252,10 @@ def resting(model: ObjectModel, X_TO: Array) -> PreparedObject:
 _KEPT = TemporaryDirectory(prefix="datasets-")
 
 
+#: With these values all columns are there.
+CERTIFIED = ("certify.repeats=4", "certify.share_others=0.5")
+
+
 def make_dataset(out: Path, meshes: Path, *overrides: str) -> Path:
     """Write the small dataset, with some values of the configuration, and its meshes."""
     kept_out, kept_meshes = _made(overrides, tuple(BOXES))

@@ -15,7 +15,16 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from helpers.datasets import SLIP, SLIPPED, TRIALS, change, end_lift, make_dataset, set_at
+from helpers.datasets import (
+    CERTIFIED,
+    SLIP,
+    SLIPPED,
+    TRIALS,
+    change,
+    end_lift,
+    make_dataset,
+    set_at,
+)
 from helpers.pages import ATTACK, Tags, coded, get, numbered, state_of, surface_of
 from matplotlib.image import imread
 from starlette.testclient import TestClient
@@ -408,7 +417,7 @@ def test_page_of_a_grasp_has_friction_certificate_and_text_to_copy(
 
 
 def test_p_hold_is_shown_and_filtered_by(tmp_path: Path) -> None:
-    out = make_dataset(tmp_path / "certified", tmp_path, "certify.repeats=4")
+    out = make_dataset(tmp_path / "certified", tmp_path, *CERTIFIED)
     change(out, TRIALS, "trials/p_hold_samples", 0, lambda _: 1)
     client = TestClient(make_app(Inspection(out)), base_url="http://127.0.0.1:8321")
     page = get(client, "/grasp/0-0-0").text

@@ -26,15 +26,9 @@ from drakegrasp.dataset.trials import Trials
 from drakegrasp.outcomes import Outcome
 
 
-@pytest.fixture
-def certified(tmp_path: Path) -> Path:
-    return make_dataset(
-        tmp_path / "certified", tmp_path, "certify.repeats=4", "certify.share_others=0.5"
-    )
-
-
-def test_files_of_certified_builds_alone_have_the_columns(certified: Path, out: Path) -> None:
-    for path, there in ((certified, True), (out, False)):
+def test_files_of_certified_builds_alone_have_the_columns(out: Path, tmp_path: Path) -> None:
+    plain = make_dataset(tmp_path / "plain", tmp_path)
+    for path, there in ((out, True), (plain, False)):
         with h5py.File(path / TRIALS) as trials, h5py.File(path / "grasping_oto.hdf5") as data:
             for field in HOLD_FIELDS:
                 assert (field.name in trials["trials"]) is there
@@ -44,13 +38,13 @@ def test_files_of_certified_builds_alone_have_the_columns(certified: Path, out: 
         must_find(path)
 
 
-def test_repeats_are_checked(certified: Path) -> None:
+def test_repeats_are_checked(out: Path) -> None:
     for column, value in (("held", 5), ("samples", 6), ("half_step", 0.5)):
-        change(certified, TRIALS, f"trials/p_hold_{column}", 0, lambda _, value=value: value)
-    change(certified, TRIALS, "trials/p_hold_repeats", 3, lambda _: 9)
-    change(certified, TRIALS, "trials/p_hold_probability", 12, lambda _: 1.5)
+        change(out, TRIALS, f"trials/p_hold_{column}", 0, lambda _, value=value: value)
+    change(out, TRIALS, "trials/p_hold_repeats", 3, lambda _: 9)
+    change(out, TRIALS, "trials/p_hold_probability", 12, lambda _: 1.5)
     must_find_without_shards(
-        certified,
+        out,
         (TRIALS, "/trials", 0, "p_hold_held must be at most p_hold_repeats"),
         (TRIALS, "/trials", 0, "p_hold_samples must be at most p_hold_held"),
         (TRIALS, "/trials", 0, "p_hold_half_step must be 0, 1 or NaN"),
@@ -92,17 +86,17 @@ def test_margin_of_a_force_on_the_cone_is_zero_and_of_one_along_the_normal_one(o
         assert found == pytest.approx(np.full(3, margin))
 
 
-def test_interval_stands_beside_k_of_n_and_the_predictor_beside_p_hold(certified: Path) -> None:
+def test_interval_stands_beside_k_of_n_and_the_predictor_beside_p_hold(out: Path) -> None:
     assert share_text(3, 4) == "3 of 4 (30 to 95 %)"
-    change(certified, TRIALS, "trials/p_hold_samples", 0, lambda _: 0)
-    holding = holding_of(Trials(certified))
+    change(out, TRIALS, "trials/p_hold_samples", 0, lambda _: 0)
+    holding = holding_of(Trials(out))
     assert holding is not None
     assert set(holding.groups) == {"samples", "others"}
     assert holding.groups["others"].samples == 0.0
     assert holding.predictor is not None
-    said = CliRunner().invoke(main, ["stats", str(certified)]).output
+    said = CliRunner().invoke(main, ["stats", str(out)]).output
     assert "% of the disturbed repeats would be samples (" in said
     assert f"ranks these samples best (AUC {holding.predictor[1]:.2f})" in said
-    card = json.loads((certified / "DATACARD.json").read_text(encoding="utf-8"))
+    card = json.loads((out / "DATACARD.json").read_text(encoding="utf-8"))
     assert card["p_hold"]["groups"]["samples"]["drawn"] == 9
-    assert "## How much a grasp bears" in (certified / "DATACARD.md").read_text(encoding="utf-8")
+    assert "## How much a grasp bears" in (out / "DATACARD.md").read_text(encoding="utf-8")
