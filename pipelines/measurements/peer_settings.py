@@ -3,8 +3,8 @@
     python pipelines/measurements/peer_settings.py lines.jsonl --dataset OUT --count 100
     python pipelines/measurements/peer_settings.py lines.jsonl
 
-As many samples and lost lifts of a dataset are drawn as for `bench --cross-check`, in turns of the
-objects. Each is tried with torsion radii of 1, 2 and 5 mm, with 10 % less and more friction with
+Samples and lost lifts are drawn from random objects of a dataset that have both, some of each. Each
+is tried with torsion radii of 1, 2 and 5 mm, with 10 % less and more friction with
 the hand, and at half the step. The first call writes a line per lift; the second prints the shares
 that hold, with their intervals, and how many verdicts are others than with the usual settings.
 """
@@ -18,7 +18,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import cache
-from itertools import groupby, zip_longest
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -31,9 +30,12 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.mjcf import links, scene
 from drakegrasp.outcomes import Outcome
+from drakegrasp.seeding import Stream
 from drakegrasp.simulation.randomization.conditions import usual_conditions
 
 GROUPS: tuple[Group, ...] = ("sample", "lost")
+#: Last number of the place of the stream that draws objects.
+PLACE = 25
 #: Torsion radius [m], factor of the friction with the hand, and of the time step, by setting.
 SETTINGS = {
     "usual": (links.TORSION_RADIUS, 1.0, 1),
@@ -86,17 +88,23 @@ def try_object(out: Path, name: str, lifts: Sequence[StoredLift]) -> Iterator[di
         yield {"trial_id": lift.trial_id, "object": name, "group": lift.group, "there": found}
 
 
-def measure(out: Path, count: int, lines: Path) -> None:
+def measure(out: Path, count: int, each: int, lines: Path) -> None:
     """Write a line for each of some samples and lost lifts of a dataset."""
-    every = draw_lifts(out, 1 << 62)
-    piles = [[lift for lift in every if lift.group == group][:count] for group in GROUPS]
-    drawn = [lift for pair in zip_longest(*piles) for lift in pair if lift is not None]
-    # Objects in the order in which they were drawn: what is there after a while is a fair share.
-    order = {name: k for k, name in reversed([*enumerate(x.object_name for x in drawn)])}
-    drawn.sort(key=lambda lift: order[lift.object_name])
+    config, by_object = read_manifest(out).config, dict[str, list[StoredLift]]()
+    for lift in draw_lifts(out, 1 << 62):
+        by_object.setdefault(lift.object_name, []).append(lift)
+
+    # Objects in random order: what is there after a while is a fair share.
+    names, left = sorted(by_object), dict.fromkeys(GROUPS, count)
     with lines.open("w", encoding="utf-8") as file:
-        for name, same in groupby(drawn, key=lambda lift: lift.object_name):
-            for line in try_object(out, name, list(same)):
+        for i in Stream(config.seed, PLACE).permutation(len(names)).tolist():
+            own = [[x for x in by_object[names[i]] if x.group == group] for group in GROUPS]
+            if not all(own):
+                continue  # cutting an object into convex parts takes longer than a lift
+            taken = [pile[: min(each, left[g])] for g, pile in zip(GROUPS, own, strict=True)]
+            for group, pile in zip(GROUPS, taken, strict=True):
+                left[group] -= len(pile)
+            for line in try_object(out, names[i], [*taken[0], *taken[1]]):
                 file.write(json.dumps(line) + "\n")
                 file.flush()
 
@@ -120,9 +128,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("lines", type=Path, help="file with a line per lift")
     parser.add_argument("--dataset", type=Path, help="measure lifts of this dataset")
     parser.add_argument("--count", type=int, default=100, help="of each group (default: 100)")
+    parser.add_argument("--each", type=int, default=4, help="of each object (default: 4)")
     arguments = parser.parse_args(argv)
     if arguments.dataset is not None:
-        measure(arguments.dataset, arguments.count, arguments.lines)
+        measure(arguments.dataset, arguments.count, arguments.each, arguments.lines)
     rows = [json.loads(line) for line in arguments.lines.read_text(encoding="utf-8").splitlines()]
     sys.stdout.writelines(f"{line}\n" for line in summarise(rows))
     return 0
