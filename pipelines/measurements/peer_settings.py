@@ -99,7 +99,7 @@ def measure(out: Path, count: int, each: int, lines: Path) -> None:
     with lines.open("w", encoding="utf-8") as file:
         for i in Stream(config.seed, PLACE).permutation(len(names)).tolist():
             own = [[x for x in by_object[names[i]] if x.group == group] for group in GROUPS]
-            if not all(own):
+            if not all(own) or not any(left.values()):
                 continue  # cutting an object into convex parts takes longer than a lift
             taken = [pile[: min(each, left[g])] for g, pile in zip(GROUPS, own, strict=True)]
             for group, pile in zip(GROUPS, taken, strict=True):
