@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePath
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import yaml
 from pydantic import (
@@ -303,14 +303,25 @@ class LiftConfig(_Section):
 
 
 class CertifyConfig(_Section):
-    """How robust each success is; see docs/explanation/physics.md."""
+    """How much lifted attempts bear; see docs/explanation/physics.md."""
 
-    repeats: NonNegativeCount = 0  # with noise, of each success; 0 switches certification off
+    repeats: NonNegativeCount = 0  # disturbed, of each attempt that is drawn; 0: none is drawn
+    # Probability that a sample (by the default filters) is drawn; null stores nothing, as it is of
+    # datasets whose successes an older version certified.
+    share: Share | None = 1.0
+    share_others: Share = 0.0  # probability that another lifted attempt is drawn
+    # The same of a sample of an object that a split by object is likely to test or to validate
+    # with; the larger one counts.
+    share_tested: Share = 0.0
     palm_noise: NonNegative = 0.002  # [m], standard deviation along each axis of the palm
     palm_noise_deg: NonNegative = 1.0  # standard deviation about each axis of the palm
     friction_noise: NonNegative = 0.1  # standard deviation of the coefficient's logarithm
     mass_noise: NonNegative = 0.1  # standard deviation of the mass's logarithm
-    friction_steps: Annotated[int, Field(ge=1, le=16)] = 4  # halvings to the least friction
+    # Halvings to the least friction of successes; 0: it is not looked for.
+    friction_steps: Annotated[int, Field(ge=0, le=16)] = 4
+
+    #: Keys that older versions lack.
+    NEW: ClassVar[tuple[str, ...]] = ("share", "share_others", "share_tested")
 
 
 class CameraConfig(_Section):
@@ -591,7 +602,15 @@ class Config(_Section):
             del tree["candidates"]["postures"]
         if self.scenes == ScenesConfig():
             del tree["scenes"]
+        if not self.certified:
+            for key in CertifyConfig.NEW:
+                del tree["certify"][key]
         return tree
+
+    @property
+    def certified(self) -> bool:
+        """Whether files say how much attempts bear, see `schema.HOLD_FIELDS`."""
+        return self.certify.repeats > 0 and self.certify.share is not None
 
     @property
     def code(self) -> Mapping[str, str]:
@@ -694,7 +713,8 @@ def parse_config(tree: dict[str, Any]) -> Config:
 def parse_stored(tree: Any) -> Config:
     """Return the configuration that a file of a dataset holds, as JSON.
 
-    Without `split.by` it was written when there was the split by class alone. With one of
+    Without `split.by` it was written when there was the split by class alone; without
+    `certify.share`, when successes were certified otherwise. With one of
     `OLD_LIMITS`, `verify.max_contact_error` decided what is tried, too, and does not count.
 
     Raises:
@@ -702,6 +722,9 @@ def parse_stored(tree: Any) -> Config:
     """
     if isinstance(tree, dict) and isinstance(split := tree.get("split"), dict):
         tree = {**tree, "split": {"by": "class", **split}}
+    certify = tree.get("certify") if isinstance(tree, dict) else None
+    if isinstance(certify, dict) and certify.get("repeats"):
+        tree = {**tree, "certify": {"share": None, **certify}}
     if isinstance(tree, dict) and isinstance(verify := tree.get("verify"), dict):
         old = {*OLD_LIMITS, "max_contact_error"} if verify.keys() & {*OLD_LIMITS} else set()
         tree = {**tree, "verify": {k: v for k, v in verify.items() if k not in old}}

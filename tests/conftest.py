@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import trimesh
-from helpers.datasets import make_dataset
+from helpers.datasets import CERTIFIED, make_dataset
 from helpers.meshes import G3DB, SMALL, write_fixed
 from helpers.objects import CUBE, box_model
 from hypothesis import HealthCheck, settings
@@ -88,8 +88,12 @@ def small_dataset(
 
 @pytest.fixture(scope="session")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset that nobody simulated: nine successes of 36 attempts on three boxes. Read only."""
-    return make_dataset(tmp_path_factory.mktemp("sound"), tmp_path_factory.mktemp("meshes"))
+    """A dataset that nobody simulated: nine successes of 36 attempts on three boxes. Read only.
+
+    Its lifts are certified, so that it has all columns that there are.
+    """
+    folders = tmp_path_factory.mktemp("sound"), tmp_path_factory.mktemp("meshes")
+    return make_dataset(*folders, *CERTIFIED)
 
 
 @pytest.fixture

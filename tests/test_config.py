@@ -101,6 +101,9 @@ lift:
   least_depth_variance: 0.0005
 certify:
   repeats: 5
+  share: 0.5
+  share_others: 0.25
+  share_tested: 0.75
   palm_noise: 0.001
   palm_noise_deg: 2.0
   friction_noise: 0.2
@@ -476,6 +479,18 @@ def test_simulation_hash_changes_with_what_is_simulated_and_nothing_else(key: st
 def test_datasets_that_were_begun_with_the_defaults_go_on() -> None:
     """A new setting whose default changes nothing must not change what manifests say."""
     assert load_config().simulation_hash() == "48ceb34ff99d5962"
+    assert not {"share", "share_others", "share_tested"} & load_config().to_dict()["certify"].keys()
+
+
+def test_dataset_that_an_older_version_certified_is_read_as_it_is() -> None:
+    """Its shards have that hash; nothing is drawn for what it does not have."""
+    tree = load_config(overrides=["certify.repeats=2"]).to_dict()
+    for key in ("share", "share_others", "share_tested"):
+        del tree["certify"][key]
+    old = parse_stored(tree)
+    assert old.simulation_hash() == "eff81440c269adb2"
+    assert old.to_dict() == tree
+    assert not old.certified
 
 
 @pytest.mark.parametrize(

@@ -12,14 +12,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib import metadata
 from itertools import chain, groupby, islice, zip_longest
-from math import sqrt
 from pathlib import Path
-from statistics import NormalDist
 from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 
 from drakegrasp.config import Config
+from drakegrasp.dataset.card.holding import wilson_interval
 from drakegrasp.dataset.manifest import installed_versions, read_manifest, refuse_older
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.trials import Trials
@@ -41,8 +40,6 @@ GROUPS: tuple[Group, ...] = get_args(Group)
 #: Outcomes of lifts that were lost; after closing, `table_contact` is no lift. What `moved` has no
 #: verdict to compare, and is in no group.
 LOST = (Outcome.SLIPPED, Outcome.DROPPED, Outcome.TABLE_CONTACT)
-#: Probability that the true share lies in the interval that is printed.
-CONFIDENCE = 0.95
 #: Last number of the place of the stream that draws lifts: the split's is 1.
 _PLACE = 2
 
@@ -168,23 +165,6 @@ def _share(hits: int, count: int) -> dict[str, float] | None:
         return None
     low, high = wilson_interval(hits, count)
     return {"share": hits / count, "low": low, "high": high}
-
-
-def wilson_interval(hits: int, count: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Return the interval of a share, from hits among independent trials (Wilson, 1927).
-
-    Unlike the normal approximation it is right near 0 and 1, where these shares lie.
-
-    Args:
-        hits: Number of hits.
-        count: Number of trials, positive.
-        confidence: Probability that the true share lies within.
-    """
-    z = NormalDist().inv_cdf(0.5 + confidence / 2.0)
-    share, weight = hits / count, z * z / count
-    centre = (share + weight / 2.0) / (1.0 + weight)
-    half = z * sqrt(share * (1.0 - share) / count + weight / (4.0 * count)) / (1.0 + weight)
-    return max(0.0, centre - half), min(1.0, centre + half)
 
 
 def _read_lifts(out: Path) -> list[StoredLift]:

@@ -172,10 +172,10 @@ def _shared(tasks: int, workers: int, seconds: float) -> float:
 
 
 def _certify_seconds(config: Config) -> float:
-    """Return how long certifying a success takes [s]."""
+    """Return how long certifying takes for each success [s]; other lifts are not counted."""
     rules = config.certify
-    simulations = rules.repeats + rules.friction_steps + 1 if rules.repeats else 0
-    return CERTIFY_SECONDS * simulations
+    simulations = rules.repeats + rules.friction_steps + 1 if config.certified else 0
+    return CERTIFY_SECONDS * (rules.share or 0.0) * simulations
 
 
 def _duration(seconds: float) -> str:

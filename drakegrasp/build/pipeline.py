@@ -54,6 +54,9 @@ from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.postures.table import PostureTable, misfits
 from drakegrasp.simulation.sampling.own import own_sampler
 
+#: By how much a rank may be off the border of a split that depends on which objects have samples.
+NEAR_BORDER = 0.05
+
 
 @dataclass(frozen=True, kw_only=True)
 class BuildReport:
@@ -464,6 +467,21 @@ def _spared(manifest: Manifest) -> set[str]:
     return {name for name in names if rank_in_split(name, seed) < share}
 
 
+def _likely_tested(manifest: Manifest) -> set[str]:
+    """Return the names of the objects that a split by object may test or validate with.
+
+    Which it does depends on which objects have samples. The shares are a little larger here, so
+    that hardly any is left out.
+    """
+    rules, config = manifest.config.split, manifest.config
+    ranks = {
+        entry.name: rank_in_split(group, config.seed)
+        for entry, group in zip(manifest.objects, manifest.groups, strict=True)
+    }
+    low, high = rules.test_fraction + NEAR_BORDER, 1.0 - rules.valid_fraction - NEAR_BORDER
+    return {name for name, rank in ranks.items() if rank < low or rank >= high}
+
+
 def _run_units(
     headers: Iterable[ShardHeader],
     manifest: Manifest,
@@ -473,17 +491,19 @@ def _run_units(
 ) -> None:
     """Run work units, and count what they found."""
     config, restartable = manifest.config, job.pool is not None
-    spared = _spared(manifest)
+    spared, tested = _spared(manifest), _likely_tested(manifest)
     units = (
         WorkUnit(
             out=job.out,
             header=header,
             config=config,
             refined=header.object_name not in spared,
+            likely_tested=header.object_name in tested,
             restartable=restartable,
         )
         for header in headers
     )
+
     for summary in job.execute(run_unit, units):
         counts.simulated += 1
         counts.errors.update(summary.errors)

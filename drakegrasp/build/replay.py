@@ -87,7 +87,8 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
         differences={
             field.name: _difference(stored.row[field.name], row[field.name][0])
             for field in trial_columns()
-            if not np.array_equal(stored.row[field.name], row[field.name][0], equal_nan=True)
+            if field.name in row
+            and not np.array_equal(stored.row[field.name], row[field.name][0], equal_nan=True)
         },
         versions={
             key: f"{then} -> {now.get(key)}"

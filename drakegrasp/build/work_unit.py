@@ -29,12 +29,13 @@ from drakegrasp.build.attempts import (
     trial_setup,
     try_attempt,
 )
-from drakegrasp.build.columns import empty_looks, fill_look, trial_rows
+from drakegrasp.build.columns import empty_looks, fill_look, judge_sample, trial_rows
 from drakegrasp.build.target import has_target
 from drakegrasp.config import Config, FilterConfig
 from drakegrasp.dataset.assembly.survey import count_samples, successes_of
 from drakegrasp.dataset.filters import judge_successes
 from drakegrasp.dataset.hdf5 import AnyArray
+from drakegrasp.dataset.schema import HOLD_FIELDS
 from drakegrasp.dataset.shards import Shard, ShardHeader, read_trials, write_shard
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.outcomes import Outcome, Removal
@@ -52,7 +53,8 @@ from drakegrasp.runtime.journal import (
 )
 from drakegrasp.runtime.timing import timed
 from drakegrasp.simulation.candidates import Attempt
-from drakegrasp.simulation.robustness import UNKNOWN, Certificate, certify
+from drakegrasp.simulation.robustness import Certificate, certify, is_drawn
+from drakegrasp.simulation.scene_cache import cached_scene
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.vision.camera import intrinsics
@@ -63,8 +65,8 @@ HANG_FACTOR = 1.5
 STAGE_SECONDS = 600.0
 #: A certificate hangs when it takes this many times the limit of all its simulations.
 CERTIFY_FACTOR = 2.0
-#: What a parent of refined palm poses passes: all default filters but that of outliers, which looks
-#: at all grasps of an object.
+#: What a parent of refined palm poses and a sample that is repeated pass: all default filters but
+#: that of outliers, which looks at all grasps of an object.
 PARENT_FILTERS = FilterConfig(outlier_sigma=0.0)
 #: What each step of a unit that is no attempt does, for error messages.
 _STEPS = {
@@ -85,6 +87,7 @@ class WorkUnit:
         header: Object and range of candidates.
         config: All the rules.
         refined: Whether palm poses about those of samples are tried, if the configuration has any.
+        likely_tested: Whether its samples may test or validate, see `certify.share_tested`.
         restartable: Whether the process that runs it is started again when it dies. If so, a
             crash or a hang costs only the attempt; if not, it propagates to the caller.
     """
@@ -93,6 +96,7 @@ class WorkUnit:
     header: ShardHeader
     config: Config
     refined: bool = True
+    likely_tested: bool = False
     restartable: bool = False
 
 
@@ -122,7 +126,7 @@ _one_unit = threading.Lock()
 
 @one_thread
 def run_unit(unit: WorkUnit) -> UnitSummary:
-    """Run all attempts of a unit, render and certify its successes, and write its shard.
+    """Run all attempts of a unit, render its successes, certify lifts, and write its shard.
 
     A unit whose shard is complete is not run again.
 
@@ -166,6 +170,9 @@ def _run_experiment(unit: WorkUnit, journal: Journal) -> UnitSummary:
     while attempts:
         first = sum(len(done.attempts) for done in rounds)
         rounds.append(_run_round(setup, attempts, first, journal, seconds))
+        if config.certified:
+            with timed(seconds, "certify"):
+                _certify_lifts(setup, rounds[-1], first, journal, likely_tested=unit.likely_tested)
         attempts = _children_of_samples(setup, rounds[-1]) if unit.refined else []
 
     # Write the shard: all of it or nothing.
@@ -200,7 +207,7 @@ def _run_round(
     journal: Journal,
     seconds: dict[str, float],
 ) -> _Round:
-    """Try attempts, the first of which is in row `first` of the unit; measure, render, certify."""
+    """Try attempts, the first of which is in row `first` of the unit; measure, render."""
     # Try each attempt: what geometry already decides is not simulated.
     with timed(seconds, "try"):
         predictions = _predict_all(setup, attempts, journal)
@@ -214,11 +221,6 @@ def _run_round(
     with timed(seconds, "look"):
         looks = render_successes(setup, attempts, records, journal, first)
 
-    # Certify: simulate each success again with noise and with less friction, if asked for.
-    if setup.config.certify.repeats:
-        with timed(seconds, "certify"):
-            _certify_successes(setup, attempts, looks, journal, first)
-
     trials = trial_rows(setup, attempts, records, fits)
     return _Round(attempts=attempts, records=records, trials=trials, looks=looks)
 
@@ -228,16 +230,23 @@ def _children_of_samples(setup: TrialSetup, done: _Round) -> list[Attempt]:
     config = setup.config
     if not config.refine.children:
         return []
+    return [
+        child
+        for row in _samples(setup, done)
+        for child in list_children(setup.prepared, done.attempts[row], config)
+    ]
+
+
+def _samples(setup: TrialSetup, done: _Round) -> list[int]:
+    """Return the rows of a round that are samples by the default filters."""
     rows = np.flatnonzero(done.trials["outcome"] == Outcome.SUCCESS)
     trials = {name: values[rows] for name, values in done.trials.items()}
     depths = done.looks["image_otm"][:, 3]
-    successes = successes_of(trials, done.looks, depths, object=0, K=intrinsics(config.camera))
+    successes = successes_of(
+        trials, done.looks, depths, object=0, K=intrinsics(setup.config.camera)
+    )
     removal = judge_successes(successes, PARENT_FILTERS)
-    return [
-        child
-        for row in rows[removal == Removal.KEPT].tolist()
-        for child in list_children(setup.prepared, done.attempts[row], config)
-    ]
+    return rows[removal == Removal.KEPT].tolist()
 
 
 def _joined(parts: Sequence[dict[str, AnyArray]]) -> dict[str, AnyArray]:
@@ -356,29 +365,56 @@ def _try_step(
         return try_attempt(setup, attempt, prediction)
 
 
-def _certify_successes(
-    setup: TrialSetup,
-    attempts: Sequence[Attempt],
-    looks: dict[str, AnyArray],
-    journal: Journal,
-    first: int,
+def _certify_lifts(
+    setup: TrialSetup, done: _Round, first: int, journal: Journal, *, likely_tested: bool
 ) -> None:
-    """Fill in the robustness of each success."""
-    for k, row in enumerate(looks["row"].tolist()):
-        certificate = _certify_step(setup, attempts[row - first], journal, f"certify {row}")
-        looks["certified_share"][k] = certificate.share
-        looks["certified_friction"][k] = certificate.friction
+    """Add to a round how much its lifts bear that are drawn for it.
+
+    Args:
+        setup: Of the unit.
+        done: The round.
+        first: Row of its first attempt in the unit.
+        journal: Of the unit.
+        likely_tested: Of the unit.
+    """
+    rules, trials, samples = setup.config.certify, done.trials, set(_samples(setup, done))
+    of_samples = max(rules.share or 0.0, rules.share_tested if likely_tested else 0.0)
+    trials |= {field.name: field.empty(len(done.attempts), {}) for field in HOLD_FIELDS}
+    look_of = {row - first: k for k, row in enumerate(done.looks["row"].tolist())}
+    for row in np.flatnonzero(np.isfinite(trials["time_lift"])).tolist():
+        probability = of_samples if row in samples else rules.share_others
+        if not is_drawn(done.attempts[row], probability):
+            continue
+        held = row in look_of
+        step = f"certify {first + row}"
+        found = _certify_step(setup, done.attempts[row], journal, step, held=held)
+        trials["p_hold_probability"][row] = probability
+        for name in ("repeats", "held", "samples", "half_step"):
+            trials[f"p_hold_{name}"][row] = getattr(found, name)
+        if held:
+            done.looks["certified_friction"][look_of[row]] = found.friction
+    # A scene in which Drake failed was forgotten.
+    setup.scene = cached_scene(setup.prepared.model, setup.config.physics, setup.config.hand_source)
 
 
-def _certify_step(setup: TrialSetup, attempt: Attempt, journal: Journal, step: str) -> Certificate:
-    # A certificate that ended its process costs the certificate: the grasp itself held.
+def _certify_step(
+    setup: TrialSetup, attempt: Attempt, journal: Journal, step: str, *, held: bool
+) -> Certificate:
+    # A certificate that ended its process costs the certificate: the lift itself has its verdict.
     if journal.verdict(step) is not None:
-        return UNKNOWN
-    rules, config = setup.config.certify, setup.config
-    simulations = rules.repeats + rules.friction_steps + 1
+        return Certificate()
+    model, config = setup.prepared.model, setup.config
+    rules = config.model_copy(update={"filters": PARENT_FILTERS})
+    simulations = config.certify.repeats + config.certify.friction_steps + 1
     with journal.step(step, CERTIFY_FACTOR * simulations * config.attempt_seconds):
-        X_TO = setup.prepared.resting_poses[attempt.resting]
-        return certify(setup.prepared.model, X_TO, attempt, config)
+        return certify(
+            model,
+            setup.prepared.resting_poses[attempt.resting],
+            attempt,
+            config,
+            lambda trial: judge_sample(model, trial, rules, views=False) is Removal.KEPT,
+            held=held,
+        )
 
 
 @contextmanager

@@ -189,6 +189,7 @@ def print_stats(out: Path) -> None:
         split_table,
         unfinished_line,
     )
+    from drakegrasp.dataset.card.holding import holding_lines, holding_of
     from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.dataset.paths import DATA_FILES
     from drakegrasp.dataset.statistics import (
@@ -198,6 +199,7 @@ def print_stats(out: Path) -> None:
         preshapes_of,
         split_rule_of,
     )
+    from drakegrasp.dataset.trials import Trials
 
     console, unfinished = make_console(), count_unfinished(out)
     funnel = count_funnel(out) if unfinished is None else unfinished.funnel
@@ -217,6 +219,9 @@ def print_stats(out: Path) -> None:
         say(split_line(split_rule_of(out / DATA_FILES["oto"]), funnel, splits))
         for line in barren_lines(funnel):
             say(line)
+        if (holding := holding_of(Trials(out))) is not None:
+            for line in holding_lines(holding):
+                say(line)
         samples = {row.split: row.samples for row in splits}
         chosen = read_manifest(out).config.split.train_classes
         if any(samples.values()) and not samples["train"] and chosen is None:

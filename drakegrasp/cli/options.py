@@ -101,7 +101,7 @@ _TABLE = {
     ),
     "--certify": _row(
         "K",
-        "Repeat each success K times with noise and store how robust it is.  [default: 0]",
+        "Repeat each sample K times, disturbed, and store how many hold.  [default: 0]",
         type=int,
     ),
     "--seed": _row("S", "Seed of all random draws.  [default: 0]", type=int),

@@ -49,6 +49,7 @@ from drakegrasp.dataset.schema import (
     SUCCESS_FIELDS,
     TRIAL_FIELDS,
     Field,
+    stored_fields,
 )
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Removal
@@ -135,6 +136,7 @@ def assemble_locked(
             known = keys_of(manifest, shards.successes)
             manifest = replace(manifest, rejected=find_keys(rejected, known, out))
         decisions = decide(manifest, shards.successes)
+        certified = manifest.config.certified
 
         # Write what is small, and room for all rows.
         paths = {name: new(name) for name in (TRIALS_FILE, *DATA_FILES.values())}
@@ -146,7 +148,7 @@ def assemble_locked(
             group = trials.create_group("trials")
             columns = [
                 create_field(group, f, f.row_shape(shards.sizes), shards.count)
-                for f in TRIAL_FIELDS
+                for f in stored_fields(TRIAL_FIELDS, certified=certified)
             ]
             rows = {}
             for camera, name in DATA_FILES.items():
@@ -154,11 +156,11 @@ def assemble_locked(
                 file.attrs.update(file_attributes(manifest, shards.seals, camera))
                 for split, ids in decisions.ids.items():
                     rows[split, camera] = SampleRows(
-                        file, split, len(ids), shards.sizes, sample_texts(manifest)
+                        file, split, len(ids), shards.sizes, sample_texts(manifest), certified
                     )
 
             # Rows are packed in any order, and put into the files in theirs.
-            tasks = list(pack_tasks(out, shards, decisions))
+            tasks = list(pack_tasks(out, shards, decisions, certified=certified))
             surveyed = len({piece.object for piece in shards.slices})
             for done, part in enumerate(_packed(execute, tasks), start=1):
                 unpack_rows(part, columns, rows)

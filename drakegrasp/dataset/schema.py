@@ -187,6 +187,12 @@ def sizes(*, fingers: int, joints: int, image: int) -> dict[str, int]:
     return {"k": fingers, "6k": 6 * fingers, "j": joints, "S": image}
 
 
+def stored_fields(fields: Sequence[Field], *, certified: bool) -> tuple[Field, ...]:
+    """Return the fields that files have: HOLD_FIELDS are in those of builds that certify alone."""
+    own = {field.name for field in HOLD_FIELDS}
+    return tuple(f for f in fields if certified or f.name.rpartition("/")[2] not in own)
+
+
 def _since(stage: Stage, *fields: Field) -> tuple[Field, ...]:
     """Return fields that have a value from a stage on."""
     return tuple(replace(field, stage=stage) for field in fields)
@@ -362,6 +368,26 @@ CONDITION_FIELDS: tuple[Field, ...] = (
           of="conditions.sensor.seed"),
 )
 
+#: How much a lifted attempt bears; see `drakegrasp.simulation.robustness`. Files of builds that do
+#: not certify lack these, see `stored_fields`.
+HOLD_FIELDS: tuple[Field, ...] = tuple(
+    replace(field, stage=Stage.LIFTED, some=True, since=4, optional=True)
+    for field in (
+        Field("p_hold_samples", "", "int32", "-", "-",
+              "k: disturbed repeats (section `certify`) that would be samples by the default "
+              "filters, but for those of pictures and outliers"),
+        Field("p_hold_held", "", "int32", "-", "-", "disturbed repeats that hold"),
+        Field("p_hold_repeats", "", "int32", "-", "-",
+              "n: disturbed repeats with a verdict; 0 of an attempt that was not drawn"),
+        Field("p_hold_half_step", "", "float64", "-", "-",
+              "whether it would be a sample, undisturbed, at half the time step: 1 or 0; NaN if "
+              "that was not tried or has no verdict"),
+        Field("p_hold_probability", "", "float64", "-", "-",
+              "probability with which an attempt of its kind was drawn for repeats; NaN if it was "
+              "not drawn"),
+    )
+)
+
 #: A row per grasp, in `/train`, `/valid` and `/test` of both data files.
 DATA_FIELDS: tuple[Field, ...] = (
     Field("images", "4 S S", "float32", "-, -, -, m", "C",
@@ -398,6 +424,7 @@ DATA_FIELDS: tuple[Field, ...] = (
           "areas of the contact patches after closing", of="closed_area"),
     Field("grasp_props/area_held", "k", "float32", "m^2", "-",
           "areas of the contact patches after the lift", of="lifted_area"),
+    *_copied("grasp_props", *HOLD_FIELDS),
     # The mass is in object_props.
     *_copied("conditions", *(field for field in CONDITION_FIELDS if field.name != "mass")),
     Field("object_props/object_name", "", "str", "-", "-", "name of the object"),
@@ -481,6 +508,7 @@ TRIAL_FIELDS: tuple[Field, ...] = (
         *_RELEASED,
         *_measured("trial", *_WORDS),
     ),
+    *HOLD_FIELDS,
 )
 
 #: How robust a success is; see `drakegrasp.simulation.robustness`.
@@ -713,6 +741,7 @@ SCENE_GRASP_FIELDS: tuple[Field, ...] = (
     Field("family", "", "int32", "-", "-",
           "number of the first-round attempt that it was refined from or is, within the scene"),
     Field("weight", "", "float32", "-", "-", "weight of a sample, see /train; 0 of others"),
+    *(replace(field, of=field.name) for field in HOLD_FIELDS),
     *_PRESHAPE,
     Field("X_TG", "12", "float32", "m, -", "T", "pose of the palm at the start and while closing"),
     Field("X_TG_held", "12", "float32", "m, -", "T",

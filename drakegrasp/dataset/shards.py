@@ -90,7 +90,7 @@ class Shard:
 
     Attributes:
         header: Identity of the unit.
-        trials: Columns by the names of `trial_columns`, a row per attempt.
+        trials: Columns by the names of `trial_columns`, a row per attempt; optional ones may lack.
         looks: Columns by the names of LOOK_FIELDS, a row per success.
     """
 
@@ -125,6 +125,8 @@ def write_shard(out: Path, shard: Shard) -> Path:
         for name, fields, columns in tables:
             group = file.create_group(name)
             for field in fields:
+                if field.optional and field.name not in columns:
+                    continue
                 write_fixed(group, field, np.asarray(columns[field.name]))
     return path
 

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from drakegrasp.config import Config
 from drakegrasp.dataset.assembly.survey import shards_sha256
 from drakegrasp.dataset.assembly.weights import effective_number
+from drakegrasp.dataset.card.holding import holding_of
 from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_names
 from drakegrasp.dataset.layout.opening import open_samples, open_trials
 from drakegrasp.dataset.layout.trial_files import NONE, shard_part
@@ -395,5 +396,12 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
     for split in splits:
         split["effective"] = split["effective"] if math.isfinite(split["effective"]) else None
     units = {"done": unfinished.done, "total": unfinished.total} if unfinished else None
-    counts = {"objects": objects, "preshapes": list(map(asdict, preshapes)), "splits": splits}
+    counts: dict[str, Any] = {
+        "objects": objects,
+        "preshapes": list(map(asdict, preshapes)),
+        "splits": splits,
+    }
+    holding = None if unfinished else holding_of(Trials(out))
+    if holding is not None:
+        counts["p_hold"] = asdict(holding)
     return {"path": str(out), "unfinished": units, **counts}

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from drakegrasp.dataset.card.holding import share_text
 from drakegrasp.dataset.rejections import Decisions
 from drakegrasp.dataset.schema import CAMERAS, TRIAL_FIELDS
 from drakegrasp.dataset.suspicion import PARTS, suspicion
@@ -144,8 +145,23 @@ def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, s
             "other links after closing",
             str(int(row["closed_other_links"])) if np.isfinite(row["time_close"]) else "–",
         ),
+        *_bears(row),
         *_certificate(snapshot, i),
     ]
+
+
+def _bears(row: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return how much an attempt bears; nothing where that was not tried."""
+    probability, half = row["p_hold_probability"], row["p_hold_half_step"]
+    if np.isnan(probability):
+        return []
+    repeats = int(row["p_hold_repeats"])
+    lines = [
+        (f"disturbed repeats that {what}", share_text(int(row[f"p_hold_{name}"]), repeats))
+        for name, what in (("samples", "would be samples"), ("held", "hold"))
+    ]
+    step = {0.0: "no", 1.0: "yes"}.get(float(half), "not known")
+    return [*lines, ("would be a sample at half the time step", step)]
 
 
 def _certificate(snapshot: Snapshot, i: int) -> list[tuple[str, str]]:

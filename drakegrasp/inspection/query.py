@@ -27,10 +27,11 @@ Limits: TypeAlias = tuple[float | None, float | None]
 QUANTITIES = {
     "suspicion": Shown("suspicion", digits=2),
     "force": Shown("largest force", "N"),
+    "p_hold": Shown("p_hold: share of disturbed repeats that would be samples", digits=2),
     **{part.name: part.shown for part in PARTS},
 }
 #: Quantities with a range among the filters.
-RANGES = ("suspicion", "penetration", "slip", "turn", "force", "normal_angle")
+RANGES = ("suspicion", "penetration", "slip", "turn", "force", "normal_angle", "p_hold")
 #: Orders by name: the quantities, and the order of the rows.
 SORTS = (*QUANTITIES, "row")
 HOLDS = ("held", "precision", "stable")

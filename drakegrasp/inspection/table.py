@@ -20,8 +20,10 @@ from drakegrasp.outcomes import Outcome
 
 AnyArray = npt.NDArray[Any]
 #: Quantities that can be filtered and sorted by, besides the parts of the suspicion.
-EXTRA = ("suspicion", "force")
+EXTRA = ("suspicion", "force", "p_hold")
 FEATURES = (*EXTRA, *(part.name for part in PARTS))
+#: Further columns that features follow from.
+_READ = ("closed_f_Q_O", "p_hold_samples", "p_hold_repeats")
 #: Columns that a table has as they are, and their types.
 _KEPT: dict[str, type[np.generic]] = {
     "object": np.int32,
@@ -98,7 +100,7 @@ def read_table(trials: Trials) -> AttemptTable:
         DataError: If a file cannot be read.
     """
     # Splits are not known before the files are assembled.
-    names = dict.fromkeys((*_KEPT, *COLUMNS, "closed_f_Q_O"))
+    names = dict.fromkeys((*_KEPT, *COLUMNS, *_READ))
     return join([_table(block) for block in trials.blocks(list(names))])
 
 
@@ -146,7 +148,12 @@ def _table(columns: Mapping[str, AnyArray]) -> AttemptTable:
     # The largest force of a fingertip, after the lift if there was one.
     lifted = np.isfinite(few["time_lift"])[:, None, None]
     forces = np.where(lifted, few["lifted_f_Q_O"], few["closed_f_Q_O"])
-    extra = {"suspicion": doubts.score, "force": norm(forces).max(axis=1, initial=-np.inf)}
+    repeats = few["p_hold_repeats"]
+    extra = {
+        "suspicion": doubts.score,
+        "force": norm(forces).max(axis=1, initial=-np.inf),
+        "p_hold": np.where(repeats > 0, few["p_hold_samples"] / np.maximum(repeats, 1), np.nan),
+    }
 
     # What a contact without a normal has no value of counts as the largest share: as infinite.
     values = {

@@ -1,8 +1,10 @@
-"""How robust a grasp is: the attempt is repeated with noise, and with less friction.
+"""How much a grasp bears: the attempt is repeated, disturbed, and with less friction.
 
-In: an attempt that succeeded. Out: a `Certificate`: the share of repeats that hold with noise on
-palm pose, friction and mass, and the least friction at which the grasp holds without noise. All
-are simulated at half the time step. The noise depends on the attempt's own seed alone.
+In: an attempt that was lifted. Out: a `Certificate`: how many of its repeats hold, and would be
+samples, with noise on palm pose, friction and mass; whether it would be a sample at half the time
+step; and the least friction at which it holds without noise, at half the step. Repeats have the
+trial's own step: its error is numerics, and told apart. The lift that was stored is none of them.
+The noise depends on the attempt's own seed alone.
 """
 
 from __future__ import annotations
@@ -20,66 +22,101 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt, palm_motion
-from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.randomization.conditions import Conditions, usual_conditions
 from drakegrasp.simulation.sampling.centring import centred
+from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.screen import Prediction, predict
-from drakegrasp.simulation.trial import run_attempt
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
-#: Time step of these simulations over the trial's, throughout the lift: a grasp that is an artefact
-#: of the step fails.
+#: Finer time step over the trial's, throughout the lift: a grasp that is an artefact of the step
+#: fails.
 STEP_RATIO = 0.5
+#: Random factors are rounded to multiples of this: the exponential of two C libraries differs by
+#: far less.
+FACTOR_GRID = 2.0**-32
+#: Last number of the place of the stream that decides which attempts are certified.
+_DRAWN = 5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Certificate:
-    """How robust one grasp is.
+    """How much one attempt bears.
 
     Attributes:
-        share: Share of the repeats that hold, 0..1; NaN if every repeat was inconclusive.
-        friction: Least coefficient of hand and object at which it holds, to within the attempt's
-            own / 2^`certify.friction_steps`; inf if it does not hold at its own at half the step,
-            NaN if a simulation was inconclusive.
+        repeats: Number of disturbed repeats with a verdict.
+        held, samples: Number of these that hold, and that would be samples.
+        half_step: Whether it would be a sample, undisturbed, at half the step: 1 or 0; NaN if that
+            was inconclusive.
+        friction: Least coefficient of hand and object at which it holds at half the step, to within
+            the attempt's own / 2^`certify.friction_steps`; inf if it does not hold at its own, NaN
+            if a simulation was inconclusive, or if it was not looked for.
     """
 
-    share: float
-    friction: float
+    repeats: int = 0
+    held: int = 0
+    samples: int = 0
+    half_step: float = np.nan
+    friction: float = np.nan
 
 
-#: Random factors are rounded to multiples of this: the exponential of two C libraries differs by
-#: far less.
-FACTOR_GRID = 2.0**-32
-#: The certificate of a grasp whose simulations were inconclusive.
-UNKNOWN = Certificate(share=np.nan, friction=np.nan)
+def is_drawn(attempt: Attempt, probability: float) -> bool:
+    """Return whether an attempt is certified, which its own seed decides."""
+    stream = Stream(attempt.seed, attempt.standoff_index, _DRAWN)
+    return bool(stream.uniform(1)[0] < probability)
 
 
-def certify(model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config) -> Certificate:
-    """Return how robust a grasp is.
+def certify(
+    model: ObjectModel,
+    X_TO: Array,
+    attempt: Attempt,
+    config: Config,
+    is_sample: Callable[[TrialRecord], bool],
+    *,
+    held: bool = True,
+) -> Certificate:
+    """Return how much an attempt bears.
 
     Args:
         model: The object.
         X_TO: Its resting pose, (4, 4).
-        attempt: One that succeeds under the configuration; noise and less friction start from its
-            own friction and mass.
+        attempt: One that was lifted; noise and less friction start from its own friction and mass.
         config: The rules; `certify` has the number of repeats and the noise.
+        is_sample: Returns whether the trial of a repeat would be a sample.
+        held: Whether the attempt holds: only then its least friction is looked for.
     """
     # Repeat the attempt with noise; inconclusive repeats do not count.
     known = attempt.conditions or usual_conditions(model, config.physics)
+    config = with_whole_lifts(config)  # whether a grasp holds is the verdict of a whole lift
     repeater = _Repeater(model, X_TO, config, attempt.preshape)
     stream = Stream(attempt.seed, attempt.standoff_index)
-    repeats = [repeater.holds(each) for each in _noisy(stream, attempt, known, config.certify)]
-    conclusive = [holds for holds in repeats if holds is not None]
+    repeats = [repeater.lift(each) for each in _noisy(stream, attempt, known, config.certify)]
+    conclusive = [record for record in repeats if record is not None]
+
+    # Once without noise at half the step.
+    step = STEP_RATIO * config.physics.time_step
+    physics = config.physics.model_copy(update={"time_step": step, "coarse_steps": 1})
+    finer = config.model_copy(update={"physics": physics})
+    repeater = _Repeater(model, X_TO, finer, attempt.preshape)
+    prediction = repeater.predict(attempt)
+    undisturbed = repeater.lift(_with_materials(attempt, known), prediction)
 
     # Search for the least friction; what geometry decides does not depend on friction.
-    prediction = repeater.predict(attempt)
+    highest, friction = known.materials.friction_hand, np.nan
 
     def holds(friction: float) -> bool | None:
-        return repeater.holds(_with_materials(attempt, known, friction_hand=friction), prediction)
+        other, record = _with_materials(attempt, known, friction_hand=friction), undisturbed
+        if friction != highest:
+            record = repeater.lift(other, prediction)
+        return None if record is None else record.outcome is Outcome.SUCCESS
 
-    highest = known.materials.friction_hand
+    if held and config.certify.friction_steps:
+        friction = least_friction(holds, highest, config.certify.friction_steps)
     return Certificate(
-        share=float(np.mean(conclusive)) if conclusive else np.nan,
-        friction=least_friction(holds, highest, config.certify.friction_steps),
+        repeats=len(conclusive),
+        held=sum(record.outcome is Outcome.SUCCESS for record in conclusive),
+        samples=sum(map(is_sample, conclusive)),
+        half_step=np.nan if undisturbed is None else float(is_sample(undisturbed)),
+        friction=friction,
     )
 
 
@@ -135,19 +172,14 @@ def _noise_factor(stream: Stream, deviation: float) -> float:
 
 
 class _Repeater:
-    """Runs attempts at half the time step."""
+    """Runs attempts on an object; a scene in which Drake failed is not used again."""
 
     def __init__(
         self, model: ObjectModel, X_TO: Array, config: Config, preshape: int | None
     ) -> None:
         """Take an object, its resting pose (4, 4), the rules of the attempts, and the preshape."""
-        step = STEP_RATIO * config.physics.time_step
-        physics = config.physics.model_copy(update={"time_step": step, "coarse_steps": 1})
-        # Whether a grasp holds is the verdict of a whole lift.
-        self._config = with_whole_lifts(config).model_copy(update={"physics": physics})
         self._model, self._X_TO, self._preshape = model, X_TO, preshape
-        self._hand = load_hand(config.hand_source)
-        self._scene = build_scene(model, physics, self._hand.at(preshape))
+        self._config, self._hand = config, load_hand(config.hand_source)
 
     def predict(self, attempt: Attempt) -> Prediction | None:
         """Return what geometry says of an attempt."""
@@ -158,18 +190,17 @@ class _Repeater:
         )
         return prediction
 
-    def holds(self, attempt: Attempt, prediction: Prediction | None = None) -> bool | None:
-        """Return whether an attempt succeeds, or None if that is inconclusive.
+    def lift(self, attempt: Attempt, prediction: Prediction | None = None) -> TrialRecord | None:
+        """Return the record of an attempt, or None if it is inconclusive.
 
         Args:
             attempt: What to try.
             prediction: What `predict` returns for it, where the caller has it already.
         """
+        config = self._config
+        scene = cached_scene(self._model, config.physics, config.hand_source, self._preshape)
         (attempt,) = centred(self._model, self._hand, [attempt])
-        record = run_attempt(self._scene, self._X_TO, attempt, self._config, prediction)
-        if not record.outcome.inconclusive:
-            return record.outcome is Outcome.SUCCESS
-        # A scene in which Drake failed must not be used again.
-        hand = self._hand.at(self._preshape)
-        self._scene = build_scene(self._model, self._config.physics, hand)
-        return None
+        record = run_attempt(scene, self._X_TO, attempt, config, prediction)
+        if record.outcome is Outcome.SOLVER_ERROR:
+            forget_scenes()
+        return None if record.outcome.inconclusive else record

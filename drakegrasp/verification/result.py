@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drakegrasp.build.columns import unjudged
 from drakegrasp.config import Config
 from drakegrasp.frames import Array
 from drakegrasp.grasp import for_all_fingers
@@ -18,7 +19,6 @@ from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.verification.explanation import explain
 from drakegrasp.verification.forces.verdict import ForceVerdict
-from drakegrasp.verification.sample import unjudged
 from drakegrasp.verification.wrist.solver import WristFit
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class PoseTrial:
             closing [m]; NaN for a fingertip that does not touch, and for a posture.
         normal_error: (k,), angle between their normals [rad]; NaN likewise.
         removal: The first filter of a dataset that would remove the grasp, `KEPT` if none does, see
-            `verification.sample`; None if it does not hold.
+            `build.columns`; None if it does not hold.
     """
 
     fit: WristFit | None

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from drakegrasp.build.columns import judge_sample
 from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.frames import Array
 from drakegrasp.grasp import for_all_fingers
@@ -36,7 +37,6 @@ from drakegrasp.verification.forces.quality import force_margin
 from drakegrasp.verification.forces.verdict import hand_contacts, judge_forces
 from drakegrasp.verification.hints import FAR, find_hints
 from drakegrasp.verification.result import PoseTrial, Verification
-from drakegrasp.verification.sample import judge_sample
 from drakegrasp.verification.wrist.solver import WristFit, fit_wrist
 
 METHODS = ("hand", "forces")

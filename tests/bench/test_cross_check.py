@@ -18,7 +18,8 @@ from helpers.datasets import (
     make_dataset,
 )
 
-from drakegrasp.bench.cross_check import GROUPS, agreement, draw_lifts, wilson_interval
+from drakegrasp.bench.cross_check import GROUPS, agreement, draw_lifts
+from drakegrasp.dataset.card.holding import wilson_interval
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome, Removal
 

@@ -374,21 +374,32 @@ def test_certificates_come_with_the_grasps_and_change_none(
     small_meshes: Path, small_config: Config, small_dataset: Path, tmp_path: Path
 ) -> None:
     """Of the last object, whose attempts do not depend on the others."""
-    certified = ["certify.repeats=2", "certify.friction_steps=1"]
+    certified = ["certify.repeats=2", "certify.friction_steps=1", "certify.share_others=1"]
+    # Each object is likely to be tested, and no other sample would be drawn.
+    certified += ["certify.share=0", "certify.share_tested=1"]
+    certified += ["split.test_fraction=0.9", "split.valid_fraction=0.09"]
     config = override_config(small_config, certified)
     build([find_meshes(small_meshes)[-1]], tmp_path / "out", config, run_here, show=False)
     with (
         h5py.File(tmp_path / "out" / "trials.hdf5", "r") as file,
         h5py.File(small_dataset / "trials.hdf5", "r") as plain,
     ):
-        share = file["successes/certified_share"][:]
         friction = file["successes/certified_friction"][:]
+        names = ("repeats", "held", "samples", "half_step", "probability")
+        repeats, held, samples, half, chance = (file[f"trials/p_hold_{n}"][:] for n in names)
+        lifted = np.isfinite(file["trials/time_lift"][:])
+        kept = file["successes/trial_id"][:][file["successes/removal"][:] == Removal.KEPT]
         last = plain["trials/object"][:] == 2
         assert file["objects/name"][0] == plain["objects/name"][2]
         assert np.array_equal(file["trials/outcome"][:], plain["trials/outcome"][:][last])
-        assert np.isnan(plain["successes/certified_share"][:]).all()
-    assert set(share.tolist()) <= {0.0, 0.5, 1.0}
+        assert not [name for name in plain["trials"] if name.startswith("p_hold")]
+        assert np.array_equal(file["trials/slip"][:], plain["trials/slip"][:][last], equal_nan=True)
+    assert np.array_equal(chance == 1.0, lifted)
+    assert (repeats[lifted] == 2).all()
+    assert np.isin(half[lifted], [0.0, 1.0]).all()
+    assert (samples <= held).all()
+    assert (samples[kept] == 2).any()
+    assert (samples[lifted] == 0).any()
     mu = config.physics.friction_hand
     assert set(friction.tolist()) <= {mu / 2.0, mu, np.inf}
-    assert (share == 1.0).any()
     assert [str(v) for v in check_dataset(tmp_path / "out")] == []

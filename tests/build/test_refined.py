@@ -15,7 +15,7 @@ from helpers.meshes import write_fixed
 
 from drakegrasp.bench.cross_check import cross_check
 from drakegrasp.build import attempts
-from drakegrasp.build.pipeline import build
+from drakegrasp.build.pipeline import NEAR_BORDER, build
 from drakegrasp.build.replay import record_trial, replay_trial
 from drakegrasp.build.work_unit import WorkUnit, run_unit
 from drakegrasp.config import Config
@@ -266,11 +266,13 @@ def test_objects_that_are_tested_first_are_spared(
 
     first, last = sorted(sources, key=lambda source: rank_in_split(source.name, config.seed))
     between = np.mean([rank_in_split(source.name, config.seed) for source in sources])
-    spared = override_config(config, [f"refine.spared={between}"])
+    rules = [f"refine.spared={between}", f"split.test_fraction={between - NEAR_BORDER}"]
+    spared = override_config(config, [*rules, "split.valid_fraction=0"])
     with pytest.raises(KeyboardInterrupt):
         build(sources, tmp_path, spared, execute, show=False)
     refined = {unit.header.object_name: unit.refined for unit in units}
     assert refined == {first.name: False, last.name: True}
+    assert all(unit.likely_tested is not unit.refined for unit in units)
 
     # What is spared is what is tested.
     objects, names = np.arange(2, dtype=np.int32), [source.name for source in sources]

@@ -177,6 +177,10 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
         row |= {"surface_distance": np.zeros(3), "normal_angle": np.zeros(3), **hold(row)}
         raised = make_pose(np.eye(3), [0.0, 0.0, 0.25]) @ X_TG
         row["X_TO_lifted"] = pack_pose(raised @ invert_pose(unpack_pose(row["X_OG_lifted"])))
+    if stage >= Stage.LIFTED and config.certified:
+        k = 3 if outcome is Outcome.SUCCESS else 0
+        row |= {"p_hold_samples": k, "p_hold_held": k + number % 2, "p_hold_repeats": 4}
+        row |= {"p_hold_half_step": float(k > 0), "p_hold_probability": 1.0 if k else 0.5}
     # A quantity that has no story here is 1, from its stage on.
     told = {
         f.name: 1.0
@@ -248,6 +252,10 @@ def resting(model: ObjectModel, X_TO: Array) -> PreparedObject:
 _KEPT = TemporaryDirectory(prefix="datasets-")
 
 
+#: With these values all columns are there.
+CERTIFIED = ("certify.repeats=4", "certify.share_others=0.5")
+
+
 def make_dataset(out: Path, meshes: Path, *overrides: str) -> Path:
     """Write the small dataset, with some values of the configuration, and its meshes."""
     kept_out, kept_meshes = _made(overrides, tuple(BOXES))
@@ -309,7 +317,7 @@ def leave_closed(out: Path, row: int) -> None:
     with h5py.File(out / TRIALS, "r+") as file:
         trials = file["trials"]
         for field in TRIAL_FIELDS:
-            if field.stage is Stage.LIFTED:
+            if field.stage is Stage.LIFTED and field.name in trials:
                 trials[field.name][row] = field.empty(1, SIZES)[0]
         trials["outcome"][row] = Outcome.NOT_LIFTED
 

@@ -15,7 +15,16 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from helpers.datasets import SLIP, SLIPPED, TRIALS, change, end_lift, set_at
+from helpers.datasets import (
+    CERTIFIED,
+    SLIP,
+    SLIPPED,
+    TRIALS,
+    change,
+    end_lift,
+    make_dataset,
+    set_at,
+)
 from helpers.pages import ATTACK, Tags, coded, get, numbered, state_of, surface_of
 from matplotlib.image import imread
 from starlette.testclient import TestClient
@@ -405,6 +414,18 @@ def test_page_of_a_grasp_has_friction_certificate_and_text_to_copy(
     content = json.loads(re.findall(r"<pre>(.*?)</pre>", html.unescape(page), re.S)[0])
     assert set(content) == {"object", "X_TO", "X_OG"}
     assert "<th>other links after closing</th><td>–</td>" in page
+
+
+def test_p_hold_is_shown_and_filtered_by(tmp_path: Path) -> None:
+    out = make_dataset(tmp_path / "certified", tmp_path, *CERTIFIED)
+    change(out, TRIALS, "trials/p_hold_samples", 0, lambda _: 1)
+    client = TestClient(make_app(Inspection(out)), base_url="http://127.0.0.1:8321")
+    page = get(client, "/grasp/0-0-0").text
+    assert "<th>disturbed repeats that would be samples</th><td>1 of 4 (5 to 70 %)</td>" in page
+    assert "<th>would be a sample at half the time step</th><td>yes</td>" in page
+    for least, shown in ((0.2, 9), (0.5, 8)):
+        text = " ".join(Tags(get(client, f"/?min_p_hold={least}").text).text.split())
+        assert f"{shown} of 36 attempts" in text
 
 
 def test_a_contact_without_a_normal_is_a_reason(client: TestClient, out: Path) -> None:

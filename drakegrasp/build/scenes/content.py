@@ -27,6 +27,7 @@ from drakegrasp.dataset.schema import (
     SURFACE_POINTS,
     VIEW_FIELDS,
     VIEW_KINDS,
+    stored_fields,
 )
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.frames import make_pose, pack_pose, rotation_about, unpack_pose
@@ -238,7 +239,9 @@ _VIEW_CONDITIONS = {f.name for f in VIEW_FIELDS if f.of}
 
 def _grasps(task: SceneTask, prepared: PreparedObject, X_TO: Array) -> Columns:
     """Return the rows of /grasps, scene by scene in the order of the attempts."""
-    names = list(dict.fromkeys([*_COPIED.values(), *_READ]))
+    stored = stored_fields(SCENE_GRASP_FIELDS, certified=task.config.certified)
+    copied = {f.name: _COPIED[f.name] for f in stored if f.name in _COPIED}
+    names = list(dict.fromkeys([*copied.values(), *_READ]))
     trials = Trials(task.out)[task.trial_ids].columns(names)
     order = np.argsort(trials["resting"], kind="stable")
     trials = {name: values[order] for name, values in trials.items()}
@@ -246,7 +249,7 @@ def _grasps(task: SceneTask, prepared: PreparedObject, X_TO: Array) -> Columns:
     X = X_TO[scene]
     R_OT = np.swapaxes(X[:, :3, :3], 1, 2)
 
-    columns = {name: trials[of] for name, of in _COPIED.items()}
+    columns = {name: trials[of] for name, of in copied.items()}
     columns |= {
         "scene": scene.astype(np.int64),
         "object": np.zeros(len(scene), dtype=np.int64),

@@ -242,7 +242,7 @@ def _write_table(file: h5py.File, name: str, parts: Sequence[Columns]) -> None:
     """Write the columns of a group that are no images of views."""
     group = file.require_group(name)
     for field in SCENE_TABLES[name]:
-        if field.name not in group:
+        if field.name not in group and field.name in parts[0]:
             values = np.concatenate([part[field.name] for part in parts])
             dtype = object if field.dtype == "str" else field.dtype
             write_field(group, field, values.astype(dtype))

@@ -209,7 +209,9 @@ def lens_attributes(camera: CameraConfig) -> dict[str, Any]:
     return {"K": intrinsics(camera), "near": camera.near, "far": camera.far}
 
 
-def pack_tasks(out: Path, shards: Shards, decisions: Decisions) -> Iterator[PackTask]:
+def pack_tasks(
+    out: Path, shards: Shards, decisions: Decisions, *, certified: bool
+) -> Iterator[PackTask]:
     """Yield the tasks that pack the rows, from the first to the last."""
     slices, ids = shards.slices, decisions.ids
     firsts = [piece.first for piece in slices]
@@ -228,4 +230,5 @@ def pack_tasks(out: Path, shards: Shards, decisions: Decisions) -> Iterator[Pack
             ids={split: ids[split][a:b] for split, (a, b) in bounds.items()},
             weights={split: weights[split][a:b] for split, (a, b) in bounds.items()},
             sizes=shards.sizes,
+            certified=certified,
         )

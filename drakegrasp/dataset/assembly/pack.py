@@ -20,8 +20,14 @@ import numpy.typing as npt
 from drakegrasp.dataset.assembly.samples import IMAGES, SampleRows, record_type, sample_values
 from drakegrasp.dataset.hdf5 import COLUMN_CHUNK, AnyArray, packed_chunk, read_column
 from drakegrasp.dataset.paths import model_path
-from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SPLITS, TRIAL_FIELDS
-from drakegrasp.dataset.shards import ShardHeader, open_shard, read_field, trial_columns
+from drakegrasp.dataset.schema import (
+    CAMERAS,
+    DATA_FIELDS,
+    SPLITS,
+    TRIAL_FIELDS,
+    stored_fields,
+)
+from drakegrasp.dataset.shards import ASSEMBLED_FIELDS, ShardHeader, open_shard, read_field
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.runtime.files import disk_full_named, temporary_name
@@ -61,6 +67,7 @@ class PackTask:
         ids: Ids of the trials in it that are samples, in rising order, by split.
         weights: Their weights.
         sizes: Lengths of the letters in the shapes of the fields.
+        certified: Whether the files have HOLD_FIELDS.
     """
 
     out: str
@@ -71,6 +78,7 @@ class PackTask:
     ids: Mapping[str, npt.NDArray[np.int64]]
     weights: Mapping[str, Array]
     sizes: Mapping[str, int]
+    certified: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -136,20 +144,24 @@ def read_rows(task: PackTask) -> tuple[dict[str, AnyArray], dict[str, SplitSampl
     """
     # The survey has verified the seals.
     count = task.stop - task.start
-    columns = {f.name: np.empty((count, *f.row_shape(task.sizes)), f.dtype) for f in TRIAL_FIELDS}
+    fields = stored_fields(TRIAL_FIELDS, certified=task.certified)
+    columns = {f.name: np.empty((count, *f.row_shape(task.sizes)), f.dtype) for f in fields}
     columns["trial_id"][:] = np.arange(task.start, task.stop)
     samples = {
         split: SplitSamples(
-            {camera: [np.zeros(0, record_type(task.sizes))] for camera in CAMERAS},
+            {camera: [np.zeros(0, record_type(task.sizes, task.certified))] for camera in CAMERAS},
             {(camera, name): [] for camera in CAMERAS for name in IMAGES},
         )
         for split in SPLITS
     }
+
+    # Shard by shard.
     load = lru_cache(1)(load_object)  # the shards of an object come one after the other
     for piece in task.slices:
         path = piece.header.path(Path(task.out))
         with open_shard(path, piece.header, verify_seal=False, again=True) as (file, _):
-            trials = {f.name: read_field(file["trials"], f) for f in trial_columns()}
+            own = [field for field in fields if field.name not in ASSEMBLED_FIELDS]
+            trials = {field.name: read_field(file["trials"], field) for field in own}
             _fill_rows(columns, trials, piece, task)
             _add_samples(samples, trials, file["looks"], piece, task, load)
     return columns, samples
@@ -265,7 +277,6 @@ def _add_samples(
 
 def _packed_columns(columns: Mapping[str, AnyArray]) -> Iterator[bytes]:
     """Yield the chunks of the columns, field by field, from the first row on."""
-    for f in TRIAL_FIELDS:
-        values = columns[f.name]
+    for values in columns.values():
         for start in range(0, len(values), COLUMN_CHUNK):
             yield packed_chunk(values[start : start + COLUMN_CHUNK], COLUMN_CHUNK)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.hdf5 import COLUMN_CHUNK, AnyArray, create_field
-from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
+from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, stored_fields
 from drakegrasp.frames import (
     X_WT,
     invert_pose,
@@ -34,13 +34,15 @@ TEXTS = {"object_props/object_name": "name", "object_props/class_name": "class_n
 _NUMBERS = tuple(f for f in DATA_FIELDS if f.name not in IMAGES and f.name not in TEXTS)
 
 
-def record_type(sizes: Mapping[str, int]) -> np.dtype[Any]:
+def record_type(sizes: Mapping[str, int], certified: bool) -> np.dtype[Any]:
     """Return the type of a record of all numbers of a sample, by the names of DATA_FIELDS.
 
     Args:
         sizes: Lengths of the letters in the shapes.
+        certified: Whether the files have HOLD_FIELDS.
     """
-    return np.dtype([(f.name, f.dtype, f.row_shape(sizes)) for f in _NUMBERS])
+    fields = stored_fields(_NUMBERS, certified=certified)
+    return np.dtype([(f.name, f.dtype, f.row_shape(sizes)) for f in fields])
 
 
 class SampleRows:
@@ -53,6 +55,7 @@ class SampleRows:
         count: int,
         sizes: Mapping[str, int],
         texts: Mapping[str, Sequence[str]],
+        certified: bool,
     ) -> None:
         """Create the split.
 
@@ -62,9 +65,10 @@ class SampleRows:
             count: Number of its samples.
             sizes: Lengths of the letters in the shapes.
             texts: By the names of TEXTS, the text of each object, by row of /objects.
+            certified: Whether the files have HOLD_FIELDS.
         """
         self._group, self._texts = file.create_group(split), texts
-        for field in DATA_FIELDS:
+        for field in stored_fields(DATA_FIELDS, certified=certified):
             create_field(self._group, field, field.row_shape(sizes), count)
         self._images = {name: self._group[name].id for name in IMAGES}
         self._origins = {n: (0,) * (self._group[n].ndim - 1) for n in IMAGES}
@@ -90,8 +94,8 @@ class SampleRows:
             return
         records, objects = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
         rows = slice(self._written, self._written + len(records))
-        for field in _NUMBERS:
-            self._group[field.name][rows] = records[field.name]
+        for name in records.dtype.names or ():
+            self._group[name][rows] = records[name]
         for name, texts in self._texts.items():
             self._group[name][rows] = [texts[i] for i in objects]
         self._written, self._waiting = rows.stop, []
@@ -139,4 +143,4 @@ def sample_values(
     values |= {f"object_props/{name}": value for name, value in properties.items()}
 
     # All others are columns of the trial.
-    return values | {field.name: trial[field.of] for field in DATA_FIELDS if field.of}
+    return values | {field.name: trial[field.of] for field in DATA_FIELDS if field.of in trial}

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drakegrasp.config import CarriedHand, Config
+from drakegrasp.dataset.card.holding import holding_lines, holding_of
 from drakegrasp.dataset.hdf5 import read_names
 from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
@@ -104,7 +106,8 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
         DataError: If one of the files is missing or damaged.
     """
     # The manifest has more objects than the files while a build goes on that adds some.
-    funnel = funnel_of(Trials(trials, any_name=True))
+    attempts = Trials(trials, any_name=True)
+    funnel, holding = funnel_of(attempts), holding_of(attempts)
     entries = [entry for entry in manifest.objects if entry.name in funnel.names]
 
     # The known limits, and one that follows from the counts.
@@ -127,6 +130,12 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
         "versions": manifest.versions,
         "licences": licences(entries),
         "counts": _counts(data, funnel),
+        # The same bytes as before there were repeats, where there are none.
+        **(
+            {}
+            if holding is None
+            else {"p_hold": {"in_words": holding_lines(holding), **asdict(holding)}}
+        ),
         "refused": {mesh.name: mesh.reason for mesh in manifest.refused},
         "files": FILES,
         "conventions": CONVENTIONS,

@@ -49,6 +49,8 @@ def card_text(content: Mapping[str, Any]) -> str:
             camera and the columns (`exchange.hub`).
     """
     sections = [_what, _files, _how, _licences, _how_many, _limits]
+    if "p_hold" in content:
+        sections.insert(-1, _bears)
     if "columns" in content:
         sections += [_cameras, _columns]
     text = "\n\n".join(section(content) for section in sections)
@@ -138,6 +140,17 @@ than 5 mm and 5 degrees in the hand. These count palm poses of the first round. 
 samples whose palm pose was drawn about that of another sample; *samples* all held grasps that
 passed all filters; *in effect* their number where those with almost the same palm count as one."""
     return "\n\n".join([head, *parts])
+
+
+def _bears(content: Mapping[str, Any]) -> str:
+    lines = "\n".join(f"* {line[0].upper()}{line[1:]}." for line in content["p_hold"]["in_words"])
+    return f"""## How much a grasp bears
+
+A share of the lifts is repeated with noise on the palm's pose, friction and mass (`p_hold_samples`
+of `p_hold_repeats`, law in the setting `certify`). Intervals are of 95 %; a grasp counts for the
+inverse of its probability to be drawn.
+
+{lines}"""
 
 
 def _limits(content: Mapping[str, Any]) -> str:

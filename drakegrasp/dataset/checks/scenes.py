@@ -29,7 +29,7 @@ from drakegrasp.dataset.checks.rows import (
     unit_length,
 )
 from drakegrasp.dataset.paths import TRIALS_FILE
-from drakegrasp.dataset.schema import DEPTH_UNIT, SPLITS
+from drakegrasp.dataset.schema import DEPTH_UNIT, HOLD_FIELDS, SPLITS
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
 from drakegrasp.objects.model import ObjectModel
@@ -242,7 +242,8 @@ def grasps_of_trials(grasps: Batch, scene: Batch, trials: Trials) -> Iterator[Vi
     names = ("X_OG", "X_OG_lifted", "time_lift", "outcome", "removal", "closed_q", "lifted_q")
     contacts = ("p_OQ", "nhat_Q_O", "f_Q_O")
     stored = [f"{when}_{name}" for when in ("closed", "lifted") for name in contacts]
-    own = trials[grasps["trial_id"]].columns([*names, *stored])
+    repeats = [field.name for field in HOLD_FIELDS]
+    own = trials[grasps["trial_id"]].columns([*names, *stored, *repeats])
 
     X_TO = unpack_pose(scene["X_TO"][0, 0])
     of = "its trial and the pose of the object"
@@ -262,6 +263,8 @@ def grasps_of_trials(grasps: Batch, scene: Batch, trials: Trials) -> Iterator[Vi
     yield from grasps.follows("outcome", own["outcome"], of)
     yield from grasps.follows("tested", lifted, "its trial's lift")
     yield from grasps.follows("sample", own["removal"] == Removal.KEPT, "/successes")
+    for name in repeats:
+        yield from grasps.follows(name, own[name], of)
 
 
 # Views

@@ -123,6 +123,29 @@ def stages(batch: Batch) -> Iterator[Violation]:
         yield from batch.broken(what, bad, lambda i: _outcome(batch, i))
 
 
+def repeats(batch: Batch, most: int | None) -> Iterator[Violation]:
+    """Of the repeats of an attempt some hold, and some of these are samples.
+
+    Args:
+        batch: Rows of `/trials`.
+        most: Number of repeats of an attempt that is drawn, if known.
+    """
+    probability = batch["p_hold_probability"]
+    drawn = ~np.isnan(probability)
+    bad = drawn & ~((probability > 0.0) & (probability <= 1.0))
+    yield from batch.broken("p_hold_probability must be NaN or in 0..1", bad, probability)
+    limit = np.where(drawn, np.inf if most is None else most, 0)
+    for name in ("repeats", "held", "samples"):
+        values = batch[f"p_hold_{name}"]
+        what = "those drawn for" if name == "repeats" else "p_hold_repeats"
+        what = "p_hold_held" if name == "samples" else what
+        yield from batch.broken(f"p_hold_{name} must be at most {what}", values > limit, values)
+        limit = values
+    half = batch["p_hold_half_step"]
+    bad = ~np.isnan(half) & (~np.isin(half, [0.0, 1.0]) | ~drawn)
+    yield from batch.broken("p_hold_half_step must be 0, 1 or NaN, of those drawn", bad, half)
+
+
 def verdicts(
     batch: Batch, required: Sequence[bool], rules: LiftConfig | None
 ) -> Iterator[Violation]:

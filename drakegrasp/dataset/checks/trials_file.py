@@ -119,7 +119,9 @@ def _rules(trials: CheckedFile, dataset: Dataset | None) -> list[list[Rule]]:
         sound.append(
             partial(attempt_rules.chances, required=required, manifest=manifest, model=model)
         )
-    return [[numbers], [trial_rules.stages], finite, sound]
+    most = None if config is None else config.certify.repeats
+    stages: list[Rule] = [trial_rules.stages, partial(trial_rules.repeats, most=most)]
+    return [[numbers], stages, finite, sound]
 
 
 def trials_tasks(
@@ -144,7 +146,8 @@ def trials_tasks(
     # What follows from the shards comes along, range by range.
     packs: Iterable[PackTask] = ()
     if again is not None and compared:
-        packs = pack_tasks(again.out, again.shards, again.decisions)
+        certified = again.manifest.config.certified
+        packs = pack_tasks(again.out, again.shards, again.decisions, certified=certified)
     firsts = dict.fromkeys(SPLITS, 0)
     for start, pack in zip_longest(range(0, count, TASK_ROWS), packs):
         first = pack.start if start is None else start

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 
@@ -22,7 +23,7 @@ from drakegrasp.dataset.hdf5 import AnyArray, read_texts
 from drakegrasp.dataset.layout.opening import open_scenes, opened, refuse_other_codes
 from drakegrasp.dataset.layout.structure import SCENE_TABLES
 from drakegrasp.dataset.layout.trial_files import stamp
-from drakegrasp.dataset.schema import DEPTH_UNIT, SPLITS
+from drakegrasp.dataset.schema import DEPTH_UNIT, SPLITS, Field
 from drakegrasp.errors import DataError
 from drakegrasp.frames import invert_pose, unpack_pose
 from drakegrasp.outcomes import Outcome
@@ -74,6 +75,7 @@ class SceneDataset:
     | `held`, `sample`, `precision`, `stable`, `tested` | (g,) bool | labels, see the schema |
     | `outcome` | (g,) uint8 | see `Outcome` |
     | `weight` | (g,) float32 | of a sample among samples like it; 0 of others |
+    | `p_hold_samples`, `p_hold_repeats` | (g,) int32 | k of n disturbed repeats, or 0 |
     | `trial_id` | (g,) int64 | row of trials.hdf5 |
     | `X_TC` | (4, 4) float32 | pose of the camera; X_TA is this, or 1 |
     | `X_AO` | (4, 4) float32 | pose of the object |
@@ -160,7 +162,7 @@ class SceneDataset:
                 read_texts(file["objects"][key]) for key in ("name", "class_name")
             )
             self._tables = {
-                group: {f.name: file[group][f.name][:] for f in fields if not f.sample}
+                group: {f.name: _column(file[group], f) for f in fields if not f.sample}
                 for group, fields in SCENE_TABLES.items()
                 if group not in ("objects", "visible")
             }
@@ -427,6 +429,13 @@ class SceneDataset:
         return opened(self.path, "the scenes of a dataset", again=True)
 
 
+def _column(group: h5py.Group, field: Field) -> AnyArray:
+    """Return a column; an optional one that is missing has no value."""
+    if field.optional and field.name not in group:
+        return field.empty(len(group["scene"]), {})
+    return np.asarray(group[field.name][:])
+
+
 def _choice(stream: Stream, among: int, count: int) -> npt.NDArray[np.int64]:
     """Return indices (count,) below `among`, each once if they are not very many or too few."""
     if among > MANY * count:
@@ -455,7 +464,7 @@ class Rounds:
 #: Fields of /grasps that items hold as they are.
 _AS_STORED = (
     *("q_open", "q", "q_held", "held", "sample", "precision", "stable", "tested", "outcome"),
-    *("weight", "trial_id"),
+    *("weight", "p_hold_samples", "p_hold_repeats", "trial_id"),
 )
 
 
