@@ -68,7 +68,7 @@ def export_dataset(
 def _writer(form: Format, publication: Publication) -> Callable[[Path, Path, Report], int]:
     """Return the function that writes a format; its libraries are loaded when it is asked for."""
     if form == "hf":
-        from drakegrasp.exchange.hub import write_hub
+        from drakegrasp.exchange.hub.folder import write_hub
 
         return partial(write_hub, publication=publication)
     if form == "original":

@@ -14,16 +14,17 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from drakegrasp.arithmetic import Array
 from drakegrasp.build.scenes.content import Columns, ObjectScenes, SceneTask, make_scenes_of
 from drakegrasp.config import Config
 from drakegrasp.dataset.assembly.split import may_train, rank_in_split
+from drakegrasp.dataset.card.text import write_card
 from drakegrasp.dataset.hdf5 import create_field, write_field
 from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.layout.structure import SCENE_TABLES
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manifest, refuse_older
 from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
+from drakegrasp.dataset.scenes.reader import count_scenes
 from drakegrasp.dataset.schema import SPLITS, VIEW_FIELDS
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError
@@ -68,7 +69,7 @@ def make_scenes(
     execute: Executor = run_here,
     progress: Report = silent,
 ) -> Scenes:
-    """Write scenes.hdf5 of a dataset; one that is there is replaced.
+    """Write scenes.hdf5 of a dataset, and its card, which counts them; what is there is replaced.
 
     Args:
         out: Directory of an assembled dataset.
@@ -94,7 +95,7 @@ def make_scenes_locked(
     execute: Executor = run_here,
     progress: Report = silent,
 ) -> Scenes:
-    """Write scenes.hdf5, see `make_scenes`; the caller holds the lock."""
+    """Write scenes.hdf5 and the card, see `make_scenes`; the caller holds the lock."""
     manifest = read_manifest(out)
     refuse_older(manifest, out)
     config = _with_scenes(manifest.config, overrides)
@@ -116,7 +117,9 @@ def make_scenes_locked(
             progress(done, len(tasks))
         for group, parts in tables.items():
             _write_table(file, group, parts)
-        return _summary(path, file)
+        summary = _summary(path, file)
+    write_card(out)
+    return summary
 
 
 def _with_scenes(config: Config, overrides: Sequence[str]) -> Config:
@@ -249,11 +252,10 @@ def _write_table(file: h5py.File, name: str, parts: Sequence[Columns]) -> None:
 
 
 def _summary(path: Path, file: h5py.File) -> Scenes:
-    split = file["scenes/split"][:]
-    of_views: Array = split[file["views/scene"][:]]
+    counts = count_scenes(file)
     return Scenes(
         path=path,
-        scenes={name: int((split == i).sum()) for i, name in enumerate(SPLITS)},
-        views={name: int((of_views == i).sum()) for i, name in enumerate(SPLITS)},
+        scenes={split: row["scenes"] for split, row in counts.items()},
+        views={split: row["views"] for split, row in counts.items()},
         grasps=len(file["grasps/scene"]),
     )

@@ -19,7 +19,9 @@ from drakegrasp.dataset.card.holding import holding_lines, holding_of
 from drakegrasp.dataset.hdf5 import read_names
 from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
-from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
+from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE, TRIALS_FILE
+from drakegrasp.dataset.scenes.reader import AnyScenes, count_scenes
+from drakegrasp.dataset.scenes.rows import refuse_other_state
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, SPLITS
 from drakegrasp.dataset.statistics import (
     Funnel,
@@ -29,7 +31,7 @@ from drakegrasp.dataset.statistics import (
     splits_of,
 )
 from drakegrasp.dataset.trials import Trials
-from drakegrasp.errors import HandError, printable
+from drakegrasp.errors import DataError, HandError, printable
 from drakegrasp.hand.file_format import HandFile, read_hand_file
 from drakegrasp.hand.files import hand_file, hand_names
 from drakegrasp.hand.folder import HandFolder, hand_folder
@@ -91,7 +93,11 @@ def card_content(out: Path) -> dict[str, Any]:
     Raises:
         DataError: If the manifest or one of the three files is missing or damaged.
     """
-    return content_of(read_manifest(out), out / TRIALS_FILE, out / DATA_FILES["oto"])
+    content = content_of(read_manifest(out), out / TRIALS_FILE, out / DATA_FILES["oto"])
+    if (counts := _count_scenes(out)) is not None:
+        content["scenes"] = counts
+        content["files"] = {**content["files"], SCENES_FILE: "the scenes"}
+    return content
 
 
 def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
@@ -141,6 +147,18 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
         "conventions": CONVENTIONS,
         "limits": [{"limit": text, "docs": f"docs/{page}"} for text, page in limits],
     }
+
+
+def _count_scenes(out: Path) -> dict[str, dict[str, int]] | None:
+    """Return the counts of scenes.hdf5; None if there is none, or a damaged or older one."""
+    path = out / SCENES_FILE
+    if not path.is_file():
+        return None
+    try:
+        refuse_other_state(path, Trials(out, any_name=True))
+        return count_scenes(AnyScenes(path, points=None).tables)
+    except DataError:
+        return None  # `drakegrasp check` says why
 
 
 def licences(entries: Iterable[ObjectEntry]) -> dict[str, list[str]]:

@@ -46,11 +46,13 @@ def card_text(content: Mapping[str, Any]) -> str:
 
     Args:
         content: As `card_content` gives it; that of an export also has the samples by camera, the
-            camera and the columns (`exchange.hub`).
+            camera, the columns, and those of scenes (`exchange.hub.folder`).
     """
     sections = [_what, _files, _how, _licences, _how_many, _limits]
     if "p_hold" in content:
         sections.insert(-1, _bears)
+    if "scenes" in content:
+        sections.insert(sections.index(_limits), _scenes)
     if "columns" in content:
         sections += [_cameras, _columns]
     text = "\n\n".join(section(content) for section in sections)
@@ -153,6 +155,18 @@ inverse of its probability to be drawn.
 {lines}"""
 
 
+def _scenes(content: Mapping[str, Any]) -> str:
+    rows = [(split, *counts.values()) for split, counts in content["scenes"].items()]
+    heads = ("split", *next(iter(content["scenes"].values())))
+    return f"""## Scenes
+
+A scene is an object in a resting pose, anywhere on the table, with views by cameras that know no
+grasp, and all hands that closed on the object in that pose. *Tested* are grasps that were lifted to
+a verdict. No object is in two splits.
+
+{_table(heads, rows)}"""
+
+
 def _limits(content: Mapping[str, Any]) -> str:
     lines = "\n".join(f"* {each['limit']} ({each['docs']})" for each in content["limits"])
     return f"## Known limits\n\nThe pages are those of drakegrasp's repository.\n\n{lines}"
@@ -177,10 +191,13 @@ from {near:g} m on; where nothing is before {far:g} m, the depth is {far:g} m.""
 
 
 def _columns(content: Mapping[str, Any]) -> str:
-    rows = [(f"`{name}`", *column) for name, column in content["columns"].items()]
-    return f"""## Columns
-
-{_table(("column", "shape", "unit", "frame", "what it is"), rows)}"""
+    tables = {"## Columns": content["columns"]}
+    tables |= {f"## Columns of `{name}`": of for name, of in content["columns_of"].items()}
+    heads = ("column", "shape", "unit", "frame", "what it is")
+    return "\n\n".join(
+        f"{title}\n\n{_table(heads, [(f'`{name}`', *column) for name, column in columns.items()])}"
+        for title, columns in tables.items()
+    )
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

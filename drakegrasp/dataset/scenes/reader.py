@@ -43,6 +43,8 @@ Balance = Literal["object", "view"]
 POOL = 2
 #: Of so many times the pixels that are wanted, they are drawn one by one: few come twice.
 MANY = 8
+#: What grasps are counted by.
+LABELS = ("tested", "held", "sample")
 #: Streams of what is kept of a view, of what is drawn for an item, and of orders.
 _VIEW, _ITEM, _ORDER, _ROUND = 0, 1, 2, 3
 
@@ -412,15 +414,23 @@ class SceneDataset:
 
     def images(self, view: int) -> dict[str, AnyArray]:
         """Return the images of a view and its camera matrix, by the keys of an item."""
-        views = self._tables["views"]
-        with self._opened() as file:
-            rgb, stored, mask = (file["views"][name][view] for name in ("rgb", "depth", "mask"))
+        views, (rgb, stored, mask) = self._tables["views"], self.stored_images(view)
         depth, K = stored * np.float32(DEPTH_UNIT), views["K"][view].reshape(3, 3)
         noise = float(views["depth_noise"][view])
         if self._noise and noise:
             sensor = DepthSensor(noise=noise, seed=int(views["depth_seed"][view]))
             depth = spoil_depth(depth, K, sensor, 0, self._lens)
         return {"rgb": rgb, "depth": depth, "mask": mask, "K": K.astype(np.float32)}
+
+    def stored_images(self, view: int) -> tuple[AnyArray, AnyArray, AnyArray]:
+        """Return the images of a view as the file holds them.
+
+        Returns:
+            Colours (h, w, 3) uint8, clean depth (h, w) uint16 [DEPTH_UNIT], mask (h, w) uint8.
+        """
+        with self._opened() as file:
+            rgb, depth, mask = (file["views"][name][view] for name in ("rgb", "depth", "mask"))
+        return rgb, depth, mask
 
     def _opened(self) -> Any:
         """Open the file, which must be the one that the tables were read from."""
@@ -434,6 +444,33 @@ def _column(group: h5py.Group, field: Field) -> AnyArray:
     if field.optional and field.name not in group:
         return field.empty(len(group["scene"]), {})
     return np.asarray(group[field.name][:])
+
+
+class AnyScenes(SceneDataset):
+    """Scenes and views of a file, also where the split has no grasp to draw."""
+
+    may_be_empty = True
+
+
+def count_scenes(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, int]]:
+    """Return by split how many scenes, objects, views and grasps there are.
+
+    Args:
+        tables: Columns of /scenes, /views and /grasps: an open file, or `SceneDataset.tables`.
+    """
+    scenes, grasps = tables["scenes"], tables["grasps"]
+    split, objects = scenes["split"][:], scenes["object"][:]
+    of_views, of_grasps = split[tables["views"]["scene"][:]], split[grasps["scene"][:]]
+    return {
+        name: {
+            "scenes": int((split == i).sum()),
+            "objects": len(np.unique(objects[split == i])),
+            "views": int((of_views == i).sum()),
+            "grasps": int((of_grasps == i).sum()),
+            **{label: int(grasps[label][:][of_grasps == i].sum()) for label in LABELS},
+        }
+        for i, name in enumerate(SPLITS)
+    }
 
 
 def _choice(stream: Stream, among: int, count: int) -> npt.NDArray[np.int64]:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.layout.opening import opened, refuse_other_codes
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.scenes.reader import SceneDataset
+from drakegrasp.dataset.scenes.reader import AnyScenes
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.frames import X_WT, invert_pose, pack_pose, unpack_pose
@@ -39,10 +39,6 @@ def open_rows(path: Path, *, split: str) -> GraspDataset:
     with opened(path, "a data file or scenes of drakegrasp") as file:
         of_scenes = "scenes" in file
     return SceneRows(path, split=split) if of_scenes else GraspDataset(path, split=split)
-
-
-class _Views(SceneDataset):
-    may_be_empty = True
 
 
 class SceneRows(GraspDataset):
@@ -69,7 +65,7 @@ class SceneRows(GraspDataset):
         self.path, self.split, self.camera = Path(path), split, CAMERA
         self._file: h5py.File | None = None
         self._fields, self._process = {}, -1
-        self._data = data = _Views(
+        self._data = data = AnyScenes(
             path, points=None, split=split, negatives="none", balance="view", grasps=1
         )
         self.views = data.views
@@ -77,7 +73,7 @@ class SceneRows(GraspDataset):
 
         # An own grasp of each view, and its trial.
         trials, ids = Trials(self.path.parent), np.zeros(self._length, dtype=np.int64)
-        self._refuse_other_state(trials)
+        refuse_other_state(self.path, trials)
         grasps = []
         for i, view in enumerate(self.views.tolist()):
             own = data.grasp_of(view, Stream(0, _OWN, view))
@@ -153,11 +149,17 @@ class SceneRows(GraspDataset):
         colour = np.moveaxis(seen["rgb"], 2, 0) / np.float32(255.0)
         return np.concatenate([colour, depth[None]])
 
-    def _refuse_other_state(self, trials: Trials) -> None:
-        with opened(self.path, "the scenes of a dataset") as file:
-            for key in ("shards", "signature"):
-                if str(file.attrs.get(key)) != str(trials.attributes.get(key)):
-                    raise DataError(
-                        f"{self.path}: must be of the trials beside it, got one of others; run "
-                        "`drakegrasp scenes` again"
-                    )
+
+def refuse_other_state(path: Path, trials: Trials) -> None:
+    """Refuse a scenes.hdf5 that was made of other trials.
+
+    Raises:
+        DataError: If it was, or it cannot be read.
+    """
+    with opened(path, "the scenes of a dataset") as file:
+        for key in ("shards", "signature"):
+            if str(file.attrs.get(key)) != str(trials.attributes.get(key)):
+                raise DataError(
+                    f"{path}: must be of the trials beside it, got one of others; run "
+                    "`drakegrasp scenes` again"
+                )

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drakegrasp.dataset.schema import Field
+from drakegrasp.exchange.hub.table import ParquetFile
 from drakegrasp.exchange.publication import Publication
 
 #: Types of Croissant by NumPy's letter of a kind.
@@ -44,27 +44,9 @@ _CONTEXT: dict[str, Any] = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class ParquetFile:
-    """A file of a hub folder.
-
-    Attributes:
-        camera: `oto` or `otm`.
-        split: `train`, `valid` or `test`.
-        path: Below the folder.
-        rows: Number of samples.
-    """
-
-    camera: str
-    split: str
-    path: str
-    rows: int
-
-
 def croissant(
     folder: Path,
     files: Sequence[ParquetFile],
-    columns: Mapping[str, Field | None],
     card: Mapping[str, Any],
     publication: Publication,
 ) -> dict[str, Any]:
@@ -73,7 +55,6 @@ def croissant(
     Args:
         folder: With the files.
         files: The files that were written.
-        columns: Fields by the columns' names; None for an image.
         card: Content of the data card (`card_content`).
         publication: What the publishers say; keys that they do not say are left out.
     """
@@ -111,7 +92,7 @@ def croissant(
         **{key: value for key, value in said.items() if value},
         **_responsibility(card),
         "distribution": distribution,
-        "recordSet": [_record_set(file, columns) for file in files],
+        "recordSet": [_record_set(file) for file in files],
     }
 
 
@@ -147,24 +128,27 @@ def _responsibility(card: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _record_set(file: ParquetFile, columns: Mapping[str, Field | None]) -> dict[str, Any]:
-    name = file.path.removesuffix(".parquet")
+def _record_set(file: ParquetFile) -> dict[str, Any]:
+    columns, name = file.table.columns, file.path.removesuffix(".parquet")
     return {
         "@type": "cr:RecordSet",
         "@id": name,
         "name": name,
-        "description": f"Samples of split {file.split} as camera {file.camera} sees them.",
+        "description": file.table.what,
         "field": [_field(name, file.path, column, field) for column, field in columns.items()],
     }
 
 
 def _field(record_set: str, path: str, column: str, field: Field | None) -> dict[str, Any]:
     source: dict[str, Any] = {"fileObject": {"@id": path}, "extract": {"column": column}}
-    if field is None:  # an image: the bytes of a PNG file
+    if field is None or field.sample:  # an image: the bytes of a PNG file
         source["transform"] = {"jsonPath": "bytes"}
-        kind, meaning = "sc:ImageObject", f"PNG file of the {column}."
+        kind, repeated = "sc:ImageObject", False
     else:
         kind = "sc:Text" if field.dtype == "str" else _TYPES[np.dtype(field.dtype).kind]
+        repeated = bool(field.axes)
+    meaning = f"PNG file of the {column}."
+    if field is not None:
         meaning = f"{field.meaning}{'' if field.unit == '-' else f' [{field.unit}]'}"
     return {
         "@type": "cr:Field",
@@ -172,6 +156,6 @@ def _field(record_set: str, path: str, column: str, field: Field | None) -> dict
         "name": column,
         "description": meaning,
         "dataType": kind,
-        "repeated": field is not None and bool(field.axes),
+        "repeated": repeated,
         "source": source,
     }

@@ -1,0 +1,1 @@
+"""The folder of a dataset for the Hugging Face Hub."""
