@@ -105,7 +105,8 @@ def test_every_column_is_that_of_the_data_file(dataset: Path, folder: Path) -> N
             assert set(table.column_names) == set(hub.columns())
             for name, field in hub.columns().items():
                 if field is not None:
-                    assert table[name].to_pylist() == data.column(field.name).tolist(), name
+                    stored = data.column(field.name).tolist()
+                    np.testing.assert_array_equal(table[name].to_pylist(), stored, err_msg=name)
 
 
 def test_card_names_licence_files_and_counts(dataset: Path, folder: Path) -> None:
