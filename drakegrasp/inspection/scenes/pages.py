@@ -28,7 +28,7 @@ PALM = 0.06
 HOLDS, FAILS, UNKNOWN = (
     ("holds", "held", TRUE),
     ("fails", "failed", REACHED),
-    ("not tested", "", "#8d949d"),
+    ("not tested", "", "#F0E442"),
 )
 
 
@@ -208,14 +208,16 @@ def _lines(
     for row, views in zip(grasps.tolist(), seen.tolist(), strict=True):
         trial, weight = int(table["trial_id"][row]), float(table["weight"][row])
         page = with_pages is None or trial in with_pages
-        words = [name for name in ("sample", "precision", "stable") if table[name][row]]
+        # As on the pages of grasps: how it holds, else why it does not.
+        words = [name for name in ("stable", "precision", "held") if table[name][row]][:1]
+        words = words or [Outcome(int(table["outcome"][row])).label.replace("_", " ")]
+        words += ["sample"] * bool(table["sample"][row])
         lines.append(
             {
                 "trial": trial,
                 "href": links.grasp(scenes.snapshot.label(trial)) if page else "",
                 "holds": _holds(table, row),
-                "outcome": Outcome(int(table["outcome"][row])).label.replace("_", " "),
-                "words": words,
+                "outcome": ", ".join(words),
                 "weight": f"{weight:.2f}" if table["sample"][row] else "–",
                 "seen": views,
             }

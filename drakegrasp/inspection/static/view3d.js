@@ -105,11 +105,11 @@
   // Palms of more grasps: a plate, and a line along +Gz.
   for (const palm of data.palms || []) {
     const p = new THREE.Vector3(...palm.p), z = new THREE.Vector3(...palm.z);
-    const plate = new THREE.Mesh(new THREE.BoxGeometry(0.014, 0.014, 0.003), new THREE.MeshBasicMaterial({ color: palm.colour }));
-    const line = new THREE.Mesh(new THREE.CylinderGeometry(0.0012, 0.0012, 0.05, 8), plate.material);
+    const plate = new THREE.Mesh(new THREE.BoxGeometry(0.008, 0.008, 0.002), new THREE.MeshBasicMaterial({ color: palm.colour }));
+    const line = new THREE.Mesh(new THREE.CylinderGeometry(0.0007, 0.0007, 0.03, 8), plate.material);
     plate.position.copy(p);
     plate.quaternion.setFromUnitVectors(UP, z);
-    line.position.copy(p).addScaledVector(z, 0.025);
+    line.position.copy(p).addScaledVector(z, 0.015);
     line.quaternion.setFromUnitVectors(new THREE.Vector3(0, 1, 0), z);
     palms.add(plate, line);
   }
