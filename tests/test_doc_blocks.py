@@ -74,7 +74,7 @@ NO_CODE = {
 #: Blocks marked `py`: Python that is not run as it stands, by a part of it, and why.
 PY_NOT_RUN = {
     "dg.build_dataset(": "simulates for hours; tests/test_api.py",
-    "datasets.load_dataset(": "tests/exchange/test_hub.py reads a folder so",
+    "datasets.load_dataset(": "tests/exchange/hub/test_hub.py reads a folder so",
     "dg.SceneDataset(": "wants scenes and torch; tests/dataset/scenes",
     'dg.place_object("mug.obj"': "tests/verification/test_verify.py",
 }

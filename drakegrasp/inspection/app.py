@@ -43,6 +43,9 @@ from drakegrasp.inspection.query import Query, count_decisions, parse_query, sel
 from drakegrasp.inspection.recording import Recordings
 from drakegrasp.inspection.rows import read_look, read_rows
 from drakegrasp.inspection.scene3d import HandView, object_surface, scene_of
+from drakegrasp.inspection.scenes.file import SceneFile, Scenes
+from drakegrasp.inspection.scenes.pages import scene_page, scenes_page
+from drakegrasp.inspection.scenes.query import parse_scene_query, select_scenes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.json_text import parse_json
 from drakegrasp.visualization.thumbnails import strip_png
@@ -93,11 +96,16 @@ class Inspection:
         self.decisions = DecisionFile(out)
         self.hand = HandView(self.catalog.current().config)
         self.recordings = Recordings(out)
+        self.scenes = SceneFile(out)
         self.token = secrets.token_urlsafe(24)
-        self.links = ServerLinks(predicted=results is not None)
         self._lock = threading.Lock()
         self._selections: OrderedDict[Any, npt.NDArray[np.int32]] = OrderedDict()
         self._selected_from: Snapshot | None = None
+
+    @property
+    def links(self) -> ServerLinks:
+        """Addresses; scenes may be made while the pages are looked at."""
+        return ServerLinks(predicted=self.results is not None, scened=self.scenes.is_there)
 
     def selection(self, snapshot: Snapshot, query: Query) -> npt.NDArray[np.int32]:
         """Return the attempts that a query selects; the last selections are remembered."""
@@ -157,6 +165,9 @@ def make_app(inspection: Inspection) -> Starlette:
             route("/mesh/{kind}-{name}.json", _mesh),
             route("/predictions", _predictions),
             route("/prediction/{label}", _prediction),
+            route("/scenes", _scenes),
+            route("/scene/{label}", _scene),
+            route("/view/{label}-{number:int}.png", _view),
             route("/plots", _plots),
             route("/plot/{name}.svg", _plot),
             route("/recording/{label}.html", _recording),
@@ -261,7 +272,43 @@ def _predicted(inspection: Inspection) -> Predictions:
     return inspection.results.current(inspection.catalog.current())
 
 
+def _scenes(inspection: Inspection, request: Request) -> Response:
+    scenes, query = _scened(inspection), parse_scene_query(request.query_params)
+    chosen = select_scenes(scenes, query)
+    return HTMLResponse(scenes_page(scenes, query, chosen, inspection.links))
+
+
+def _scene(inspection: Inspection, request: Request) -> Response:
+    scenes, i = _found_scene(inspection, request)
+    query = parse_scene_query(request.query_params)
+    chosen = select_scenes(scenes, query)
+    return HTMLResponse(scene_page(scenes, query, chosen, i, inspection.hand, inspection.links))
+
+
+def _found_scene(inspection: Inspection, request: Request) -> tuple[Scenes, int]:
+    """Return the scenes, and the number of the one that a request names."""
+    scenes = _scened(inspection)
+    i = scenes.numbers.get(request.path_params["label"])
+    if i is None:
+        raise HTTPException(404, "there is no such scene")
+    return scenes, i
+
+
+def _scened(inspection: Inspection) -> Scenes:
+    if not inspection.scenes.is_there:
+        raise HTTPException(404, "there are no scenes; drakegrasp scenes makes them")
+    return inspection.scenes.current(inspection.catalog.current())
+
+
 # Pictures and meshes
+
+
+def _view(inspection: Inspection, request: Request) -> Response:
+    scenes, i = _found_scene(inspection, request)
+    views, number = scenes.views(i), request.path_params["number"]
+    if number >= len(views):
+        raise HTTPException(404, "there is no such view")
+    return Response(scenes.png(int(views[number])), media_type="image/png")
 
 
 def _strip(inspection: Inspection, request: Request) -> Response:

@@ -15,7 +15,14 @@ from drakegrasp.dataset.suspicion import PARTS, suspicion
 from drakegrasp.frames import unpack_pose
 from drakegrasp.inspection.catalog import Snapshot
 from drakegrasp.inspection.links import Links
-from drakegrasp.inspection.pages import Places, decision_values, number_text, render, words_of
+from drakegrasp.inspection.pages import (
+    Places,
+    decision_values,
+    neighbours,
+    number_text,
+    render,
+    words_of,
+)
 from drakegrasp.inspection.query import QUANTITIES, Query
 from drakegrasp.inspection.rows import contact_dots, read_certificate, read_look, read_rows
 from drakegrasp.outcomes import Outcome
@@ -48,14 +55,9 @@ def grasp_page(
     Raises:
         DataError: If a file was replaced meanwhile.
     """
-    # Its neighbours in the selection.
-    (found,) = np.nonzero(places == i)
-    place = int(found[0]) if len(found) else None
-    before = after = ""
-    if place is not None and place > 0:
-        before = links.grasp(snapshot.label(int(places[place - 1])), query.params())
-    if place is not None and place + 1 < len(places):
-        after = links.grasp(snapshot.label(int(places[place + 1])), query.params())
+
+    def address(place: int) -> str:
+        return links.grasp(snapshot.label(place), query.params())
 
     # Its row, and where both cameras see its contacts.
     (row,) = read_rows(snapshot, [i])
@@ -65,7 +67,6 @@ def grasp_page(
     for camera in CAMERAS if success else ():
         dots = contact_dots(snapshot, row, camera, read_look(snapshot, i, camera))
         views.append({"camera": camera, "strip": links.strip(label, camera), "dots": dots})
-    position = "not in the selection" if place is None else f"{place + 1:,} of {len(places):,}"
     return render(
         "grasp.html",
         links,
@@ -81,9 +82,7 @@ def grasp_page(
         words=words_of(snapshot, i),
         success=success,
         decision=decisions.of(key),
-        position=position,
-        previous=before,
-        next=after,
+        **neighbours(places, i, address),
         gallery=links.gallery(query.params()),
         views=views,
         size=snapshot.config.camera.size,

@@ -32,6 +32,19 @@ class Links(Protocol):
     def prediction(self, label: str, params: str = "") -> str:
         """Return that of a prediction's page, with the query that next and previous go through."""
 
+    @property
+    def scened(self) -> bool:
+        """Whether there are pages of scenes."""
+
+    def scenes(self, params: str = "") -> str:
+        """Return that of the gallery of scenes, with a query."""
+
+    def scene(self, label: str, params: str = "") -> str:
+        """Return that of a scene's page, with the query that next and previous go through."""
+
+    def view(self, label: str, number: int) -> str:
+        """Return that of the image of a scene by one of its cameras."""
+
     def strip(self, label: str, camera: str) -> str:
         """Return that of an attempt's images."""
 
@@ -50,10 +63,11 @@ class ServerLinks:
     """Addresses of the server.
 
     Attributes:
-        predicted: See `Links`.
+        predicted, scened: See `Links`.
     """
 
     predicted: bool = False
+    scened: bool = False
     static: bool = False
 
     def asset(self, name: str) -> str:
@@ -75,6 +89,18 @@ class ServerLinks:
     def prediction(self, label: str, params: str = "") -> str:
         """See `Links`."""
         return f"/prediction/{label}" + f"?{params}" * bool(params)
+
+    def scenes(self, params: str = "") -> str:
+        """See `Links`."""
+        return "/scenes" + f"?{params}" * bool(params)
+
+    def scene(self, label: str, params: str = "") -> str:
+        """See `Links`."""
+        return f"/scene/{label}" + f"?{params}" * bool(params)
+
+    def view(self, label: str, number: int) -> str:
+        """See `Links`."""
+        return f"/view/{label}-{number}.png"
 
     def strip(self, label: str, camera: str) -> str:
         """See `Links`."""
@@ -99,11 +125,12 @@ class FileLinks:
 
     Attributes:
         up: From the page to the folder of all: empty, or "../".
-        predicted: See `Links`.
+        predicted, scened: See `Links`.
     """
 
     up: str = ""
     predicted: bool = False
+    scened: bool = False
     static: bool = True
 
     def asset(self, name: str) -> str:
@@ -125,6 +152,18 @@ class FileLinks:
     def prediction(self, label: str, params: str = "") -> str:
         """See `Links`."""
         return f"{self.up}prediction/{label}.html"
+
+    def scenes(self, params: str = "") -> str:
+        """See `Links`; without a server a query has no effect."""
+        return f"{self.up}scenes.html"
+
+    def scene(self, label: str, params: str = "") -> str:
+        """See `Links`."""
+        return f"{self.up}scene/{label}.html"
+
+    def view(self, label: str, number: int) -> str:
+        """See `Links`."""
+        return f"{self.up}view/{label}-{number}.png"
 
     def strip(self, label: str, camera: str) -> str:
         """See `Links`."""

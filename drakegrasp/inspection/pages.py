@@ -7,6 +7,7 @@ or a style of its own, so the strictest content security policy fits.
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from drakegrasp.errors import printable
 from drakegrasp.inspection.catalog import Snapshot
 from drakegrasp.inspection.forms import attempt_form
 from drakegrasp.inspection.links import Links
-from drakegrasp.inspection.query import PAGE, QUANTITIES, Query, count_decisions
+from drakegrasp.inspection.query import PAGE, QUANTITIES, GalleryQuery, Query, count_decisions
 from drakegrasp.inspection.rows import THUMBNAIL, contact_dots, read_rows
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.visualization.style import FINGER_COLOURS, PREDICTED, REACHED, TRUE
@@ -72,10 +73,7 @@ def gallery_page(
         links: Addresses.
         token: Of this server; empty without one.
     """
-    # The cards of one page; a page beyond the last is the last. Files hold all of them.
-    pages = max(1, -(-len(places) // PAGE))
-    page = min(query.page, pages)
-    shown = places if links.static else places[(page - 1) * PAGE : page * PAGE]
+    shown, turning = paged(query, places, links.gallery, static=links.static)
     cards = make_cards(snapshot, decisions, query, shown, links)
 
     return render(
@@ -90,13 +88,50 @@ def gallery_page(
         samples=int(np.count_nonzero(snapshot.table.split != NONE)),
         only_samples=links.gallery(query.params(split="samples", page=1)),
         **decision_values(snapshot, decisions),
-        page=page,
-        pages=pages,
-        previous=links.gallery(query.params(page=page - 1)) if page > 1 else "",
-        next=links.gallery(query.params(page=page + 1)) if page < pages else "",
-        address=links.gallery(query.params()),
+        **turning,
         form=attempt_form(snapshot, query, failures=not links.static),
     )
+
+
+def paged(
+    query: GalleryQuery, chosen: Places, address: Callable[[str], str], *, static: bool
+) -> tuple[Places, dict[str, Any]]:
+    """Return those of one page of a gallery, and what the template turns pages by.
+
+    Args:
+        query: What is asked for; a page beyond the last is the last.
+        chosen: Numbers of all that the query selects, in order.
+        address: Returns that of the gallery with a query.
+        static: Whether the pages are files, which hold all cards.
+    """
+    pages = max(1, -(-len(chosen) // PAGE))
+    page = min(query.page, pages)
+    return chosen if static else chosen[(page - 1) * PAGE : page * PAGE], {
+        "page": page,
+        "pages": pages,
+        "previous": address(query.params(page=page - 1)) if page > 1 else "",
+        "next": address(query.params(page=page + 1)) if page < pages else "",
+        "address": address(query.params()),
+    }
+
+
+def neighbours(chosen: Places, i: int, address: Callable[[int], str]) -> dict[str, str]:
+    """Return where something is in a selection, and the addresses before and after it.
+
+    Args:
+        chosen: Numbers of all that is selected, in order.
+        i: Its number.
+        address: Returns that of a number.
+    """
+    (found,) = np.nonzero(chosen == i)
+    if not len(found):
+        return {"position": "not in the selection", "previous": "", "next": ""}
+    k = int(found[0])
+    return {
+        "position": f"{k + 1:,} of {len(chosen):,}",
+        "previous": address(int(chosen[k - 1])) if k else "",
+        "next": address(int(chosen[k + 1])) if k + 1 < len(chosen) else "",
+    }
 
 
 def decision_values(snapshot: Snapshot, decisions: Decisions) -> dict[str, Any]:

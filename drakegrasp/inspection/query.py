@@ -74,6 +74,10 @@ class GalleryQuery:
             "page": self.page,
         }
 
+    def params(self, **changes: object) -> str:
+        """Return the query as part of an address, with some values changed; see `address_of`."""
+        return address_of(self.shared, self.ranges, changes, {"page": 1})
+
 
 @dataclass(frozen=True, kw_only=True)
 class Query(GalleryQuery):

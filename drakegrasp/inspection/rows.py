@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -166,15 +166,35 @@ def contact_dots(
     X_TO, X_OG = unpack_pose(row["X_TO"]), unpack_pose(row["X_OG"])
     X_TC = _CAMERA_POSES[camera](multiply(X_TO, X_OG), config, unpack_pose(row["X_C0C"]))
     X_CO = multiply(invert_pose(X_TC), X_TO)
-    p_CQ = transform_points(X_CO, p_OQ)
-    p_CE = p_CQ + ARROW * np.nan_to_num(rotate_vectors(X_CO, nhat_Q_O))
+    p_CQ, nhat_Q_C = transform_points(X_CO, p_OQ), rotate_vectors(X_CO, nhat_Q_O)
 
-    K, dots = intrinsics(config), []
+    def is_hidden(finger: int, u: float, v: float) -> bool:
+        return look is not None and _is_hidden(look, u, v, float(p_CQ[finger, 2]))
+
+    return dots_of(intrinsics(config), p_CQ, nhat_Q_C, config.near, is_hidden)
+
+
+def dots_of(
+    K: Array,
+    p_CQ: Array,
+    nhat_Q_C: Array,
+    near: float,
+    is_hidden: Callable[[int, float, float], bool],
+) -> list[Dot]:
+    """Return contacts (k, 3) in {C} as dots; those that are not before the near plane are left out.
+
+    Args:
+        K: (3, 3), camera matrix [px].
+        p_CQ: (k, 3), points [m]; NaN where there is none.
+        nhat_Q_C: (k, 3), normals; their tips are at `ARROW` times them.
+        near: Near plane [m].
+        is_hidden: Whether the camera does not see a finger's contact, which it has at u, v [px].
+    """
+    p_CE, dots = p_CQ + ARROW * np.nan_to_num(nhat_Q_C), []
     for finger, (point, tip) in enumerate(zip(p_CQ, p_CE, strict=True)):
-        if np.isfinite(point).all() and min(point[2], tip[2]) > config.near:
+        if np.isfinite(point).all() and min(point[2], tip[2]) > near:
             (u, v), (tip_u, tip_v) = project(K, np.array([point, tip])).tolist()
-            hidden = look is not None and _is_hidden(look, u, v, float(point[2]))
-            dots.append(Dot(finger, u, v, tip_u, tip_v, hidden))
+            dots.append(Dot(finger, u, v, tip_u, tip_v, is_hidden(finger, u, v)))
     return dots
 
 

@@ -1,7 +1,8 @@
 """The pages as files that a browser opens without a server.
 
 In: a dataset, and results of predictions for its rows. Out: a folder with `index.html`, a page per
-success, their images and meshes; `predictions.html` and a page per prediction. A page of a file may
+success, their images and meshes; `predictions.html` and a page per prediction; `scenes.html` and a
+page per scene. A page of a file may
 load no other file but scripts, styles and pictures, so each mesh is a script that holds its JSON.
 Decisions are shown and cannot be changed.
 """
@@ -30,12 +31,17 @@ from drakegrasp.inspection.predictions.results import Predictions, ResultFile
 from drakegrasp.inspection.query import Query, select
 from drakegrasp.inspection.rows import read_look, read_rows
 from drakegrasp.inspection.scene3d import HandView, object_surface, scene_of
+from drakegrasp.inspection.scenes.file import SceneFile, Scenes
+from drakegrasp.inspection.scenes.pages import scene_page, scenes_page
+from drakegrasp.inspection.scenes.query import SceneQuery, select_scenes
 from drakegrasp.runtime.files import atomic_folder
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.visualization.thumbnails import strip_png
 
 #: Grasps, and predictions, that are written at most: a browser must hold all cards at once.
 MAX_GRASPS = 2000
+#: Scenes that are written at most: each has many images.
+MAX_SCENES = 100
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,9 @@ class Site:
 def write_site(
     out: Path, folder: Path, *, results: Path | None = None, progress: Report = silent
 ) -> Site:
-    """Write the pages of a dataset's successes, and of predictions, as files.
+    """Write the pages of a dataset's successes, of predictions and of scenes, as files.
+
+    Scenes that cannot be read are left out, and the pages say why.
 
     Args:
         out: Directory of the dataset.
@@ -77,18 +85,32 @@ def write_site(
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DataError(f"--static must be a new or empty directory, got {folder}")
     predictions = None if results is None else ResultFile(results).current(snapshot)
+    scenes, why = _scenes_of(snapshot)
+    snapshot = replace(snapshot, missing=(*why, *snapshot.missing))
     if len(places) < len(successes):
         cut = f"Only the {len(places):,} most suspicious of {len(successes):,} successes are here."
         snapshot = replace(snapshot, missing=(cut, *snapshot.missing))
 
     with atomic_folder(folder) as unfinished:
-        site = _Writer(snapshot, unfinished, predictions)
-        total = len(places) + len(site.worst)
+        site = _Writer(snapshot, unfinished, predictions, scenes)
+        total = len(places) + len(site.worst) + len(site.richest)
         site.write_grasps(decisions, query, places, lambda done: progress(done, total))
         if predictions is not None:
             site.write_predictions(predictions, lambda done: progress(len(places) + done, total))
+        if scenes is not None:
+            before = total - len(site.richest)
+            site.write_scenes(scenes, lambda done: progress(before + done, total))
         snapshot.refuse_replaced()
     return Site(grasps=len(places), successes=len(successes))
+
+
+def _scenes_of(snapshot: Snapshot) -> tuple[Scenes | None, tuple[str, ...]]:
+    """Return the scenes of a dataset, if there are any, and why they are not shown."""
+    file = SceneFile(snapshot.out)
+    try:
+        return file.current(snapshot) if file.is_there else None, ()
+    except DataError as error:
+        return None, (f"Scenes are left out: {error}",)
 
 
 class _Writer:
@@ -98,9 +120,16 @@ class _Writer:
         snapshot: State of the files.
         folder: Where to write.
         predictions: Beside its rows, if there are any.
+        scenes: Likewise.
     """
 
-    def __init__(self, snapshot: Snapshot, folder: Path, predictions: Predictions | None) -> None:
+    def __init__(
+        self,
+        snapshot: Snapshot,
+        folder: Path,
+        predictions: Predictions | None,
+        scenes: Scenes | None,
+    ) -> None:
         self._snapshot, self._folder = snapshot, folder
         self._there = predictions is not None
         self._hand = HandView(snapshot.config)
@@ -110,6 +139,10 @@ class _Writer:
         self.worst = np.zeros(0, dtype=np.int32)
         if predictions is not None:
             self.worst = select_predictions(predictions, PredictionQuery())[:MAX_GRASPS]
+        #: The scenes that are written, in their order.
+        self.richest = np.zeros(0, dtype=np.int32)
+        if scenes is not None:
+            self.richest = select_scenes(scenes, SceneQuery())[:MAX_SCENES]
 
         # What all pages share.
         shutil.copytree(ASSETS, folder / "static", ignore=shutil.ignore_patterns("__pycache__"))
@@ -153,23 +186,45 @@ class _Writer:
         gallery = predictions_page(predictions, query, self.worst, self._links())
         _write_text(self._folder / "predictions.html", gallery)
 
+    def write_scenes(self, scenes: Scenes, wrote: Callable[[int], None]) -> None:
+        """Write the pages of scenes with their images, and their gallery last."""
+        query, links = SceneQuery(), self._links("../")
+        with_pages = frozenset(self._seen)
+        for done, i in enumerate(self.richest.tolist(), start=1):
+            page = scene_page(
+                *(scenes, query, self.richest, i, self._hand, links), with_pages=with_pages
+            )
+            _write_text(self._folder / "scene" / f"{scenes.labels[i]}.html", page)
+            for k, view in enumerate(scenes.views(i).tolist()):
+                _write(self._folder / "view" / f"{scenes.labels[i]}-{k}.png", scenes.png(view))
+            self._write_object(int(scenes.objects[i]))
+            wrote(done)
+        _write_text(
+            self._folder / "scenes.html", scenes_page(scenes, query, self.richest, self._links())
+        )
+
     def _links(self, up: str = "") -> FileLinks:
-        return FileLinks(up, predicted=self._there)
+        return FileLinks(up, predicted=self._there, scened=len(self.richest) > 0)
 
     def _write_look(self, i: int) -> None:
         """Write the images of an attempt and the mesh of its object, once."""
-        snapshot, number = self._snapshot, int(self._snapshot.table.object[i])
+        snapshot = self._snapshot
         if i not in self._seen:
             for camera in CAMERAS:
                 look = read_look(snapshot, i, camera)
                 if look is not None:
                     png = strip_png(look.image, look.mask, far=snapshot.config.camera.far)
                     _write(self._folder / "strip" / f"{snapshot.label(i)}-{camera}.png", png)
-        if number not in self._meshes:
-            surface = object_surface(snapshot, number)
-            if surface is not None:
-                _write_mesh(self._folder, f"object-{snapshot.codes[number]}", surface)
         self._seen.add(i)
+        self._write_object(int(snapshot.table.object[i]))
+
+    def _write_object(self, number: int) -> None:
+        """Write the mesh of an object, once."""
+        if number not in self._meshes:
+            surface = object_surface(self._snapshot, number)
+            if surface is not None:
+                code = self._snapshot.codes[number]
+                _write_mesh(self._folder, f"object-{code}", surface)
         self._meshes.add(number)
 
 

@@ -44,6 +44,11 @@ def strip_png(image: npt.NDArray[np.float32], mask: npt.NDArray[np.uint8], *, fa
     colours = np.rint(255.0 * np.moveaxis(image[:3], 0, 2).clip(0.0, 1.0)).astype(np.uint8)
     colours = np.dstack([colours, np.full(colours.shape[:2], 255, dtype=np.uint8)])
     strip = np.concatenate([colours, depths, MASK[(mask > 0).astype(int)]], axis=1)
+    return colour_png(strip)
+
+
+def colour_png(colours: npt.NDArray[np.uint8]) -> bytes:
+    """Return colours (h, w, 3), with opacity (h, w, 4), as a PNG."""
     buffer = io.BytesIO()
-    imsave(buffer, strip, format="png")
+    imsave(buffer, colours, format="png")
     return buffer.getvalue()

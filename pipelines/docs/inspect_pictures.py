@@ -1,8 +1,8 @@
-"""Take the pictures of the inspection page for the docs: galleries, a grasp, and a prediction.
+"""Take the pictures of the inspection page for the docs: galleries, a grasp, a prediction, a scene.
 
 In: a dataset's directory, and the results of `drakegrasp verify` for rows of it. Out: one picture
-of each page, `inspect_NAME.png`. Needs Playwright and the system's Chromium (`make test-browser`
-installs it).
+of each page, `inspect_NAME.png`; of predictions and scenes only if there are any. Needs Playwright
+and the system's Chromium (`make test-browser` installs it).
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Run the script."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="directory of a dataset")
-    parser.add_argument("results", type=Path, help="file that verify --out has written")
     parser.add_argument("pictures", type=Path, help="directory that the pictures go to")
+    parser.add_argument("--predictions", type=Path, help="file that verify --out has written")
     arguments = parser.parse_args(argv)
 
     # Serve the dataset from a thread.
     listener = listen(0)
-    inspection = Inspection(arguments.out, arguments.results)
+    inspection = Inspection(arguments.out, arguments.predictions)
     server = uvicorn.Server(uvicorn.Config(make_app(inspection), log_level="error"))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()
     address = f"http://127.0.0.1:{listener.getsockname()[1]}"
 
-    # Look at it: both galleries, the first grasp, and one of the farthest predictions that hold, in
-    # the dark theme.
+    # Look at it: galleries, the first grasp, the scene of the training part with most tested ones,
+    # and one of the farthest predictions that hold, in the dark theme.
     program = shutil.which("chromium") or shutil.which("chromium-browser")
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=program, args=list(OPTIONS))
@@ -52,8 +52,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         page.set_default_timeout(PATIENCE)
         for gallery, grasp, path in (
             ("gallery", "grasp", "/?split=samples"),
+            ("scenes", "scene", "/scenes?split=train&sort=tested"),
             ("predictions", "prediction", "/predictions?verdict=held&sort=true_error"),
         ):
+            links = inspection.links
+            if not {"scenes": links.scened, "predictions": links.predicted}.get(gallery, True):
+                continue
             page.goto(f"{address}{path}")
             page.wait_for_load_state("networkidle")
             page.screenshot(path=arguments.pictures / f"inspect_{gallery}.png")

@@ -23,6 +23,7 @@ from helpers.pages import ATTACK, coded, numbered
 from helpers.predictions import write_predictions
 from matplotlib.image import imread
 
+from drakegrasp.build.scenes.make import make_scenes
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.rejections import (
@@ -537,3 +538,45 @@ def test_predictions_filter_and_open(page: Page, out: Path, tmp_path: Path) -> N
         assert len(shots) == 4
         page.keyboard.press("g")
         page.wait_for_url("**/predictions?verdict=fails")
+
+
+@pytest.mark.sim
+def test_scenes_filter_and_open(page: Page, out: Path, tmp_path: Path) -> None:
+    make_scenes(out, overrides=["scenes.views=3"])
+    for address in serve(out):
+        for name, (width, height) in SIZES.items():
+            page.set_viewport_size({"width": width, "height": height})
+            page.goto(address)
+            page.click("text=Scenes")
+            page.wait_for_load_state("networkidle")
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            keep_screenshot(page, f"scenes_{name}")
+            page.click("#cards li:nth-child(2) a")
+            wait_for_view(page)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            assert "2 of 3" in page.inner_text(".position")
+            keep_screenshot(page, f"scene_{name}")
+        assert page.get_attribute("#view3d", "data-ready") == "yes"
+        # Palms, hands and the hand of another grasp are all drawn.
+        shots = {page.locator("#view3d").screenshot()}
+        for key in ("m", "2", "h", "m"):
+            page.keyboard.press(key)
+            shots.add(page.locator("#view3d").screenshot())
+        assert len(shots) == 5
+        for theme in ("light", "dark"):
+            page.select_option("#theme", theme)
+            contrast, text = page.evaluate(CONTRAST)
+            assert contrast >= 4.5, f"{theme}: {text!r} has {contrast:.2f}"
+        page.keyboard.press("g")
+        page.set_viewport_size({"width": 1280, "height": 900})
+        page.select_option("select[name=split]", "test")
+        wait_for_cards(page, 2)
+
+    # As files, too.
+    write_site(out, tmp_path / "site")
+    page.goto((tmp_path / "site" / "scenes.html").as_uri())
+    page.select_option("select[name=split]", "train")
+    wait_for_cards(page, 1)
+    page.click("#cards a")
+    wait_for_view(page)
+    assert page.get_attribute("#view3d", "data-ready") == "yes"

@@ -114,6 +114,7 @@ class SceneDataset:
         names, classes: Of the objects, by their rows.
         joints, fingers: Names of the hand's joints and fingers, in the order of the arrays.
         views: Rows of /views that items are of: those of scenes with a grasp to draw.
+        image_size: Height and width of the images [px].
         epoch: Changes what is drawn.
 
     Raises:
@@ -169,6 +170,7 @@ class SceneDataset:
                 if group not in ("objects", "visible")
             }
             self._visible = file["visible/visible"][:]
+            self.image_size = file["views/mask"].shape[1:]
             self.joints = tuple(parse_json(file.attrs["joints"]))
             self.fingers = tuple(parse_json(file.attrs["fingers"]))
             self._lens = _Lens(near=float(file.attrs["near"]), far=float(file.attrs["far"]))
@@ -235,14 +237,27 @@ class SceneDataset:
     def grasps_in(self, view: int, *, frame: Frame = "table") -> dict[str, AnyArray]:
         """Return all grasps of a view's scene, by the keys of an item; g is their number."""
         _refuse_other("frame", frame, get_args(Frame))
-        first, last = self._bounds[self._scene_of[view] : self._scene_of[view] + 2]
         X_AT = invert_pose(self._X_TC[view]) if frame == "camera" else np.eye(4)
-        return self._grasps_of(view, np.arange(first, last), X_AT)
+        return self._grasps_of(view, self.rows_in(self._scene_of[view]), X_AT)
 
     def grasp_of(self, view: int, stream: Stream) -> dict[str, AnyArray]:
         """Return grasps of a view that a stream draws, in {C}, as those of an item."""
         rows = self._drawn(int(self._scene_of[view]), stream)
         return self._grasps_of(view, rows, invert_pose(self._X_TC[view]))
+
+    def rows_in(self, scene: int) -> npt.NDArray[np.int64]:
+        """Return the rows of /grasps of a scene, which stand together."""
+        return np.arange(*self._bounds[scene : scene + 2])
+
+    def visible_in(self, view: int) -> npt.NDArray[np.bool_]:
+        """Return which contacts (g, k) of the grasps of its scene a view sees, in their order."""
+        first, last = self._first_visible[view : view + 2]
+        return self._visible[first:last]
+
+    @property
+    def near(self) -> float:
+        """Near plane of the cameras [m]."""
+        return self._lens.near
 
     @property
     def far(self) -> float:
@@ -261,6 +276,9 @@ class SceneDataset:
         """Number the rows of /grasps by scene and of /visible by view."""
         views, scenes = self._tables["views"], self._tables["scenes"]
         count = len(scenes["split"])
+        for name, shape in (("object", scenes["object"].shape), ("mask", self.image_size)):
+            if count and 0 in shape:
+                raise DataError(f"{self.path}: {name} must have a value in each row, got none")
         for name, values, codes in (
             ("/scenes/split", scenes["split"], len(SPLITS)),
             ("/scenes/object", scenes["object"][:, 0], len(self.names)),

@@ -12,7 +12,7 @@ from drakegrasp.dataset.schema import CAMERAS, Shown
 from drakegrasp.frames import Array
 from drakegrasp.inspection.forms import object_fields, options, range_fields
 from drakegrasp.inspection.links import Links
-from drakegrasp.inspection.pages import number_text, render, words_of
+from drakegrasp.inspection.pages import neighbours, number_text, paged, render, words_of
 from drakegrasp.inspection.predictions.query import (
     RANGES,
     SORTS,
@@ -26,7 +26,6 @@ from drakegrasp.inspection.predictions.results import (
     Predictions,
 )
 from drakegrasp.inspection.predictions.scene import prediction_scene
-from drakegrasp.inspection.query import PAGE
 from drakegrasp.inspection.rows import THUMBNAIL, Dot, Look, contact_dots, read_look, read_rows
 from drakegrasp.inspection.scene3d import HandView
 from drakegrasp.outcomes import Outcome
@@ -69,10 +68,7 @@ def predictions_page(
         chosen: Numbers of all predictions that the query selects, in order.
         links: Addresses.
     """
-    # The cards of one page; a page beyond the last is the last. Files hold all of them.
-    pages = max(1, -(-len(chosen) // PAGE))
-    page = min(query.page, pages)
-    shown = chosen if links.static else chosen[(page - 1) * PAGE : page * PAGE]
+    shown, turning = paged(query, chosen, links.predictions, static=links.static)
     held = int(np.count_nonzero(predictions.words["held"][chosen]))
 
     return render(
@@ -87,11 +83,7 @@ def predictions_page(
         total=len(chosen),
         all=len(predictions),
         held=held,
-        page=page,
-        pages=pages,
-        address=links.predictions(query.params()),
-        previous=links.predictions(query.params(page=page - 1)) if page > 1 else "",
-        next=links.predictions(query.params(page=page + 1)) if page < pages else "",
+        **turning,
         form=_form(predictions, query),
     )
 
@@ -120,16 +112,9 @@ def prediction_page(
     Raises:
         DataError: If a file was replaced meanwhile.
     """
-    # Its neighbours in the selection.
-    (found,) = np.nonzero(chosen == i)
-    place = int(found[0]) if len(found) else None
-    around = [None, None] if place is None else [place - 1, place + 1]
-    before, after = (
-        links.prediction(predictions.label(int(chosen[k])), query.params())
-        if k is not None and 0 <= k < len(chosen)
-        else ""
-        for k in around
-    )
+
+    def address(number: int) -> str:
+        return links.prediction(predictions.label(number), query.params())
 
     # The verdict, the row, and where both cameras see the contacts; first that of the data file.
     snapshot, at = predictions.snapshot, int(predictions.places[i])
@@ -142,9 +127,6 @@ def prediction_page(
         window = _window(marks, snapshot.config.camera.size, wide=camera != predictions.rows.camera)
         views.append({"camera": camera, "strip": strip, "marks": marks, "window": window})
     scene = prediction_scene(predictions, i, verdict, row, hand)
-    position = "not in the selection"
-    if place is not None:
-        position = f"{place + 1:,} of {len(chosen):,}"
     return render(
         "prediction.html",
         links,
@@ -155,9 +137,7 @@ def prediction_page(
         hints=verdict.get("hints") or "",
         row_words=[_outcome(row["outcome"]), *words_of(snapshot, at)],
         row_page=links.grasp(snapshot.label(at)) if row_link else "",
-        position=position,
-        previous=before,
-        next=after,
+        **neighbours(chosen, i, address),
         gallery=links.predictions(query.params()),
         views=views,
         size=snapshot.config.camera.size,

@@ -5,6 +5,7 @@
   const note = box.querySelector(".loading");
   const { scene: data, meshes, colours, kinds } = JSON.parse(document.getElementById("scene").textContent);
   const NORMAL = 0.03, PER_NEWTON = 0.001, DOT = kinds ? 0.004 : 0.003;
+  const UP = new THREE.Vector3(0, 0, 1);
 
   let renderer;
   try {
@@ -40,7 +41,8 @@
   const hand = new THREE.Group();
   const contacts = new THREE.Group();
   const forces = new THREE.Group();
-  const layers = { hand, object, contacts, forces };
+  const palms = new THREE.Group();
+  const layers = { hand, object, contacts, forces, palms };
   for (const kind of Object.keys(kinds || {})) layers[kind] = new THREE.Group();
   scene.add(...Object.values(layers));
   const place = (group, columns) => {
@@ -98,6 +100,18 @@
     if (kind === "asked") return new THREE.TorusGeometry(1.6 * DOT, 0.3 * DOT, 12, 32);
     if (kind === "true") return new THREE.BoxGeometry(1.9 * DOT, 1.9 * DOT, 0.6 * DOT);
     return new THREE.SphereGeometry(DOT, 24, 16);
+  }
+
+  // Palms of more grasps: a plate, and a line along +Gz.
+  for (const palm of data.palms || []) {
+    const p = new THREE.Vector3(...palm.p), z = new THREE.Vector3(...palm.z);
+    const plate = new THREE.Mesh(new THREE.BoxGeometry(0.008, 0.008, 0.002), new THREE.MeshBasicMaterial({ color: palm.colour }));
+    const line = new THREE.Mesh(new THREE.CylinderGeometry(0.0007, 0.0007, 0.03, 8), plate.material);
+    plate.position.copy(p);
+    plate.quaternion.setFromUnitVectors(UP, z);
+    line.position.copy(p).addScaledVector(z, 0.015);
+    line.quaternion.setFromUnitVectors(new THREE.Vector3(0, 1, 0), z);
+    palms.add(plate, line);
   }
 
   function show(name) {
@@ -164,7 +178,7 @@
   function aim() {
     const bounds = new THREE.Box3().setFromObject(object);
     if (bounds.isEmpty()) bounds.set(new THREE.Vector3(-0.05, -0.05, 0), new THREE.Vector3(0.05, 0.05, 0.1));
-    const all = new THREE.Box3().setFromObject(hand).union(bounds);
+    const all = new THREE.Box3().setFromObject(hand).union(bounds).union(new THREE.Box3().setFromObject(palms));
     const middle = bounds.getCenter(new THREE.Vector3()).lerp(all.getCenter(new THREE.Vector3()), 0.5);
     const radius = all.getSize(new THREE.Vector3()).length() / 2;
     // From beside the palm, so that the hand does not hide the object.
@@ -209,7 +223,7 @@
   }
 
   // By keys: angles in radians about the vertical and above the table, a factor of the distance.
-  const UP = new THREE.Vector3(0, 0, 1), STEP = Math.PI / 18;
+  const STEP = Math.PI / 18;
   function move(turn, rise, factor) {
     const offset = camera.position.clone().sub(controls.target);
     const height = Math.PI / 2 - offset.angleTo(UP);
