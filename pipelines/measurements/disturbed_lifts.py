@@ -76,11 +76,11 @@ def palm_off(attempt: Attempt, stream: Stream) -> Attempt:
 
 def lift_again(out: Path, trials: Trials, trial_id: int, config: Config) -> list[dict[str, Any]]:
     """Return what becomes of a sample with each change."""
-    keys = ("object_name", "candidate", "standoff_index", "child")
     row = trials.trial(trial_id)
-    name, *place = (row[key] for key in keys)
+    name = row["object_name"]
+    candidate, standoff, child = (int(row[k]) for k in ("candidate", "standoff_index", "child"))
     prepared = load_prepared(out, name, config)
-    attempt = find_attempt(prepared, *map(int, place), config=config)
+    attempt = find_attempt(prepared, candidate, standoff, child, config)
     known = attempt.conditions or usual_conditions(prepared.model, config.physics)
     X_TO = prepared.resting_poses[attempt.resting]
     half = {"time_step": config.physics.time_step / 2.0, "coarse_steps": 1}
