@@ -18,6 +18,7 @@ from helpers.commands import run
 from drakegrasp.dataset.scenes.reader import SceneDataset
 from drakegrasp.exchange.posture_files import read_postures
 from drakegrasp.hand.description import load_hand
+from drakegrasp.simulation.candidates import Source
 
 # Where torch is said to be there, a test that skips is a failure.
 if os.environ.get("DRAKEGRASP_TORCH") != "1":
@@ -194,9 +195,10 @@ def assert_assessed(out: Path, scenes: Path) -> None:
     done = script("assess.py", judge, scenes, out / "curve.png", "--split", "train")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
-    data = SceneDataset(scenes, split="train", negatives="tested")
+    data = SceneDataset(scenes, split="train", negatives="tested", positives="held")
     grasps, ours = data.tables["grasps"], data.tables["views"]["scene"][data.views]
-    held = grasps["held"][grasps["tested"] & np.isin(grasps["scene"], ours)]
+    first = grasps["tested"] & (grasps["source"] != Source.REFINE)
+    held = grasps["held"][first & np.isin(grasps["scene"], ours)]
     assert found["grasps"] == len(held) == sum(b["grasps"] for b in found["held"]["curve"])
     assert found["held"]["share"] == pytest.approx(held.mean(), abs=1e-4)
     assert (out / "curve.png").read_bytes().startswith(b"\x89PNG")

@@ -2,7 +2,8 @@
 
   python pipelines/baseline/assess.py classifier.pt OUT/scenes.hdf5 reliability.png
 
-All grasps that were lifted to a verdict are judged, each once, from one view of its scene. It
+All grasps of the first round that were lifted to a verdict are judged, each once, from one view of
+its scene: a palm pose refined about one that holds is never tested, so it cannot be a sample. It
 prints JSON: AUC with its interval over objects, Brier score, and the reliability curve, which is
 drawn, too.
 """
@@ -27,6 +28,7 @@ from train import judged
 
 import drakegrasp as dg
 from drakegrasp.errors import DrakegraspError
+from drakegrasp.simulation.candidates import Source
 
 #: The two questions that the classifier answers.
 LABELS = ("held", "sample")
@@ -72,12 +74,14 @@ def judge(checkpoint: Path, path: Path, split: str) -> tuple[np.ndarray, np.ndar
     network.eval()
 
     # The first view of each scene; `grasps_in` gives all grasps, of which the lifted ones count.
-    data = dg.SceneDataset(path, split=split, negatives="tested", balance="view")
-    scenes = data.tables["views"]["scene"][data.views]
+    data = dg.SceneDataset(path, split=split, negatives="tested", positives="held", balance="view")
+    scenes, table = data.tables["views"]["scene"][data.views], data.tables["grasps"]
     chances, labels, objects = [], [], []
     for index in np.unique(scenes, return_index=True)[1].tolist():
         item, grasps = data[index], data.grasps_in(int(data.views[index]))
-        lifted = grasps["tested"]
+        lifted = grasps["tested"] & (
+            table["source"][table["scene"] == scenes[index]] != Source.REFINE
+        )
         batch = {"points": object_points(item["points"], item["on_object"])[None]}
         batch |= {k: grasps[k][lifted][None] for k in ("q", *LABELS)}
         batch["X_TG"] = grasps["X_AG"][lifted][None].astype(np.float32)

@@ -95,7 +95,8 @@ def train_postures(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def train_classifier(arguments: argparse.Namespace) -> dict[str, Any]:
     """Train the network that judges postures, on lifts to a verdict, and calibrate it."""
-    train, valid = _scenes(arguments, "tested")
+    # Held grasps that are no samples too, or both questions had the same answers.
+    train, valid = _scenes(arguments, "tested", positives="held")
     hand = hand_of(train)
     torch.manual_seed(arguments.seed)
     network = GraspClassifier(len(hand.directions))
@@ -185,14 +186,14 @@ def hand_of(train: Sequence[dg.SceneDataset]) -> HandCoordinates:
 
 
 def _scenes(
-    arguments: argparse.Namespace, negatives: Any
+    arguments: argparse.Namespace, negatives: Any, positives: Any = "sample"
 ) -> tuple[list[dg.SceneDataset], list[dg.SceneDataset]]:
     """Return the parts that train and validate.
 
     Only the first file validates: what was fed back is of objects that train there. A small dataset
     may have nothing that validates.
     """
-    options = {"negatives": negatives, "seed": arguments.seed}
+    options = {"negatives": negatives, "positives": positives, "seed": arguments.seed}
     train = [dg.SceneDataset(path, split="train", **options) for path in arguments.data]
     if len({data.joints for data in train}) > 1:
         raise DataError(f"{arguments.data[-1]}: must be of the same hand as the others")
