@@ -11,8 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drakegrasp.arithmetic import norm
+from drakegrasp.hand.file_format import rated_load, read_hand_file
+from drakegrasp.hand.files import hand_file
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.simulation.lift import Lift
+from drakegrasp.simulation.trial import TrialRecord
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
@@ -42,6 +46,7 @@ def _sentences(verified: Verification) -> Iterator[str]:
         yield _other_poses(verified)
     if verified.trial is not None and verified.trial.lift is not None:
         yield _in_the_hand(verified, verified.trial.lift)
+        yield from _loads(verified, verified.trial)
     if verified.removal is not None:
         yield _as_a_sample(verified, verified.removal)
 
@@ -109,6 +114,20 @@ def _in_the_hand(verified: Verification, lift: Lift) -> str:
         return f"{text}; {still}."
     precision = "a precision grasp" if verified.precision else "no precision grasp"
     return f"{text}: {precision}, {'' if verified.stable else 'not '}stable."
+
+
+def _loads(verified: Verification, trial: TrialRecord) -> Iterator[str]:
+    """Yield how the largest force of a fingertip compares with what its maker allows, if known."""
+    config = verified.config
+    rated = rated_load(config.hand, read_hand_file(hand_file(config.hand_source)))
+    if rated is None or trial.closed is None or trial.lift is None:
+        return
+    forces = [norm(stage.contacts.f_Q_O).max() for stage in (trial.closed, trial.lift)]
+    largest = float(max(forces))
+    yield (
+        f"The largest force of a fingertip is {largest:.1f} N, {largest / rated:.1f} times the "
+        f"hand's rated load of {rated:.1f} N."
+    )
 
 
 def _as_a_sample(verified: Verification, removal: Removal) -> str:

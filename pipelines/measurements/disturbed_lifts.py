@@ -5,7 +5,8 @@
 
 Friction and mass are changed by their share, up and down; the palm by 3 mm in a random direction
 and 3 degrees about a random axis; `together` changes all three, with random signs. Only `half step`
-changes the time step. A lift counts as held, and as a sample by the dataset's filters but for those
+changes the time step; `weaker motors` lets no fingertip press harder than the Barrett Hand's rated
+load. A lift counts as held, and as a sample by the dataset's filters but for those
 of pictures, of outliers, and the user's own. The first call writes a line per sample, the second
 prints the shares with their intervals, and how well numbers of the first lift tell the samples of
 which half of the lifts `palm` and `together` or more are samples (area under the ROC curve).
@@ -23,10 +24,10 @@ from typing import Any
 
 import numpy as np
 
-from drakegrasp.arithmetic import multiply
+from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.build.attempts import find_attempt
 from drakegrasp.build.columns import judge_sample
-from drakegrasp.config import Config, with_whole_lifts
+from drakegrasp.config import Config, PhysicsConfig, with_whole_lifts
 from drakegrasp.dataset.card.holding import (
     COLUMNS,
     MUCH,
@@ -43,10 +44,12 @@ from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.randomization.conditions import usual_conditions
 from drakegrasp.simulation.scene_cache import cached_scene
-from drakegrasp.simulation.trial import run_attempt
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
 #: Changes of friction and mass as shares, and of the palm.
 FRICTION, MASS, SHIFT, TURN = 0.15, 0.20, 3e-3, np.deg2rad(3.0)
+#: Rated load of the Barrett Hand's fingers [N].
+LOAD = 2.0 * 9.81
 #: Lifts of each sample with the palm off, and with all changes.
 PALMS, TOGETHER = 2, 4
 #: Last number of the place of the streams that are drawn from.
@@ -57,6 +60,7 @@ def changes(stream: Stream) -> Iterator[tuple[str, float, float, bool]]:
     """Yield the name of each change, the factors of friction and mass, whether the palm is off."""
     yield "as stored", 1.0, 1.0, False
     yield "half step", 1.0, 1.0, False
+    yield "weaker motors", 1.0, 1.0, False
     for sign in (-1.0, 1.0):
         yield f"friction {sign * FRICTION:+.0%}", 1.0 + sign * FRICTION, 1.0, False
         yield f"mass {sign * MASS:+.0%}", 1.0, 1.0 + sign * MASS, False
@@ -67,6 +71,15 @@ def changes(stream: Stream) -> Iterator[tuple[str, float, float, bool]]:
         yield "together", 1.0 + friction * FRICTION, 1.0 + mass * MASS, True
 
 
+def physics_of(change: str, physics: PhysicsConfig) -> PhysicsConfig:
+    """Return the physics of a change."""
+    updates = {
+        "half step": {"time_step": physics.time_step / 2.0, "coarse_steps": 1},
+        "weaker motors": {"finger_load": LOAD},
+    }
+    return physics.model_copy(update=updates.get(change, {}))
+
+
 def palm_off(attempt: Attempt, stream: Stream) -> Attempt:
     """Return an attempt with the palm off, in a direction and about an axis that are drawn."""
     shift, axis = (v / np.linalg.norm(v) for v in stream.normal(6).reshape(2, 3))
@@ -74,7 +87,16 @@ def palm_off(attempt: Attempt, stream: Stream) -> Attempt:
     return replace(attempt, X_OG=multiply(attempt.X_OG, X_GH))
 
 
-def lift_again(out: Path, trials: Trials, trial_id: int, config: Config) -> list[dict[str, Any]]:
+def largest_force(record: TrialRecord) -> float | None:
+    """Return the largest force of a fingertip after closing and after the lift [N]."""
+    stages = [stage for stage in (record.closed, record.lift) if stage is not None]
+    forces = [float(norm(stage.contacts.f_Q_O).max()) for stage in stages]
+    return max(forces, default=None)
+
+
+def lift_again(
+    out: Path, trials: Trials, trial_id: int, config: Config, only: Sequence[str]
+) -> list[dict[str, Any]]:
     """Return what becomes of a sample with each change."""
     keys = ("object_name", "candidate", "standoff_index", "child")
     row = trials.trial(trial_id)
@@ -83,10 +105,11 @@ def lift_again(out: Path, trials: Trials, trial_id: int, config: Config) -> list
     attempt = find_attempt(prepared, *map(int, place), config=config)
     known = attempt.conditions or usual_conditions(prepared.model, config.physics)
     X_TO = prepared.resting_poses[attempt.resting]
-    half = {"time_step": config.physics.time_step / 2.0, "coarse_steps": 1}
     stream, found = Stream(config.seed, trial_id, PLACE), []
     for change, friction, mass, is_off in changes(stream):
-        physics = config.physics.model_copy(update=half if change == "half step" else {})
+        if only and change not in only:
+            continue
+        physics = physics_of(change, config.physics)
         rules = with_whole_lifts(config).model_copy(update={"physics": physics})
         materials = replace(
             known.materials,
@@ -102,19 +125,20 @@ def lift_again(out: Path, trials: Trials, trial_id: int, config: Config) -> list
                 "change": change,
                 "outcome": record.outcome.label,
                 "sample": removal is Removal.KEPT,
+                "force": largest_force(record),
                 "removal": None if removal is None else removal.label,
             }
         )
     return found
 
 
-def measure(out: Path, count: int, lines: Path) -> None:
+def measure(out: Path, count: int, lines: Path, only: Sequence[str]) -> None:
     """Write a line for each of some samples of a dataset, drawn at random."""
     config, trials = read_manifest(out).config, Trials(out).where(sample=True)
     order = Stream(config.seed, PLACE).permutation(len(trials))[:count]
     with lines.open("w", encoding="utf-8") as file:
         for trial_id in trials.trial_ids[order].tolist():
-            lifts = lift_again(out, Trials(out), trial_id, config)
+            lifts = lift_again(out, Trials(out), trial_id, config, only)
             columns = Trials(out)[np.array([trial_id])].columns(COLUMNS)
             told = {key: float(value[0]) for key, value in predictors(columns).items()}
             line = {"trial_id": trial_id, "lifts": lifts, "told": told}
@@ -124,7 +148,7 @@ def measure(out: Path, count: int, lines: Path) -> None:
 
 def summarise(rows: Sequence[dict[str, Any]]) -> Iterator[str]:
     """Yield the tables of what was measured, as lines of Markdown."""
-    yield f"{len(rows)} samples\n\n| change | lifts | held | sample |\n|---|--:|--:|--:|"
+    yield f"{len(rows)} samples\n\n| change | lifts | held | sample | force [N] |\n|---|--:|--:|--:|--:|"
     lifts = [lift for row in rows for lift in row["lifts"]]
     failed = ("solver_error", "timeout", "crashed")
     for change in dict.fromkeys(lift["change"] for lift in lifts):
@@ -133,7 +157,10 @@ def summarise(rows: Sequence[dict[str, Any]]) -> Iterator[str]:
         for hits in (sum(x["outcome"] == "success" for x in own), sum(x["sample"] for x in own)):
             low, high = wilson_interval(hits, len(own))
             cells.append(f"{hits / len(own):.0%} ({low:.0%} to {high:.0%})")
+        cells.append(f"{np.median([x.get('force') or np.nan for x in own]):.1f}")
         yield f"| {change} | {len(own)} | {' | '.join(cells)} |"
+    if not all(any(x["change"] == "palm" for x in row["lifts"]) for row in rows):
+        return
     noisy = [[x["sample"] for x in r["lifts"] if x["change"] in ("palm", "together")] for r in rows]
     much = np.array([np.mean(own) >= MUCH for own in noisy])
     yield f"\n{much.sum()} of {len(rows)} bear half or more\n\n| number | AUC |\n|---|--:|"
@@ -151,9 +178,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("lines", type=Path, help="file with a line per sample")
     parser.add_argument("--dataset", type=Path, help="measure samples of this dataset")
     parser.add_argument("--count", type=int, default=100, help="how many (default: 100)")
+    parser.add_argument("--only", action="append", default=[], metavar="CHANGE")
     arguments = parser.parse_args(argv)
     if arguments.dataset is not None:
-        measure(arguments.dataset, arguments.count, arguments.lines)
+        measure(arguments.dataset, arguments.count, arguments.lines, arguments.only)
     rows = [json.loads(line) for line in arguments.lines.read_text(encoding="utf-8").splitlines()]
     sys.stdout.writelines(f"{line}\n" for line in summarise(rows))
     return 0

@@ -49,6 +49,8 @@ def card_text(content: Mapping[str, Any]) -> str:
             camera and the columns (`exchange.hub`).
     """
     sections = [_what, _files, _how, _licences, _how_many, _limits]
+    if content.get("fingertip_loads", {}).get("samples"):
+        sections.insert(-1, _loads)
     if "p_hold" in content:
         sections.insert(-1, _bears)
     if "columns" in content:
@@ -151,6 +153,15 @@ of `p_hold_repeats`, law in the setting `certify`). Intervals are of 95 %; a gra
 inverse of its probability to be drawn.
 
 {lines}"""
+
+
+def _loads(content: Mapping[str, Any]) -> str:
+    rated, above, samples, median = content["fingertip_loads"].values()
+    return f"""## Forces and the hand
+
+The maker allows {rated:.1f} N at a fingertip. In {above:,} of {samples:,} samples one presses harder,
+after closing or after the lift; the median of the largest force is {median:.1f} N. The setting
+`physics.finger_load` makes the motors weaker."""
 
 
 def _limits(content: Mapping[str, Any]) -> str:
