@@ -16,7 +16,6 @@ from drakegrasp.hand.file_format import rated_load, read_hand_file
 from drakegrasp.hand.files import hand_file
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.simulation.lift import Lift
-from drakegrasp.simulation.trial import TrialRecord
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
@@ -46,9 +45,9 @@ def _sentences(verified: Verification) -> Iterator[str]:
         yield _other_poses(verified)
     if verified.trial is not None and verified.trial.lift is not None:
         yield _in_the_hand(verified, verified.trial.lift)
-        yield from _loads(verified, verified.trial)
     if verified.removal is not None:
         yield _as_a_sample(verified, verified.removal)
+        yield from _loads(verified)
 
     # What forces at the contacts alone can do, and what may be wrong with the numbers.
     if not np.isnan(verified.smallest_friction):
@@ -116,11 +115,11 @@ def _in_the_hand(verified: Verification, lift: Lift) -> str:
     return f"{text}: {precision}, {'' if verified.stable else 'not '}stable."
 
 
-def _loads(verified: Verification, trial: TrialRecord) -> Iterator[str]:
+def _loads(verified: Verification) -> Iterator[str]:
     """Yield how the largest force of a fingertip compares with what its maker allows, if known."""
-    config = verified.config
+    config, trial = verified.config, verified.trial
     rated = rated_load(config.hand, read_hand_file(hand_file(config.hand_source)))
-    if rated is None or trial.closed is None or trial.lift is None:
+    if rated is None or trial is None or trial.closed is None or trial.lift is None:
         return
     forces = [norm(stage.contacts.f_Q_O).max() for stage in (trial.closed, trial.lift)]
     largest = float(max(forces))

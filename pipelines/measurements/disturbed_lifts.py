@@ -6,8 +6,8 @@
 Friction and mass are changed by their share, up and down; the palm by 3 mm in a random direction
 and 3 degrees about a random axis; `together` changes all three, with random signs. Only `half step`
 changes the time step; `weaker motors` lets no fingertip press harder than the Barrett Hand's rated
-load. A lift counts as held, and as a sample by the dataset's filters but for those
-of pictures, of outliers, and the user's own. The first call writes a line per sample, the second
+load. A lift counts as held, and as a sample by the dataset's filters but for those of pictures, of
+outliers, and the user's own. The first call writes a line per sample, the second
 prints the shares with their intervals, and how well numbers of the first lift tell the samples of
 which half of the lifts `palm` and `together` or more are samples (area under the ROC curve).
 """
@@ -148,7 +148,8 @@ def measure(out: Path, count: int, lines: Path, only: Sequence[str]) -> None:
 
 def summarise(rows: Sequence[dict[str, Any]]) -> Iterator[str]:
     """Yield the tables of what was measured, as lines of Markdown."""
-    yield f"{len(rows)} samples\n\n| change | lifts | held | sample | force [N] |\n|---|--:|--:|--:|--:|"
+    yield f"{len(rows)} samples\n"
+    yield "| change | lifts | held | sample | force [N] |\n|---|--:|--:|--:|--:|"
     lifts = [lift for row in rows for lift in row["lifts"]]
     failed = ("solver_error", "timeout", "crashed")
     for change in dict.fromkeys(lift["change"] for lift in lifts):

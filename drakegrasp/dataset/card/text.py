@@ -159,9 +159,9 @@ def _loads(content: Mapping[str, Any]) -> str:
     rated, above, samples, median = content["fingertip_loads"].values()
     return f"""## Forces and the hand
 
-The maker allows {rated:.1f} N at a fingertip. In {above:,} of {samples:,} samples one presses harder,
-after closing or after the lift; the median of the largest force is {median:.1f} N. The setting
-`physics.finger_load` makes the motors weaker."""
+The maker allows {rated:.1f} N at a fingertip. In {above:,} of {samples:,} samples one presses
+harder, after closing or after the lift; the median of the largest force is {median:.1f} N. The
+setting `physics.finger_load` makes the motors weaker."""
 
 
 def _limits(content: Mapping[str, Any]) -> str:
