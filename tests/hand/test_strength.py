@@ -59,7 +59,7 @@ def test_no_finger_holds_more_than_its_worm():
 
 
 def test_no_fingertip_of_weaker_motors_carries_more_than_the_load():
-    """All by one factor, so that fingers stay as strong beside each other; worms stay as they are."""
+    """All by one factor: fingers stay as strong beside each other, and worms as they are."""
     hand = load_hand()
     weak = within_load(hand, 19.6)
     assert fingertip_forces(weak, "worm").max() == pytest.approx(19.6)
