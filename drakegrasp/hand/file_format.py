@@ -372,7 +372,7 @@ def rated_load(hand: str, described: HandFile) -> float | None:
     """Return the largest force of a fingertip that the maker of a hand allows [N]; None if unknown.
 
     Args:
-        hand: What a configuration calls the hand.
+        hand: Name of the hand.
         described: Its file.
     """
     return described.rated_load or _RATED_LOADS.get(hand)

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drakegrasp.arithmetic import norm
-from drakegrasp.hand.file_format import rated_load, read_hand_file
-from drakegrasp.hand.files import hand_file
+from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.simulation.lift import Lift
 
@@ -117,8 +116,7 @@ def _in_the_hand(verified: Verification, lift: Lift) -> str:
 
 def _loads(verified: Verification) -> Iterator[str]:
     """Yield how the largest force of a fingertip compares with what its maker allows, if known."""
-    config, trial = verified.config, verified.trial
-    rated = rated_load(config.hand, read_hand_file(hand_file(config.hand_source)))
+    rated, trial = load_hand(verified.config.hand_source).rated_load, verified.trial
     if rated is None or trial is None or trial.closed is None or trial.lift is None:
         return
     forces = [norm(stage.contacts.f_Q_O).max() for stage in (trial.closed, trial.lift)]
