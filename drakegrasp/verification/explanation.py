@@ -107,8 +107,8 @@ def _in_the_hand(verified: Verification, lift: Lift) -> str:
 
     # What that is called, if it is held at all.
     if not verified.held:
-        touching = lift.contacts.touching
-        still = f"{int(touching.sum())} of {len(touching)} fingertips still touch it"
+        tips = lift.contacts.touching
+        still = f"{int(tips.sum())} of {len(tips)} fingertips still touch it"
         return f"{text}; {still}."
     precision = "a precision grasp" if verified.precision else "no precision grasp"
     return f"{text}: {precision}, {'' if verified.stable else 'not '}stable."

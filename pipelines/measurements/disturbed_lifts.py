@@ -98,11 +98,10 @@ def lift_again(
     out: Path, trials: Trials, trial_id: int, config: Config, only: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Return what becomes of a sample with each change."""
-    keys = ("object_name", "candidate", "standoff_index", "child")
     row = trials.trial(trial_id)
-    name, *place = (row[key] for key in keys)
+    name, place = row["object_name"], ("candidate", "standoff_index", "child")
     prepared = load_prepared(out, name, config)
-    attempt = find_attempt(prepared, *map(int, place), config=config)
+    attempt = find_attempt(prepared, **{key: int(row[key]) for key in place}, config=config)
     known = attempt.conditions or usual_conditions(prepared.model, config.physics)
     X_TO = prepared.resting_poses[attempt.resting]
     stream, found = Stream(config.seed, trial_id, PLACE), []

@@ -29,6 +29,7 @@ from drakegrasp.dataset.card.holding import wilson_interval
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.mjcf import links, scene
+from drakegrasp.mjcf.convex_parts import convex_parts
 from drakegrasp.outcomes import Outcome
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.randomization.conditions import usual_conditions
@@ -65,7 +66,7 @@ def try_object(out: Path, name: str, lifts: Sequence[StoredLift]) -> Iterator[di
     config = read_manifest(out).config_of(name)
     prepared = load_prepared(out, name, config)
     usual = usual_conditions(prepared.model, config.physics)
-    cut = cache(scene.convex_parts)
+    cut = cache(convex_parts)
     with mock.patch.object(scene, "convex_parts", lambda _: cut(prepared.model)):
         peers = {}
         for finer in (1, 2):
