@@ -138,6 +138,9 @@ class PhysicsConfig(_Section):
     solver: Literal["lagged", "similar", "sap"] = "lagged"  # Drake's contact approximation
     contact_force: Positive = 0.05  # [N], a weaker contact does not count as one
     max_speed: Positive = 10.0  # [m/s], a faster object means that the simulation diverged
+    # [N] at the pad point of the strongest fingertip; motors that press harder are all weakened by
+    # one factor. Null: as strong as the hand file says.
+    finger_load: Positive | None = None
 
     @model_validator(mode="after")
     def _short_enough(self) -> PhysicsConfig:
@@ -602,6 +605,8 @@ class Config(_Section):
             del tree["candidates"]["postures"]
         if self.scenes == ScenesConfig():
             del tree["scenes"]
+        if self.physics.finger_load is None:
+            del tree["physics"]["finger_load"]
         if not self.certified:
             for key in CertifyConfig.NEW:
                 del tree["certify"][key]

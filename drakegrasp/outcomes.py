@@ -24,7 +24,9 @@ class Outcome(IntEnum):
     MISSING_FINGERTIP = 5  # after closing, a fingertip does not touch the object
     HAND_CONTACT = 6  # after closing, a hand link other than a fingertip touches the object
     TABLE_CONTACT = 7  # after closing the hand touches the table, or after the lift the object does
-    SLIPPED = 8  # a fingertip lost contact during the lift, but the object was held
+    # A fingertip lost contact during the lift, and none holds the object off the table; in datasets
+    # of older versions, also what is PARTLY_HELD now.
+    SLIPPED = 8
     DROPPED = 9  # the object fell during the lift
     SOLVER_ERROR = 10  # Drake failed or the state diverged; says nothing about the grasp
     TIMEOUT = 11  # the attempt's limit of computing time passed; says nothing about the grasp
@@ -39,6 +41,9 @@ class Outcome(IntEnum):
     # image is too flat for one: whether it would have held the object is unknown.
     NOT_LIFTED = 16
     INVALID = 17  # verification only: the row of numbers is no grasp; it counts as a failure
+    # A fingertip lost contact during the lift; at its end, which may be early, others still hold
+    # the object off the table.
+    PARTLY_HELD = 18
 
     @property
     def label(self) -> str:
@@ -112,4 +117,5 @@ _STAGE = {
     Outcome.MOVED: Stage.LIFTED,
     Outcome.NOT_LIFTED: Stage.CLOSED,
     Outcome.INVALID: Stage.PLACED,
+    Outcome.PARTLY_HELD: Stage.LIFTED,
 }

@@ -55,6 +55,7 @@ physics:
   contact_force: 0.1
   coarse_steps: 2
   max_speed: 5.0
+  finger_load: 15.0
 settle:
   drop_height: 0.1
   max_time: 10.0
@@ -479,6 +480,7 @@ def test_simulation_hash_changes_with_what_is_simulated_and_nothing_else(key: st
 def test_datasets_that_were_begun_with_the_defaults_go_on() -> None:
     """A new setting whose default changes nothing must not change what manifests say."""
     assert load_config().simulation_hash() == "48ceb34ff99d5962"
+    assert "finger_load" not in load_config().to_dict()["physics"]
     assert not {"share", "share_others", "share_tested"} & load_config().to_dict()["certify"].keys()
 
 

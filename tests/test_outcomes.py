@@ -26,6 +26,7 @@ TABLE = [
     ("moved", 15, LIFTED, False),
     ("not_lifted", 16, CLOSED, False),
     ("invalid", 17, PLACED, False),
+    ("partly_held", 18, LIFTED, False),
 ]
 
 

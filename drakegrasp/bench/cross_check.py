@@ -39,7 +39,7 @@ Group = Literal["sample", "removed", "lost"]
 GROUPS: tuple[Group, ...] = get_args(Group)
 #: Outcomes of lifts that were lost; after closing, `table_contact` is no lift. What `moved` has no
 #: verdict to compare, and is in no group.
-LOST = (Outcome.SLIPPED, Outcome.DROPPED, Outcome.TABLE_CONTACT)
+LOST = (Outcome.SLIPPED, Outcome.PARTLY_HELD, Outcome.DROPPED, Outcome.TABLE_CONTACT)
 #: Last number of the place of the stream that draws lifts: the split's is 1.
 _PLACE = 2
 

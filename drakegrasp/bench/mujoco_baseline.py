@@ -18,6 +18,7 @@ from drakegrasp.bench.mujoco_drive import FingerDrive
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, rotation_angle
 from drakegrasp.hand.description import load_plain_hand
+from drakegrasp.hand.strength import within_load
 from drakegrasp.mjcf.links import TIME_STEP, pair_friction, quaternion
 from drakegrasp.mjcf.scene import IMMOVABLE, build_mujoco_scene
 from drakegrasp.objects.model import ObjectModel
@@ -88,7 +89,8 @@ class MujocoBaseline:
             HandError: If the hand has preshapes.
         """
         self._config = config
-        self._hand = load_plain_hand(config.hand_source, "attempts in MuJoCo")
+        plain = load_plain_hand(config.hand_source, "attempts in MuJoCo")
+        self._hand = within_load(plain, config.physics.finger_load)
         self._usual = usual_materials(model, config.physics)
         self.place(X_TO)
         scene = build_mujoco_scene(model, self._hand, config)

@@ -71,6 +71,8 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
     setup = TrialSetup(prepared=prepared, config=config, scene=scene)
     record = try_attempt(setup, stored.attempt)
     row = trial_rows(setup, [stored.attempt], [record], [measure_contacts(setup, record)])
+    if stored.row["outcome"] == Outcome.SLIPPED and record.outcome is Outcome.PARTLY_HELD:
+        row["outcome"][0] = Outcome.SLIPPED  # as an older version called it
 
     # What a hand met that could not start.
     meetings = {}

@@ -154,7 +154,8 @@ def _mend(outcomes: Counter[str], missing: Counter[str]) -> str:
         return ": other links touch it first; open the hand wider, or move the palm back (p_BG)"
     if label == Outcome.START_COLLISION.label:
         return ": the open hand is in its way; keep fingers that do not grasp away with preshape"
-    if label in (Outcome.SLIPPED.label, Outcome.DROPPED.label, MOVED):
+    lost = (Outcome.SLIPPED, Outcome.PARTLY_HELD, Outcome.DROPPED)
+    if label in (*(outcome.label for outcome in lost), MOVED):
         return ": pads must face each other where they meet, and motors press enough (efforts)"
     return ""
 

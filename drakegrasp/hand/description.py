@@ -44,6 +44,7 @@ from drakegrasp.hand.file_format import (
     Finger,
     HandFile,
     Spread,
+    rated_load,
     read_hand_file,
 )
 from drakegrasp.hand.files import find_packages, hand_file
@@ -73,6 +74,7 @@ class Hand:
     standoffs: tuple[float, ...]  # usual distances of the palm from the object [m]
     spreads_deg: tuple[float, ...]  # usual angles of the spread
     payload: float | None  # largest mass that the hand is made for [kg]
+    rated_load: float | None  # largest force of a fingertip that its maker allows [N]
     joint_names: tuple[str, ...]  # the n joints that turn or slide
     joint_slides: npt.NDArray[np.bool_]  # (n,), whether each slides
     joint_gain: Array  # (n, 1 + k), positions per coordinate; at most one non-zero in each row
@@ -299,6 +301,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         standoffs=described.standoffs,
         spreads_deg=described.spreads_deg,
         payload=described.payload,
+        rated_load=rated_load(name, described),
         joint_names=tuple(moving),
         joint_slides=np.array([joint_slides(joint) for joint in moving.values()], dtype=np.bool_),
         joint_gain=np.array([drives[joint].gain for joint in moving]),

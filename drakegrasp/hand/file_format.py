@@ -47,6 +47,9 @@ Drive = Literal["worm", "torque", "locked"]
 #: contacts are at their corners, and a border is drawn along an edge: that of the Barrett Hand
 #: misses the corners of the tip by 0.9 mm. A patch is nine times as wide.
 PAD_BAND = 0.001
+#: Rated loads [N] of hands of the package. They are not in their files, by whose digest a dataset
+#: knows its hand: 2 kg per finger [Barrett wiki 262, SafetyFeaturesPrecautions].
+_RATED_LOADS = {"barrett": 2.0 * 9.81}
 _STRICT = ConfigDict(frozen=True, extra="forbid")
 
 
@@ -232,6 +235,7 @@ class HandFile(BaseModel):
         tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(min_length=1)
     ] = (0.0,)
     payload: Positive | None = None  # largest mass that the hand is made for [kg]
+    rated_load: Positive | None = None  # largest force of a fingertip that its maker allows [N]
 
     @model_validator(mode="after")
     def _check_names(self) -> HandFile:
@@ -362,6 +366,16 @@ def _as_driven(finger: Finger, driver: Finger, by: DrivenBy) -> Finger:
     limit, holding = driver.effort_limit / by.ratio, driver.holding_effort
     holding = None if holding is None else holding / by.ratio
     return with_efforts(finger, limit, holding, slides=driver.slides)
+
+
+def rated_load(hand: str, described: HandFile) -> float | None:
+    """Return the largest force of a fingertip that the maker of a hand allows [N]; None if unknown.
+
+    Args:
+        hand: Name of the hand.
+        described: Its file.
+    """
+    return described.rated_load or _RATED_LOADS.get(hand)
 
 
 def with_efforts(finger: Finger, limit: float, holding: float | None, *, slides: bool) -> Finger:

@@ -6,13 +6,15 @@ only.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply, norm
 from drakegrasp.frames import transform_points
 from drakegrasp.hand.description import Hand
-from drakegrasp.hand.file_format import Drive
+from drakegrasp.hand.file_format import Drive, with_efforts
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_frames
 
 
@@ -52,6 +54,25 @@ def fingertip_forces(hand: Hand, drive: Drive) -> Array:
     # The other motors' forces, up to what the finger can hold.
     strongest = [np.inf if f.holding_effort is None else f.holding_effort for f in own]
     return np.minimum(np.maximum(motors, motors.sum() - motors), np.array(strongest) / levers)
+
+
+def within_load(hand: Hand, load: float | None) -> Hand:
+    """Return a hand whose motors are all weaker by one factor, so that it presses less.
+
+    Its strongest fingertip then carries at most `load` [N] at its pad point, by `fingertip_forces`.
+    The hand is as it was where it is no stronger, or `load` is None. Worms hold what they did: what
+    loads them comes from the motors.
+    """
+    if load is None:
+        return hand
+    factor = load / float(fingertip_forces(hand, hand.drive).max())
+    if factor >= 1.0:
+        return hand
+    fingers = [
+        with_efforts(f, factor * f.effort_limit, f.holding_effort, slides=f.slides)
+        for f in hand.fingers
+    ]
+    return replace(hand, fingers=tuple(fingers))
 
 
 def closing_levers(hand: Hand, closing: npt.ArrayLike) -> Array:

@@ -67,6 +67,7 @@ from drakegrasp.hand.file_format import Finger, with_efforts
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.parsing import add_model, make_parser
 from drakegrasp.hand.shapes import hull_corners
+from drakegrasp.hand.strength import within_load
 from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour
@@ -113,7 +114,7 @@ def build_scene(
         hand: The hand.
         meshcat: Where to show the scene while it is simulated; the results are the same bits.
     """
-    physics = model.own_physics(physics)
+    physics, hand = model.own_physics(physics), within_load(hand, physics.finger_load)
     own = cache(partial(_with_coarse, model, physics, hand, meshcat, own_motors=True))
     return replace(_with_coarse(model, physics, hand, meshcat), own_motors=own)
 

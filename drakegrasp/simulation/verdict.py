@@ -62,9 +62,11 @@ def judge_lifted(
         required: (k,), whether each fingertip must touch the object; all if one value.
     """
     touching = np.asarray(touching)
+    some, misses = touching.any(axis=-1), _misses(touching, required)
     return _first(
-        (~touching.any(axis=-1) & (np.asarray(other_links) == 0), Outcome.DROPPED),
-        (_misses(touching, required), Outcome.SLIPPED),
+        (~some & (np.asarray(other_links) == 0), Outcome.DROPPED),
+        (misses & some & ~np.asarray(object_on_table), Outcome.PARTLY_HELD),
+        (misses, Outcome.SLIPPED),
         (object_on_table, Outcome.TABLE_CONTACT),
     )
 

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drakegrasp.arithmetic import norm
+from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.simulation.lift import Lift
 
@@ -44,6 +46,7 @@ def _sentences(verified: Verification) -> Iterator[str]:
         yield _in_the_hand(verified, verified.trial.lift)
     if verified.removal is not None:
         yield _as_a_sample(verified, verified.removal)
+        yield from _loads(verified)
 
     # What forces at the contacts alone can do, and what may be wrong with the numbers.
     if not np.isnan(verified.smallest_friction):
@@ -104,9 +107,24 @@ def _in_the_hand(verified: Verification, lift: Lift) -> str:
 
     # What that is called, if it is held at all.
     if not verified.held:
-        return f"{text}."
+        tips = lift.contacts.touching
+        still = f"{int(tips.sum())} of {len(tips)} fingertips still touch it"
+        return f"{text}; {still}."
     precision = "a precision grasp" if verified.precision else "no precision grasp"
     return f"{text}: {precision}, {'' if verified.stable else 'not '}stable."
+
+
+def _loads(verified: Verification) -> Iterator[str]:
+    """Yield how the largest force of a fingertip compares with what its maker allows, if known."""
+    rated, trial = load_hand(verified.config.hand_source).rated_load, verified.trial
+    if rated is None or trial is None or trial.closed is None or trial.lift is None:
+        return
+    forces = [norm(stage.contacts.f_Q_O).max() for stage in (trial.closed, trial.lift)]
+    largest = float(max(forces))
+    yield (
+        f"The largest force of a fingertip is {largest:.1f} N, {largest / rated:.1f} times the "
+        f"hand's rated load of {rated:.1f} N."
+    )
 
 
 def _as_a_sample(verified: Verification, removal: Removal) -> str:

@@ -58,7 +58,8 @@ _REASONS = {
     Outcome.HAND_CONTACT: "a part of the hand that is not a fingertip touches the object",
     Outcome.TABLE_CONTACT: "the closing hand or the lifted object touches the table",
     Outcome.DROPPED: "the hand loses the object during the lift",
-    Outcome.SLIPPED: "a fingertip loses contact during the lift",
+    Outcome.SLIPPED: "a fingertip loses contact during the lift, and no other holds the object",
+    Outcome.PARTLY_HELD: "a fingertip loses contact during the lift; others still hold the object",
     Outcome.SOLVER_ERROR: "the simulation failed, which says nothing about the grasp",
     Outcome.TIMEOUT: "the limit of computing time passed, which says nothing about the grasp",
 }

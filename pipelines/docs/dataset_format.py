@@ -132,7 +132,8 @@ page.
 The two data files hold no NaN. In `trials.hdf5` a value that does not exist for a row is NaN
 (floats), 0 or false: the column "from" above says with which stage a value begins. Contact points
 and normals, and how they fit the mesh, are also NaN for a finger that does not touch. The stage of
-a row follows from its outcome: `success`, `slipped`, `dropped` and `moved` were lifted;
+a row follows from its outcome: `success`, `slipped`, `partly_held`, `dropped` and `moved` were
+lifted;
 `missing_fingertip` and `hand_contact` were closed; `table_contact` was closed, and lifted if
 `time_lift` is a number (then it is the object that still touches the table); all others were only
 placed. "After the lift" is when it ended: of `moved`, the moment at which it was ended.

@@ -30,7 +30,7 @@ DECIDED: dict[str, tuple[tuple[Outcome, ...], str]] = {
         ),
         "#e3b23c",
     ),
-    "lift": ((Outcome.DROPPED, Outcome.SLIPPED, Outcome.MOVED), "#d9722e"),
+    "lift": ((Outcome.DROPPED, Outcome.SLIPPED, Outcome.PARTLY_HELD, Outcome.MOVED), "#d9722e"),
     "success": ((Outcome.SUCCESS,), "#2f8f5b"),
 }
 STAGES = {"screen": "#5f6f86", "try": "#d9722e", "look": "#2f8f5b", "scene": "#c9ced6"}

@@ -84,7 +84,7 @@ def test_slippery_cube_is_not_held(cube: ObjectModel, config: Config) -> None:
     slick = override_config(config, ["physics.friction_hand=0.05"])
     trial = MujocoBaseline(cube, standing(cube), slick).run(from_above(cube, STANDOFF))
     assert trial.lifted
-    assert trial.outcome in (Outcome.DROPPED, Outcome.SLIPPED)
+    assert trial.outcome in (Outcome.DROPPED, Outcome.SLIPPED, Outcome.PARTLY_HELD)
 
 
 def test_friction_and_mass_of_an_attempt_are_those_of_a_model_built_with_them(

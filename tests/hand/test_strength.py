@@ -11,7 +11,7 @@ from helpers.hands import PINCER_SDF, changed_finger, write_pincer
 from drakegrasp.frames import transform_points
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
-from drakegrasp.hand.strength import closing_levers, fingertip_forces
+from drakegrasp.hand.strength import closing_levers, fingertip_forces, within_load
 
 #: Distance of the gripper's pad points from their hinges [m].
 ARM = np.hypot(0.01, 0.09)
@@ -56,6 +56,18 @@ def test_no_finger_holds_more_than_its_worm():
     weak = replace(hand, fingers=tuple(replace(f, holding_torque=4.5) for f in hand.fingers))
     levers = closing_levers(hand, np.full(3, np.deg2rad(70.0)))
     assert np.allclose(fingertip_forces(weak, "worm") * levers, [4.5, 4.5, 4.0])
+
+
+def test_no_fingertip_of_weaker_motors_carries_more_than_the_load():
+    """All by one factor: fingers stay as strong beside each other, and worms as they are."""
+    hand = load_hand()
+    weak = within_load(hand, 19.6)
+    assert fingertip_forces(weak, "worm").max() == pytest.approx(19.6)
+    before, after = (np.array([f.effort_limit for f in each.fingers]) for each in (hand, weak))
+    assert np.allclose(after / before, after[0] / before[0])
+    assert [f.holding_effort for f in weak.fingers] == [f.holding_effort for f in hand.fingers]
+    for load in (None, 1e3):
+        assert within_load(hand, load) is hand
 
 
 def test_strength_at_the_ends_of_the_range_is_what_the_docs_say():

@@ -47,7 +47,9 @@ def test_closed_hand_lifts_what_its_fingertips_alone_touch(
         (ALL, 0, False, Outcome.SUCCESS),
         # The palm may touch a lifted object that the fingertips hold.
         (ALL, 1, False, Outcome.SUCCESS),
-        (ONE_OFF, 0, False, Outcome.SLIPPED),
+        (ONE_OFF, 0, False, Outcome.PARTLY_HELD),
+        (ONE_OFF, 1, False, Outcome.PARTLY_HELD),
+        # No finger holds what lies on the palm.
         (NONE, 1, False, Outcome.SLIPPED),
         (NONE, 0, False, Outcome.DROPPED),
         (ALL, 0, True, Outcome.TABLE_CONTACT),
@@ -122,4 +124,4 @@ def test_a_fingertip_that_is_not_required_may_miss() -> None:
     closed = judge_closed(touching, [0, 0], [False, False], required=required)
     assert closed.tolist() == [Outcome.SUCCESS, Outcome.MISSING_FINGERTIP]
     lifted = judge_lifted(touching, [0, 0], [False, False], required=required)
-    assert lifted.tolist() == [Outcome.SUCCESS, Outcome.SLIPPED]
+    assert lifted.tolist() == [Outcome.SUCCESS, Outcome.PARTLY_HELD]

@@ -99,12 +99,16 @@ def test_explanation_tells_what_moved_and_what_touched(
     moved = f"slips by {slip_mm:.1f} mm and turns by {turn_deg:.1f}° in the hand"
     assert text.startswith("The grasp of vase holds: so it is. Before closing, the fingertips are ")
     assert f" During the lift the object {moved}, and at the end {said} In a dataset" in text
+    assert (
+        "The largest force of a fingertip is 1.0 N, 0.1 times the hand's rated load of 19.6 N."
+        in text
+    )
 
 
 def test_explanation_of_a_lost_object_gives_no_mark() -> None:
     text = lifted(slip_mm=80.0, turn_deg=9.0, links=0, outcome=Outcome.DROPPED).explain()
     assert text.startswith("The grasp of vase fails (dropped): so it is. ")
-    assert text.endswith("no other link of the hand touches it.")
+    assert text.endswith("touches it; 3 of 3 fingertips still touch it.")
 
 
 def test_what_forces_alone_hold_is_a_precision_grasp_that_is_stable() -> None:

@@ -218,7 +218,7 @@ def test_at_little_friction_neither_method_holds(
     slippery = override_config(CONFIG, ["physics.friction_hand=0.05"])
     for method in ("hand", "forces"):
         found = verify(cube, *grasp, method, slippery)
-        assert found.outcome in (Outcome.DROPPED, Outcome.SLIPPED)
+        assert found.outcome in (Outcome.DROPPED, Outcome.SLIPPED, Outcome.PARTLY_HELD)
 
 
 def test_a_drake_error_is_a_value_and_the_next_grasp_is_untouched(

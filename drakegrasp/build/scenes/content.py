@@ -50,7 +50,10 @@ _PLACE = 4
 #: The number before it: of where the object lies, how the scene looks, and of the first camera.
 _WHERE, _LOOK, _CAMERA = 0, 1, 2
 #: Outcomes of lifts to a verdict; `table_contact` after closing is none.
-LIFTED = (Outcome.SUCCESS, Outcome.SLIPPED, Outcome.DROPPED, Outcome.TABLE_CONTACT)
+LIFTED = (
+    *(Outcome.SUCCESS, Outcome.SLIPPED, Outcome.PARTLY_HELD, Outcome.DROPPED),
+    Outcome.TABLE_CONTACT,
+)
 #: Fields of /grasps that are columns of /trials, by their names here.
 _COPIED = {f.name: f.of for f in SCENE_GRASP_FIELDS if f.of} | {
     name: name for name in ("trial_id", "outcome", "precision", "stable", "preshape", "unused")

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from drakegrasp.arithmetic import norm
 from drakegrasp.config import CarriedHand, Config
 from drakegrasp.dataset.card.holding import holding_lines, holding_of
 from drakegrasp.dataset.hdf5 import read_names
@@ -32,7 +33,7 @@ from drakegrasp.dataset.statistics import (
 )
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError, HandError, printable
-from drakegrasp.hand.file_format import HandFile, read_hand_file
+from drakegrasp.hand.file_format import HandFile, rated_load, read_hand_file
 from drakegrasp.hand.files import hand_file, hand_names
 from drakegrasp.hand.folder import HandFolder, hand_folder
 from drakegrasp.outcomes import Outcome, Removal
@@ -136,6 +137,7 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
         "versions": manifest.versions,
         "licences": licences(entries),
         "counts": _counts(data, funnel),
+        **_loads(data, manifest.config),
         # The same bytes as before there were repeats, where there are none.
         **(
             {}
@@ -207,6 +209,35 @@ def _hand_licences(config: Config) -> dict[str, str]:
     folder = known[1]
     found = {place: _first_line(folder.content(place)) for place in folder.licences}
     return found or ({"LICENSE": OWN_LICENCE} if config.hand in hand_names() else {})
+
+
+def _loads(data: Path, config: Config) -> dict[str, Any]:
+    """Return how the samples' forces compare with the hand's rated load; nothing if it is unknown.
+
+    A fingertip's force is the larger one of after closing and after the lift.
+    """
+    known = _known_hand(config)
+    rated = (
+        None
+        if known is None
+        else rated_load(Path(config.hand).stem.removesuffix("_hand"), known[0])
+    )
+    if rated is None:
+        return {}
+    with open_samples(data) as file:
+        forces = np.concatenate(
+            [
+                np.maximum(
+                    *(norm(file[split][f"grasp_props/f_Q_C{when}"][:]) for when in ("", "_held"))
+                )
+                for split in SPLITS
+            ]
+        )
+    largest = forces.max(axis=1, initial=0.0)
+    loads = {"rated_N": rated, "above": int((largest > rated).sum()), "samples": len(forces)}
+    if len(forces):
+        loads["median_N"] = round(float(np.median(largest)), 1)
+    return {"fingertip_loads": loads}
 
 
 def _first_line(text: bytes) -> str:

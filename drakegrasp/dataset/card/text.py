@@ -49,6 +49,8 @@ def card_text(content: Mapping[str, Any]) -> str:
             camera, the columns, and those of scenes (`exchange.hub.folder`).
     """
     sections = [_what, _files, _how, _licences, _how_many, _limits]
+    if content.get("fingertip_loads", {}).get("samples"):
+        sections.insert(-1, _loads)
     if "p_hold" in content:
         sections.insert(-1, _bears)
     if "scenes" in content:
@@ -165,6 +167,15 @@ grasp, and all hands that closed on the object in that pose. *Tested* are grasps
 a verdict. No object is in two splits.
 
 {_table(heads, rows)}"""
+
+
+def _loads(content: Mapping[str, Any]) -> str:
+    rated, above, samples, median = content["fingertip_loads"].values()
+    return f"""## Forces and the hand
+
+The maker allows {rated:.1f} N at a fingertip. In {above:,} of {samples:,} samples one presses
+harder, after closing or after the lift; the median of the largest force is {median:.1f} N. The
+setting `physics.finger_load` makes the motors weaker."""
 
 
 def _limits(content: Mapping[str, Any]) -> str:

@@ -171,6 +171,10 @@ def verdicts(
         required=own,
     )
 
+    # Older versions called slipped what is partly held.
+    older = (batch["outcome"] == Outcome.SLIPPED) & (lifted == Outcome.PARTLY_HELD)
+    lifted = np.where(older, Outcome.SLIPPED.value, lifted)
+
     # A lift that was ended has no verdict, but a reason.
     moved = batch["outcome"] == Outcome.MOVED
     lifted = np.where(moved, Outcome.MOVED.value, lifted)

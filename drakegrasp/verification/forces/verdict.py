@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from drakegrasp.config import Config
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.strength import fingertip_forces
+from drakegrasp.hand.strength import fingertip_forces, within_load
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.trajectory import lift_path
@@ -172,7 +172,7 @@ def _grasp(
     model: ObjectModel, contacts: SurfaceContacts, config: Config, *, patches: bool
 ) -> GraspContacts:
     """Return contacts as points or patches, with the limits of the hand's fingertips."""
-    hand = load_hand(config.hand_source)
+    hand = within_load(load_hand(config.hand_source), config.physics.finger_load)
     points = patch_points(model, contacts) if patches else (contacts.p_OQ, contacts.nhat_Q_O)
     return GraspContacts(
         *points, model.p_OOcm, force_limit=fingertip_forces(hand, drive_of(hand, config.lift))

@@ -39,18 +39,17 @@ def test_files_of_certified_builds_alone_have_the_columns(out: Path, tmp_path: P
 
 
 def test_repeats_are_checked(out: Path) -> None:
-    for column, value in (("held", 5), ("samples", 6), ("half_step", 0.5)):
-        change(out, TRIALS, f"trials/p_hold_{column}", 0, lambda _, value=value: value)
-    change(out, TRIALS, "trials/p_hold_repeats", 3, lambda _: 9)
-    change(out, TRIALS, "trials/p_hold_probability", 12, lambda _: 1.5)
-    must_find_without_shards(
-        out,
-        (TRIALS, "/trials", 0, "p_hold_held must be at most p_hold_repeats"),
-        (TRIALS, "/trials", 0, "p_hold_samples must be at most p_hold_held"),
-        (TRIALS, "/trials", 0, "p_hold_half_step must be 0, 1 or NaN"),
-        (TRIALS, "/trials", 3, "p_hold_repeats must be at most"),
-        (TRIALS, "/trials", 12, "p_hold_probability must be NaN or in 0..1"),
-    )
+    wrong = {
+        (0, "repeats"): (2, "p_hold_held must be at most p_hold_repeats"),
+        (3, "repeats"): (9, "p_hold_repeats must be at most"),
+        (12, "probability"): (1.5, "p_hold_probability must be NaN or in 0..1"),
+        (15, "half_step"): (0.5, "p_hold_half_step must be 0, 1 or NaN"),
+        (24, "held"): (2, "p_hold_samples must be at most p_hold_held"),
+    }
+    for (row, column), (value, _) in wrong.items():
+        change(out, TRIALS, f"trials/p_hold_{column}", row, lambda _, value=value: value)
+    found = [(TRIALS, "/trials", row, what) for (row, _), (_, what) in wrong.items()]
+    must_find_without_shards(out, *found)
 
 
 def columns_of(*rows: tuple[int, int, int, float]) -> dict[str, np.ndarray]:

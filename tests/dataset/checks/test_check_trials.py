@@ -208,6 +208,15 @@ def test_successes_and_removals_are_checked(out: Path) -> None:
     )
 
 
+def test_what_older_versions_called_slipped_may_be_partly_held(out: Path) -> None:
+    """But nothing is partly held that touches the table."""
+    change(out, TRIALS, "trials/outcome", SLIPPED, lambda _: Outcome.PARTLY_HELD)
+    must_find(out / TRIALS)
+    change(out, TRIALS, "trials/lifted_object_on_table", SLIPPED, lambda _: True)
+    what = "outcome must follow from the contacts"
+    must_find(out / TRIALS, (TRIALS, "/trials", SLIPPED, what))
+
+
 def test_certificates_are_checked(out: Path) -> None:
     change(out, TRIALS, "successes/certified_share", 1, lambda _: 1.0)
     change(out, TRIALS, "successes/certified_friction", 1, lambda _: np.inf)
