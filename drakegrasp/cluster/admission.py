@@ -30,6 +30,8 @@ SATURATION = 1.0
 #: limits of every step (see `runtime.journal`). A step that holds the interpreter gives none, and
 #: its journal tells more than the scheduler knows. A lost connection is noticed at once.
 SILENCE_SECONDS = 2.0 * wall_limit(PREPARE_SECONDS)
+#: The variable that chooses a kernel of OpenBLAS, read when the library is loaded.
+BLAS_KERNEL = "OPENBLAS_CORETYPE"
 #: Topic of the messages from workers that join later.
 _TOPIC = "drakegrasp-admission"
 
@@ -38,8 +40,7 @@ def worker_environment() -> dict[str, str]:
     """Return the environment variables that every worker gets, on this machine and on others.
 
     Software OpenGL and BLAS would start threads beside the one process per core, and nothing that
-    a worker does needs the network. Which kernel OpenBLAS runs is left to each machine: it changes
-    no value (`docs/explanation/determinism.md`).
+    a worker does needs the network.
     """
     return {
         "LP_NUM_THREADS": "0",
@@ -48,6 +49,16 @@ def worker_environment() -> dict[str, str]:
         "MKL_NUM_THREADS": "1",
         "OPENBLAS_NUM_THREADS": "1",
     }
+
+
+def start_environment() -> dict[str, str]:
+    """Return the environment variables of workers that we start.
+
+    Which kernel OpenBLAS runs is left to each machine, unless the caller's environment says it: the
+    last bits of a lift depend on it (`docs/explanation/determinism.md`).
+    """
+    kernel = {name: os.environ[name] for name in (BLAS_KERNEL,) if name in os.environ}
+    return {**worker_environment(), **kernel}
 
 
 class Admission(WorkerPlugin):  # type: ignore[misc]

@@ -13,7 +13,7 @@ import dask
 from distributed import Client, SpecCluster
 from distributed.security import Security
 
-from drakegrasp.cluster.admission import SATURATION, SILENCE_SECONDS, worker_environment
+from drakegrasp.cluster.admission import SATURATION, SILENCE_SECONDS, start_environment
 from drakegrasp.cluster.local import PrivateCluster, undisturbed_loop
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.runtime.allocator import PRELOAD, SETTINGS, kept_variables
@@ -38,7 +38,7 @@ def dask_settings() -> dict[str, Any]:
         "distributed.worker.profile.enabled": False,
         "distributed.scheduler.worker-saturation": SATURATION,
         "distributed.scheduler.worker-ttl": f"{SILENCE_SECONDS:g}s",
-        "distributed.nanny.pre-spawn-environ": worker_environment(),
+        "distributed.nanny.pre-spawn-environ": start_environment(),
         "distributed.nanny.preload": [NANNY_PRELOAD],
         # On a busy machine a worker takes long to start again; Dask would close its nanny.
         "distributed.deploy.lost-worker-timeout": "60 s",

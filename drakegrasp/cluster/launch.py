@@ -21,7 +21,7 @@ from distributed import Client, SpecCluster, SSHCluster, Status
 from distributed.security import Security
 from tornado.ioloop import PeriodicCallback
 
-from drakegrasp.cluster.admission import worker_environment
+from drakegrasp.cluster.admission import start_environment
 from drakegrasp.cluster.certificates import (
     chosen_security,
     make_certificates,
@@ -116,7 +116,7 @@ def _ssh(request: ClusterRequest, security: Security | None) -> SpecCluster:
         "n_workers": cores_per_host(request),
         "nthreads": 1,
         "memory_limit": request.memory or "auto",
-        "env": worker_environment(),
+        "env": start_environment(),
         **workers_listening(listening),
         **server_options(security),
     }

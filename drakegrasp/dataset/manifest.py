@@ -78,6 +78,8 @@ def _refuse_unprintable(text: str) -> str:
     return text
 
 
+#: Key of the hash of all other keys.
+DIGEST = "sha256"
 #: Types of what a manifest holds; they are checked when one is read.
 Axis = Annotated[str, Field(pattern=r"^[+-][xyz]$")]
 Hex = Annotated[str, Field(pattern="^[0-9a-f]+$")]
@@ -319,7 +321,15 @@ def write_manifest(manifest: Manifest, out: Path) -> None:
 
 def manifest_text(manifest: Manifest) -> bytes:
     """Return the bytes of a manifest's file."""
-    return (json.dumps(_content(manifest), indent=1, ensure_ascii=False) + "\n").encode()
+    content = _content(manifest)
+    content[DIGEST] = _digest(content)
+    return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    """Return the hash of all that a manifest says beside it, however it is laid out."""
+    said = {key: value for key, value in content.items() if key != DIGEST}
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
 def _content(manifest: Manifest) -> dict[str, Any]:
@@ -374,6 +384,12 @@ def read_manifest(out: Path) -> Manifest:
     )
     if (mistake := next(_contradictions(stored, manifest), None)) is not None:
         raise DataError(f"{path}: {mistake}")
+    # What is left is a value that may be, but is another one. Older manifests have no digest.
+    if stored.sha256 not in (None, _digest(tree)):
+        raise DataError(
+            f"{path}: must be as it was written, got one with another {DIGEST}: it is damaged, or "
+            f"was edited (without the key {DIGEST} it is taken as it is)"
+        )
     return manifest
 
 
@@ -417,6 +433,7 @@ class _Stored(BaseModel):
     objects: tuple[ObjectEntry, ...]
     refused: tuple[RefusedMesh, ...]
     rejected: tuple[AttemptKey, ...] = ()
+    sha256: Hex | None = None
 
 
 def _contradictions(stored: _Stored, manifest: Manifest) -> Iterator[str]:

@@ -32,6 +32,7 @@ from drakegrasp.errors import DataError, one_line
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel, load_object, save_object
 from drakegrasp.runtime.files import atomic_hdf5
+from drakegrasp.runtime.json_text import parse_json
 from drakegrasp.simulation.candidates import Candidates, GivenPostures
 
 
@@ -182,7 +183,7 @@ def _given_postures(arrays: dict[str, AnyArray], path: Path) -> GivenPostures | 
         return None
 
     def texts(name: str) -> tuple[str, ...]:
-        return tuple(map(str, json.loads(arrays.pop(name).tobytes())))
+        return tuple(map(str, parse_json(arrays.pop(name).tobytes())))
 
     try:
         count, said = len(arrays["row"]), texts("said")

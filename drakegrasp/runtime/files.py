@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 #: Size of the user block that holds the seal [B]; HDF5 demands a power of two.
 SEAL_SIZE = 512
-#: Format of sealed files, which have many small columns: HDF5's first one spends four times as many
-#: bytes on each. Every HDF5 since 1.10 reads it.
-LEAN = ("v110", "v110")
+#: Format of HDF5 files. Unlike HDF5's first one it has checksums of where values lie, and a small
+#: column takes a quarter of the bytes. Every HDF5 since 1.10 reads it.
+FORMAT = ("v110", "v110")
 #: Suffix of a file that is being written; after a crash such a file may be deleted.
 TEMPORARY_SUFFIX = ".tmp"
 #: End of its name: the machine and the process that write it.
@@ -113,7 +113,7 @@ def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
     with atomic_path(path) as temporary:
         if sealed:
             content = BytesIO()
-            with h5py.File(content, "w", userblock_size=SEAL_SIZE, libver=LEAN) as file:
+            with h5py.File(content, "w", userblock_size=SEAL_SIZE, libver=FORMAT) as file:
                 yield file
             temporary.write_bytes(content.getbuffer())
             seal(temporary)
@@ -131,7 +131,7 @@ def new_hdf5(path: Path) -> Iterator[h5py.File]:
     """
     with _PatientFile(path) as patient:
         try:
-            with h5py.File(patient, "w") as file:
+            with h5py.File(patient, "w", libver=FORMAT) as file:
                 yield file
         finally:
             # Other errors follow from this one.

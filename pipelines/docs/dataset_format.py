@@ -59,6 +59,10 @@ OUT/
 The data card is written with the three files, and `drakegrasp check` compares its counts with
 them. It has no time and no machine in it: equal files have equal cards.
 
+A changed bit shows when a file is read: `sha256` in the manifest is the hash of its other keys,
+shards and plans have a seal, and the HDF5 files have checksums of their columns and of where these
+lie. Texts of HDF5 (names, attributes) have none: `check` compares them.
+
 Only the data files, `grasping_*.hdf5`, are needed to train. With `objects/`, `hand/` and
 `manifest.json`, every trial can be replayed.
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.commands import error_line, run
+from helpers.datasets import edit_manifest
 from helpers.hands import write_tongs
 from helpers.machine import needs_egl
 
@@ -202,10 +203,7 @@ def test_an_older_dataset_reads_the_hand_at_its_path_until_a_build_goes_on(
 ) -> None:
     hand = write_hand(tmp_path / "elsewhere")
     shutil.rmtree(copy / "hand")
-    tree = json.loads((copy / "manifest.json").read_text())
-    tree["config"]["hand"] = str(hand)
-    del tree["joints"]
-    (copy / "manifest.json").write_text(json.dumps(tree))
+    edit_manifest(copy, lambda tree: (tree["config"].update(hand=str(hand)), tree.pop("joints")))
     assert run("replay", copy, "--trial", success(copy)).exit_code == 0
 
     report = go_on(copy, hand)
@@ -223,9 +221,7 @@ def test_merging_demands_the_same_hand_and_carries_it(
     assert hand_digest(hand_path(tmp_path / "merged")) == hand_digest(hand_path(passed_on))
     assert run("check", tmp_path / "merged").exit_code == 0
 
-    manifest = json.loads((copy / "manifest.json").read_text())
-    manifest["versions"]["hand"] = "0" * 16
-    (copy / "manifest.json").write_text(json.dumps(manifest))
+    edit_manifest(copy, lambda tree: tree["versions"].update(hand="0" * 16))
     assert run("assemble", copy).exit_code == 0
     said = error_line(run("merge", tmp_path / "again", passed_on, copy))
     assert "must be of hand " in said

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Callable
@@ -13,7 +12,16 @@ import h5py
 import numpy as np
 import pytest
 from helpers.assertions import arrays_of, assert_same_arrays
-from helpers.datasets import BOTH, BOXES, OTO, TRIALS, change, make_dataset, must_find
+from helpers.datasets import (
+    BOTH,
+    BOXES,
+    OTO,
+    TRIALS,
+    change,
+    edit_manifest,
+    make_dataset,
+    must_find,
+)
 from helpers.meshes import write_fixed
 
 from drakegrasp.build.merge import merge
@@ -218,9 +226,7 @@ def with_manifest(edit: Callable[[dict], object]) -> Callable[[Path, Path], list
     """Return two datasets, the second with another manifest, of which its files are."""
 
     def spoil(sound: Path, copy: Path) -> list[Path]:
-        tree = json.loads((copy / "manifest.json").read_bytes())
-        edit(tree)
-        (copy / "manifest.json").write_text(json.dumps(tree))
+        edit_manifest(copy, edit)
         for name in (*BOTH, TRIALS):
             with h5py.File(copy / name, "r+") as file:
                 file.attrs["signature"] = read_manifest(copy).signature()

@@ -35,6 +35,7 @@ from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
+from drakegrasp.runtime.files import seal
 from drakegrasp.scoring.verdict import verdict_of
 from drakegrasp.simulation.candidates import Source
 from drakegrasp.simulation.construction import build_scene
@@ -131,6 +132,17 @@ def test_plan_keeps_what_the_file_said(dataset, table):
     kept = load_prepared(dataset, NAME, config).candidates.postures
     np.testing.assert_array_equal(kept.q_pregrasp, table.q_pregrasp)
     assert kept.said == ("mine", "", "", "")
+
+
+def test_plan_whose_texts_are_nested_too_deeply_is_refused_in_a_line(dataset, table, tmp_path):
+    shutil.copytree(dataset / "objects", tmp_path / "objects")
+    path = tmp_path / f"objects/{NAME}.plan.h5"
+    with h5py.File(path, "r+") as file:
+        del file["said"]
+        file["said"] = np.frombuffer(b"[" * 100_000, dtype=np.uint8)
+    seal(path)
+    with pytest.raises(DataError, match="must hold postures, got none: values nested too deeply"):
+        load_prepared(tmp_path, NAME, posture_config(load_config(), table))
 
 
 def test_dataset_without_the_columns_reads_as_one_of_samplers(dataset, tmp_path):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.commands import run
-from helpers.datasets import OTO, TRIALS
+from helpers.datasets import OTO, TRIALS, edit_manifest
 
 from drakegrasp.api.building import build_dataset
 from drakegrasp.dataset.log import BuildLog, read_log
@@ -153,9 +153,7 @@ def test_script_that_a_worker_imports_again_starts_nothing(
 
 @pytest.mark.parametrize("name", ["../../outside", f"a{STEERING}", ".hidden", ""])
 def test_names_in_a_manifest_are_names(out: Path, name: str) -> None:
-    content = json.loads((out / "manifest.json").read_text())
-    content["objects"][0]["name"] = name
-    (out / "manifest.json").write_text(json.dumps(content))
+    edit_manifest(out, lambda tree: tree["objects"][0].update(name=name))
     for command in ("stats", "assemble", "check"):
         assert "a name must be printable" in refusal(command, out)
 

@@ -12,6 +12,7 @@ import pytest
 
 from drakegrasp.cluster import launch
 from drakegrasp.cluster.certificates import security_of
+from drakegrasp.cluster.connect import dask_settings
 from drakegrasp.cluster.request import ClusterRequest
 from drakegrasp.errors import MachineError
 
@@ -65,3 +66,14 @@ def test_job_has_the_memory_of_all_its_workers(monkeypatch: pytest.MonkeyPatch) 
     lines = [line.removeprefix("#SBATCH ").split("=") for line in script.splitlines()]
     said = {line[0]: line[1] for line in lines if len(line) == 2}
     assert (said["--cpus-per-task"], said["--mem"]) == ("3", "6G")
+
+
+def test_workers_run_the_kernel_of_blas_that_the_caller_chose(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A job inherits nothing, and the last bits of a lift depend on the kernel."""
+    key = "distributed.nanny.pre-spawn-environ"
+    monkeypatch.setenv("OPENBLAS_CORETYPE", "Prescott")
+    assert dask_settings()[key]["OPENBLAS_CORETYPE"] == "Prescott"
+    monkeypatch.delenv("OPENBLAS_CORETYPE")
+    assert "OPENBLAS_CORETYPE" not in dask_settings()[key]

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from drakegrasp.dataset.manifest import (
+    DIGEST,
     Manifest,
     ObjectEntry,
     RefusedMesh,
@@ -108,7 +109,8 @@ def manifest() -> Manifest:
 
 def test_entries_are_written_as_ever(tmp_path: Path, manifest: Manifest) -> None:
     write_manifest(manifest, tmp_path)
-    assert (tmp_path / FILE_NAME).read_text(encoding="utf-8").endswith(ENTRIES)
+    text = (tmp_path / FILE_NAME).read_text(encoding="utf-8")
+    assert text.split(f',\n "{DIGEST}"')[0].endswith(ENTRIES.removesuffix("\n}\n"))
 
 
 def test_manifest_that_is_read_and_written_keeps_its_bytes(
@@ -120,6 +122,24 @@ def test_manifest_that_is_read_and_written_keeps_its_bytes(
     assert again == manifest
     write_manifest(again, tmp_path)
     assert (tmp_path / FILE_NAME).read_bytes() == before
+
+
+def test_a_value_that_may_be_but_was_not_written_is_refused(
+    tmp_path: Path, manifest: Manifest
+) -> None:
+    """A changed bit shows; another layout, or a manifest from before the hash, is read."""
+    write_manifest(manifest, tmp_path)
+    path = tmp_path / FILE_NAME
+    text = path.read_text(encoding="utf-8")
+    tree = json.loads(text)
+    path.write_text(json.dumps(tree), encoding="utf-8")
+    assert read_manifest(tmp_path) == manifest
+    path.write_text(text.replace('"mass": 0.1', '"mass": 0.3'), encoding="utf-8")
+    with pytest.raises(DataError, match="must be as it was written, got one with another sha256"):
+        read_manifest(tmp_path)
+    del tree[DIGEST]
+    path.write_text(json.dumps(tree), encoding="utf-8")
+    assert read_manifest(tmp_path) == manifest
 
 
 def test_rule_of_the_split_and_groups_are_stated(tmp_path: Path, manifest: Manifest) -> None:
@@ -140,7 +160,12 @@ def test_a_manifest_of_before_the_rule_is_of_a_split_by_class(
 ) -> None:
     write_manifest(manifest, tmp_path)
     tree = json.loads((tmp_path / FILE_NAME).read_text(encoding="utf-8"))
-    del tree["split_by"], tree["config"]["split"]["by"], tree["config"]["split"]["test_fraction"]
+    del (
+        tree[DIGEST],
+        tree["split_by"],
+        tree["config"]["split"]["by"],
+        tree["config"]["split"]["test_fraction"],
+    )
     (tmp_path / FILE_NAME).write_text(json.dumps(tree), encoding="utf-8")
     assert manifest.split_rule == "object"
     assert read_manifest(tmp_path).split_rule == "class"

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
+from helpers.datasets import edit_manifest
 
 from drakegrasp.build.merge import merge
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import claim_directory, read_manifest
-from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME
+from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS, TRIAL_FIELDS
@@ -37,13 +38,15 @@ def older(out: Path) -> Path:
                 for field in fields:
                     if field.since > 3:
                         del file[group][field.name]
-    tree = json.loads((out / FILE_NAME).read_bytes())
+    edit_manifest(out, _to_schema_3)
+    return out
+
+
+def _to_schema_3(tree: dict[str, Any]) -> None:
     tree |= {"schema_version": 3, "config_hash": "0" * 16}
     for entry in tree["objects"]:
         (pose,) = entry.pop("resting")
         entry |= {"X_TO": pose["X_TO"], "rolled": pose["rolled"]}
-    (out / FILE_NAME).write_text(json.dumps(tree))
-    return out
 
 
 def test_older_counts_are_those_of_its_files(older: Path, sound: Path) -> None:

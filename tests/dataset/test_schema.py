@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable
 from functools import cached_property, partial
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
-from helpers.datasets import OTM, OTO, TRIALS, edit_file, make_dataset
+from helpers.datasets import OTM, OTO, TRIALS, edit_file, edit_manifest, make_dataset
 
 from drakegrasp.build.columns import TrialRow
 from drakegrasp.build.replay import replay_trial
@@ -127,8 +126,7 @@ def test_number_of_a_sample_is_a_column_of_its_trial_in_single_precision() -> No
 def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset whose files say that they are of version 1."""
     out = make_dataset(tmp_path_factory.mktemp("old"), tmp_path_factory.mktemp("meshes"))
-    manifest = json.loads((out / FILE_NAME).read_text())
-    (out / FILE_NAME).write_text(json.dumps({**manifest, "schema_version": 1}))
+    edit_manifest(out, lambda tree: tree.update(schema_version=1))
     for name in (OTO, OTM, TRIALS):
         edit_file(out / name, lambda f: f.attrs.update(schema_version=1))
     return out

@@ -188,7 +188,7 @@ def test_degrees_are_refused_and_one_wild_row_is_not(tmp_path):
     assert read_postures(tmp_path / "w.npz", HAND).q_grasp[0].max() == 50.0
 
 
-@pytest.mark.parametrize("write", [write_npz, write_hdf5])
+@pytest.mark.parametrize("write", [write_npz, write_hdf5, write_parquet])
 def test_arrays_larger_than_any_postures_are_refused(tmp_path, write, monkeypatch):
     monkeypatch.setattr(posture_files, "MOST_BYTES", 100)
     with pytest.raises(GraspError, match=r"arrays must be at most 1e\+02 bytes, got"):
@@ -479,6 +479,20 @@ def test_other_files_are_refused_in_a_line(tmp_path, name, content, words):
     (tmp_path / name).write_text(content, encoding="utf-8")
     with pytest.raises(GraspError, match=words):
         read_postures(tmp_path / name, HAND)
+
+
+def test_damaged_stream_is_refused_in_a_line(tmp_path):
+    """Zlib has an error of its own for what cannot be inflated."""
+    np.savez_compressed(tmp_path / "a.npz", **arrays())
+    content = bytearray((tmp_path / "a.npz").read_bytes())
+    name, extra = (int.from_bytes(content[at : at + 2], "little") for at in (26, 28))
+    content[30 + name + extra] = 0b111  # the last block, of a type that there is not
+    (tmp_path / "a.npz").write_bytes(content)
+    with pytest.raises(
+        GraspError, match=r"must be a readable file of arrays, got: .*inv"
+    ) as caught:
+        read_postures(tmp_path / "a.npz", HAND)
+    assert "\n" not in str(caught.value)
 
 
 def test_array_that_is_named_as_several_is_refused(tmp_path):

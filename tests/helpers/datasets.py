@@ -6,6 +6,7 @@ quantity of the closed hand is that of the lifted one.
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from functools import cache
@@ -20,7 +21,8 @@ import trimesh
 from drakegrasp.config import CameraConfig, Config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
-from drakegrasp.dataset.manifest import Manifest, installed_versions, write_manifest
+from drakegrasp.dataset.manifest import DIGEST, Manifest, installed_versions, write_manifest
+from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.prepared_objects import PreparedObject, save_prepared
 from drakegrasp.dataset.schema import LOOK_FIELDS, TRIAL_FIELDS, sizes
 from drakegrasp.dataset.shards import Shard, ShardHeader, trial_columns, write_shard
@@ -383,6 +385,14 @@ def must_find_without_shards(out: Path, *expected: tuple[str, str, int | None, s
     """Require what is found where the files cannot be compared with the shards."""
     (out / LAST_SHARD).unlink()
     must_find(out, LOST, *expected)
+
+
+def edit_manifest(out: Path, edit: Callable[[dict[str, Any]], Any]) -> None:
+    """Change what a manifest says by hand, and drop its hash: it is taken as it is."""
+    tree = json.loads((out / FILE_NAME).read_bytes())
+    del tree[DIGEST]
+    edit(tree)
+    (out / FILE_NAME).write_text(json.dumps(tree))
 
 
 def edit_file(path: Path, edit: Callable[[h5py.File], Any]) -> None:

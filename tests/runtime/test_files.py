@@ -6,10 +6,13 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from helpers.shards import some_shard
 
+from drakegrasp.dataset.hdf5 import write_field
+from drakegrasp.dataset.schema import Field
 from drakegrasp.dataset.shards import write_shard
 from drakegrasp.runtime import files
 from drakegrasp.runtime.file_set import LIST_NAME, replaced_together
@@ -46,6 +49,23 @@ def test_exception_while_writing_keeps_the_file_that_was_there(tmp_path: Path) -
         write_shard(tmp_path, incomplete)
     assert everything_in(tmp_path) == [path]
     assert path.read_bytes() == before
+
+
+def test_values_are_not_read_from_where_others_lie(tmp_path: Path) -> None:
+    """A changed address of a chunk may be that of another chunk, whose own checksum is right."""
+    path = tmp_path / "file.h5"
+    with atomic_hdf5(path) as file:
+        for number, name in enumerate(("mine", "other")):
+            field = Field(name, "", "float32", "-", "-", "a column")
+            write_field(file, field, np.full(5, number, dtype=np.float32))
+    with h5py.File(path) as file:
+        mine, other = (
+            file[name].id.get_chunk_info(0).byte_offset.to_bytes(8, "little")
+            for name in ("mine", "other")
+        )
+    path.write_bytes(path.read_bytes().replace(mine, other))
+    with pytest.raises(OSError, match="checksum"), h5py.File(path) as file:
+        file["mine"][:]
 
 
 def test_file_appears_only_when_it_is_whole(tmp_path: Path) -> None:
