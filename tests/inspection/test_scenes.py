@@ -150,6 +150,7 @@ def change(name: str, value: object) -> Callable[[Path], None]:
         (change("grasps/outcome", 250), "/grasps/outcome must be 0 to"),
         (change("grasps/trial_id", 10**6), "/grasps/trial_id must be 0 to 35, got 1000000"),
         (change("objects/name", "3_other"), "must be of objects of"),
+        (change("scenes/X_TO", np.nan), "/scenes/X_TO must be finite"),
     ],
 )
 def test_file_that_cannot_be_shown_is_a_line(

@@ -133,6 +133,8 @@ def _read_scenes(path: Path, read_at: Stamp, snapshot: Snapshot) -> Scenes:
     refuse_other_codes(path, "/grasps/outcome", grasps["outcome"], list(Outcome))
     refuse_other_codes(path, "/grasps/trial_id", grasps["trial_id"], len(snapshot.table))
     refuse_other_codes(path, "/views/kind", views["kind"], len(VIEW_KINDS))
+    if not np.isfinite(data.tables["scenes"]["X_TO"]).all():
+        raise DataError(f"{path}: /scenes/X_TO must be finite, got other numbers")
     if others := set(data.names) - set(snapshot.names):
         raise DataError(f"{path}: must be of objects of {snapshot.out}, got {min(others)}")
     return Scenes(snapshot=snapshot, stamp=read_at, data=data)
