@@ -36,6 +36,8 @@ from drakegrasp.runtime.progress import progress_bar
 
 #: Two proposals are one if palms are nearer than both [m, rad].
 SAME = (0.01, np.deg2rad(15))
+#: From so many times the proposals that are wanted a judge chooses.
+POOL = 8
 #: Views or images at a time.
 BATCH = 32
 
@@ -109,7 +111,9 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
             points = torch.from_numpy(object_points(item["points"], item["on_object"]))[None]
             none = torch.eye(4)[None, None]
             batch = centred({"points": points, "X_TG": none})
-            weight, X_TG, q = proposals(network, hand, batch["points"], arguments.proposals)
+            wanted = arguments.proposals
+            pool = wanted if judge is None else POOL * wanted
+            weight, X_TG, q = proposals(network, hand, batch["points"], pool)
             confidence = weight
             if judge is not None:
                 clouds = batch["points"][:, :SEEN].expand(len(X_TG), -1, -1)
@@ -118,7 +122,7 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
             # Back to where the cloud was, and into the object's frame.
             X_TG[:, :3, 3] += batch["shift"]
             X_OG = torch.linalg.inv(torch.from_numpy(item["X_AO"]).double()) @ X_TG.double()
-            order = confidence.argsort(descending=True, stable=True)
+            order = confidence.argsort(descending=True, stable=True)[:wanted]
             scene = int(item["scene"])
             rows = {
                 "object": [data.names[int(item["object"])]] * len(order),
