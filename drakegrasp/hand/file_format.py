@@ -9,6 +9,7 @@ A joint turns, and its positions are angles [rad], or it slides, and they are le
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from math import sqrt
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -29,6 +30,7 @@ from drakegrasp.config import Standoffs, describe_mistake
 from drakegrasp.errors import HandError, one_line
 from drakegrasp.foreign_files import read_text
 from drakegrasp.frames import Array
+from drakegrasp.hand.files import MODELS
 from drakegrasp.yaml_text import parse_yaml
 
 #: Version of the keys that this module reads.
@@ -47,9 +49,6 @@ Drive = Literal["worm", "torque", "locked"]
 #: contacts are at their corners, and a border is drawn along an edge: that of the Barrett Hand
 #: misses the corners of the tip by 0.9 mm. A patch is nine times as wide.
 PAD_BAND = 0.001
-#: Rated loads [N] of hands of the package. They are not in their files, by whose digest a dataset
-#: knows its hand: 2 kg per finger [Barrett wiki 262, SafetyFeaturesPrecautions].
-_RATED_LOADS = {"barrett": 2.0 * 9.81}
 _STRICT = ConfigDict(frozen=True, extra="forbid")
 
 
@@ -375,7 +374,13 @@ def rated_load(hand: str, described: HandFile) -> float | None:
         hand: Name of the hand.
         described: Its file.
     """
-    return described.rated_load or _RATED_LOADS.get(hand)
+    return described.rated_load or _rated_loads().get(hand)
+
+
+@cache
+def _rated_loads() -> dict[str, float]:
+    loads: dict[str, float] = parse_yaml(read_text(MODELS / "rated_loads.yaml"))
+    return loads
 
 
 def with_efforts(finger: Finger, limit: float, holding: float | None, *, slides: bool) -> Finger:
