@@ -24,7 +24,7 @@ from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.config import Config
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import claim_directory, release_directory
-from drakegrasp.dataset.paths import BUILTIN_FOLDER
+from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
 from drakegrasp.dataset.paths import FILE_NAME as MANIFEST
 from drakegrasp.errors import DataError, GraspError
 from drakegrasp.exchange.posture_files import read_postures
@@ -33,7 +33,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.runtime.progress import progress_bar
-from drakegrasp.scoring.benchmark import FILE_NAME, NAME, PRESET, write_objects
+from drakegrasp.scoring.benchmark import NAME, PRESET, write_objects
 from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.postures.table import PostureTable, unknown_objects
@@ -252,7 +252,7 @@ def _claim_benchmark(folder: Path, config: Config, only: Sequence[str]) -> None:
     known = claim_directory(folder, config)
     if known is None:
         return
-    if not (folder / BUILTIN_FOLDER / FILE_NAME).is_file():
+    if not (folder / BUILTIN_FOLDER / BENCHMARK_FILE).is_file():
         raise DataError(
             f"{folder}: must be empty or hold {NAME}, got another dataset; choose another OUT"
         )

@@ -191,7 +191,7 @@ def print_stats(out: Path) -> None:
     )
     from drakegrasp.dataset.card.holding import holding_lines, holding_of
     from drakegrasp.dataset.manifest import read_manifest
-    from drakegrasp.dataset.paths import DATA_FILES
+    from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, DATA_FILES
     from drakegrasp.dataset.statistics import (
         count_funnel,
         count_splits,
@@ -223,8 +223,8 @@ def print_stats(out: Path) -> None:
             for line in holding_lines(holding):
                 say(line)
         samples = {row.split: row.samples for row in splits}
-        chosen = read_manifest(out).config.split.train_classes
-        if any(samples.values()) and not samples["train"] and chosen is None:
+        of_benchmark = (out / BUILTIN_FOLDER / BENCHMARK_FILE).is_file()
+        if any(samples.values()) and not samples["train"] and not of_benchmark:
             say(
                 "no sample is for training: by class, a class trains if two of its objects have "
                 "samples, or if split.train_classes names it; --set split.by=object trains on any"

@@ -24,6 +24,8 @@ ASSEMBLED_FILES = (TRIALS_FILE, *DATA_FILES.values())
 CARD_FILES = ("DATACARD.json", "DATACARD.md")
 #: Folder of the meshes of the built-in objects, in a dataset that is built from them.
 BUILTIN_FOLDER = "builtin"
+#: In it: what the frozen benchmark says of itself.
+BENCHMARK_FILE = "benchmark.json"
 
 
 def model_path(out: Path, name: str) -> Path:

@@ -19,7 +19,7 @@ import yaml
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import differences, read_manifest
-from drakegrasp.dataset.paths import BUILTIN_FOLDER, DATA_FILES
+from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, MeshError
 from drakegrasp.hand.settings import load_config
@@ -37,8 +37,6 @@ MASSES = (0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 FRICTIONS = (0.3, 0.5, 0.71)
 #: Classes that no training set may have, and the seed that chooses them.
 NEW_CLASSES, SEED = 16, 20261
-#: What a benchmark says of itself, beside its meshes.
-FILE_NAME = "benchmark.json"
 #: Digits of the published hashes of the meshes.
 HASH_DIGITS = 16
 
@@ -120,7 +118,7 @@ def write_objects(
         "different_meshes": differ,
         "new_classes": new_classes(),
     }
-    write_atomic(folder / FILE_NAME, (json.dumps(about, indent=1) + "\n").encode())
+    write_atomic(folder / BENCHMARK_FILE, (json.dumps(about, indent=1) + "\n").encode())
     return folder
 
 
@@ -136,7 +134,7 @@ def read_benchmark(out: Path, config: Config, versions: Mapping[str, str]) -> di
     Raises:
         DataError: If its file, or the data file beside it, is damaged.
     """
-    path = out / BUILTIN_FOLDER / FILE_NAME
+    path = out / BUILTIN_FOLDER / BENCHMARK_FILE
     if not path.is_file():
         return None
     try:

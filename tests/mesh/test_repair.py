@@ -234,6 +234,7 @@ def test_surface_of_too_many_pieces_is_refused(tmp_path, monkeypatch):
         prepare(path)
 
 
+@needs_g3db
 def test_surface_that_passes_through_itself_too_much_is_refused(monkeypatch):
     monkeypatch.setattr(drakegrasp.mesh.union, "MAX_OVERLAP", 0.02)
     (source,) = (s for s in find_meshes(G3DB, units="cm") if "toaster" in s.name)

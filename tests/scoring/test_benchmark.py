@@ -16,7 +16,7 @@ from drakegrasp.dataset.manifest import (
     installed_versions,
     write_manifest,
 )
-from drakegrasp.dataset.paths import BUILTIN_FOLDER
+from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
 from drakegrasp.errors import DataError, MeshError
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import find_meshes
@@ -156,7 +156,7 @@ def test_other_meshes_versions_and_settings_are_named(
 def test_another_dataset_is_no_benchmark_and_a_damaged_file_is_refused(tmp_path: Path) -> None:
     assert read_benchmark(tmp_path, SCORED, {}) is None
     (tmp_path / BUILTIN_FOLDER).mkdir()
-    (tmp_path / BUILTIN_FOLDER / benchmark.FILE_NAME).write_text(json.dumps({"name": "x"}))
+    (tmp_path / BUILTIN_FOLDER / BENCHMARK_FILE).write_text(json.dumps({"name": "x"}))
     with pytest.raises(DataError, match="must be the file of a benchmark"):
         read_benchmark(tmp_path, SCORED, {})
 

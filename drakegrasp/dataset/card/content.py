@@ -224,6 +224,7 @@ def _loads(data: Path, config: Config) -> dict[str, Any]:
     )
     if rated is None:
         return {}
+
     with open_samples(data) as file:
         forces = np.concatenate(
             [
@@ -233,7 +234,8 @@ def _loads(data: Path, config: Config) -> dict[str, Any]:
                 for split in SPLITS
             ]
         )
-    largest = forces.max(axis=1, initial=0.0)
+    # A finger that a preshape leaves out has none.
+    largest = np.nan_to_num(forces).max(axis=1, initial=0.0)
     loads = {"rated_N": rated, "above": int((largest > rated).sum()), "samples": len(forces)}
     if len(forces):
         loads["median_N"] = round(float(np.median(largest)), 1)

@@ -46,6 +46,8 @@ def scenes_page(
     shown, turning = paged(query, chosen, links.scenes, static=links.static)
     snapshot = scenes.snapshot
     splits = [SPLITS[number] for number in np.unique(scenes.split)]
+
+    # The cards, and the form beside them.
     return render(
         "scenes.html",
         links,
@@ -251,6 +253,8 @@ def _scene3d(scenes: Scenes, i: int, grasps: Rows, hand: HandView) -> dict[str, 
     X_TO = unpack_pose(scenes.data.tables["scenes"]["X_TO"][i, 0])
     X_TG = unpack_pose(table["X_TG"][grasps].astype(float))
     known = np.isfinite(X_TG).all(axis=(1, 2)) & np.isfinite(table["q"][grasps]).all(axis=1)
+
+    # The hands of the best ones, with their contacts.
     states: dict[str, Any] = {}
     for row, X in zip(grasps[known][:HANDS].tolist(), X_TG[known], strict=False):
         points, normals, forces = (
@@ -260,6 +264,8 @@ def _scene3d(scenes: Scenes, i: int, grasps: Rows, hand: HandView) -> dict[str, 
             "links": hand.poses(X, table["q"][row].astype(float), 0.0),
             "contacts": contacts_in_table(points, normals, forces, np.eye(4)),
         }
+
+    # The palms of more.
     palms = [
         {"p": X[:3, 3].tolist(), "z": X[:3, 2].tolist(), "colour": _holds(table, row)[2]}
         for row, X in zip(grasps[known][:PALMS].tolist(), X_TG[known], strict=False)

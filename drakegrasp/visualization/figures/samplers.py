@@ -186,7 +186,8 @@ def _refuse_other_configuration(other: Path, config: Config) -> None:
     wanted = config.candidates.model_copy(update={"method": _other_method(config)})
     mine = _settings(config.model_copy(update={"candidates": wanted}))
     theirs = _settings(read_manifest(other).config)
-    differing = [key for key in sorted(mine) if mine[key] != theirs[key]]
+    keys = sorted(mine.keys() | theirs.keys())
+    differing = [key for key in keys if mine.get(key) != theirs.get(key)]
     if differing:
         raise DataError(
             f"{other}: must be of candidates.method={_other_method(config)} and else of the same "

@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 import pytest
 from helpers.datasets import (
+    CERTIFIED,
     OTM,
     OTO,
     TRIALS,
@@ -221,7 +222,7 @@ def test_each_file_of_an_object_is_checked(out: Path) -> None:
 def test_files_are_of_the_manifests_configuration(out: Path) -> None:
     manifest = read_manifest(out)
     files = (OTO, OTM, TRIALS)
-    overrides = ["camera.size=32", "unit_candidates=2", "split.valid_fraction=0.34"]
+    overrides = ["camera.size=32", "unit_candidates=2", "split.valid_fraction=0.34", *CERTIFIED]
     other = load_config(overrides=overrides)
     write_manifest(replace(manifest, config=other), out)
     what = "attribute config must be that of manifest.json"

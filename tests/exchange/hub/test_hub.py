@@ -15,9 +15,11 @@ from helpers.commands import run
 
 from drakegrasp.dataset.card.content import LIMITS, card_content
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.schema import DEPTH_UNIT
 from drakegrasp.errors import DataError, MachineError
-from drakegrasp.exchange import hub
 from drakegrasp.exchange.export import export_dataset
+from drakegrasp.exchange.hub import folder as hub
+from drakegrasp.exchange.hub import table
 from drakegrasp.exchange.publication import read_publication
 
 pytest.importorskip("pyarrow")
@@ -88,8 +90,8 @@ def test_official_loaders_read_what_the_dataset_holds(
                 assert row["f_Q_C"] == sample.grasp_props["f_Q_C"].tolist()
                 colour = np.moveaxis(np.array(row["image"]) / 255.0, -1, 0)
                 assert np.abs(colour - sample.image[:3]).max() <= 0.5 / 255.0 + 1e-6
-                depth = np.array(row["depth"]) * hub.DEPTH_UNIT
-                assert np.abs(depth - sample.image[3]).max() <= 0.51 * hub.DEPTH_UNIT
+                depth = np.array(row["depth"]) * DEPTH_UNIT
+                assert np.abs(depth - sample.image[3]).max() <= 0.51 * DEPTH_UNIT
                 assert (np.array(row["mask"]) == 255 * sample.mask).all()
 
 
@@ -105,8 +107,8 @@ def test_every_column_is_that_of_the_data_file(dataset: Path, folder: Path) -> N
             assert set(table.column_names) == set(hub.columns())
             for name, field in hub.columns().items():
                 if field is not None:
-                    stored = data.column(field.name).tolist()
-                    np.testing.assert_array_equal(table[name].to_pylist(), stored, err_msg=name)
+                    own = data.column(field.name).tolist()
+                    np.testing.assert_equal(table[name].to_pylist(), own, err_msg=name)
 
 
 def test_card_names_licence_files_and_counts(dataset: Path, folder: Path) -> None:
@@ -185,8 +187,8 @@ def test_long_splits_are_cut_into_files(
 ) -> None:
     import pyarrow.parquet as pq
 
-    monkeypatch.setattr(hub, "FILE_ROWS", 2)
-    monkeypatch.setattr(hub, "GROUP_ROWS", 1)
+    monkeypatch.setattr(table, "FILE_ROWS", 2)
+    monkeypatch.setattr(table, "GROUP_ROWS", 1)
     export_dataset(dataset, tmp_path / "to", "hf")
     data = GraspDataset(dataset / "grasping_oto.hdf5", split="test")
     files = sorted((tmp_path / "to" / "oto").glob("test-*.parquet"))

@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from helpers.datasets import TRIALS, edit_file, make_dataset
+from helpers.datasets import CERTIFIED, TRIALS, edit_file, make_dataset
 
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.errors import DataError
@@ -45,7 +45,7 @@ def test_objects_without_trials_are_left_out(sound: Path, tmp_path: Path) -> Non
 
 
 def test_both_samplers_have_numbers_of_their_own_datasets(sound: Path, tmp_path: Path) -> None:
-    other = make_dataset(tmp_path / "other", tmp_path, "candidates.method=normals")
+    other = make_dataset(tmp_path / "other", tmp_path, *CERTIFIED, "candidates.method=normals")
     for first, second in ((sound, other), (other, sound)):
         numbers = compare_samplers(first, second).numbers
         for method in ("normals", "rotations"):
@@ -59,7 +59,7 @@ def test_datasets_must_differ_by_the_sampler_alone(sound: Path, tmp_path: Path) 
     for folder in (tmp_path / "a", tmp_path / "b"):
         folder.mkdir()
     rough = make_dataset(
-        tmp_path / "a" / "out", tmp_path / "a",
+        tmp_path / "a" / "out", tmp_path / "a", *CERTIFIED,
         "candidates.method=normals", "physics.friction_hand=0.9", "filters.max_slip=0.02",
     )  # fmt: skip
     with pytest.raises(DataError, match=r"got another physics.friction_hand$"):
