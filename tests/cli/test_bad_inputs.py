@@ -252,7 +252,7 @@ def test_attributes_that_contradict(base: Path, tmp_path: Path, command: str, na
 
 def test_log_is_skipped_where_no_build_wrote_it(base: Path, tmp_path: Path) -> None:
     """A log is no data: what is wrong in it leaves the estimate of what is right."""
-    out = Path(shutil.copytree(base / "out", tmp_path / "out"))
+    out = make_dataset(tmp_path / "out", base / "meshes")  # of the usual configuration
     places = {"out": out, "meshes": base / "meshes"}
     started = {"event": "started", "config_hash": read_manifest(out).config.simulation_hash()}
     done = {"event": "unit done", "object": "1_box_a", "outcomes": {"success": 3}}
