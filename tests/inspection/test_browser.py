@@ -567,8 +567,10 @@ def test_scenes_filter_and_open(page: Page, out: Path, tmp_path: Path) -> None:
             page.select_option("#theme", theme)
             contrast, text = page.evaluate(CONTRAST)
             assert contrast >= 4.5, f"{theme}: {text!r} has {contrast:.2f}"
-        page.keyboard.press("g")
         page.set_viewport_size({"width": 1280, "height": 900})
+        page.keyboard.press("g")
+        page.wait_for_url("**/scenes")
+        page.wait_for_load_state("networkidle")
         page.select_option("select[name=split]", "test")
         wait_for_cards(page, 2)
 
