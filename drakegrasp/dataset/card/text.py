@@ -147,7 +147,7 @@ passed all filters; *in effect* their number where those with almost the same pa
 
 
 def _bears(content: Mapping[str, Any]) -> str:
-    lines = "\n".join(f"* {line[0].upper()}{line[1:]}." for line in content["p_hold"]["in_words"])
+    lines = "\n".join(f"* {line}." for line in content["p_hold"]["in_words"])
     return f"""## How much a grasp bears
 
 A share of the lifts is repeated with noise on the palm's pose, friction and mass (`p_hold_samples`
