@@ -227,9 +227,12 @@ def commands(everything: bool) -> dict[str, Callable[[Path], object]]:
             "replay": say("replay", "OUT", "--trial", "0"),
             "figures": say("figures", "OUT", "--out", "OUT/pictures"),
             "inspect": say("inspect", "OUT", "--static", "OUT/page"),
-            "export": say("export", "OUT", "--to", "glb", "--out", "OUT/exported"),
+            "export": say("export", "OUT", "OUT/exported", "--to", "glb"),
             "assemble": say("assemble", "OUT"),
-            "verify": say("verify", "--dataset", "OUT/grasping_oto.hdf5", "--out", "OUT/verified"),
+            "verify": say(
+                *("verify", "OUT/grasping_oto.hdf5", "--dataset", "OUT/grasping_oto.hdf5"),
+                *("--split", "test", "--workers", "1", "--out", "OUT/verified"),
+            ),
         }
     return readers
 
