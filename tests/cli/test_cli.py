@@ -275,6 +275,10 @@ def test_stats_say_that_nothing_trains(out: Path) -> None:
     assert "split by class: 3 objects with samples, 2 of them test\n" in said
     assemble(out, overrides=["split.train_classes=[]"])
     assert "no sample is for training" in run("stats", out).stdout
+    # Of the frozen benchmark it is meant.
+    (out / "builtin").mkdir()
+    (out / "builtin" / "benchmark.json").write_text("{}")
+    assert "no sample is for training" not in run("stats", out).stdout
     said = run("assemble", out, "--set", "split={by: object}").stdout
     assert "split by object: 3 objects with samples, 1 of them test, 1 valid\n" in said
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from helpers.datasets import make_dataset
 
 from drakegrasp.api.building import make_benchmark
 from drakegrasp.dataset.manifest import (
@@ -16,7 +17,8 @@ from drakegrasp.dataset.manifest import (
     installed_versions,
     write_manifest,
 )
-from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
+from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, DATA_FILES
+from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, MeshError
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import find_meshes
@@ -30,6 +32,7 @@ from drakegrasp.scoring.benchmark import (
     new_classes,
     published,
     read_benchmark,
+    rows_digest,
     write_objects,
 )
 from drakegrasp.shapes.catalog import draw_builtin
@@ -171,3 +174,22 @@ def test_all_objects_test(part: Path) -> None:
     assert CONFIG.split.train_classes == ()
     said = yaml.safe_load((part / BUILTIN_FOLDER / "objects.yaml").read_text())
     assert said["objects"].keys() == {BOTTLE}
+
+
+def test_a_card_says_whether_all_rows_are_the_published_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = make_dataset(tmp_path / "out", tmp_path, "split.train_classes=[]")
+    (out / BUILTIN_FOLDER).mkdir()
+    about = {"objects": 3, "of": 3, "different_meshes": []}
+    (out / BUILTIN_FOLDER / BENCHMARK_FILE).write_text(json.dumps(about))
+    test, real = GraspDataset(out / DATA_FILES["oto"], split="test"), published()
+    own = {"count": len(test), "sha256": rows_digest(test, range(len(test)))}
+    assert len(test) > 1
+    assert rows_digest(test, [0, 1]) != rows_digest(test, [1, 0])
+    for rows, same in ((real["rows"], False), (own, True)):
+        monkeypatch.setattr(benchmark, "published", lambda rows=rows: {**real, "rows": rows})
+        found = read_benchmark(out, SCORED, {})
+        assert found is not None
+        assert (found["rows"], found["rows_as_published"]) == (len(test), same)
+        assert found["published_rows"] == rows["count"]
