@@ -126,21 +126,21 @@ class PostureNetwork(nn.Module):
         return weight, position.flatten(1, 2), rotation.flatten(1, 2), out[..., 10:].flatten(1, 2)
 
     def loss(self, points: Tensor, p_TG: Tensor, R_TG: Tensor, closing: Tensor) -> Tensor:
-        """Return the negative log-likelihood of one posture per cloud, the mean of a batch.
+        """Return the negative log-likelihood of some postures for each cloud, the mean of a batch.
 
         Args:
             points: (b, n, 3) in {T}.
-            p_TG: (b, 3).
-            R_TG: (b, 3, 3).
-            closing: (b, c), coordinates of the closed hand.
+            p_TG: (b, g, 3).
+            R_TG: (b, g, 3, 3).
+            closing: (b, g, c), coordinates of the closed hand.
         """
-        weight, position, rotation, coordinates = self(points)
+        weight, position, rotation, coordinates = (x.unsqueeze(1) for x in self(points))
         # |R - R'|^2 = 8 sin^2(angle / 2), hence half of it is near to the squared angle.
         squares = torch.stack(
             [
-                (position - p_TG[:, None]).square().sum(-1),
-                (rotation - R_TG[:, None]).square().sum((-1, -2)) / 2,
-                (coordinates - closing[:, None]).square().sum(-1),
+                (position - p_TG.unsqueeze(2)).square().sum(-1),
+                (rotation - R_TG.unsqueeze(2)).square().sum((-1, -2)) / 2,
+                (coordinates - closing.unsqueeze(2)).square().sum(-1),
             ],
             -1,
         )

@@ -20,6 +20,7 @@ import h5py
 import numpy as np
 import torch
 from batches import as_input, centred, object_points
+from collisions import hand_of_scenes, hand_points, refuted
 from networks import (
     ContactNetwork,
     GraspClassifier,
@@ -104,25 +105,32 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
         arguments.data, split=arguments.split, negatives="none", balance="view", grasps=1
     )
     found: dict[str, list[Any]] = {key: [] for key in COLUMNS}
-    chosen = _views(data, arguments.views)
+    chosen, model = _views(data, arguments.views), hand_of_scenes(arguments.data)
     with progress_bar("predict", "view") as progress:
         for done, index in enumerate(chosen):
             item = data[index]
             points = torch.from_numpy(object_points(item["points"], item["on_object"]))[None]
             none = torch.eye(4)[None, None]
             batch = centred({"points": points, "X_TG": none})
-            wanted = arguments.proposals
-            pool = wanted if judge is None else POOL * wanted
-            weight, X_TG, q = proposals(network, hand, batch["points"], pool)
+            weight, X_TG, q = proposals(network, hand, batch["points"], POOL * arguments.proposals)
             confidence = weight
             if judge is not None:
                 clouds = batch["points"][:, :SEEN].expand(len(X_TG), -1, -1)
                 confidence = judge(clouds, X_TG, of_judge.coordinates(q))[:, 1].sigmoid()
 
-            # Back to where the cloud was, and into the object's frame.
+            # Back to where the cloud was. What the view refutes comes last.
             X_TG[:, :3, 3] += batch["shift"]
+            if model is not None:
+                images = data.images(int(item["view"]))
+                hits = [
+                    refuted(hand_points(model, data.joints, start), X.numpy(), item["X_TC"], images)
+                    for start, X in zip(hand.opened(q), X_TG, strict=True)
+                ]
+                confidence = confidence.where(~torch.tensor(hits), 0.0)
+            order = confidence.argsort(descending=True, stable=True)[: arguments.proposals]
+
+            # Into the object's frame.
             X_OG = torch.linalg.inv(torch.from_numpy(item["X_AO"]).double()) @ X_TG.double()
-            order = confidence.argsort(descending=True, stable=True)[:wanted]
             scene = int(item["scene"])
             rows = {
                 "object": [data.names[int(item["object"])]] * len(order),

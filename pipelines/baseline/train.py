@@ -84,9 +84,8 @@ def train_postures(arguments: argparse.Namespace) -> dict[str, Any]:
     network = PostureNetwork(size)
 
     def loss(batch: Batch) -> Tensor:
-        # One of the drawn grasps of each view.
-        X_TG, q = batch["X_TG"][:, 0], batch["q"][:, 0]
-        return network.loss(batch["points"], X_TG[:, :3, 3], X_TG[:, :3, :3], hand.coordinates(q))
+        X_TG, closing = batch["X_TG"], hand.coordinates(batch["q"])
+        return network.loss(batch["points"], X_TG[..., :3, 3], X_TG[..., :3, :3], closing)
 
     history = _fit(arguments, network, loss, train, valid, cloud_batches)
     _save(arguments, network, history, size=asdict(size), hand=hand.as_dict())

@@ -1,0 +1,103 @@
+"""Draw the best and the worst predictions for views of scenes: those that are samples, and others.
+
+  python pipelines/baseline/gallery.py predicted.h5 OUT/scenes.hdf5 card gallery.png
+
+`card` is the folder of `drakegrasp score`, whose verdicts are used; what it has not tried is tried
+now. Above are the predictions with the largest confidence that became samples, below those that did
+not, each of another object: where the network is wrong while it is sure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import drakegrasp as dg
+from drakegrasp.dataset.scenes.rows import SceneRows
+from drakegrasp.errors import DrakegraspError
+from drakegrasp.frames import invert_pose
+from drakegrasp.vision.camera import project
+from drakegrasp.visualization.style import add_axes, hide_ticks, save_figure, shortened
+
+#: Pictures side by side, lines of each kind, and the width of a picture [inch].
+ACROSS, LINES, WIDE = 6, 2, 1.5
+#: Length of the lines along the palm's +z, and to both sides along its x, from its origin [m].
+AHEAD, ASIDE = 0.08, 0.04
+#: Colours of samples and of others.
+GOOD, BAD = "#1a7f37", "#c2410c"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the script; return its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("predictions", type=Path, help="of predict.py, for postures")
+    parser.add_argument("data", type=Path, help="scenes.hdf5")
+    parser.add_argument("card", type=Path, help="folder of the score")
+    parser.add_argument("picture", type=Path)
+    arguments = parser.parse_args(argv)
+    try:
+        rows = SceneRows(arguments.data, split="test")
+        views = dg.SceneDataset(
+            arguments.data, points=None, split="test", negatives="none", balance="view", grasps=1
+        )
+        judged = dg.score(
+            arguments.predictions,
+            rows,
+            references=(),
+            per_object=1,
+            out=arguments.card,
+            show=True,
+        ).sets[0]
+    except DrakegraspError as error:
+        print(f"error: {error}", file=sys.stderr)  # noqa: T201
+        return 2
+
+    # The first choice for each view; the surest first.
+    ranked, verdicts = judged.ranked[0], judged.verdicts[0]
+    order = np.argsort(-ranked.confidence, kind="stable")
+    first = [i for i in order.tolist() if ranked.ranks[i] == 0]
+    kinds = [[i for i in first if verdicts[i].counted == good] for good in (True, False)]
+    with h5py.File(arguments.predictions) as file:
+        # Ranked are the predictions of the scored rows, in the order of confidence.
+        rows_of, poses, stated = (file[key][:] for key in ("row", "X_FG", "confidence"))
+
+    figure = Figure(figsize=(ACROSS * (WIDE + 0.05) + 0.2, 2 * LINES * (0.75 * WIDE + 0.32) + 0.1))
+    for kind, (places, colour) in enumerate(zip(kinds, (GOOD, BAD), strict=True)):
+        for number, i in enumerate(places[: ACROSS * LINES]):
+            line, column = divmod(number, ACROSS)
+            top = 0.3 + (kind * LINES + line) * (0.75 * WIDE + 0.32)
+            axes = add_axes(figure, 0.1 + column * (WIDE + 0.05), top, WIDE, 0.75 * WIDE)
+            row, confidence = int(ranked.rows[i]), float(ranked.confidence[i])
+            best = np.flatnonzero((rows_of == row) & (stated == stated[rows_of == row].max()))[0]
+            draw(axes, views[row], poses[best], colour)
+            name = shortened(views.names[int(views[row]["object"])], 16).replace("_", " ")
+            outcome = verdicts[i].outcome.replace("_", " ")
+            said = "sample" if verdicts[i].counted else "held, no sample" if verdicts[i].held else outcome
+            axes.set_title(f"{name}\n{said}, {confidence:.2f}", fontsize=6.5, color=colour, pad=2)
+    save_figure(figure, arguments.picture, dpi=150)
+    return 0
+
+
+def draw(axes: Axes, item: dict[str, np.ndarray], X_OG: np.ndarray, colour: str) -> None:
+    """Draw a view with a palm, as a line where it looks and one to both sides of its origin."""
+    X_CG = invert_pose(item["X_TC"].astype(float)) @ item["X_AO"].astype(float) @ X_OG
+    axes.imshow(item["rgb"], interpolation="nearest")
+    origin, x, z = X_CG[:3, 3], X_CG[:3, 0], X_CG[:3, 2]
+    for ends in ((origin, origin + AHEAD * z), (origin - ASIDE * x, origin + ASIDE * x)):
+        axes.plot(*project(item["K"].astype(float), np.array(ends)).T, color=colour, linewidth=2)
+    height, width = item["mask"].shape
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+    hide_ticks(axes)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
