@@ -4,7 +4,7 @@
 
 `card` is the folder of `drakegrasp score`, whose verdicts are used; what it has not tried is tried
 now. Above are the predictions with the largest confidence that became samples, below those that did
-not, each of another object: where the network is wrong while it is sure.
+not: where the network is wrong while it is sure.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from drakegrasp.frames import invert_pose
 from drakegrasp.vision.camera import project
 from drakegrasp.visualization.style import add_axes, hide_ticks, save_figure, shortened
 
-#: Pictures side by side, lines of each kind, and the width of a picture [inch].
-ACROSS, LINES, WIDE = 6, 2, 1.5
+#: Pictures side by side, lines of each kind, the width of a picture and between two [inch].
+ACROSS, LINES, WIDE, GAP = 6, 2, 1.5, 0.05
 #: Length of the lines along the palm's +z, and to both sides along its x, from its origin [m].
 AHEAD, ASIDE = 0.08, 0.04
 #: Colours of samples and of others.
-GOOD, BAD = "#1a7f37", "#c2410c"
+COLOURS = ("#1a7f37", "#c2410c")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -61,28 +61,29 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201
         return 2
 
-    # The first choice for each view; the surest first.
+    # The first choice for each view, the surest first.
     ranked, verdicts = judged.ranked[0], judged.verdicts[0]
-    order = np.argsort(-ranked.confidence, kind="stable")
+    order = np.argsort(-np.asarray(ranked.confidence), kind="stable")
     first = [i for i in order.tolist() if ranked.ranks[i] == 0]
-    kinds = [[i for i in first if verdicts[i].counted == good] for good in (True, False)]
     with h5py.File(arguments.predictions) as file:
-        # Ranked are the predictions of the scored rows, in the order of confidence.
-        rows_of, poses, stated = (file[key][:] for key in ("row", "X_FG", "confidence"))
+        row_of, X_OG, confidence = (file[key][:] for key in ("row", "X_FG", "confidence"))
 
-    figure = Figure(figsize=(ACROSS * (WIDE + 0.05) + 0.2, 2 * LINES * (0.75 * WIDE + 0.32) + 0.1))
-    for kind, (places, colour) in enumerate(zip(kinds, (GOOD, BAD), strict=True)):
-        for number, i in enumerate(places[: ACROSS * LINES]):
-            line, column = divmod(number, ACROSS)
-            top = 0.3 + (kind * LINES + line) * (0.75 * WIDE + 0.32)
-            axes = add_axes(figure, 0.1 + column * (WIDE + 0.05), top, WIDE, 0.75 * WIDE)
-            row, confidence = int(ranked.rows[i]), float(ranked.confidence[i])
-            best = np.flatnonzero((rows_of == row) & (stated == stated[rows_of == row].max()))[0]
-            draw(axes, views[row], poses[best], colour)
-            name = shortened(views.names[int(views[row]["object"])], 16).replace("_", " ")
-            outcome = verdicts[i].outcome.replace("_", " ")
-            said = "sample" if verdicts[i].counted else "held, no sample" if verdicts[i].held else outcome
-            axes.set_title(f"{name}\n{said}, {confidence:.2f}", fontsize=6.5, color=colour, pad=2)
+    line = 0.75 * WIDE + 0.34
+    figure = Figure(figsize=(ACROSS * (WIDE + GAP) + 0.2, 2 * LINES * line + 0.1))
+    for kind, good in enumerate((True, False)):
+        places = [i for i in first if verdicts[i].counted == good][: ACROSS * LINES]
+        for number, i in enumerate(places):
+            down, across = divmod(number, ACROSS)
+            top = (kind * LINES + down) * line + 0.3
+            axes = add_axes(figure, 0.1 + across * (WIDE + GAP), top, WIDE, 0.75 * WIDE)
+            # The surest of a row comes first in the file.
+            row = int(ranked.rows[i])
+            item, place = views[row], int(np.flatnonzero(row_of == row)[0])
+            draw(axes, item, X_OG[place], COLOURS[kind])
+            outcome = "a sample" if good else verdicts[i].outcome.replace("_", " ")
+            name = shortened(views.names[int(item["object"])], 18).replace("_", " ")
+            said = f"{name}\n{'held, no sample' if outcome == 'success' else outcome}"
+            axes.set_title(f"{said}, {confidence[place]:.2f}", fontsize=6.5, color=COLOURS[kind])
     save_figure(figure, arguments.picture, dpi=150)
     return 0
 

@@ -5,6 +5,7 @@ Plain PyTorch, made to be changed. All poses and points are in metres; angles in
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 
@@ -134,7 +135,13 @@ class PostureNetwork(nn.Module):
             R_TG: (b, g, 3, 3).
             closing: (b, g, c), coordinates of the closed hand.
         """
-        weight, position, rotation, coordinates = (x.unsqueeze(1) for x in self(points))
+        return -self.log_density(self(points), p_TG, R_TG, closing).mean()
+
+    def log_density(
+        self, modes: Sequence[Tensor], p_TG: Tensor, R_TG: Tensor, closing: Tensor
+    ) -> Tensor:
+        """Return logarithms of the density (b, g) of postures, under what `forward` returned."""
+        weight, position, rotation, coordinates = (each.unsqueeze(1) for each in modes)
         # |R - R'|^2 = 8 sin^2(angle / 2), hence half of it is near to the squared angle.
         squares = torch.stack(
             [
@@ -145,9 +152,9 @@ class PostureNetwork(nn.Module):
             -1,
         )
         widths = self.log_width.clamp(min=-4.6)  # 10 mm, 0.6 deg: never a spike
-        sizes = torch.tensor([3.0, 3.0, self.size.closing], device=points.device)
+        sizes = torch.tensor([3.0, 3.0, self.size.closing], device=p_TG.device)
         density = -(0.5 * squares * torch.exp(-2 * widths) + sizes * widths).sum(-1)
-        return -(weight + density).logsumexp(-1).mean()
+        return torch.as_tensor((weight + density).logsumexp(-1))
 
 
 def orthonormal(columns: Tensor) -> Tensor:

@@ -112,8 +112,9 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
             points = torch.from_numpy(object_points(item["points"], item["on_object"]))[None]
             none = torch.eye(4)[None, None]
             batch = centred({"points": points, "X_TG": none})
-            weight, X_TG, q = proposals(network, hand, batch["points"], POOL * arguments.proposals)
-            confidence = weight
+            confidence, X_TG, q = proposals(
+                network, hand, batch["points"], POOL * arguments.proposals
+            )
             if judge is not None:
                 clouds = batch["points"][:, :SEEN].expand(len(X_TG), -1, -1)
                 confidence = judge(clouds, X_TG, of_judge.coordinates(q))[:, 1].sigmoid()
@@ -126,7 +127,7 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
                     refuted(hand_points(model, data.joints, start), X.numpy(), item["X_TC"], images)
                     for start, X in zip(hand.opened(q), X_TG, strict=True)
                 ]
-                confidence = confidence.where(~torch.tensor(hits), 0.0)
+                confidence = confidence.where(~torch.tensor(hits), confidence.min() - 1.0)
             order = confidence.argsort(descending=True, stable=True)[: arguments.proposals]
 
             # Into the object's frame.
@@ -155,14 +156,19 @@ COLUMNS = ("object", "resting", "row", "X_FG", "q_grasp", "q_pregrasp", "confide
 def proposals(
     network: PostureNetwork, hand: HandCoordinates, points: Tensor, count: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the modes of a cloud (1, n, 3) with the largest weights, no two of them the same.
+    """Return the modes of a cloud (1, n, 3) that are likeliest of all, no two of them the same.
+
+    A mode is as likely as all modes around it make it: its own weight is small where many agree.
 
     Returns:
-        Weights (m,), poses X_TG (m, 4, 4) and closed joints (m, j), m <= count.
+        Log densities (m,), largest first, poses X_TG (m, 4, 4) and closed joints (m, j),
+        m <= count.
     """
-    weight, position, rotation, coordinates = (each[0] for each in network(points))
+    modes = network(points)
+    density = network.log_density(modes, *modes[1:])[0]
+    _, position, rotation, coordinates = (each[0] for each in modes)
     kept: list[int] = []
-    for mode in weight.argsort(descending=True, stable=True).tolist():
+    for mode in density.argsort(descending=True, stable=True).tolist():
         near = (position[kept] - position[mode]).norm(dim=-1) < SAME[0]
         cosine = ((rotation[kept] * rotation[mode]).sum((-1, -2)) - 1) / 2
         if not (near & (cosine > np.cos(SAME[1]))).any():
@@ -172,7 +178,7 @@ def proposals(
     X_TG = torch.eye(4).repeat(len(kept), 1, 1)
     X_TG[:, :3, :3], X_TG[:, :3, 3] = rotation[kept], position[kept]
     # Beyond what was seen in training a hand may not be one.
-    return weight[kept].exp(), X_TG, hand.closed(coordinates[kept].clamp(-3, 3))
+    return density[kept], X_TG, hand.closed(coordinates[kept].clamp(-3, 3))
 
 
 def _views(data: dg.SceneDataset, per_scene: int | None) -> list[int]:

@@ -58,6 +58,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--rate", type=float, default=1e-3, help="learning rate  [default: 0.001]")
     parser.add_argument("--batch", type=int, default=32, help="[default: 32]")
     parser.add_argument("--seed", type=int, default=0, help="[default: 0]")
+    parser.add_argument(
+        "--objects", type=int, help="train on so many of the first file, drawn by the seed"
+    )
     parser.add_argument("--heads", type=int, default=5, help="of contacts  [default: 5]")
     arguments = parser.parse_args(argv)
     try:
@@ -171,8 +174,14 @@ def temperature(logits: Tensor, labels: Tensor) -> Tensor:
     return tried[losses.argmin(0)]
 
 
+def _objects_of(data: dg.SceneDataset) -> list[int]:
+    """Return the rows of the objects whose views are items."""
+    scenes = data.tables["views"]["scene"][data.views]
+    return sorted(set(data.tables["scenes"]["object"][scenes, 0].tolist()))
+
+
 def hand_of(train: Sequence[dg.SceneDataset]) -> HandCoordinates:
-    """Return the coordinates of the hand, from the samples of the training part."""
+    """Return the coordinates of the hand, from the samples of the training part; print of which."""
     found: dict[str, list[np.ndarray]] = {"q": [], "q_open": []}
     for data in train:
         grasps, scenes = data.tables["grasps"], data.tables["views"]["scene"][data.views]
@@ -181,6 +190,7 @@ def hand_of(train: Sequence[dg.SceneDataset]) -> HandCoordinates:
     closed, opened = (torch.from_numpy(np.concatenate(found[name])) for name in found)
     if len(closed) < 2:
         raise DataError(f"{train[0].path}: train must have two samples or more, got {len(closed)}")
+    print(f"{len(closed)} samples of {sum(len(_objects_of(data)) for data in train)} objects")  # noqa: T201
     return HandCoordinates.fit(closed, opened)
 
 
@@ -194,6 +204,11 @@ def _scenes(
     """
     options = {"negatives": negatives, "positives": positives, "seed": arguments.seed}
     train = [dg.SceneDataset(path, split="train", **options) for path in arguments.data]
+    if arguments.objects is not None:
+        names = sorted({train[0].names[k] for k in _objects_of(train[0])})
+        draw = torch.Generator().manual_seed(arguments.seed)
+        few = [names[i] for i in torch.randperm(len(names), generator=draw)[: arguments.objects]]
+        train[0] = dg.SceneDataset(train[0].path, split="train", objects=few, **options)
     if len({data.joints for data in train}) > 1:
         raise DataError(f"{arguments.data[-1]}: must be of the same hand as the others")
     valid = []

@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -106,6 +106,7 @@ class SceneDataset:
             held and no sample is never a bad one.
         on_object: Share of the points that are on the object, as far as it is in the image.
         noise: Whether depths get the noise that was drawn for their view, if there was any.
+        objects: Names of the objects whose views are items; all if None.
         seed: Of all draws.
         cache: Memory for points or images of views, per process [byte]; others are read again.
 
@@ -138,6 +139,7 @@ class SceneDataset:
         positives: Positives = "sample",
         on_object: float = 0.75,
         noise: bool = True,
+        objects: Collection[str] | None = None,
         seed: int = 0,
         cache: int = 512 << 20,
     ) -> None:
@@ -174,9 +176,11 @@ class SceneDataset:
             self.joints = tuple(parse_json(file.attrs["joints"]))
             self.fingers = tuple(parse_json(file.attrs["fingers"]))
             self._lens = _Lens(near=float(file.attrs["near"]), far=float(file.attrs["far"]))
+        if objects is not None and (unknown := sorted(set(objects) - set(self.names))):
+            raise DataError(f"objects must be of {self.path}, got {unknown[0]!r}")
         self._number()
         self._choose(negatives, positives)
-        self.views, self._order = self._order_of(balance)
+        self.views, self._order = self._order_of(balance, objects)
         if not len(self.views) and not self.may_be_empty:
             raise DataError(f"{self.path}: {split} must have grasps to draw, got none")
 
@@ -316,11 +320,15 @@ class SceneDataset:
             own = rows[good[rows]]
             self._kinds.append((own, np.cumsum(weight[own]), rows[bad[rows]]))
 
-    def _order_of(self, balance: Balance) -> tuple[AnyArray, AnyArray]:
+    def _order_of(
+        self, balance: Balance, names: Collection[str] | None
+    ) -> tuple[AnyArray, AnyArray]:
         """Return the views to draw from, and of each item the object's place, or the view."""
         scenes = self._tables["scenes"]
         usable = np.array([len(good) + len(bad) > 0 for good, _, bad in self._kinds], dtype=bool)
         usable &= scenes["split"] == SPLITS.index(self.split)
+        if names is not None:
+            usable &= np.isin(self.names, sorted(names))[scenes["object"][:, 0]]
         views = np.flatnonzero(usable[self._scene_of]) if len(usable) else np.zeros(0, np.int64)
         self._balance = balance
         if balance == "view" or not len(views):

@@ -85,6 +85,16 @@ def test_objects_come_as_often_as_each_other(path: Path) -> None:
     assert sorted(views) == sorted(again) == data.views.tolist() and views != again
 
 
+def test_items_are_of_the_objects_that_are_named(path: Path) -> None:
+    every = SceneDataset(path, points=16, split="test")
+    name = every.names[int(every[0]["object"])]
+    for balance in ("object", "view"):
+        some = SceneDataset(path, points=16, split="test", objects=[name], balance=balance)
+        assert len(some) == 5 and {int(item["object"]) for item in some} == {every.names.index(name)}
+    with pytest.raises(DataError, match="objects must be of .*, got 'unicorn'"):
+        SceneDataset(path, objects=[name, "unicorn"])
+
+
 def test_each_round_draws_anew_and_says_its_epoch(path: Path) -> None:
     data = SceneDataset(path, points=16, split="test")
     rounds = data.rounds()
