@@ -37,7 +37,7 @@ from drakegrasp.runtime.progress import progress_bar
 
 #: Two proposals are one if palms are nearer than both [m, rad].
 SAME = (0.01, np.deg2rad(15))
-#: From so many times the proposals that are wanted a judge chooses.
+#: So many times the proposals that are wanted are judged by what the view shows, and by a judge.
 POOL = 8
 #: Views or images at a time.
 BATCH = 32
@@ -90,15 +90,15 @@ def load(path: Path, *tasks: str) -> dict[str, Any]:
 
 def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
     """Return postures for the views of a split, best first, as a file of postures has them."""
-    network = PostureNetwork(PostureSize(**checkpoint["size"]))
+    network = PostureNetwork(PostureSize(**checkpoint["size"])).eval()
     network.load_state_dict(checkpoint["weights"])
     hand, judge = HandCoordinates(**checkpoint["hand"]), None
     if arguments.judge:
         said = load(arguments.judge, "classifier")
-        judge = GraspClassifier(len(said["hand"]["directions"])).eval()
-        judge.load_state_dict(said["weights"])
         of_judge = HandCoordinates(**said["hand"])
-    network.eval()
+        classifier = GraspClassifier(len(of_judge.directions)).eval()
+        classifier.load_state_dict(said["weights"])
+        judge = classifier, of_judge
 
     # The views that `drakegrasp score` counts, in its order.
     data = dg.SceneDataset(
@@ -106,26 +106,24 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
     )
     found: dict[str, list[Any]] = {key: [] for key in COLUMNS}
     chosen, model = _views(data, arguments.views), hand_of_scenes(arguments.data)
+    pool = POOL * arguments.proposals
     with progress_bar("predict", "view") as progress:
         for done, index in enumerate(chosen):
             item = data[index]
             points = torch.from_numpy(object_points(item["points"], item["on_object"]))[None]
-            none = torch.eye(4)[None, None]
-            batch = centred({"points": points, "X_TG": none})
-            confidence, X_TG, q = proposals(
-                network, hand, batch["points"], POOL * arguments.proposals
-            )
+            batch = centred({"points": points, "X_TG": torch.eye(4)[None, None]})
+            confidence, X_TG, q = proposals(network, hand, batch["points"], pool)
             if judge is not None:
                 clouds = batch["points"][:, :SEEN].expand(len(X_TG), -1, -1)
-                confidence = judge(clouds, X_TG, of_judge.coordinates(q))[:, 1].sigmoid()
+                confidence = judge[0](clouds, X_TG, judge[1].coordinates(q))[:, 1].sigmoid()
 
             # Back to where the cloud was. What the view refutes comes last.
             X_TG[:, :3, 3] += batch["shift"]
             if model is not None:
-                images = data.images(int(item["view"]))
+                images, starts = data.images(int(item["view"])), hand.opened(q)
                 hits = [
                     refuted(hand_points(model, data.joints, start), X.numpy(), item["X_TC"], images)
-                    for start, X in zip(hand.opened(q), X_TG, strict=True)
+                    for start, X in zip(starts, X_TG, strict=True)
                 ]
                 confidence = confidence.where(~torch.tensor(hits), confidence.min() - 1.0)
             order = confidence.argsort(descending=True, stable=True)[: arguments.proposals]
