@@ -37,8 +37,8 @@ from drakegrasp.runtime.progress import progress_bar
 
 #: Two proposals are one if palms are nearer than both [m, rad].
 SAME = (0.01, np.deg2rad(15))
-#: So many times the proposals that are wanted are judged by what the view shows, and by a judge.
-POOL = 8
+#: So many proposals are compared with what the view shows, and by a judge.
+POOL = 64
 #: Views or images at a time.
 BATCH = 32
 
@@ -106,7 +106,7 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
     )
     found: dict[str, list[Any]] = {key: [] for key in COLUMNS}
     chosen, model = _views(data, arguments.views), hand_of_scenes(arguments.data)
-    pool = POOL * arguments.proposals
+    pool = max(POOL, arguments.proposals)
     with progress_bar("predict", "view") as progress:
         for done, index in enumerate(chosen):
             item = data[index]
