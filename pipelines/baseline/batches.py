@@ -18,7 +18,7 @@ from torch.utils.data import ConcatDataset, DataLoader
 import drakegrasp as dg
 
 #: Points of a cloud that a network sees, all on the object.
-POINTS = 1024
+POINTS = 512
 #: Standard deviation of the noise of points [m].
 NOISE = 1e-3
 

@@ -89,7 +89,7 @@ class PostureSize:
     closing: int
     seeds: int = 64
     modes: int = 4
-    neighbours: int = 32
+    neighbours: int = 16
     width: int = 128
 
 
@@ -141,20 +141,24 @@ class PostureNetwork(nn.Module):
         self, modes: Sequence[Tensor], p_TG: Tensor, R_TG: Tensor, closing: Tensor
     ) -> Tensor:
         """Return logarithms of the density (b, g) of postures, under what `forward` returned."""
-        weight, position, rotation, coordinates = (each.unsqueeze(1) for each in modes)
-        # |R - R'|^2 = 8 sin^2(angle / 2), hence half of it is near to the squared angle.
-        squares = torch.stack(
-            [
-                (position - p_TG.unsqueeze(2)).square().sum(-1),
-                (rotation - R_TG.unsqueeze(2)).square().sum((-1, -2)) / 2,
-                (coordinates - closing.unsqueeze(2)).square().sum(-1),
-            ],
-            -1,
-        )
+        weight, *means = modes
         widths = self.log_width.clamp(min=-4.6)  # 10 mm, 0.6 deg: never a spike
+        x, y = (self._in_widths(each, widths) for each in ((p_TG, R_TG, closing), means))
+        squares = x.square().sum(-1)[:, :, None] + y.square().sum(-1)[:, None] - 2 * x @ y.mT
         sizes = torch.tensor([3.0, 3.0, self.size.closing], device=p_TG.device)
-        density = -(0.5 * squares * torch.exp(-2 * widths) + sizes * widths).sum(-1)
-        return torch.as_tensor((weight + density).logsumexp(-1))
+        density = weight[:, None] - 0.5 * squares - (sizes * widths).sum()
+        return torch.as_tensor(density.logsumexp(-1))
+
+    @staticmethod
+    def _in_widths(postures: Sequence[Tensor], widths: Tensor) -> Tensor:
+        """Return postures as vectors (b, n, 12 + c), in which all widths are 1.
+
+        |R - R'|^2 = 8 sin^2(angle / 2), so half of it is near to the squared angle.
+        """
+        position, rotation, coordinates = postures
+        parts = position, rotation.flatten(-2) / 2**0.5, coordinates
+        scaled = [part * (-width).exp() for part, width in zip(parts, widths, strict=True)]
+        return torch.cat(scaled, -1)
 
 
 def orthonormal(columns: Tensor) -> Tensor:
