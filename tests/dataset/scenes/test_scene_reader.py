@@ -87,11 +87,12 @@ def test_objects_come_as_often_as_each_other(path: Path) -> None:
 
 def test_items_are_of_the_objects_that_are_named(path: Path) -> None:
     every = SceneDataset(path, points=16, split="test")
-    name = every.names[int(every[0]["object"])]
+    row = int(every[0]["object"])
+    name = every.names[row]
     for balance in ("object", "view"):
         some = SceneDataset(path, points=16, split="test", objects=[name], balance=balance)
-        assert len(some) == 5 and {int(item["object"]) for item in some} == {every.names.index(name)}
-    with pytest.raises(DataError, match="objects must be of .*, got 'unicorn'"):
+        assert len(some) == 5 and {int(item["object"]) for item in some} == {row}
+    with pytest.raises(DataError, match=r"objects must be of .*, got 'unicorn'"):
         SceneDataset(path, objects=[name, "unicorn"])
 
 
