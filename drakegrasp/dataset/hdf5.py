@@ -274,7 +274,7 @@ class ImageRows:
             deflate is not None
             and filters == [h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE]
             and dataset.chunks == (1, *self._shape)
-            and dataset.dtype in (np.dtype("<f4"), np.dtype("u1"))
+            and dataset.dtype in (np.dtype("<f4"), np.dtype("<u2"), np.dtype("u1"))
         )
 
     def __getitem__(self, row: int) -> AnyArray:
@@ -323,12 +323,9 @@ class ImageRows:
 
 def _unshuffle(content: bytearray, image: AnyArray) -> None:
     """Write the numbers whose first bytes come first in a buffer, then the second ones."""
-    planes = np.frombuffer(content, dtype=np.uint8).reshape(image.itemsize, -1)
-    if image.itemsize == 1:
-        image.reshape(-1)[:] = planes[0]
-        return
-    numbers = image.view(np.uint32).reshape(-1)
-    numbers[:] = planes[3]
-    for k in (2, 1, 0):
+    *planes, highest = np.frombuffer(content, dtype=np.uint8).reshape(image.itemsize, -1)
+    numbers = image.view(f"<u{image.itemsize}").reshape(-1)
+    numbers[:] = highest
+    for plane in reversed(planes):
         numbers <<= 8
-        numbers |= planes[k]
+        numbers |= plane

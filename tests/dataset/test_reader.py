@@ -15,7 +15,7 @@ import pytest
 from drakegrasp.dataset import hdf5
 from drakegrasp.dataset.hdf5 import ImageRows, create_field
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS, sizes
+from drakegrasp.dataset.schema import DATA_FIELDS, VIEW_FIELDS, SCHEMA_VERSION, SPLITS, sizes
 from drakegrasp.errors import DataError, MachineError
 
 LETTERS = sizes(fingers=3, joints=8, image=16)
@@ -201,10 +201,11 @@ def test_images_inflated_here_are_those_of_hdf5(
     pytest.importorskip("deflate")
     rng = np.random.default_rng(0)
     with h5py.File(tmp_path / "images.hdf5", "w") as file:
-        for field in DATA_FIELDS[:2]:
-            dataset = create_field(file, field, field.row_shape(LETTERS))
+        for field in (*DATA_FIELDS[:2], *(f for f in VIEW_FIELDS if f.sample)):
+            dataset = create_field(file, field, field.row_shape(LETTERS | {"h": 5, "w": 3}))
             dataset.resize(4, axis=0)
-            values = rng.integers(0, 255, dataset.shape) / (1 if field.dtype == "uint8" else 7)
+            values = rng.integers(0, 255 if field.dtype == "uint8" else 65535, dataset.shape)
+            values = values / (7 if field.dtype == "float32" else 1)
             dataset[:3] = values[:3]  # the last was never written
             rows = ImageRows(dataset)
             for row in range(4):

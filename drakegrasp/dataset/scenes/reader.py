@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array
-from drakegrasp.dataset.hdf5 import AnyArray, read_texts
+from drakegrasp.dataset.hdf5 import AnyArray, ImageRows, read_texts
 from drakegrasp.dataset.layout.opening import open_scenes, opened, refuse_other_codes
 from drakegrasp.dataset.layout.structure import SCENE_TABLES
 from drakegrasp.dataset.layout.trial_files import stamp
@@ -455,7 +455,9 @@ class SceneDataset:
             Colours (h, w, 3) uint8, clean depth (h, w) uint16 [DEPTH_UNIT], mask (h, w) uint8.
         """
         with self._opened() as file:
-            rgb, depth, mask = (file["views"][name][view] for name in ("rgb", "depth", "mask"))
+            rgb, depth, mask = (
+                ImageRows(file["views"][name])[view] for name in ("rgb", "depth", "mask")
+            )
         return rgb, depth, mask
 
     def _opened(self) -> Any:
