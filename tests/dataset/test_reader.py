@@ -15,7 +15,7 @@ import pytest
 from drakegrasp.dataset import hdf5
 from drakegrasp.dataset.hdf5 import ImageRows, create_field
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.schema import DATA_FIELDS, VIEW_FIELDS, SCHEMA_VERSION, SPLITS, sizes
+from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS, VIEW_FIELDS, sizes
 from drakegrasp.errors import DataError, MachineError
 
 LETTERS = sizes(fingers=3, joints=8, image=16)
