@@ -40,7 +40,7 @@ import drakegrasp as dg
 from drakegrasp.errors import DataError, DrakegraspError
 
 #: Points of a cloud that the classifier sees: it looks at each cloud once for each grasp.
-SEEN = 256
+SEEN = 128
 
 
 def main(argv: Sequence[str] | None = None) -> int:
