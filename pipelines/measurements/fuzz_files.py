@@ -277,14 +277,21 @@ def _child(run: Callable[[Path], object], out: Path, folder: Path) -> None:
 class Said:
     """How a reader ended: its exit code, None if it did not end, what it printed and wrote.
 
-    `written` has a hash of each file of the dataset's folder that is new or was replaced.
+    `written` has a hash of each file of the dataset's folder that is new or was replaced, `pages`
+    the text of the web pages among them.
     """
 
     code: int | None
     out: str = ""
     err: str = ""
     modules: str = ""
+    pages: str = ""
     written: dict[Path, str] = field(default_factory=dict)
+
+    @property
+    def lines(self) -> set[str]:
+        """The lines that it printed or wrote on pages."""
+        return set((self.out + self.err + self.pages).splitlines())
 
     def says_as(self, sound: Said) -> bool:
         """Return whether it printed the same, and wrote what is sound in the same way."""
@@ -309,12 +316,12 @@ def read(run: Callable[[Path], object], out: Path) -> Said:
             path.name: path.read_text(encoding="utf-8", errors="replace")
             for path in folder.iterdir()
         }
+        new = [path for path, changed in times(out) if before.get(path) != changed]
+        pages = "\n".join(path.read_text() for path in new if path.suffix == ".html")
         digests = {
-            path.relative_to(out): hashlib.sha256(path.read_bytes()).hexdigest()
-            for path, changed in times(out)
-            if before.get(path) != changed
+            path.relative_to(out): hashlib.sha256(path.read_bytes()).hexdigest() for path in new
         }
-        return Said(code=process.exitcode, written=digests, **texts)
+        return Said(code=process.exitcode, pages=pages, written=digests, **texts)
 
 
 def times(out: Path) -> Iterator[tuple[Path, int]]:
@@ -364,9 +371,9 @@ def judge(said: Said, sound: Said | None = None, name: Path = Path()) -> str | N
     if said.code == 0:
         if sound is None or said.says_as(sound):
             return None
-        lines = [line for line in (said.out + said.err).splitlines() if line not in sound.out]
-        words = (name.name, f"{name.parts[0]}: ")  # a folder's files may be named together
-        named = any(word in line for word in words for line in lines)
+        # The files of a hand, or of an object, may be named together.
+        words = (name.name, f"{name.parts[0]}: ", f"{name.parts[0]} of {name.parent.name}")
+        named = any(word in line for word in words for line in said.lines - sound.lines)
         return None if named else "other values without a word"
     if len(lines) > LINES:
         return f"{len(lines)} lines: {said.err[:200]!r}"
