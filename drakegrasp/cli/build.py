@@ -86,6 +86,7 @@ def assemble(
     Entries of reject.json that are not successes are skipped and listed.
     """
     from drakegrasp.dataset.assemble import assemble as assemble_files
+    from drakegrasp.dataset.checks.object_files import carried_hand_as_built
     from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.dataset.rejections import read_rejected, unused_rejections
     from drakegrasp.runtime.executor import processes
@@ -102,6 +103,8 @@ def assemble(
     print_stats(out)
     for sentence in unused_rejections(out, rejected, manifest.rejected):
         say(sentence)
+    for changed in carried_hand_as_built(manifest):
+        say(f"{changed}; the card leaves out its drive, load limit and licence")
 
 
 @click.command()

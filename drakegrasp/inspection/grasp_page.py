@@ -24,7 +24,13 @@ from drakegrasp.inspection.pages import (
     words_of,
 )
 from drakegrasp.inspection.query import QUANTITIES, Query
-from drakegrasp.inspection.rows import contact_dots, read_certificate, read_look, read_rows
+from drakegrasp.inspection.rows import (
+    contact_dots,
+    look_source,
+    read_certificate,
+    read_look,
+    read_rows,
+)
 from drakegrasp.outcomes import Outcome
 
 
@@ -65,8 +71,10 @@ def grasp_page(
     success, trial = bool(table.outcome[i] == Outcome.SUCCESS), snapshot.trial_id(i)
     views = []
     for camera in CAMERAS if success else ():
-        dots = contact_dots(snapshot, row, camera, read_look(snapshot, i, camera))
-        views.append({"camera": camera, "strip": links.strip(label, camera), "dots": dots})
+        look = read_look(snapshot, i, camera)
+        view = {"camera": camera, "strip": links.strip(label, camera)}
+        view["unread"] = look_source(snapshot, i, camera) if look is None else ""
+        views.append({**view, "dots": contact_dots(snapshot, row, camera, look)})
     return render(
         "grasp.html",
         links,

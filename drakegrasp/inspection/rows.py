@@ -99,6 +99,14 @@ def read_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
     return look
 
 
+def look_source(snapshot: Snapshot, i: int, camera: str) -> str:
+    """Return in words which file `read_look` reads."""
+    is_there = (snapshot.out / DATA_FILES[camera]).is_file()
+    if snapshot.table.split[i] != NONE and is_there:
+        return DATA_FILES[camera]
+    return f"shards of {snapshot.key(i).object}"
+
+
 def _sample_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
     split = SPLITS[snapshot.table.split[i]]
     row = int(np.searchsorted(snapshot.sample_ids[split], i))

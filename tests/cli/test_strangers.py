@@ -17,8 +17,10 @@ from helpers.datasets import OTO, TRIALS, edit_manifest
 
 from drakegrasp.api.building import build_dataset
 from drakegrasp.dataset.log import BuildLog, read_log
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
+from drakegrasp.hand.carried import carry_hand
 from drakegrasp.inspection.pages import TEMPLATES
 from drakegrasp.runtime.processes import host_label
 
@@ -45,6 +47,16 @@ def test_lock_that_is_a_link_is_not_written(
     assert "build.lock: must be a file of its own, got a link" in refusal("assemble", out)
     assert run("stats", out).exit_code == 0
     assert victim.read_text() == "mine\n"
+
+
+def test_assemble_says_that_the_hand_is_another_one_and_the_card_leaves_it_out(out: Path) -> None:
+    carry_hand(out, read_manifest(out).config)
+    with (out / "hand" / "barrett_hand.yaml").open("a") as file:
+        file.write("# changed\n")
+    said = run("assemble", out, "--workers", "1").stdout.splitlines()
+    assert said[-1].startswith("hand: the hand must be that of manifest.json, ")
+    settings = json.loads((out / "DATACARD.json").read_text())["settings"]
+    assert settings["lift.drive"] == "that of the hand file"
 
 
 def test_log_that_is_a_link_is_not_written(out: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import html
 import json
+import os
 import re
 import shutil
 import weakref
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 from helpers.datasets import (
     CERTIFIED,
+    OTM,
     SLIP,
     SLIPPED,
     TRIALS,
@@ -78,6 +80,17 @@ def test_contacts_are_drawn_in_all_three_images(client: TestClient) -> None:
     assert strip.shape[:2] == (32, 96)
     for address in ("0-0-1-oto", "0-0-0-out", "9-9-9-oto", "x-oto"):
         assert get(client, f"/strip/{address}.png").status_code == 404
+
+
+def test_page_says_which_images_cannot_be_read(client: TestClient, out: Path) -> None:
+    os.truncate(out / OTM, 3000)
+    page = get(client, "/grasp/0-0-0").text
+    assert "The images of camera otm cannot be read from grasping_otm.hdf5." in page
+    assert page.count("<image") == 1
+    assert assemble(out, rejected=[0]).removed[Removal.REJECTED] == 1
+    shutil.rmtree(out / "shards")
+    page = get(client, "/grasp/0-0-0").text
+    assert page.count("cannot be read from shards of 1_box_a.") == 2
 
 
 def test_next_and_previous_go_through_the_selection(client: TestClient) -> None:

@@ -192,12 +192,15 @@ def _settings(config: Config) -> dict[str, Any]:
 
 
 def _known_hand(config: Config) -> tuple[HandFile, HandFolder] | None:
-    """Return the hand of the dataset or the package; None if it is neither's, or damaged."""
-    if not isinstance(config.hand_source, CarriedHand) and config.hand not in hand_names():
+    """Return the hand of the dataset or the package; None if it is neither's, or has changed."""
+    source = config.hand_source
+    if not isinstance(source, CarriedHand) and config.hand not in hand_names():
         return None
     try:
-        source = config.hand_source
-        return read_hand_file(hand_file(source)), hand_folder(source)
+        folder = hand_folder(source)
+        if isinstance(source, CarriedHand) and folder.digest != source.digest:
+            return None
+        return read_hand_file(hand_file(source)), folder
     except HandError:
         return None
 
