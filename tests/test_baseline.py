@@ -7,7 +7,9 @@ import json
 import os
 import subprocess
 import sys
+from argparse import Namespace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -24,6 +26,7 @@ from drakegrasp.simulation.candidates import Source
 # Where torch is said to be there, a test that skips is a failure.
 if os.environ.get("DRAKEGRASP_TORCH") != "1":
     pytest.importorskip("torch")
+import predict
 import torch
 from assess import assessment, auc
 from batches import centred, object_points, turned
@@ -31,13 +34,14 @@ from collisions import hand_points, refuted
 from model_card import card_text
 from networks import (
     ContactNetwork,
+    GraspClassifier,
     HandCoordinates,
     PostureNetwork,
     PostureSize,
     farthest_points,
     orthonormal,
 )
-from predict import proposals
+from predict import predict_postures, proposals
 from train import temperature
 
 BASELINE = Path(__file__).resolve().parents[1] / "pipelines" / "baseline"
@@ -142,6 +146,41 @@ def test_proposals_are_ranked_and_differ() -> None:
     gaps = torch.cdist(X_TG[:, :3, 3], X_TG[:, :3, 3]) + torch.eye(4)
     turned_by = (X_TG[:, None, :3, :3] * X_TG[None, :, :3, :3]).sum((-1, -2)) < 1 + 2 * 0.9659
     assert ((gaps > 0.01) | turned_by).all()
+
+
+class OneView:
+    """Scenes of one view."""
+
+    names, joints, views = ("box",), ("a", "b", "c"), (0,)
+
+    def __init__(self) -> None:
+        self.tables = {"views": {"scene": [0]}, "scenes": {"resting": np.zeros((1, 1), dtype=int)}}
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        points = made_up()["points"][0].numpy()
+        seen = {"points": points, "on_object": np.ones(len(points), dtype=bool)}
+        return seen | {"X_AO": np.eye(4), "object": 0, "scene": 0}
+
+
+def test_a_judge_chooses_from_eight_times_the_proposals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that likes the least likely proposal the best has that of eight."""
+    torch.manual_seed(0)
+    hand = HandCoordinates(torch.zeros(3), torch.eye(3)[:2], torch.zeros(3)).as_dict()
+    weights = [each.state_dict() for each in (PostureNetwork(SMALL), GraspClassifier(2))]
+    judge = {"task": "classifier", "hand": hand, "weights": weights[1]}
+    torch.save(judge, tmp_path / "judge.pt")
+    order = lambda _, cloud, *rest: torch.arange(float(len(cloud)))[:, None].expand(-1, 2)  # noqa: E731
+    monkeypatch.setattr(GraspClassifier, "forward", order)
+    monkeypatch.setattr(predict.dg, "SceneDataset", lambda *_, **__: OneView())
+    arguments = Namespace(
+        data=None, split="test", judge=tmp_path / "judge.pt", proposals=1, views=None
+    )
+    checkpoint = {"size": vars(SMALL), "hand": hand, "weights": weights[0]}
+    with torch.no_grad():
+        found = predict_postures(checkpoint, arguments)
+    assert found["confidence"] == pytest.approx(torch.tensor([7.0]).sigmoid().numpy())
 
 
 def test_coordinates_of_a_hand_keep_its_couplings() -> None:

@@ -301,7 +301,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         standoffs=described.standoffs,
         spreads_deg=described.spreads_deg,
         payload=described.payload,
-        rated_load=rated_load(name, described),
+        rated_load=rated_load(described),
         joint_names=tuple(moving),
         joint_slides=np.array([joint_slides(joint) for joint in moving.values()], dtype=np.bool_),
         joint_gain=np.array([drives[joint].gain for joint in moving]),

@@ -367,20 +367,21 @@ def _as_driven(finger: Finger, driver: Finger, by: DrivenBy) -> Finger:
     return with_efforts(finger, limit, holding, slides=driver.slides)
 
 
-def rated_load(hand: str, described: HandFile) -> float | None:
+def rated_load(described: HandFile) -> float | None:
     """Return the largest force of a fingertip that the maker of a hand allows [N]; None if unknown.
 
     Args:
-        hand: Name of the hand.
-        described: Its file.
+        described: The hand's file. That of a hand of the package says nothing of it, and is told
+            by its contents: a user's hand may have any name.
     """
-    return described.rated_load or _rated_loads().get(hand)
+    of_package = (load for other, load in _rated_loads() if other == described)
+    return described.rated_load or next(of_package, None)
 
 
 @cache
-def _rated_loads() -> dict[str, float]:
+def _rated_loads() -> list[tuple[HandFile, float]]:
     loads: dict[str, float] = parse_yaml(read_text(MODELS / "rated_loads.yaml"))
-    return loads
+    return [(read_hand_file(MODELS / f"{name}_hand.yaml"), loads[name]) for name in loads]
 
 
 def with_efforts(finger: Finger, limit: float, holding: float | None, *, slides: bool) -> Finger:

@@ -64,7 +64,7 @@ class Origin:
         settings: All that decides a verdict, with the versions.
         limit: d, the largest distance between asked and reached contacts [m].
         oracle: Whether more wrist poses than the first were tried.
-        known_objects: Scored objects whose names are in the training split.
+        known_objects: Scored objects that are in the training split.
         new_classes: Whether no class of the scored objects is in the training split.
         benchmark: What the frozen benchmark says of itself; None for another dataset.
         again: The command that makes the card again.
@@ -172,7 +172,7 @@ def _warnings(grouping: Grouping, origin: Origin, sets: Sequence[Judged]) -> lis
     if len(grouping.rows) < total:
         found.append(f"{len(grouping.rows)} of the {total} rows of the split were scored")
     if origin.known_objects:
-        found.append(f"{origin.known_objects} test objects have names of training objects")
+        found.append(f"{origin.known_objects} test objects are training objects, by their names")
     if not any(REFERENCES[each.name].trained for each in sets if each.name in REFERENCES):
         found.append("no blind row stands beside the score, so it says little (--train)")
 

@@ -16,9 +16,9 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.manifest import installed_versions
+from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import GraspError, MachineError
+from drakegrasp.errors import DataError, GraspError, MachineError
 from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
 from drakegrasp.grasp import unpack_grasp
 from drakegrasp.runtime.files import write_atomic
@@ -149,7 +149,7 @@ def score(request: Request, verify: Verify, folder: Path | None) -> Score:
         settings=settings,
         limit=request.config.verify.max_contact_error,
         oracle=request.config.verify.max_tries > 1,
-        known_objects=len(set(grouping.names) & _texts(request.train, "object_name")),
+        known_objects=_known_objects(grouping.names, request.data, request.train),
         new_classes=not set(grouping.classes) & _texts(request.train, "class_name"),
         benchmark=read_benchmark(request.data.path.parent, request.config, versions),
         again=request.again,
@@ -313,6 +313,25 @@ def _place(row: int, objects: Sequence[str], resting: Sequence[int]) -> tuple[st
 
 def _texts(data: GraspDataset, name: str) -> set[str]:
     return set(data.column(f"object_props/{name}").tolist())
+
+
+def _known_objects(names: Sequence[str], data: GraspDataset, train: GraspDataset) -> int:
+    """Return how many scored objects are in the training split.
+
+    Built-in objects of another seed have their names, but other meshes. A data file without its
+    dataset knows no meshes: then names alone decide.
+    """
+    own, known = _meshes(data), _meshes(train)
+    common = set(names) & _texts(train, "object_name")
+    return sum(len({own.get(name), known.get(name)} - {None}) < 2 for name in common)
+
+
+def _meshes(data: GraspDataset) -> dict[str, str]:
+    """Return the hash of each object's mesh by its name; none of a file without its dataset."""
+    try:
+        return {each.name: each.mesh_sha256 for each in read_manifest(data.path.parent).objects}
+    except DataError:
+        return {}
 
 
 def _described(data: GraspDataset, rows: Sequence[int]) -> dict[str, Any]:

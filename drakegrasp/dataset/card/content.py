@@ -220,11 +220,7 @@ def _loads(data: Path, config: Config) -> dict[str, Any]:
     A fingertip's force is the larger one of after closing and after the lift.
     """
     known = _known_hand(config)
-    rated = (
-        None
-        if known is None
-        else rated_load(Path(config.hand).stem.removesuffix("_hand"), known[0])
-    )
+    rated = None if known is None else rated_load(known[0])
     if rated is None:
         return {}
 
