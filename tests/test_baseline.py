@@ -162,10 +162,11 @@ class OneView:
         return seen | {"X_AO": np.eye(4), "object": 0, "scene": 0}
 
 
-def test_a_judge_chooses_from_eight_times_the_proposals(
+def test_a_judge_chooses_from_the_proposals_that_compete(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One that likes the least likely proposal the best has that of eight."""
+    monkeypatch.setattr(predict, "POOL", 8)
     torch.manual_seed(0)
     hand = HandCoordinates(torch.zeros(3), torch.eye(3)[:2], torch.zeros(3)).as_dict()
     weights = [each.state_dict() for each in (PostureNetwork(SMALL), GraspClassifier(2))]
@@ -175,7 +176,11 @@ def test_a_judge_chooses_from_eight_times_the_proposals(
     monkeypatch.setattr(GraspClassifier, "forward", order)
     monkeypatch.setattr(predict.dg, "SceneDataset", lambda *_, **__: OneView())
     arguments = Namespace(
-        data=None, split="test", judge=tmp_path / "judge.pt", proposals=1, views=None
+        data=tmp_path / "scenes.hdf5",
+        split="test",
+        judge=tmp_path / "judge.pt",
+        proposals=1,
+        views=None,
     )
     checkpoint = {"size": vars(SMALL), "hand": hand, "weights": weights[0]}
     with torch.no_grad():
