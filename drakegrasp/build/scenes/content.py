@@ -183,7 +183,7 @@ def _views(
         own = np.flatnonzero(grasps["scene"] == k)
         paint(renderer, look.appearance)
         for number, (kind, X_TC) in enumerate(_cameras(task, name, k, X)):
-            depth = _picture(renderer, lens, X, X_TC, images)
+            depth, mask = _picture(renderer, lens, X, X_TC, images)
             row = {
                 "scene": k,
                 "kind": kind,
@@ -194,7 +194,8 @@ def _views(
 
             # What it sees of the contacts.
             p_TQ, nhat_Q_T = (grasps[key][own] for key in ("p_TQ", "nhat_Q_T"))
-            visible["visible"].append(visible_contacts(p_TQ, nhat_Q_T, X_TC, lens.K, depth))
+            sees = visible_contacts(p_TQ, nhat_Q_T, X_TC, lens.K, depth, mask)
+            visible["visible"].append(sees)
             visible["view"].append(np.full(len(own), len(numbers["scene"])))
             visible["grasp"].append(own)
             for key, values in numbers.items():
@@ -217,15 +218,15 @@ def _cameras(task: SceneTask, name: str, resting: int, X_TO: Array) -> list[tupl
 
 def _picture(
     renderer: Renderer, lens: Lens, X_TO: Array, X_TC: Array, images: dict[str, list[bytes]]
-) -> npt.NDArray[np.uint16]:
-    """Render a view, add its packed images to lists, and return its depth image."""
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint8]]:
+    """Render a view, add its packed images to lists, and return its depth image and its mask."""
     seen = capture(renderer, lens, X_TO, X_TC)
     far = np.where(np.isfinite(seen.depth), np.rint(seen.depth / DEPTH_UNIT), 0)
     depth = far.astype(np.uint16)
     stored = {"rgb": seen.rgb, "depth": depth, "mask": seen.mask}
     for key, image in stored.items():
         images[key].append(packed_chunk(np.ascontiguousarray(image)[None], 1))
-    return depth
+    return depth, seen.mask
 
 
 def _conditions(look: Conditions, camera: Stream) -> dict[str, Any]:

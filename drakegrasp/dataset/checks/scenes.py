@@ -340,14 +340,16 @@ def seen_contacts(
                 farthest = _around(depth, pixels[k]).max()
                 behind[i] = max(behind[i], p_CQ[k, 2] - farthest if farthest else 0.0)
 
-        # What is hidden, though in the image and turned to the camera, has something before it.
+        # What is hidden, though in the image and turned to the camera, has something before it, or
+        # is no place on the object.
         facing = np.einsum("ij,ij->i", nhat, X_TC[:3, 3] - p_TQ) > POSITION_TOLERANCE
         edge = np.array(depth.shape[::-1]) - 2.0
         inside = ((pixels > 1.0) & (pixels < edge)).all(axis=1) & (p_CQ[:, 2] > 0.0)
         hidden = ~seen & facing & inside
-        u, v = np.rint(pixels[hidden]).astype(int).T
-        before = (depth[v, u] > 0.0) & (depth[v, u] < p_CQ[hidden, 2] - HIDDEN)
-        open_[i] = np.count_nonzero(~before)
+        column, row = np.rint(pixels[hidden]).astype(int).T
+        before = (depth[row, column] > 0.0) & (depth[row, column] < p_CQ[hidden, 2] - HIDDEN)
+        in_sight = [np.hypot(u - x, v - y).min(initial=np.inf) for x, y in pixels[hidden][~before]]
+        open_[i] = np.count_nonzero(np.array(in_sight) <= MASK_TOLERANCE)
     what = f"visible contacts must project within {MASK_TOLERANCE:g} px of the mask"
     yield from views.broken(what, beside > MASK_TOLERANCE, beside)
     what = f"visible contacts must not be more than {BEHIND:g} m behind all around them"

@@ -141,9 +141,24 @@ def test_what_is_before_a_contact_hides_it_and_so_does_its_normal() -> None:
     up, down = [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]
     p_TQ = [[0.1, 0, 0], [-0.1, 0, 0], [0.1, 0, 0], [0.1, 0, -0.002], [0.1, 0, -0.004], [1, 0, 0]]
     nhat = [up, up, down, up, up, up]
-    seen = visible_contacts(np.array(p_TQ), np.array(nhat), X_TC, K, depth)
+    picture = K, depth, np.ones(depth.shape, dtype=np.uint8)
+    seen = visible_contacts(np.array(p_TQ), np.array(nhat), X_TC, *picture)
     assert seen.tolist() == [True, False, False, True, False, False]
-    assert not visible_contacts(np.full((1, 3), np.nan), np.array([up]), X_TC, K, depth).any()
+    assert not visible_contacts(np.full((1, 3), np.nan), np.array([up]), X_TC, *picture).any()
+
+
+def test_a_contact_that_is_no_place_on_the_object_is_hidden() -> None:
+    """The mask ends at column 40; the contacts are 5 mm, a pixel, apart."""
+    depth, mask = np.full((48, 64), 5000, dtype=np.uint16), np.zeros((48, 64), dtype=np.uint8)
+    mask[:, :41] = 1
+    K = np.array([[100.0, 0.0, 32.0], [0.0, 100.0, 24.0], [0.0, 0.0, 1.0]])
+    X_TC = np.diag([1.0, -1.0, -1.0, 1.0])
+    X_TC[2, 3] = 0.5
+    p_TQ = np.array([[0.005 * (column - 32), 0, 0] for column in (39.5, 41.5, 42.1, 50)])
+    nhat = np.tile([0.0, 0.0, 1.0], (4, 1))
+    seen = visible_contacts(p_TQ, nhat, X_TC, K, depth, mask)
+    assert seen.tolist() == [True, True, False, False]
+    assert not visible_contacts(p_TQ, nhat, X_TC, K, depth, 0 * mask).any()
 
 
 def test_assemble_makes_them_where_the_configuration_says_so(out: Path) -> None:
