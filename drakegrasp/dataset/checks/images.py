@@ -221,7 +221,7 @@ def object_pixels(batch: Batch, lens: Lens, model: ObjectModel) -> Iterator[Viol
             continue
         border = _border(batch["masks"][i])
         p_OQ = _points(X_OC[i], lens, depth, seen)
-        slack = np.where(border, depth / lens.K[0, 0], 0.0)[seen]
+        slack = np.where(border, np.maximum(depth / lens.K[0, 0], _step(depth, seen)), 0.0)[seen]
         beyond[i] = _beyond_box(p_OQ, X_OC[i][:3, 3], model.half_extents, slack)
 
         # The mesh is measured inside the border, if there is any inside.
@@ -247,6 +247,21 @@ def object_pixels(batch: Batch, lens: Lens, model: ObjectModel) -> Iterator[Viol
 def _border(mask: AnyArray) -> AnyArray:
     """Return which pixels of a mask (S, S) have a neighbour outside of it, (S, S) bool."""
     return (mask == 1) & ~binary_erosion(mask, np.ones((3, 3)), border_value=1)
+
+
+def _step(depth: AnyArray, seen: AnyArray) -> Array:
+    """Return by how much depths (S, S) change from one seen pixel to the next, beside each [m].
+
+    A face that is seen nearly from its edge goes on by as much where a pixel shows it beyond. Its
+    own depth does not count, as it is to be checked.
+    """
+    values = np.where(seen, depth, np.nan)
+    steps = np.zeros(depth.shape)
+    for turned, result in ((values, steps), (values.T, steps.T)):
+        change = np.nan_to_num(np.abs(np.diff(turned, axis=0)))
+        result[:-2] = np.maximum(result[:-2], change[1:])
+        result[2:] = np.maximum(result[2:], change[:-1])
+    return steps
 
 
 def _beyond_box(p_OQ: Array, p_OC: Array, half_extents: Array, slack: Array) -> float:

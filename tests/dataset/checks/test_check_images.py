@@ -148,6 +148,17 @@ def test_border_of_the_mask_may_be_a_pixels_width_off(out: Path) -> None:
     must_find_without_shards(out)
 
 
+def test_a_face_that_is_seen_from_its_edge_may_go_on_beyond_the_border() -> None:
+    """By a step of the depths beside a pixel, but not by its own."""
+    depth = np.tile(0.4 + 0.005 * np.arange(8.0), (8, 1))
+    seen = np.zeros((8, 8), dtype=bool)
+    seen[2:6, 2:6] = True
+    depth[3, 5] += 0.1
+    steps = image_rules._step(depth, seen)
+    assert steps[3, 5] == pytest.approx(0.005) and not steps[~seen][:2].any()
+    assert steps[2, 2] == pytest.approx(0.005)
+
+
 def set_nearest_depth(out: Path, inside: bool, by: float) -> None:
     """Set the depth of a pixel inside the mask, or at its border, to the nearest and `by` [m]."""
     with h5py.File(out / OTO, "r+") as file:
