@@ -20,7 +20,6 @@ from helpers.commands import run
 from drakegrasp.dataset.scenes.reader import SceneDataset
 from drakegrasp.exchange.posture_files import read_postures
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.finger_sweep import hand_paths
 from drakegrasp.simulation.candidates import Source
 
 # Where torch is said to be there, a test that skips is a failure.
@@ -30,7 +29,6 @@ import predict
 import torch
 from assess import assessment, auc
 from batches import centred, object_points, turned
-from collisions import hand_points, refuted
 from model_card import card_text
 from networks import (
     ContactNetwork,
@@ -103,38 +101,6 @@ def test_a_posture_at_a_mode_is_likelier_than_one_beside_it() -> None:
     both = [torch.cat([m, m + shift], 1) for m, shift in zip(mode, (0.1, 0.0, 0.0), strict=True)]
     losses = [network.loss(points, *[m[:, k : k + 1] for m in both]) for k in range(2)]
     assert torch.isclose(network.loss(points, *both), torch.stack(losses).mean())
-
-
-def test_a_view_refutes_a_hand_in_the_object_or_the_table() -> None:
-    """A camera 0.6 m above the table looks down at an object of 0.1 m and the table beside it."""
-    X_TC = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0.6], [0, 0, 0, 1]])
-    mask = np.zeros((100, 100))
-    mask[40:60, 40:60] = 1
-    K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
-    images = {"depth": np.where(mask, 0.5, 0.6), "mask": mask, "K": K}
-    points, X_TG = 0.01 * np.mgrid[0:2, 0:2, 0:1].reshape(3, -1).T, np.eye(4)
-
-    def is_refuted(*p_TG: float, some: np.ndarray = points) -> bool:
-        X_TG[:3, 3] = p_TG
-        return refuted(some, X_TG, X_TC, images)
-
-    assert is_refuted(0.0, 0.0, 0.09) and is_refuted(0.03, 0.03, 0.09)
-    # Above it, little behind its surface, far behind it, beside it, beside the image.
-    assert not any(is_refuted(0.0, 0.0, z) for z in (0.11, 0.099, 0.06))
-    assert not is_refuted(0.1, 0.0, 0.09) and not is_refuted(2.0, 0.0, 0.09)
-    assert not is_refuted(0.0, 0.0, 0.09, some=points[:2])
-    assert is_refuted(0.2, 0.2, -0.003) and not is_refuted(0.2, 0.2, -0.001)
-
-
-def test_points_of_the_hand_are_where_its_joints_put_them() -> None:
-    hand, joints = load_hand(), sorted(load_hand().joint_names)
-    opened, closed = (hand_points(hand, joints, np.full(len(joints), q)) for q in (0.0, 0.8))
-    paths = hand_paths(hand, 0.0)
-    assert paths is not None
-    expected = np.concatenate([paths.still, *(path.points[0] for path in paths.fingers)])
-    assert np.allclose(opened.min(0), expected.min(0), atol=1e-6)
-    assert np.allclose(opened.max(0), expected.max(0), atol=1e-6)
-    assert closed[:, 2].max() > opened[:, 2].max() + 0.02
 
 
 def test_proposals_are_ranked_and_differ() -> None:

@@ -89,14 +89,19 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def draw(axes: Axes, item: dict[str, np.ndarray], X_OG: np.ndarray, colour: str) -> None:
-    """Draw a view with a palm, as a line where it looks and one to both sides of its origin."""
+    """Draw the middle of a view with a palm: lines where it looks, and to both sides."""
     X_CG = invert_pose(item["X_TC"].astype(float)) @ item["X_AO"].astype(float) @ X_OG
     axes.imshow(item["rgb"], interpolation="nearest")
+    axes.set_facecolor(item["rgb"][0, 0] / 255.0)
     origin, x, z = X_CG[:3, 3], X_CG[:3, 0], X_CG[:3, 2]
     for ends in ((origin, origin + AHEAD * z), (origin - ASIDE * x, origin + ASIDE * x)):
         axes.plot(*project(item["K"].astype(float), np.array(ends)).T, color=colour, linewidth=2)
+    # The part of the image around the object.
     height, width = item["mask"].shape
-    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+    v, u = np.nonzero(item["mask"])
+    centre = np.array([u.mean(), v.mean()]) if len(u) else np.array([width, height]) / 2
+    (left, upper), half = centre, np.array([width, height]) / 4
+    axes.set(xlim=(left - half[0], left + half[0]), ylim=(upper + half[1], upper - half[1]))
     hide_ticks(axes)
 
 

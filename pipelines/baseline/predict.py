@@ -20,7 +20,6 @@ import h5py
 import numpy as np
 import torch
 from batches import as_input, centred, object_points
-from collisions import hand_of_scenes, hand_points, refuted
 from networks import (
     ContactNetwork,
     GraspClassifier,
@@ -37,7 +36,7 @@ from drakegrasp.runtime.progress import progress_bar
 
 #: Two proposals are one if palms are nearer than both [m, rad].
 SAME = (0.01, np.deg2rad(15))
-#: So many proposals are compared with what the view shows, and by a judge.
+#: From so many proposals a judge chooses.
 POOL = 64
 #: Views or images at a time.
 BATCH = 32
@@ -105,7 +104,7 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
         arguments.data, split=arguments.split, negatives="none", balance="view", grasps=1
     )
     found: dict[str, list[Any]] = {key: [] for key in COLUMNS}
-    chosen, model = _views(data, arguments.views), hand_of_scenes(arguments.data)
+    chosen = _views(data, arguments.views)
     pool = max(POOL, arguments.proposals)
     with progress_bar("predict", "view") as progress:
         for done, index in enumerate(chosen):
@@ -116,19 +115,10 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
             if judge is not None:
                 clouds = batch["points"][:, :SEEN].expand(len(X_TG), -1, -1)
                 confidence = judge[0](clouds, X_TG, judge[1].coordinates(q))[:, 1].sigmoid()
-
-            # Back to where the cloud was. What the view refutes comes last.
-            X_TG[:, :3, 3] += batch["shift"]
-            if model is not None:
-                images, starts = data.images(int(item["view"])), hand.opened(q)
-                hits = [
-                    refuted(hand_points(model, data.joints, start), X.numpy(), item["X_TC"], images)
-                    for start, X in zip(starts, X_TG, strict=True)
-                ]
-                confidence = confidence.where(~torch.tensor(hits), confidence.min() - 1.0)
             order = confidence.argsort(descending=True, stable=True)[: arguments.proposals]
 
-            # Into the object's frame.
+            # Back to where the cloud was, and into the object's frame.
+            X_TG[:, :3, 3] += batch["shift"]
             X_OG = torch.linalg.inv(torch.from_numpy(item["X_AO"]).double()) @ X_TG.double()
             scene = int(item["scene"])
             rows = {

@@ -61,6 +61,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--objects", type=int, help="train on so many of the first file, drawn by the seed"
     )
+    parser.add_argument(
+        "--without", metavar="CLASS", nargs="+", default=[], help="train on none of these classes"
+    )
     parser.add_argument("--heads", type=int, default=5, help="of contacts  [default: 5]")
     arguments = parser.parse_args(argv)
     try:
@@ -203,18 +206,28 @@ def _scenes(
     may have nothing that validates.
     """
     options = {"negatives": negatives, "positives": positives, "seed": arguments.seed}
-    train = [dg.SceneDataset(path, split="train", **options) for path in arguments.data]
-    if arguments.objects is not None:
-        names = sorted({train[0].names[k] for k in _objects_of(train[0])})
-        draw = torch.Generator().manual_seed(arguments.seed)
-        few = [names[i] for i in torch.randperm(len(names), generator=draw)[: arguments.objects]]
-        train[0] = dg.SceneDataset(train[0].path, split="train", objects=few, **options)
+    train = []
+    for path in arguments.data:
+        names = _names(arguments, path, "train", options)
+        if arguments.objects is not None and path == arguments.data[0]:
+            draw = torch.Generator().manual_seed(arguments.seed)
+            order = torch.randperm(len(names), generator=draw)[: arguments.objects]
+            names = [names[i] for i in order.tolist()]
+        train.append(dg.SceneDataset(path, split="train", objects=names, **options))
     if len({data.joints for data in train}) > 1:
         raise DataError(f"{arguments.data[-1]}: must be of the same hand as the others")
-    valid = []
+    valid, path = [], arguments.data[0]
     with contextlib.suppress(DataError):
-        valid.append(dg.SceneDataset(arguments.data[0], split="valid", balance="view", **options))
+        names = _names(arguments, path, "valid", options)
+        valid.append(dg.SceneDataset(path, split="valid", balance="view", objects=names, **options))
     return train, valid
+
+
+def _names(arguments: argparse.Namespace, path: Path, split: str, options: Any) -> list[str]:
+    """Return the names of the objects with grasps to draw, of the classes that are not left out."""
+    data = dg.SceneDataset(path, split=split, **options)
+    kept = [k for k in _objects_of(data) if data.classes[k] not in arguments.without]
+    return sorted(data.names[k] for k in kept)
 
 
 def _fit(
