@@ -148,15 +148,15 @@ def test_border_of_the_mask_may_be_a_pixels_width_off(out: Path) -> None:
     must_find_without_shards(out)
 
 
-def test_a_face_that_is_seen_from_its_edge_may_go_on_beyond_the_border() -> None:
-    """By a step of the depths beside a pixel, but not by its own."""
-    depth = np.tile(0.4 + 0.005 * np.arange(8.0), (8, 1))
-    seen = np.zeros((8, 8), dtype=bool)
-    seen[2:6, 2:6] = True
-    depth[3, 5] += 0.1
-    steps = image_rules._step(depth, seen)
-    assert steps[3, 5] == pytest.approx(0.005) and not steps[~seen][:2].any()
-    assert steps[2, 2] == pytest.approx(0.005)
+def test_a_face_that_is_seen_from_its_edge_may_go_on_beyond_it() -> None:
+    """Inside the mask, where the depths around a pixel leap; its own leap is no edge."""
+    depth, seen = np.full((8, 8), 0.4), np.zeros((8, 8), dtype=bool)
+    seen[1:7, 1:7] = True
+    depth[:, 4:] = 0.43
+    depth[5, 2] -= 0.05
+    slack = image_rules._edge_depth(depth, seen)
+    assert slack[2, 3:5] == pytest.approx(0.03) and slack[2, 6] == 0.0
+    assert slack[5, 2] == 0.0 and slack[0, 0] == 0.0
 
 
 def set_nearest_depth(out: Path, inside: bool, by: float) -> None:
