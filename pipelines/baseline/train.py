@@ -226,6 +226,8 @@ def _scenes(
 def _names(arguments: argparse.Namespace, path: Path, split: str, options: Any) -> list[str]:
     """Return the names of the objects with grasps to draw, of the classes that are not left out."""
     data = dg.SceneDataset(path, split=split, **options)
+    if unknown := sorted(set(arguments.without) - set(data.classes)):
+        raise DataError(f"{path}: --without must name classes of it, got {unknown[0]}")
     kept = [k for k in _objects_of(data) if data.classes[k] not in arguments.without]
     return sorted(data.names[k] for k in kept)
 
