@@ -107,8 +107,12 @@ def test_proposals_are_ranked_and_differ() -> None:
     torch.manual_seed(0)
     hand = HandCoordinates(torch.zeros(3), torch.eye(3)[:2], torch.zeros(3))
     cloud = made_up()["points"][:1]
-    weight, X_TG, q = proposals(PostureNetwork(SMALL), hand, cloud, 4)
-    assert (weight[:-1] >= weight[1:]).all() and len(weight) == len(X_TG) == len(q) == 4
+    network = PostureNetwork(SMALL)
+    density, X_TG, q = proposals(network, hand, cloud, 4)
+    assert (density[:-1] >= density[1:]).all() and len(density) == len(X_TG) == len(q) == 4
+    # By the density of all modes, not by a mode's own weight.
+    modes = network(cloud)
+    assert density[0] == network.log_density(modes, *modes[1:]).max()
     gaps = torch.cdist(X_TG[:, :3, 3], X_TG[:, :3, 3]) + torch.eye(4)
     turned_by = (X_TG[:, None, :3, :3] * X_TG[None, :, :3, :3]).sum((-1, -2)) < 1 + 2 * 0.9659
     assert ((gaps > 0.01) | turned_by).all()

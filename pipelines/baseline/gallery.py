@@ -10,7 +10,9 @@ not: where the network is wrong while it is sure.
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,6 +25,7 @@ import drakegrasp as dg
 from drakegrasp.dataset.scenes.rows import SceneRows
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.frames import invert_pose
+from drakegrasp.scoring.run import VERDICTS
 from drakegrasp.vision.camera import project
 from drakegrasp.visualization.style import add_axes, hide_ticks, save_figure, shortened
 
@@ -49,14 +52,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         views = dg.SceneDataset(
             arguments.data, points=None, split="test", negatives="none", balance="view", grasps=1
         )
-        judged = dg.score(
-            arguments.predictions,
-            rows,
-            references=(),
-            per_object=1,
-            out=arguments.card,
-            show=True,
-        ).sets[0]
+        # A score writes a card, and that of the folder has reference rows.
+        with tempfile.TemporaryDirectory() as folder:
+            if (arguments.card / VERDICTS).is_file():
+                shutil.copy(arguments.card / VERDICTS, folder)
+            again = {"references": (), "per_object": 1, "out": folder, "show": True}
+            judged = dg.score(arguments.predictions, rows, **again).sets[0]
     except DrakegraspError as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201
         return 2

@@ -193,7 +193,8 @@ def hand_of(train: Sequence[dg.SceneDataset]) -> HandCoordinates:
     closed, opened = (torch.from_numpy(np.concatenate(found[name])) for name in found)
     if len(closed) < 2:
         raise DataError(f"{train[0].path}: train must have two samples or more, got {len(closed)}")
-    print(f"{len(closed)} samples of {sum(len(_objects_of(data)) for data in train)} objects")  # noqa: T201
+    objects = sum(len(_objects_of(data)) for data in train)
+    print(f"{len(closed)} samples; views of {objects} objects")  # noqa: T201
     return HandCoordinates.fit(closed, opened)
 
 

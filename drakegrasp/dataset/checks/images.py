@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.ndimage import binary_erosion, maximum_filter, minimum_filter
+from scipy.ndimage import binary_erosion
 
 from drakegrasp.config import CameraConfig, Config
 from drakegrasp.dataset.checks.findings import Violation
@@ -25,8 +25,6 @@ from drakegrasp.vision.depth_sensor import DepthSensor, clean_depth
 #: With the right lens, depth images reproduce the table and the mesh to 1e-6 m. An error of half a
 #: pixel moves them by 1 to 3 mm.
 DEPTH_TOLERANCE = 3e-4  # [m]
-#: Depths around a pixel that differ by more are of two faces, with an edge between them.
-EDGE = 0.02  # [m]
 #: A contact on the object's outline may be rounded to a pixel beside the mask, and the collision
 #: mesh and `filters.max_surface_distance` allow it to be off the full mesh.
 MASK_TOLERANCE = 2.0  # [px]
@@ -223,7 +221,7 @@ def object_pixels(batch: Batch, lens: Lens, model: ObjectModel) -> Iterator[Viol
             continue
         border = _border(batch["masks"][i])
         p_OQ = _points(X_OC[i], lens, depth, seen)
-        slack = np.where(border, depth / lens.K[0, 0], _edge_depth(depth, seen))[seen]
+        slack = np.where(border, depth / lens.K[0, 0], 0.0)[seen]
         beyond[i] = _beyond_box(p_OQ, X_OC[i][:3, 3], model.half_extents, slack)
 
         # The mesh is measured inside the border, if there is any inside.
@@ -249,20 +247,6 @@ def object_pixels(batch: Batch, lens: Lens, model: ObjectModel) -> Iterator[Viol
 def _border(mask: AnyArray) -> AnyArray:
     """Return which pixels of a mask (S, S) have a neighbour outside of it, (S, S) bool."""
     return (mask == 1) & ~binary_erosion(mask, np.ones((3, 3)), border_value=1)
-
-
-def _edge_depth(depth: AnyArray, seen: AnyArray) -> Array:
-    """Return by how much the seen depths around each pixel (S, S) differ [m], where an edge passes.
-
-    A face that is seen nearly from its edge goes on beyond it there. The pixel's own depth does not
-    count, as it is to be checked.
-    """
-    around = np.ones((3, 3), dtype=bool)
-    around[1, 1] = False
-    farthest = maximum_filter(np.where(seen, depth, -np.inf), footprint=around)
-    nearest = minimum_filter(np.where(seen, depth, np.inf), footprint=around)
-    apart = np.maximum(farthest - nearest, 0.0)
-    return np.asarray(np.where(apart > EDGE, apart, 0.0))
 
 
 def _beyond_box(p_OQ: Array, p_OC: Array, half_extents: Array, slack: Array) -> float:

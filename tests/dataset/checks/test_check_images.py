@@ -148,17 +148,6 @@ def test_border_of_the_mask_may_be_a_pixels_width_off(out: Path) -> None:
     must_find_without_shards(out)
 
 
-def test_a_face_that_is_seen_from_its_edge_may_go_on_beyond_it() -> None:
-    """Inside the mask, where the depths around a pixel leap; its own leap is no edge."""
-    depth, seen = np.full((8, 8), 0.4), np.zeros((8, 8), dtype=bool)
-    seen[1:7, 1:7] = True
-    depth[:, 4:] = 0.43
-    depth[5, 2] -= 0.05
-    slack = image_rules._edge_depth(depth, seen)
-    assert slack[2, 3:5] == pytest.approx(0.03) and slack[2, 6] == 0.0
-    assert slack[5, 2] == 0.0 and slack[0, 0] == 0.0
-
-
 def set_nearest_depth(out: Path, inside: bool, by: float) -> None:
     """Set the depth of a pixel inside the mask, or at its border, to the nearest and `by` [m]."""
     with h5py.File(out / OTO, "r+") as file:
