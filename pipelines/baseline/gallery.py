@@ -56,8 +56,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         with tempfile.TemporaryDirectory() as folder:
             if (arguments.card / VERDICTS).is_file():
                 shutil.copy(arguments.card / VERDICTS, folder)
-            again = {"references": (), "per_object": 1, "out": folder, "show": True}
-            judged = dg.score(arguments.predictions, rows, **again).sets[0]
+            judged = dg.score(
+                arguments.predictions, rows, references=(), per_object=1, out=folder, show=True
+            ).sets[0]
     except DrakegraspError as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201
         return 2
