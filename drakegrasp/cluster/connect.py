@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,6 +22,8 @@ from drakegrasp.runtime.environment import available_cores
 
 #: How long to wait for a scheduler to answer [s].
 CONNECT_SECONDS = 10
+#: How long a scheduler may take to write its file [s].
+WRITE_SECONDS = 2
 #: Module that a nanny loads before it starts its worker: it chooses the worker's allocator.
 NANNY_PRELOAD = "drakegrasp.runtime.allocator"
 
@@ -126,13 +129,23 @@ def _connect_remote(
 
 
 def _address_of(file: Path) -> str | None:
-    """Return the address in a scheduler's file; None if it has none, or is empty yet."""
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    address = content.get("address") if isinstance(content, dict) else None
-    return address if isinstance(address, str) else None
+    """Return the address in a scheduler's file; None if it has none.
+
+    A scheduler that starts has made its file before it writes it: half a file is read again.
+    """
+    end = time.monotonic() + WRITE_SECONDS
+    while True:
+        try:
+            content = json.loads(file.read_text(encoding="utf-8"))
+        except OSError:
+            return None
+        except ValueError:
+            if time.monotonic() > end:
+                return None
+            time.sleep(0.05)
+        else:
+            address = content.get("address") if isinstance(content, dict) else None
+            return address if isinstance(address, str) else None
 
 
 @contextmanager

@@ -33,7 +33,7 @@ from drakegrasp.cluster.certificates import make_certificates, private_directory
 from drakegrasp.cluster.connect import connect, dask_settings
 from drakegrasp.cluster.launch import _exports, start_cluster
 from drakegrasp.cluster.request import ClusterRequest, walltime_seconds
-from drakegrasp.errors import MachineError
+from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here
@@ -321,6 +321,20 @@ def test_only_the_loopback_address_is_listened_on_and_not_for_http(local: Client
     ]
     assert sorted(listening) == sorted(addresses(local))
     assert all(address.startswith("tls://127.0.0.1:") for address in listening)
+
+
+def test_scheduler_file_that_is_being_written_is_read_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "scheduler.json"
+    file.write_text('{"addr')
+
+    def write_rest(_: float) -> None:
+        file.write_text('{"address": "tcp://127.0.0.1:8786"}')
+
+    monkeypatch.setattr(connecting.time, "sleep", write_rest)
+    with pytest.raises(ConfigError, match="got tcp://127"), connect(scheduler_file=file):
+        pass
 
 
 @pytest.mark.cluster
