@@ -40,14 +40,14 @@ from pydrake.systems.sensors import CameraInfo
 from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import CameraConfig
 from drakegrasp.errors import BlankImageError
-from drakegrasp.frames import X_WT
+from drakegrasp.frames import X_WT, invert_pose, transform_points
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.parsing import make_parser
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour
 from drakegrasp.runtime.environment import require_render_memory
 from drakegrasp.vision.appearance import Appearance, usual_appearance
-from drakegrasp.vision.camera import Lens
+from drakegrasp.vision.camera import Lens, unproject
 
 #: Colour of pixels beyond the table.
 BACKGROUND = np.array([0.86, 0.90, 0.94])
@@ -98,6 +98,7 @@ class Renderer:
         diagram, context: The diagram with its one context.
         plant, scene_graph: The two systems of the diagram.
         object, table: The bodies.
+        half_extents: Of the object's box, (3,) [m].
         config: The camera.
         appearance: How object and table look, and in which light; `paint` changes it.
     """
@@ -108,6 +109,7 @@ class Renderer:
     scene_graph: SceneGraph
     object: RigidBody
     table: RigidBody
+    half_extents: Array
     config: CameraConfig
     appearance: Appearance
 
@@ -135,6 +137,7 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
         scene_graph=scene_graph,
         object=body,
         table=table,
+        half_extents=model.half_extents,
         config=config,
         appearance=appearance,
     )
@@ -253,4 +256,46 @@ def capture(renderer: Renderer, lens: Lens, X_TO: npt.ArrayLike, X_TC: npt.Array
     if not rgb.any() or not depth.any():
         raise BlankImageError(BLANK)
     mask = (labels == int(renderer.object.index())).astype(np.uint8)
+    X_OC = multiply(invert_pose(X_TO), X_TC)
+    depth = depth_in_box(depth, mask, K, X_OC, renderer.half_extents)
     return Capture(rgb=rgb, depth=depth, mask=mask)
+
+
+def depth_in_box(
+    depth: npt.NDArray[np.float32],
+    mask: npt.NDArray[np.uint8],
+    K: Array,
+    X_OC: Array,
+    half_extents: Array,
+) -> npt.NDArray[np.float32]:
+    """Return depth images (H, W) [m] in which the object's points are within its box.
+
+    A renderer gives a pixel at an edge the depth of a face that is seen nearly from its edge,
+    continued beyond that edge by up to centimetres. Such a point moves along its ray to where the
+    ray enters the box, or leaves it. It stays where the ray misses the box by a part of a pixel.
+
+    Args:
+        depth: (H, W) [m], 0 where something is too near, inf where nothing is near enough.
+        mask: (H, W), 1 where the object is seen.
+        K: Camera matrix (3, 3) [px].
+        X_OC: Pose of the camera (4, 4).
+        half_extents: Of the box, (3,) [m].
+    """
+    v, u = np.nonzero((mask == 1) & (depth > 0.0) & np.isfinite(depth))
+    z = depth[v, u]
+    p_OQ = transform_points(X_OC, unproject(K, np.column_stack([u, v]), z))
+    # Float32 depths have errors of less than 1e-6 m.
+    outside = np.flatnonzero((np.abs(p_OQ) > half_extents + 1e-6).any(axis=1))
+    if not len(outside):
+        return depth
+
+    # Depths at which the rays cross the box's six planes.
+    u, v, z = u[outside], v[outside], z[outside]
+    along = (p_OQ[outside] - X_OC[:3, 3]) / z[:, None]
+    along = np.where(np.abs(along) < 1e-12, 1e-12, along)
+    walls = np.stack([-1.0, 1.0])[:, None, None] * half_extents
+    cuts = (walls - X_OC[:3, 3]) / along
+    enters, leaves = cuts.min(axis=0).max(axis=1), cuts.max(axis=0).min(axis=1)
+    found = depth.copy()
+    found[v, u] = np.where(enters <= leaves, np.clip(z, enters, leaves), z)
+    return found

@@ -19,7 +19,14 @@ from drakegrasp.hand.files import MODELS
 from drakegrasp.objects.model import ObjectModel, object_colour
 from drakegrasp.vision.appearance import TABLE_COLOUR, Appearance, usual_appearance
 from drakegrasp.vision.camera import intrinsics, project, unproject
-from drakegrasp.vision.rendering import RenderedView, Renderer, build_renderer, paint, render
+from drakegrasp.vision.rendering import (
+    RenderedView,
+    Renderer,
+    build_renderer,
+    depth_in_box,
+    paint,
+    render,
+)
 
 pytestmark = [pytest.mark.sim, needs_egl]
 
@@ -145,6 +152,26 @@ def test_mask_and_depth_agree(renderer: Renderer) -> None:
     # The table's pixels at the foot of the box come near to it.
     assert np.median(box_distance(object_points(inverted, X_TC), HALF)) > 0.02
     assert box_distance(object_points(inverted, X_TC), HALF).min() > -1e-6
+
+
+def test_depth_beyond_the_box_moves_along_its_ray() -> None:
+    """A camera looks down on the box's lid from 0.25 m; each pixel is 10 mm from the next there."""
+    lens = np.array([[25.0, 0.0, 2.0], [0.0, 25.0, 0.0], [0.0, 0.0, 1.0]])
+    X_OC = make_pose(R_FROM_ABOVE, [0.0, 0.0, HALF[2] + 0.25])
+    # Above the lid, on it, inside, below the floor, too near, nothing, where the ray misses the box.
+    given = np.array([[0.24, 0.25, 0.3, 0.36, 0.0, np.inf, 0.26]], dtype=np.float32)
+    mask = np.ones_like(given, dtype=np.uint8)
+    found = depth_in_box(given, mask, lens, X_OC, HALF)
+    expected = [0.25, 0.25, 0.3, 0.35, 0.0, np.inf, 0.26]
+    np.testing.assert_allclose(found[0], expected, rtol=0.0, atol=1e-7)
+    # What is not of the object stays.
+    assert depth_in_box(given, 0 * mask, lens, X_OC, HALF) is given
+
+
+def test_rendered_depths_are_within_the_box(renderer: Renderer) -> None:
+    """Told that the object is smaller, the renderer moves the +x face to the smaller box's."""
+    seen = render(replace(renderer, half_extents=HALF - [0.005, 0.0, 0.0]), X_TO, facing_x(0.25))
+    assert seen.image[3][seen.mask == 1].min() == pytest.approx(0.255, abs=1e-6)
 
 
 def test_all_that_is_drawn_is_object_table_or_nothing(renderer: Renderer) -> None:
