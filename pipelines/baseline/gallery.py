@@ -25,6 +25,7 @@ import drakegrasp as dg
 from drakegrasp.dataset.scenes.rows import SceneRows
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.frames import invert_pose
+from drakegrasp.scoring.measures import Judged
 from drakegrasp.scoring.run import VERDICTS
 from drakegrasp.vision.camera import project
 from drakegrasp.visualization.style import add_axes, hide_ticks, save_figure, shortened
@@ -48,27 +49,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("picture", type=Path)
     arguments = parser.parse_args(argv)
     try:
-        rows = SceneRows(arguments.data, split="test")
-        views = dg.SceneDataset(
-            arguments.data, points=None, split="test", negatives="none", balance="view", grasps=1
-        )
-        # A score writes a card, and that of the folder has reference rows.
-        with tempfile.TemporaryDirectory() as folder:
-            if (arguments.card / VERDICTS).is_file():
-                shutil.copy(arguments.card / VERDICTS, folder)
-            judged = dg.score(
-                arguments.predictions, rows, references=(), per_object=1, out=folder, show=True
-            ).sets[0]
+        figure = gallery(arguments.predictions, arguments.data, arguments.card)
     except DrakegraspError as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201
         return 2
+    save_figure(figure, arguments.picture, dpi=150)
+    return 0
+
+
+def gallery(predictions: Path, data: Path, card: Path) -> Figure:
+    """Return pictures of the surest predictions that are samples, and below of those that are not.
+
+    Raises:
+        DataError, GraspError, UsageError: As of `drakegrasp score`.
+    """
+    views = dg.SceneDataset(
+        data, points=None, split="test", negatives="none", balance="view", grasps=1
+    )
+    judged = judge(predictions, data, card)
+    with h5py.File(predictions) as file:
+        row_of, X_OG, confidence = (file[key][:] for key in ("row", "X_FG", "confidence"))
 
     # The first choice for each view, the surest first.
     ranked, verdicts = judged.ranked[0], judged.verdicts[0]
     order = np.argsort(-np.asarray(ranked.confidence), kind="stable")
     first = [i for i in order.tolist() if ranked.ranks[i] == 0]
-    with h5py.File(arguments.predictions) as file:
-        row_of, X_OG, confidence = (file[key][:] for key in ("row", "X_FG", "confidence"))
 
     line = 0.75 * WIDE + 0.34
     figure = Figure(figsize=(ACROSS * (WIDE + GAP) + 0.2, 2 * LINES * line + 0.1))
@@ -86,8 +91,19 @@ def main(argv: Sequence[str] | None = None) -> int:
             name = shortened(views.names[int(item["object"])], 18).replace("_", " ")
             said = f"{name}\n{'held, no sample' if outcome == 'success' else outcome}"
             axes.set_title(f"{said}, {confidence[place]:.2f}", fontsize=6.5, color=COLOURS[kind])
-    save_figure(figure, arguments.picture, dpi=150)
-    return 0
+    return figure
+
+
+def judge(predictions: Path, data: Path, card: Path) -> Judged:
+    """Return the predictions with their verdicts, those of a score's folder where it has them."""
+    # A score writes a card, and that of the folder has reference rows.
+    with tempfile.TemporaryDirectory() as folder:
+        if (card / VERDICTS).is_file():
+            shutil.copy(card / VERDICTS, folder)
+        rows = SceneRows(data, split="test")
+        return dg.score(predictions, rows, references=(), per_object=1, out=folder, show=True).sets[
+            0
+        ]
 
 
 def draw(axes: Axes, item: dict[str, np.ndarray], X_OG: np.ndarray, colour: str) -> None:

@@ -158,7 +158,7 @@ def test_depth_beyond_the_box_moves_along_its_ray() -> None:
     """A camera looks down on the box's lid from 0.25 m; each pixel is 10 mm from the next there."""
     lens = np.array([[25.0, 0.0, 2.0], [0.0, 25.0, 0.0], [0.0, 0.0, 1.0]])
     X_OC = make_pose(R_FROM_ABOVE, [0.0, 0.0, HALF[2] + 0.25])
-    # Above the lid, on it, inside, below the floor, too near, nothing, where the ray misses the box.
+    # Above the lid, on it, inside, below the floor, too near, nothing, where the ray misses it.
     given = np.array([[0.24, 0.25, 0.3, 0.36, 0.0, np.inf, 0.26]], dtype=np.float32)
     mask = np.ones_like(given, dtype=np.uint8)
     found = depth_in_box(given, mask, lens, X_OC, HALF)
