@@ -39,6 +39,7 @@ def score(
     *,
     rows: Sequence[int] | None = None,
     confidence: npt.ArrayLike | None = None,
+    against: str | Path | Sequence[str | Path] | None = None,
     train: GraspDataset | None = None,
     references: Sequence[str] = tuple(REFERENCES),
     per_object: int | None = None,
@@ -63,6 +64,8 @@ def score(
         dataset: The split whose rows the predictions are for.
         rows: With an array: (n,), the row of each; all rows, in order, if None.
         confidence: With an array: (n,) or (n, m), greater is better.
+        against: File or files of another method for the same rows: the card says by how much the
+            headline is above its, object by object.
         train: Training rows for reference rows; the split `train` of the same file if None.
         references: Names of the reference rows, see `scoring.references.REFERENCES`.
         per_object: Rows of each object, at most; all if None.
@@ -90,6 +93,7 @@ def score(
         raise GraspError(f"references must be of {', '.join(REFERENCES)}, got {unknown[0]!r}")
     settings = ("verify.max_tries=1", *overrides)
     name, ranked = ranked_sets(predictions, dataset, rows=rows, confidence=confidence)
+    other = None if against is None else ranked_sets(against, dataset)
     rule, stored = find_protocol(protocol)
     peer = not isinstance(rule, Lift)
     if peer and (scheduler or scheduler_file):
@@ -99,6 +103,7 @@ def score(
         train=type(dataset)(dataset.path, split="train") if train is None else train,
         predictions=ranked,
         name=name,
+        against=other,
         references=tuple(references),
         per_object=per_object,
         config=dataset_config(dataset, overrides=settings),

@@ -37,6 +37,14 @@ DEFAULT_FOLDER = Path("score")
     help="Rows of the dataset.",
 )
 @click.option(
+    "--against",
+    type=FILE,
+    multiple=True,
+    metavar="FILE",
+    help="Predictions of another method for the same rows: the card says by how much the headline "
+    "is above its. May be given several times, for a method that was trained several times.",
+)
+@click.option(
     "--train",
     type=PATH,
     metavar="FILE",
@@ -77,6 +85,7 @@ def score(
     predictions: tuple[Path, ...],
     dataset: Path,
     split: str,
+    against: tuple[Path, ...],
     train: Path | None,
     references: tuple[str, ...],
     per_object: int | None,
@@ -113,11 +122,12 @@ def score(
     except DataError as error:
         raise GraspError(str(error)) from None
     again = _command(
-        predictions, dataset, split, train, references, per_object, overrides, protocol
+        predictions, dataset, split, against, train, references, per_object, overrides, protocol
     )
     scored = score_predictions(
         predictions,
         data,
+        against=against or None,
         train=trained,
         references=references or tuple(REFERENCES),
         per_object=per_object,
@@ -150,6 +160,7 @@ def _command(
     predictions: tuple[Path, ...],
     dataset: Path,
     split: str,
+    against: tuple[Path, ...],
     train: Path | None,
     references: tuple[str, ...],
     per_object: int | None,
@@ -159,6 +170,8 @@ def _command(
     """Return the command that makes the card again, without what changes no verdict."""
     words = ["drakegrasp", "score", *map(str, predictions), "--dataset", str(dataset)]
     words += [] if split == "test" else ["--split", split]
+    for path in against:
+        words += ["--against", str(path)]
     words += [] if train is None else ["--train", str(train)]
     for name in references:
         words += ["--reference", name]

@@ -87,6 +87,7 @@ class Request:
         train: Rows from which reference rows are made.
         predictions: By training seed; none scores the reference rows alone.
         name: Of the predictions, on the card.
+        against: Name and predictions of another method, for the same rows; None if there is none.
         references: Names of the reference rows, in the order of the card.
         per_object: Rows of each object, at most; all if None.
         config: Of the verification.
@@ -99,6 +100,7 @@ class Request:
     train: GraspDataset
     predictions: tuple[Ranked, ...]
     name: str
+    against: tuple[str, tuple[Ranked, ...]] | None
     references: tuple[str, ...]
     per_object: int | None
     config: Config
@@ -124,8 +126,9 @@ def score(request: Request, verify: Verify, folder: Path | None) -> Score:
     # The rows, and what is scored on them.
     rows = _chosen_rows(request)
     grouping = _grouping(request.data, rows)
-    sets = [(request.name, tuple(each.of_rows(rows) for each in request.predictions))]
-    sets = [each for each in sets if each[1]] + _reference_rows(request, rows)
+    methods = [(request.name, request.predictions), *_methods_against(request)]
+    sets = [(name, tuple(each.of_rows(rows) for each in own)) for name, own in methods if own]
+    sets += _reference_rows(request, rows)
     if not sets:
         raise GraspError("there must be predictions or reference rows to score, got none")
 
@@ -175,9 +178,26 @@ def _refuse_other_train(data: GraspDataset, train: GraspDataset) -> None:
         )
 
 
+def _methods_against(request: Request) -> list[tuple[str, tuple[Ranked, ...]]]:
+    """Return the other method if there is one.
+
+    Raises:
+        GraspError: If the card could not tell it from the predictions.
+    """
+    if request.against is None:
+        return []
+    if not request.predictions or request.against[0] == request.name:
+        raise GraspError(
+            "against must be beside predictions of another name, got "
+            f"{request.name if request.predictions else 'no predictions'}"
+        )
+    return [request.against]
+
+
 def _chosen_rows(request: Request) -> list[int]:
     """Return the rows to score, in order: those of the predictions, some of each object."""
-    data, predictions = request.data, request.predictions
+    others = request.against[1] if request.against else ()
+    data, predictions = request.data, (*request.predictions, *others)
     if request.per_object is not None and request.per_object < 1:
         raise GraspError(f"per_object must be 1 or more, got {request.per_object}")
     numbers = data.column("grasps").shape[1]

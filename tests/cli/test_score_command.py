@@ -27,7 +27,9 @@ def test_a_card_does_not_depend_on_the_number_of_workers(
     path = small_dataset / OTO
     test = GraspDataset(path, split="test")
     np.save(tmp_path / "net.npy", np.flip(test.column("grasps"), axis=0))
-    given = ("score", tmp_path / "net.npy", "--dataset", path, *FEW)
+    np.save(tmp_path / "old.npy", test.column("grasps"))
+    against = ("--against", tmp_path / "old.npy")
+    given = ("score", tmp_path / "net.npy", "--dataset", path, *against, *FEW)
     texts = []
     for workers in (1, 2):
         out = tmp_path / f"by {workers}"
@@ -44,7 +46,8 @@ def test_a_card_does_not_depend_on_the_number_of_workers(
     again = run(*given, "--out", tmp_path / "by 1", "--json")
     card = json.loads(again.stdout)
     assert card == json.loads(texts[0])
-    assert list(card["sets"]) == ["net.npy", "own", "constant"]
+    assert list(card["sets"]) == ["net.npy", "old.npy", "own", "constant"]
+    assert f"--against {tmp_path / 'old.npy'}" in card["again"]
     assert card["again"].endswith("--per-object 1")
     assert card["sets"]["own"]["measures"]["held"]["value"] > 0.0
 

@@ -37,6 +37,7 @@ def request_of(data: GraspDataset, /, given: Any = (), **changes: Any) -> Reques
         "train": GraspDataset(data.path, split="train"),
         "predictions": ranked,
         "name": name,
+        "against": None,
         "references": ("own", "constant"),
         "per_object": None,
         "config": dataset_config(data, overrides=("verify.max_tries=1",)),
@@ -120,11 +121,32 @@ def test_files_of_several_training_seeds_are_one_set(data: GraspDataset, tmp_pat
     assert card["intervals"]["training_seeds"] == 2
 
 
+def test_another_method_stands_beside_the_predictions(data: GraspDataset) -> None:
+    """Of all seeds, on the same rows, and before the reference rows."""
+    grasps, rest = data.column("grasps"), np.zeros((len(data), 18))
+    other = ranked_sets(grasps, data)[1] + ranked_sets(rest, data)[1]
+    request = request_of(data, rest, against=("before", other), per_object=1)
+    card = score(request, FakeVerify(is_own(data)), None).card
+    assert list(card["sets"]) == ["predictions", "before", "own", "constant"]
+    assert card["sets"]["before"]["predictions"] == 2 * card["rows"] == 4
+    assert card["above"]["predictions"]["before"]["value"] == -0.5
+    assert card["headline"]["before"]["value"] == 0.5
+
+
 def test_predictions_for_different_rows_are_refused(data: GraspDataset) -> None:
     one = ranked_sets(data.column("grasps")[:1], data, rows=[0])[1]
     other = ranked_sets(data.column("grasps")[:1], data, rows=[1])[1]
-    with pytest.raises(GraspError, match="must have predictions for the rows"):
-        score(request_of(data, predictions=one + other), FakeVerify(is_own(data)), None)
+    for changes in ({"predictions": one + other}, {"predictions": one, "against": ("b", other)}):
+        with pytest.raises(GraspError, match="must have predictions for the rows"):
+            score(request_of(data, **changes), FakeVerify(is_own(data)), None)
+
+
+def test_a_method_that_the_card_could_not_tell_is_refused(data: GraspDataset) -> None:
+    name, grasps = ranked_sets(data.column("grasps"), data)
+    for given, of in ((data.column("grasps"), name), ((), "no predictions")):
+        request = request_of(data, given, against=(name, grasps))
+        with pytest.raises(GraspError, match=f"against must be .* of another name, got {of}"):
+            score(request, FakeVerify(is_own(data)), None)
 
 
 def other_hand(data: GraspDataset) -> dict[str, Any]:
