@@ -134,6 +134,7 @@ def make_scene(
     return {
         "object": _columns(X_TO),
         "objectCode": snapshot.codes[number],
+        "objectName": snapshot.names[number],
         "hasObject": find_model(snapshot.out, snapshot.names[number]) is not None,
         "links": len(hand.links),
         "states": states,
@@ -165,7 +166,7 @@ def _columns(X: Array) -> list[float]:
 def object_surface(snapshot: Snapshot, number: int) -> bytes | None:
     """Return what is shown of an object by its number, see `visualization.surfaces`.
 
-    It is None if the object's mesh is not in the directory.
+    It is None if there is no file of the object's meshes.
 
     Raises:
         MeshError: If the file cannot be read.

@@ -342,6 +342,16 @@ def test_an_open_page_rejects_the_grasp_that_it_shows(client: TestClient, out: P
     assert mesh.extents.tolist() == pytest.approx([0.08, 0.04, 0.06])
 
 
+def test_a_page_names_the_file_of_meshes_that_is_not_there(client: TestClient, out: Path) -> None:
+    label = coded(state_of(client), "0-0-0")
+    page = client.get(f"/grasp/{label}").text
+    assert "There is no file" not in page
+    path = sorted((out / "objects").glob("*.npz"))[0]
+    path.unlink()
+    page = client.get(f"/grasp/{label}").text
+    assert f"There is no file objects/{path.name}" in page
+
+
 def test_answers_say_what_is_decided_in_all(client: TestClient, out: Path) -> None:
     headers = {TOKEN_HEADER: token(client)}
 

@@ -98,6 +98,7 @@ def differences(
             yield Difference(path=f"/{name}", what="the group must be there", got="none")
             continue
 
+        meanings = {f.meaning: f.name for f in fields}
         # Each field by itself; the number of rows is that of most datasets.
         rows = _most_frequent([dataset.shape[0] for dataset in datasets.values() if dataset.shape])
         for f in fields:
@@ -105,6 +106,8 @@ def differences(
                 continue
             path, dataset = f"/{name}/{f.name}", datasets.get(f.name)
             yield from _of_field(path, dataset, f, rows, lengths)
+            if dataset is not None:
+                yield from _of_another(path, h5py.Dataset(dataset), f, meanings)
             if thorough and dataset is not None:
                 yield from _of_attributes(path, h5py.Dataset(dataset), f)
 
@@ -201,6 +204,23 @@ def _of_field(
         shape = (rows, *(stored or ())[1:])
     if stored != shape:
         yield Difference(path=path, what=f"shape must be {shape}", got=str(stored))
+
+
+def _of_another(
+    path: str, dataset: h5py.Dataset, field: Field, meanings: Mapping[str, str]
+) -> Iterator[Difference]:
+    """Yield that a dataset is, as it says itself, another field: two were swapped.
+
+    Args:
+        path: Path of the dataset.
+        dataset: The dataset.
+        field: The field.
+        meanings: Names of the fields of the group by their meanings.
+    """
+    # Wording may improve without a new version of the schema: only what is another's is told.
+    said = dataset.attrs.get("meaning")
+    if isinstance(said, str) and said != field.meaning and said in meanings:
+        yield Difference(path=path, what=f"must be {field.name}", got=meanings[said])
 
 
 def _of_attributes(path: str, dataset: h5py.Dataset, field: Field) -> Iterator[Difference]:
