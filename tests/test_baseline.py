@@ -7,7 +7,9 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from argparse import Namespace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -30,6 +32,7 @@ import predict
 import torch
 from assess import assessment, auc
 from batches import centred, object_points, turned
+from fitting import ahead
 from gallery import COLOURS, gallery
 from model_card import card_text
 from networks import (
@@ -174,6 +177,25 @@ def test_coordinates_of_a_hand_keep_its_couplings() -> None:
     assert torch.allclose(some[:, 1] * 3, some[:, 0], atol=1e-5)
     # The third joint is set before closing, as a spread is.
     assert torch.equal(hand.opened(some), torch.tensor([[0.0, 0.0, float(some[0, 2])]]))
+
+
+def test_batches_are_made_ahead_in_their_order() -> None:
+    asked = threading.Event()
+
+    def batches() -> Iterator[int]:
+        yield 1
+        # Nobody has asked for it: the first is still in use.
+        asked.set()
+        yield 2
+        raise ValueError("a damaged file")
+
+    given = ahead(batches())
+    assert next(given) == 1
+    assert asked.wait(timeout=60)
+    assert next(given) == 2
+    with pytest.raises(ValueError, match="a damaged file"):
+        next(given)
+    assert not list(ahead(iter(range(0))))
 
 
 def test_several_heads_learn_two_answers_and_one_their_mean() -> None:

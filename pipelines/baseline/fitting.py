@@ -6,13 +6,15 @@ import argparse
 import copy
 import math
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from time import perf_counter
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from batches import Batch
 from torch import Tensor, nn
 
+T = TypeVar("T")
 #: Share of the steps over which the learning rate rises; then it falls as a cosine.
 WARM = 0.05
 #: Weight decay of AdamW, and the largest norm of a step's gradient.
@@ -58,7 +60,7 @@ def fit(
         # One pass over the training part.
         network.train()
         values, asked = [], perf_counter()
-        for batch in train(epoch):
+        for batch in ahead(train(epoch)):
             waited += perf_counter() - asked
             value = loss(batch)
             optimizer.zero_grad()
@@ -89,6 +91,15 @@ def fit(
     network.load_state_dict(weights)
     network.eval()
     return {**losses, "best": best, "seconds": seconds, "loading": waited / seconds}
+
+
+def ahead(batches: Iterator[T]) -> Iterator[T]:
+    """Yield batches in their order; a thread makes the next while one is used."""
+    with ThreadPoolExecutor(1) as thread:
+        following = thread.submit(next, batches, None)
+        while (batch := following.result()) is not None:
+            following = thread.submit(next, batches, None)
+            yield batch
 
 
 def mean_loss(
