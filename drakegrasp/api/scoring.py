@@ -19,7 +19,7 @@ from drakegrasp.protocols.catalog import Lift, find_protocol
 from drakegrasp.protocols.postures import describe, prepare_trials, verify_postures, versions
 from drakegrasp.runtime.executor import processes
 from drakegrasp.runtime.progress import progress_bar
-from drakegrasp.scoring.ranked import ranked_sets
+from drakegrasp.scoring.ranked import Ranked, ranked_sets
 from drakegrasp.scoring.references import REFERENCES
 from drakegrasp.scoring.run import Request, Score
 from drakegrasp.scoring.run import score as score_request
@@ -93,7 +93,7 @@ def score(
         raise GraspError(f"references must be of {', '.join(REFERENCES)}, got {unknown[0]!r}")
     settings = ("verify.max_tries=1", *overrides)
     name, ranked = ranked_sets(predictions, dataset, rows=rows, confidence=confidence)
-    other = None if against is None else ranked_sets(against, dataset)
+    other = None if against is None else _method(against, dataset)
     rule, stored = find_protocol(protocol)
     peer = not isinstance(rule, Lift)
     if peer and (scheduler or scheduler_file):
@@ -136,6 +136,16 @@ def score(
     if out is not None:
         scored.save(Path(out))
     return scored
+
+
+def _method(files: object, dataset: GraspDataset) -> tuple[str, tuple[Ranked, ...]]:
+    """Return the name and the predictions of another method."""
+    given = [files] if isinstance(files, str | Path) else files
+    if not isinstance(given, list | tuple) or not given:
+        raise GraspError(f"against must be a file or a list of files, got {files!r}")
+    if wrong := [each for each in given if not isinstance(each, str | Path)]:
+        raise GraspError(f"against must have files of predictions, got {wrong[0]!r}")
+    return ranked_sets(given, dataset)
 
 
 def _try_by_protocol(

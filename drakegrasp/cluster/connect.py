@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from time import monotonic, sleep
 from typing import Any
 
 import dask
@@ -131,18 +131,19 @@ def _connect_remote(
 def _address_of(file: Path) -> str | None:
     """Return the address in a scheduler's file; None if it has none.
 
-    A scheduler that starts has made its file before it writes it: half a file is read again.
+    A scheduler that starts has made its file before it writes it: half a file is read again, for
+    `WRITE_SECONDS`.
     """
-    end = time.monotonic() + WRITE_SECONDS
+    end = monotonic() + WRITE_SECONDS
     while True:
         try:
             content = json.loads(file.read_text(encoding="utf-8"))
         except OSError:
             return None
         except ValueError:
-            if time.monotonic() > end:
+            if monotonic() > end:
                 return None
-            time.sleep(0.05)
+            sleep(0.05)
         else:
             address = content.get("address") if isinstance(content, dict) else None
             return address if isinstance(address, str) else None

@@ -34,6 +34,10 @@ class Estimate:
     low: float
     high: float
 
+    def __neg__(self) -> Estimate:
+        """Return the estimate of the negative mean."""
+        return Estimate(value=0.0 - self.value, low=0.0 - self.high, high=0.0 - self.low)
+
 
 @dataclass(frozen=True, eq=False)
 class Resampling:
@@ -49,19 +53,36 @@ class Resampling:
 
     def estimate(self, table: Array) -> Estimate:
         """Return the mean of a table (training seeds, objects) over both, with its interval."""
-        values = np.einsum("bs,so,bo->b", self._seed_weights(len(table)), table, self.weights)
-        low, high = np.quantile(values, [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0])
-        rounded = [round(float(v), DIGITS) + 0.0 for v in (table.mean(), low, high)]
-        return Estimate(value=rounded[0], low=rounded[1], high=rounded[2])
+        return _estimate(float(table.mean()), self._means(table, "training seeds"))
 
-    def _seed_weights(self, count: int) -> Array:
-        """Return (B, count), share of each training seed in each resample."""
+    def difference(self, table: Array, other: Array) -> Estimate:
+        """Return by how much the mean of a table is above that of another, of the same objects.
+
+        The training seeds of both are drawn, apart from each other.
+        """
+        values = self._means(table, "training seeds") - self._means(other, "other training seeds")
+        return _estimate(float(table.mean() - other.mean()), values)
+
+    def _means(self, table: Array, draws: str) -> Array:
+        """Return (B,), the mean of a table (training seeds, objects) in each resample."""
+        seeds = self._seed_weights(len(table), draws)
+        return np.asarray(np.einsum("bs,so,bo->b", seeds, table, self.weights))
+
+    def _seed_weights(self, count: int, draws: str) -> Array:
+        """Return (B, count), share of each training seed in each resample, by draws of a name."""
         resamples = len(self.weights)
         if count == 1:
             return np.ones((resamples, 1))
-        stream = Stream(self.seed, object_key("training seeds"), count)
+        stream = Stream(self.seed, object_key(draws), count)
         drawn = stream.integers(count, resamples * count).reshape(resamples, count)
         return _shares(drawn, count)
+
+
+def _estimate(value: float, resampled: Array) -> Estimate:
+    """Return a value and the interval of its resamples (B,)."""
+    low, high = np.quantile(resampled, [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0])
+    rounded = [round(float(v), DIGITS) + 0.0 for v in (value, low, high)]
+    return Estimate(value=rounded[0], low=rounded[1], high=rounded[2])
 
 
 def resample(clusters: Sequence[str], seed: int = 0) -> Resampling:

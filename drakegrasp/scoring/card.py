@@ -13,7 +13,7 @@ from typing import Any
 
 from drakegrasp.errors import NAMED
 from drakegrasp.frames import Array
-from drakegrasp.scoring.bootstrap import LEVEL, RESAMPLES, Resampling, resample
+from drakegrasp.scoring.bootstrap import LEVEL, RESAMPLES, Estimate, Resampling, resample
 from drakegrasp.scoring.measures import (
     COVER,
     CURVE_MM,
@@ -115,14 +115,7 @@ def card_of(
         },
         "warnings": _warnings(grouping, origin, sets),
         "sets": described,
-        "above": {
-            one.name: {
-                other.name: asdict(difference(one, other, grouping, draws))
-                for other in sets
-                if other is not one
-            }
-            for one in tested
-        },
+        "above": _above(sets, tested, grouping, draws),
         "by_class": {each.name: by_class(each, grouping) for each in sets},
         "by_object": {each.name: by_object(each, grouping) for each in sets},
         "dataset": dict(origin.dataset),
@@ -130,6 +123,22 @@ def card_of(
         "again": origin.again,
     }
     return card if origin.benchmark is None else card | {"benchmark": dict(origin.benchmark)}
+
+
+def _above(
+    sets: Sequence[Judged], tested: Sequence[Judged], grouping: Grouping, draws: Resampling
+) -> dict[str, dict[str, Any]]:
+    """Return by how much each tested set is above each other; a pair is compared once."""
+    found: dict[str, dict[str, Estimate]] = {}
+    for one in tested:
+        found[one.name] = {
+            other.name: -found[other.name][one.name]
+            if other.name in found
+            else difference(one, other, grouping, draws)
+            for other in sets
+            if other is not one
+        }
+    return {one: {k: asdict(v) for k, v in others.items()} for one, others in found.items()}
 
 
 def _set_of(

@@ -140,7 +140,7 @@ def estimates(
 def difference(one: Judged, other: Judged, grouping: Grouping, draws: Resampling) -> Estimate:
     """Return by how much the headline of a set is above that of another, object by object."""
     tables = [grouping.means(first_table(each, grouping, "headline")) for each in (one, other)]
-    return draws.estimate(tables[0] - tables[1].mean(axis=0))
+    return draws.difference(*tables)
 
 
 def curve(judged: Judged, grouping: Grouping) -> list[float]:

@@ -188,7 +188,7 @@ def _methods_against(request: Request) -> list[tuple[str, tuple[Ranked, ...]]]:
         return []
     if not request.predictions or request.against[0] == request.name:
         raise GraspError(
-            "against must be beside predictions of another name, got "
+            "against must be beside predictions whose file has another name, got "
             f"{request.name if request.predictions else 'no predictions'}"
         )
     return [request.against]

@@ -58,6 +58,8 @@ BLANK = (
     "the rendered image must not be blank, got all zeros: OpenGL works in one thread of a "
     "process only, and needs EGL (run `drakegrasp doctor`)"
 )
+#: Depths of a face that is continued beyond its edge are moved by no more than this [m].
+FARTHEST = 0.03
 #: Name of the render engine in a diagram.
 ENGINE = "vtk"
 
@@ -268,11 +270,12 @@ def depth_in_box(
     X_OC: Array,
     half_extents: Array,
 ) -> npt.NDArray[np.float32]:
-    """Return depth images (H, W) [m] in which the object's points are within its box.
+    """Return a depth image (H, W) [m] whose object points are in its box, where rays meet it.
 
     A renderer gives a pixel at an edge the depth of a face that is seen nearly from its edge,
     continued beyond that edge by up to centimetres. Such a point moves along its ray to where the
-    ray enters the box, or leaves it. It stays where the ray misses the box by a part of a pixel.
+    ray enters the box, or leaves it. It stays where the ray misses the box by a part of a pixel,
+    and where it had to move by more than `FARTHEST`: that is another fault, for `check` to name.
 
     Args:
         depth: (H, W) [m], 0 where something is too near, inf where nothing is near enough.
@@ -297,5 +300,7 @@ def depth_in_box(
     cuts = (walls - X_OC[:3, 3]) / along
     enters, leaves = cuts.min(axis=0).max(axis=1), cuts.max(axis=0).min(axis=1)
     found = depth.copy()
-    found[v, u] = np.where(enters <= leaves, np.clip(z, enters, leaves), z)
+    moved = np.clip(z, enters, leaves)
+    good = (enters <= leaves) & (leaves > 0.0) & (np.abs(moved - z) <= FARTHEST)
+    found[v, u] = np.where(good, moved, z)
     return found

@@ -130,6 +130,10 @@ def pictures(
     """Return pictures of the closed hand and of the last touch in each simulator."""
     X_WG, X_WC, found = X_WT @ make_pose(np.eye(3), [0.0, 0.0, 1.0]), None, []
     for instants in seen:
+        # An attempt that ended before the hand was closed was not seen.
+        if not instants:
+            found += 2 * [Image.new("RGB", (edge, edge), "white")]
+            continue
         last = max(i for i, now in enumerate(instants) if i == 0 or now.force.any())
         for i in (0, last):
             q = np.where(np.isnan(instants[i].q), scene.positions(spread), instants[i].q)
@@ -143,18 +147,23 @@ def pictures(
 def watch(lifts: Sequence[StoredLift], arguments: argparse.Namespace) -> Iterator[str]:
     """Yield what happened in lifts, in both simulators and in pictures if there is a sheet."""
     out, edge, before, drawn = arguments.dataset, arguments.edge, "", list[Any]()
-    stored = read_manifest(out).config
-    config = override_config(stored, arguments.overrides)
+    manifest = read_manifest(out)
     for number, lift in enumerate(lifts, 1):
         if lift.object_name != before:
-            before, prepared = lift.object_name, load_prepared(out, lift.object_name, stored)
+            before = lift.object_name
+            stored = manifest.config_of(before)
+            config = override_config(stored, arguments.overrides)
+            prepared = load_prepared(out, before, stored)
             model, hand = prepared.model, load_hand(config.hand_source)
             scene = build_scene(model, config.physics, hand)
             if arguments.sheet:
                 peer = Watched(model, prepared.X_TO, config)
                 still = StillScene(hand, model, table_size=1e-3)
         X_TO, usual = prepared.resting_poses[lift.resting], usual_conditions(model, config.physics)
-        attempt = replace(lift.pregrasp, conditions=usual)
+        # Settings that are given hold for all, in place of what was drawn.
+        own = usual if arguments.overrides else replace(usual, materials=lift.materials)
+        attempt = replace(lift.pregrasp, conditions=own)
+        Monitor.seen.clear()
         with mock.patch.object(lifting, "_Monitor", Monitor):
             outcome = run_attempt(scene, X_TO, attempt, config).outcome
         yield f"{number} {before}, trial {lift.trial_id}, {lift.outcome.label}: {outcome.label}\n"
@@ -190,6 +199,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     arguments = parser.parse_args(argv)
     lifts = chosen(arguments.dataset, arguments.lines, arguments.count)
+    if not lifts:
+        print(f"{arguments.lines}: no lift has another verdict in MuJoCo")  # noqa: T201
+        return 1
     sys.stdout.writelines(watch(lifts, arguments))
     return 0
 

@@ -332,7 +332,7 @@ def test_scheduler_file_that_is_being_written_is_read_again(
     def write_rest(_: float) -> None:
         file.write_text('{"address": "tcp://127.0.0.1:8786"}')
 
-    monkeypatch.setattr(connecting.time, "sleep", write_rest)
+    monkeypatch.setattr(connecting, "sleep", write_rest)
     with pytest.raises(ConfigError, match="got tcp://127"), connect(scheduler_file=file):
         pass
 

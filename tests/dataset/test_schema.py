@@ -17,6 +17,7 @@ from drakegrasp.build.columns import TrialRow
 from drakegrasp.build.replay import replay_trial
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.layout.structure import DATA_TABLES, SCENE_TABLES, TRIAL_TABLES, Tables
 from drakegrasp.dataset.manifest import claim_directory
 from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.reader import GraspDataset
@@ -38,6 +39,13 @@ from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.verification.result import Verification
 
 SIZES = sizes(fingers=3, joints=4, image=8)
+
+
+@pytest.mark.parametrize("tables", [DATA_TABLES, TRIAL_TABLES, SCENE_TABLES])
+def test_fields_of_a_group_have_meanings_of_their_own(tables: Tables) -> None:
+    """By its meaning a column says which it is."""
+    for fields in tables.values():
+        assert len({field.meaning for field in fields}) == len(fields)
 
 
 @pytest.mark.parametrize(

@@ -90,6 +90,17 @@ def test_training_seeds_widen_the_interval() -> None:
     assert (one.value, one.low, one.high) == (0.5, 0.0, 1.0)
 
 
+def test_training_seeds_of_both_sets_widen_a_difference() -> None:
+    """Drawn apart: the better seeds of one may meet the worse of the other."""
+    good, bad = [["sample"]] * 3, [["fails"]] * 3
+    spread = judged("spread", good, bad)
+    for one, other in ((spread, judged("bad", bad)), (judged("good", good), spread)):
+        found = difference(one, other, grouping(0, 1, 2), DRAWS)
+        assert (found.value, found.low, found.high) == (0.5, 0.0, 1.0)
+    both = difference(spread, judged("other", good, bad), grouping(0, 1, 2), DRAWS)
+    assert (both.value, both.low, both.high) == (0.0, -1.0, 1.0)
+
+
 def test_the_curve_rises_with_the_distance() -> None:
     ranked = rank("net", np.zeros((2, 18)), length=2)
     verdicts = (verdict("held", error=0.012), verdict("held", error=0.05))

@@ -131,6 +131,9 @@ def test_another_method_stands_beside_the_predictions(data: GraspDataset) -> Non
     assert card["sets"]["before"]["predictions"] == 2 * card["rows"] == 4
     assert card["above"]["predictions"]["before"]["value"] == -0.5
     assert card["headline"]["before"]["value"] == 0.5
+    ours, theirs = card["above"]["predictions"]["before"], card["above"]["before"]["predictions"]
+    assert (theirs["value"], theirs["low"]) == (0.5, 0.0)
+    assert (theirs["low"], theirs["high"]) == (-ours["high"], -ours["low"])
 
 
 def test_predictions_for_different_rows_are_refused(data: GraspDataset) -> None:
@@ -145,7 +148,7 @@ def test_a_method_that_the_card_could_not_tell_is_refused(data: GraspDataset) ->
     name, grasps = ranked_sets(data.column("grasps"), data)
     for given, of in ((data.column("grasps"), name), ((), "no predictions")):
         request = request_of(data, given, against=(name, grasps))
-        with pytest.raises(GraspError, match=f"against must be .* of another name, got {of}"):
+        with pytest.raises(GraspError, match=f"against must be .* has another name, got {of}"):
             score(request, FakeVerify(is_own(data)), None)
 
 

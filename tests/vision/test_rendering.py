@@ -164,6 +164,13 @@ def test_depth_beyond_the_box_moves_along_its_ray() -> None:
     found = depth_in_box(given, mask, lens, X_OC, HALF)
     expected = [0.25, 0.25, 0.3, 0.35, 0.0, np.inf, 0.26]
     np.testing.assert_allclose(found[0], expected, rtol=0.0, atol=1e-7)
+    # A fault of another kind stays, for `check` to name.
+    far = given - np.float32(0.1)
+    assert depth_in_box(far, mask, lens, X_OC, HALF)[0, 0] == far[0, 0]
+    # Nothing moves behind the camera: here it looks away from the lid, 5 mm above it.
+    away = make_pose(np.eye(3), [0.0, 0.0, HALF[2] + 0.005])
+    near = np.full_like(given, 0.01)
+    np.testing.assert_array_equal(depth_in_box(near, mask, lens, away, HALF), near)
     # What is not of the object stays.
     assert depth_in_box(given, 0 * mask, lens, X_OC, HALF) is given
 
