@@ -29,6 +29,8 @@ from drakegrasp.verification.placed_grasp import dataset_config, overridden_keys
 from drakegrasp.verification.placed_postures import place_postures_on_rows
 from drakegrasp.verification.verify import PlacedGrasp
 
+#: Folder of the convex parts of objects, for protocols of MuJoCo.
+CONVEX_PARTS = "convex_parts"
 #: Receives verdicts as they come: called with the place of a grasp and its verdict.
 Deliver: TypeAlias = Callable[[int, Verdict], None]
 
@@ -119,7 +121,8 @@ def score(
         else:
             placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
         if peer:
-            _try_by_protocol(placed, protocol, deliver, workers=workers, show=show)
+            keep = None if out is None else Path(out) / CONVEX_PARTS
+            _try_by_protocol(placed, protocol, deliver, keep=keep, workers=workers, show=show)
             return
         run_verification(
             placed,
@@ -153,18 +156,24 @@ def _try_by_protocol(
     protocol: str,
     deliver: Deliver,
     *,
+    keep: Path | None,
     workers: int | None,
     show: bool,
 ) -> None:
     """Try the first wrist pose of grasps by a protocol of MuJoCo."""
     hand = load_hand(grasps[0].config.hand_source)
-    with (
-        TemporaryDirectory() as folder,
-        processes(workers) as execute,
-        progress_bar("score", "grasps", show=show) as report,
-    ):
-        path, files = write_grasps(list(fitted_postures(grasps)), hand, Path(folder))
-        found = verify_postures(files, prepare_trials(protocol, path, Path(folder)), execute)
-        for done, (grasp, result) in enumerate(zip(grasps, found, strict=True), start=1):
-            deliver(grasp.index, protocol_verdict(grasp, result.verdict))
-            report(done, len(grasps))
+    with TemporaryDirectory() as folder, processes(workers) as execute:
+        with progress_bar("cut", "objects", show=show) as report:
+            path, files = write_grasps(
+                fitted_postures(grasps, execute),
+                hand,
+                Path(folder),
+                execute=execute,
+                keep=keep,
+                report=report,
+            )
+        with progress_bar("score", "grasps", show=show) as report:
+            found = verify_postures(files, prepare_trials(protocol, path, Path(folder)), execute)
+            for done, (grasp, result) in enumerate(zip(grasps, found, strict=True), start=1):
+                deliver(grasp.index, protocol_verdict(grasp, result.verdict))
+                report(done, len(grasps))

@@ -37,7 +37,7 @@ from drakegrasp.frames import Array, invert_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.mesh.wavefront import hull_text
-from drakegrasp.objects.model import ObjectModel, load_object
+from drakegrasp.objects.model import load_object
 from drakegrasp.protocols.grasp_file import POSTURES
 from drakegrasp.runtime.progress import Report
 from drakegrasp.visualization.still_scene import StillScene
@@ -47,10 +47,13 @@ from drakegrasp.visualization.still_scene import StillScene
 APART = 0.2
 #: Where hand and objects are in the benchmark's repository, and the name of the experiment.
 ASSETS, EXPERIMENT = Path("assets/drakegrasp"), "export"
+OBJECTS = ASSETS / "objects"
 
 
 def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
     """Write the files and return the number of samples; see `export.export_dataset`."""
+    from drakegrasp.mjcf.convex_parts import convex_parts
+
     # The hand, by a name that the benchmark does not have.
     hand = load_hand(read_manifest(out).config.hand_source)
     files = BenchFiles(hand, folder)
@@ -64,7 +67,8 @@ def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
     progress(0, len(grasps))
     done, data = 0, folder / "output" / f"{EXPERIMENT}_{name}" / "graspdata"
     for thing, same in groupby(grasps, key=lambda grasp: grasp.object_name):
-        files.write_object(load_object(model_path(out, thing)))
+        parts = convex_parts(load_object(model_path(out, thing)))
+        write_object(folder / OBJECTS / thing, parts)
         for grasp in same:
             files.write_grasp(data / thing / f"{grasp.trial_id}.npy", grasp)
             done += 1
@@ -73,7 +77,7 @@ def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
 
 
 class BenchFiles:
-    """Writes a hand, objects and grasps as the benchmark reads them.
+    """Writes a hand and grasps as the benchmark reads them.
 
     Attributes:
         hand_path: MJCF of the hand.
@@ -90,14 +94,8 @@ class BenchFiles:
 
         model = make_hand_model(hand)
         self.posed, self._joints = StillScene(hand), model.joints
-        self._folder, self.hand_path = folder, folder / ASSETS / "hand" / "hand.xml"
+        self.hand_path = folder / ASSETS / "hand" / "hand.xml"
         write_hand_model(model, self.hand_path)
-
-    def write_object(self, model: ObjectModel) -> None:
-        """Write an object's convex parts."""
-        from drakegrasp.mjcf.convex_parts import convex_parts
-
-        write_object(self._folder / ASSETS / "objects" / model.name, convex_parts(model))
 
     def write_grasp(self, path: Path, grasp: ClosedGrasp, **known: Array | None) -> None:
         """Write a grasp.
@@ -183,7 +181,7 @@ def grasp_dictionary(
     return {
         "obj_pose": pose_vector(grasp.X_TO),
         "obj_scale": 1.0,
-        "obj_path": str(ASSETS / "objects" / grasp.object_name),
+        "obj_path": str(OBJECTS / grasp.object_name),
         "pregrasp_qpos": posture(-1.0),
         "grasp_qpos": posture(0.0),
         "squeeze_qpos": posture(1.0),

@@ -24,6 +24,7 @@ from drakegrasp.grasp import pack_grasp
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config
+from drakegrasp.mjcf import convex_parts
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.postures.posture import Posture, joint_order
@@ -116,6 +117,30 @@ def test_files_say_what_the_posture_says(tmp_path: Path, grasps: list[ClosedGras
     assert (content["pregrasp_qpos"][7:] <= content["grasp_qpos"][7:]).all()
 
 
+def test_convex_parts_are_kept_and_a_damaged_file_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, longer = (box_model(tmp_path, edges) for edges in ([0.06] * 3, [0.06, 0.06, 0.1]))
+    keep = tmp_path / "keep"
+    parts = convex_parts.kept_convex_parts(model, keep)
+    convex_parts.kept_convex_parts(longer, keep)
+    assert len(list(keep.iterdir())) == 2
+
+    def never(model: Any) -> None:
+        raise AssertionError("it was cut again")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(convex_parts, "convex_parts", never)
+        again = convex_parts.kept_convex_parts(model, keep)
+        assert all(np.array_equal(a, b) for a, b in zip(parts, again, strict=True))
+
+    for path in keep.iterdir():
+        content = path.read_bytes()
+        path.write_bytes(content[: len(content) // 2])
+        assert all(len(convex_parts.kept_convex_parts(each, keep)) == 1 for each in (model, longer))
+        assert path.read_bytes() == content
+
+
 def test_what_a_file_holds_is_told_from_its_content(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.zeros((1, 18)))
     (tmp_path / "a.csv").write_text("1,2,3\n")
@@ -138,12 +163,15 @@ def test_options_that_postures_answer(tmp_path: Path, options: list[str], why: s
     assert why in error_line(result)
 
 
-def test_score_by_a_protocol_says_so_on_the_card(dataset: Path, tmp_path: Path) -> None:
-    given = ("score", "--dataset", dataset / "grasping_oto.hdf5", "--reference", "constant")
-    result = run(
-        *(*given, "--protocol", "dexgraspbench", "--per-object", 1, "--workers", 1),
+def test_score_by_a_protocol_says_so_on_the_card(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = (
+        *("score", "--dataset", dataset / "grasping_oto.hdf5", "--reference", "constant"),
+        *("--protocol", "dexgraspbench", "--per-object", 1, "--workers", 1),
         *("--out", tmp_path / "card", "--json", "--quiet"),
     )
+    result = run(*given)
     assert result.exit_code == 0, result.output
     card = json.loads(result.stdout)
     assert card["settings"]["protocol"]["protocol"] == "dexgraspbench"
@@ -153,3 +181,11 @@ def test_score_by_a_protocol_says_so_on_the_card(dataset: Path, tmp_path: Path) 
     assert card["again"].endswith("--protocol dexgraspbench")
     text = (tmp_path / "card" / "card.md").read_text()
     assert "held(d)" not in text and "JYChen18/DexGraspBench" in text
+
+    # Convex parts stay in its folder: another score there cuts none.
+    assert list((tmp_path / "card" / "convex_parts").iterdir())
+    (tmp_path / "card" / "verdicts.jsonl").unlink()
+    monkeypatch.setattr(convex_parts, "convex_parts", pytest.fail)
+    result = run(*given)
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout) == card

@@ -14,8 +14,10 @@ import click
 from drakegrasp.cli.errors import say
 
 if TYPE_CHECKING:
-    from drakegrasp.exchange.protocol_grasps import PlacedPosture
     from drakegrasp.hand.description import Hand
+    from drakegrasp.runtime.executor import Executor
+    from drakegrasp.runtime.progress import Report
+    from drakegrasp.verification.verify import PlacedGrasp
 
 #: Options that say what the grasps are and where.
 PLACES = ("grasps", "mesh", "units", "dataset", "split", "frame", "camera", "hand")
@@ -99,15 +101,15 @@ def verify_by_protocol(
 
     if out is not None:
         refuse_unwritable(out)
-    with TemporaryDirectory() as folder:
-        hand, assets, files, names = _grasp_files(request, Path(folder))
+    held, show = 0, not (quiet or as_json)
+    with TemporaryDirectory() as folder, processes(workers) as execute:
+        with progress_bar("cut", "objects", show=show) as report:
+            hand, assets, files, names = _grasp_files(request, Path(folder), execute, report)
         trials = prepare_trials(request.protocol, hand, assets)
 
         # A line per verdict as it comes.
-        held, show = 0, not (quiet or as_json)
         with (
             nullcontext(_print_line) if out is None else text_lines(out) as write,
-            processes(workers) as execute,
             progress_bar("verify", "grasps", show=show) as report,
         ):
             for index, result in enumerate(verify_postures(files, trials, execute)):
@@ -124,11 +126,11 @@ def verify_by_protocol(
 
 
 def _grasp_files(
-    request: ProtocolRequest, folder: Path
+    request: ProtocolRequest, folder: Path, execute: Executor, report: Report
 ) -> tuple[Path, Path, list[Path | str], list[Path]]:
     """Return the MJCF of the hand, the folder of objects, and of each grasp its file and name."""
     from drakegrasp.errors import DataError, HandError
-    from drakegrasp.exchange.protocol_grasps import write_grasps
+    from drakegrasp.exchange.protocol_grasps import fitted_postures, write_grasps
 
     # Files of DexGraspBench.
     path = request.grasps
@@ -146,20 +148,20 @@ def _grasp_files(
 
     # Our own grasps are written as such files.
     hand, grasps = _own_grasps(request)
-    hand_path, found = write_grasps(grasps, hand, folder)
+    postures = fitted_postures(grasps, execute)
+    hand_path, found = write_grasps(postures, hand, folder, execute=execute, report=report)
     return hand_path, folder, found, [path] * len(found)
 
 
-def _own_grasps(request: ProtocolRequest) -> tuple[Hand, list[PlacedPosture]]:
-    """Return postures of a file, or those that predictions of contacts mean, and their hand."""
+def _own_grasps(request: ProtocolRequest) -> tuple[Hand, list[PlacedGrasp]]:
+    """Return the grasps of a file of postures or contacts, in its order, and their hand."""
     from drakegrasp.cli.verify.request import VerifyRequest, place_requested
-    from drakegrasp.exchange.protocol_grasps import fitted_postures
     from drakegrasp.hand.description import load_hand
 
     options = {name: getattr(request, name) for name in PLACES}
     placed, config = place_requested(VerifyRequest(**options))
     placed.sort(key=lambda grasp: grasp.index)
-    return load_hand(config.hand_source), list(fitted_postures(placed))
+    return load_hand(config.hand_source), placed
 
 
 def _print_line(line: str) -> None:
