@@ -15,6 +15,7 @@ from helpers.objects import CUBE, STANDOFF, box_model, from_above, standing
 pytest.importorskip("mujoco")
 pytest.importorskip("coacd")
 
+from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.exchange.closed_grasps import ClosedGrasp
 from drakegrasp.exchange.posture_files import holds_postures
 from drakegrasp.exchange.posture_rows import quaternion_poses
@@ -25,6 +26,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config
 from drakegrasp.mjcf import convex_parts
+from drakegrasp.runtime import environment
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.postures.posture import Posture, joint_order
@@ -189,3 +191,21 @@ def test_score_by_a_protocol_says_so_on_the_card(
     result = run(*given)
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout) == card
+
+
+@pytest.mark.parametrize("missing", ["mujoco", "coacd"])
+@pytest.mark.parametrize("command", ["score", "verify"])
+def test_a_missing_library_is_named(
+    command: str, missing: str, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def found(name: str) -> object:
+        return None if name == missing else object()
+
+    monkeypatch.setattr(environment, "find_spec", found)
+    rows = len(GraspDataset(dataset / "grasping_oto.hdf5", split="test"))
+    np.save(tmp_path / "18.npy", np.full((rows, 18), np.nan))
+    options = ("--dataset", dataset / "grasping_oto.hdf5", "--out", tmp_path / "out")
+    given = ("--reference", "constant") if command == "score" else (tmp_path / "18.npy",)
+    result = run(command, *given, *options, "--protocol", "dexgraspbench", "--workers", 1)
+    line = f"error: {missing} must be installed: pip install 'drakegrasp[peer]'"
+    assert error_line(result) == line
