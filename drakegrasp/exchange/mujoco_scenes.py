@@ -26,6 +26,7 @@ from drakegrasp.mesh.wavefront import hull_text
 from drakegrasp.mjcf.convex_parts import convex_parts
 from drakegrasp.mjcf.hand_model import HandModel, make_hand_model
 from drakegrasp.mjcf.links import pair_friction, set_inertia
+from drakegrasp.mjcf.memory import MEMORY
 from drakegrasp.objects.model import ObjectModel, load_object, object_colour
 from drakegrasp.runtime.progress import Report
 from drakegrasp.visualization.still_scene import StillScene
@@ -71,6 +72,7 @@ class ObjectScenes:
         physics = thing.own_physics(config.physics)
         self._hand, self._meshes = hand, folder / MESHES
         self._spec = mujoco.MjSpec()
+        self._spec.memory = MEMORY
         self._spec.modelname = thing.name
         self._spec.worldbody.add_light(pos=[0.3, -0.3, 1.5], dir=[-0.2, 0.2, -1.0])
         self._spec.worldbody.add_geom(

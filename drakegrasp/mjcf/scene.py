@@ -26,6 +26,7 @@ from drakegrasp.mjcf.links import (
     pair_friction,
     set_inertia,
 )
+from drakegrasp.mjcf.memory import MEMORY
 from drakegrasp.objects.model import ObjectModel
 
 #: Friction is this much stiffer than the normal direction, and is solved again until it is exact
@@ -96,6 +97,7 @@ def build_mujoco_scene(model: ObjectModel, hand: Hand, config: Config) -> Mujoco
 def _spec() -> mujoco.MjSpec:
     """Return an empty model with the solver's settings."""
     spec = mujoco.MjSpec()
+    spec.memory = MEMORY
     spec.compiler.degree = False
     spec.compiler.balanceinertia = True
     spec.option.timestep = TIME_STEP

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from drakegrasp.errors import HandError, MeshError, one_line
 from drakegrasp.frames import Array
+from drakegrasp.mjcf.memory import MEMORY
 from drakegrasp.protocols.object_folder import ObjectFolder
 from drakegrasp.protocols.protocol import MujocoProtocol
 
@@ -27,8 +28,10 @@ _WELD, _TORQUE_SCALE = (0.9, 0.95, 0.001, 0.5, 2.0), 10
 _SETTINGS = (*("timestep", "integrator", "disableflags", "cone", "noslip_iterations", "impratio"),)
 #: Half extents of the table's plane, which has no edge, and the spacing of its grid.
 _PLANE = (0.0, 0.0, 1.0)
-#: What MuJoCo warns of when it begins again from its rest.
+#: What MuJoCo warns of when it begins again from its rest, or leaves contacts out.
 _DIVERGED = (
+    mujoco.mjtWarning.mjWARN_CONTACTFULL,
+    mujoco.mjtWarning.mjWARN_CNSTRFULL,
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
     mujoco.mjtWarning.mjWARN_BADQACC,
@@ -124,7 +127,7 @@ class ProtocolScene:
 
     @property
     def diverged(self) -> bool:
-        """Whether the simulation failed since the last reset: MuJoCo then starts from its rest."""
+        """Whether the simulation failed since the last reset."""
         return any(self._data.warning[kind].number > 0 for kind in _DIVERGED)
 
     def push(self, force: Array) -> None:
@@ -162,6 +165,7 @@ class ProtocolScene:
 def _spec(protocol: MujocoProtocol) -> mujoco.MjSpec:
     """Return an empty model with the solver's settings; nothing has weight."""
     spec = mujoco.MjSpec()
+    spec.memory = MEMORY
     spec.option.timestep = protocol.time_step
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_GRAVITY

@@ -309,9 +309,9 @@ def _row(cells: Sequence[str]) -> str:
 
 
 def _percent(share: float) -> str:
-    return f"{100.0 * share:.0f}"
+    return f"{100.0 * share:z.0f}"
 
 
 def _interval(value: Mapping[str, float]) -> str:
     numbers = (100.0 * value[name] for name in ("value", "low", "high"))
-    return "{:.0f} ({:.0f} to {:.0f})".format(*numbers)
+    return "{:z.0f} ({:z.0f} to {:z.0f})".format(*numbers)

@@ -8,16 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from helpers.jaws import EDGE, HAND, HERE, box_folder, jaws
 
 from drakegrasp.errors import ConfigError
+from drakegrasp.exchange.dexgraspbench import write_object
 from drakegrasp.protocols.catalog import (
     PROTOCOLS,
     DexGraspBench,
     DexGraspBenchTabletop,
     DexonomyHard,
 )
-from drakegrasp.protocols.object_folder import ObjectFolder
+from drakegrasp.protocols.object_folder import ObjectFolder, read_object_folder
 from drakegrasp.protocols.protocol import PostureVerdict, displacement
 from drakegrasp.protocols.scene import ProtocolScene
 
@@ -193,3 +195,16 @@ def test_protocols_have_a_name_a_source_and_words_for_a_paper(name: str) -> None
 def test_a_simulation_that_diverges_is_no_success(judge: Judge) -> None:
     verdict = judge(acceleration=1e12)
     assert (verdict.success, verdict.reason) == (False, "diverged")
+
+
+@pytest.mark.parametrize(("parts", "fits"), [(100, True), (300, False)])
+def test_contacts_that_do_not_fit_into_memory_are_no_verdict(
+    hand: Path, tmp_path: Path, parts: int, *, fits: bool
+) -> None:
+    """MuJoCo would leave out all contacts of the step, with a warning: 14 MB are a few hundred."""
+    corners = np.asarray(trimesh.creation.box([EDGE] * 3).vertices)
+    write_object(tmp_path / "many", [corners] * parts)
+    scene = ProtocolScene(DexGraspBench(), hand, read_object_folder(tmp_path / "many", 1.0))
+    deep = jaws(-0.02)
+    scene.reset(deep.pregrasp, deep.object_pose)
+    assert scene.diverged != fits

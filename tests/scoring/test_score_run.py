@@ -18,6 +18,7 @@ from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
 from drakegrasp.runtime.json_text import read_json
+from drakegrasp.scoring.card import card_text
 from drakegrasp.scoring.ranked import ranked_sets
 from drakegrasp.scoring.run import VERDICTS, Request, own_contacts, score
 from drakegrasp.verification.placed_grasp import dataset_config, place_on_rows
@@ -119,6 +120,12 @@ def test_files_of_several_training_seeds_are_one_set(data: GraspDataset, tmp_pat
     card = score(request_of(data, paths), FakeVerify(is_own(data)), None).card
     assert card["headline"]["a.npy and 1 more"]["value"] == 0.5
     assert card["intervals"]["training_seeds"] == 2
+
+
+def test_next_to_nothing_has_no_sign(data: GraspDataset) -> None:
+    card = score(request_of(data, data.column("grasps")), FakeVerify(is_own(data)), None).card
+    card["above"]["predictions"]["own"] = {"value": 0.1, "low": -0.001, "high": 0.2}
+    assert "* predictions above own: 10 (0 to 20)\n" in card_text(card)
 
 
 def test_another_method_stands_beside_the_predictions(data: GraspDataset) -> None:
