@@ -413,12 +413,13 @@ def cross_check_lines(report: Mapping[str, Any]) -> list[str]:
 
 
 def score_table(card: Mapping[str, Any], seconds: Mapping[str, float]) -> Table:
-    """Return the sets of a score card beside each other, with seconds per verdict."""
+    """Return the sets of a score card beside each other, with seconds per verdict of the lift."""
     names = [name for name in card["measures"] if name != "headline"]
     protocol = card["settings"].get("protocol")
     counts = "Sample" if protocol is None else f"By {protocol['protocol']}"
     title = f"{counts}, success@1, first wrist pose, mean over {card['objects']} objects [%]"
-    table = _table(title, "set", "headline", "95 %\ninterval", *names, "s per\nverdict")
+    timed = ("s per\nverdict",) if protocol is None else ()
+    table = _table(title, "set", "headline", "95 %\ninterval", *names, *timed)
     for name, each in card["sets"].items():
         values = each["measures"]
         head = values["headline"]
@@ -427,7 +428,8 @@ def score_table(card: Mapping[str, Any], seconds: Mapping[str, float]) -> Table:
             f"{100 * head['low']:.0f} to {100 * head['high']:.0f}",
         ]
         cells += [f"{100 * values[measure]['value']:.0f}" for measure in names]
-        table.add_row(_safe(name), *cells, f"{seconds[name]:.2f}")
+        cells += [f"{seconds[name]:.2f}" for _ in timed]
+        table.add_row(_safe(name), *cells)
     return table
 
 
