@@ -115,7 +115,7 @@ def fitted_postures(
     contacts = [(i, g) for i, g in enumerate(grasps) if not g.invalid and g.posture is None]
     fitted = dict(execute(_fit, contacts))
     return [
-        PlacedPosture(placed=g.placed, posture=fitted.get(i) or g.posture or g.invalid)
+        PlacedPosture(placed=g.placed, posture=g.invalid or g.posture or fitted[i])
         for i, g in enumerate(grasps)
     ]
 

@@ -44,7 +44,7 @@ def kept_convex_parts(model: ObjectModel, keep: Path) -> list[Array]:
     except Exception:  # missing, or damaged in any way: it can be made again
         parts = convex_parts(model)
 
-    # Parts are named in an order that their number does not change.
+    # The file's order is that of the parts.
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **{f"{k:06d}": part for k, part in enumerate(parts)})
     keep.mkdir(parents=True, exist_ok=True)
