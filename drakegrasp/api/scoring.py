@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TypeAlias
@@ -17,6 +18,7 @@ from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.protocols.catalog import Lift, find_protocol
 from drakegrasp.protocols.postures import describe, prepare_trials, verify_postures, versions
+from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.executor import processes
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.scoring.ranked import Ranked, ranked_sets
@@ -100,6 +102,8 @@ def score(
     peer = not isinstance(rule, Lift)
     if peer and (scheduler or scheduler_file):
         raise ConfigError(f"scheduler must be None with protocol {stored}, got one")
+    if peer:
+        require_mujoco("mujoco", "coacd")
     request = Request(
         data=dataset,
         train=type(dataset)(dataset.path, split="train") if train is None else train,
@@ -111,7 +115,7 @@ def score(
         config=dataset_config(dataset, overrides=settings),
         overridden=tuple(overridden_keys(settings)),
         again=again,
-        protocol={**describe(rule, stored), "versions": versions()} if peer else None,
+        protocol={**describe(rule, stored), "versions": _versions()} if peer else None,
     )
 
     # Its verdicts, by this process or workers, and the card.
@@ -121,7 +125,7 @@ def score(
         else:
             placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
         if peer:
-            keep = None if out is None else Path(out) / CONVEX_PARTS
+            keep = Path(scratch if out is None else out) / CONVEX_PARTS
             _try_by_protocol(placed, protocol, deliver, keep=keep, workers=workers, show=show)
             return
         run_verification(
@@ -135,7 +139,8 @@ def score(
             show=show,
         )
 
-    scored = score_request(request, try_all, None if out is None else Path(out))
+    with TemporaryDirectory() as scratch:
+        scored = score_request(request, try_all, None if out is None else Path(out))
     if out is not None:
         scored.save(Path(out))
     return scored
@@ -151,12 +156,17 @@ def _method(files: object, dataset: GraspDataset) -> tuple[str, tuple[Ranked, ..
     return ranked_sets(given, dataset)
 
 
+def _versions() -> dict[str, str]:
+    """Return the versions of what makes a verdict by a protocol, which CoACD cuts objects for."""
+    return {**versions(), "coacd": metadata.version("coacd")}
+
+
 def _try_by_protocol(
     grasps: Sequence[PlacedGrasp],
     protocol: str,
     deliver: Deliver,
     *,
-    keep: Path | None,
+    keep: Path,
     workers: int | None,
     show: bool,
 ) -> None:

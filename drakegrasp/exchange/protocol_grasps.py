@@ -20,7 +20,6 @@ from drakegrasp.exchange.dexgraspbench import OBJECTS, BenchFiles, write_object
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.simulation.placement import PlacedObject
@@ -61,11 +60,8 @@ def write_grasps(
         report: Is told how many objects are written.
 
     Raises:
-        MachineError: If MuJoCo or CoACD is missing.
         OSError: If a folder cannot be written.
     """
-    require_mujoco("mujoco", "coacd")
-
     # The hand, and where its spread is among the joints.
     files = BenchFiles(hand, folder)
     spread = joint_order(hand).index(hand.spread.joints[0]) if hand.spread.joints else None

@@ -15,15 +15,16 @@ from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.files import write_atomic
 
-#: Largest concavity of a convex part over the object's size, and the largest number of its corners.
-CONCAVITY, CORNERS = 0.02, 64
+#: Largest concavity of a convex part over the object's size, the seed, and the largest number of a
+#: part's corners.
+SETTINGS = {"threshold": 0.02, "seed": 0, "max_convex_hull": 64}
 
 
 def convex_parts(model: ObjectModel) -> list[Array]:
     """Return the corners of an object's convex parts, each (n, 3) in {O} [m]."""
     coacd.set_log_level("error")
     mesh = coacd.Mesh(model.collision_vertices, model.collision_faces)
-    parts = coacd.run_coacd(mesh, threshold=CONCAVITY, seed=0, max_convex_hull=CORNERS)
+    parts = coacd.run_coacd(mesh, **SETTINGS)
     return [np.asarray(corners, dtype=float) for corners, _ in parts]
 
 
@@ -32,30 +33,45 @@ def kept_convex_parts(model: ObjectModel, keep: Path) -> list[Array]:
 
     Args:
         model: The object.
-        keep: The folder, made with the first object. A file that is damaged is written again.
+        keep: The folder, made with the first object. A file that holds no parts is written again.
 
     Raises:
         OSError: If the folder cannot be written.
     """
     path = keep / f"{_digest(model)}.npz"
     try:
-        with np.load(io.BytesIO(read_content(path)), allow_pickle=False) as content:
-            return [content[name] for name in content.files]
+        return _read_parts(path)
     except Exception:  # missing, or damaged in any way: it can be made again
         parts = convex_parts(model)
 
-    # The file's order is that of the parts.
+    # The parts are read in the order in which they are written.
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{f"{k:06d}": part for k, part in enumerate(parts)})
-    keep.mkdir(parents=True, exist_ok=True)
+    np.savez(buffer, *parts)
     write_atomic(path, buffer.getvalue())
+    return parts
+
+
+def _read_parts(path: Path) -> list[Array]:
+    """Return the parts in a file.
+
+    Raises:
+        Exception: Of any kind, if it is missing or holds something else.
+    """
+    with np.load(io.BytesIO(read_content(path)), allow_pickle=False) as content:
+        parts = [content[f"arr_{k}"] for k in range(len(content.files))]
+    if not parts:
+        raise ValueError("it must have parts, got none")
+    for part in parts:
+        if part.dtype != float or part.shape[1:] != (3,) or len(part) < 4:
+            raise ValueError(f"a part must have corners (n, 3), got {part.dtype} {part.shape}")
+        if not np.isfinite(part).all():
+            raise ValueError("corners must be finite, got others")
     return parts
 
 
 def _digest(model: ObjectModel) -> str:
     """Return 32 hex digits that name all that decides an object's parts."""
-    rules = CONCAVITY, CORNERS, metadata.version("coacd")
-    digest = hashlib.sha256(repr(rules).encode())
+    digest = hashlib.sha256(repr((SETTINGS, metadata.version("coacd"))).encode())
     for array in (model.collision_vertices, model.collision_faces):
         digest.update(repr((array.shape, array.dtype.str)).encode())
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -185,12 +185,7 @@ def json_line(index: int, result: PostureResult, trials: PostureTrials) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what makes a verdict.
-
-    Raises:
-        MachineError: If MuJoCo is missing.
-    """
-    require_mujoco("mujoco")
+    """Return the versions of what makes a verdict."""
     return {"drakegrasp": __version__, "mujoco": metadata.version("mujoco")}
 
 

@@ -139,6 +139,7 @@ def verify_placed(grasp: PlacedGrasp) -> Verification:
     return replace(result, hints=hints)
 
 
+@one_thread
 def first_fit(grasp: PlacedGrasp) -> WristFit:
     """Return the wrist pose by which a grasp that is none of the invalid is judged."""
     p_OQ, nhat_Q_O = _rounded(grasp)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +19,10 @@ pytest.importorskip("coacd")
 
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.exchange.closed_grasps import ClosedGrasp
+from drakegrasp.exchange.dexgraspbench import OBJECTS
 from drakegrasp.exchange.posture_files import holds_postures
 from drakegrasp.exchange.posture_rows import quaternion_poses
-from drakegrasp.exchange.protocol_grasps import PlacedPosture, write_grasps
+from drakegrasp.exchange.protocol_grasps import PlacedPosture, fitted_postures, write_grasps
 from drakegrasp.frames import invert_pose
 from drakegrasp.grasp import pack_grasp
 from drakegrasp.hand.description import load_hand
@@ -31,6 +34,7 @@ from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.postures.posture import Posture, joint_order
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
+from drakegrasp.verification.verify import PlacedGrasp, first_fit
 
 HAND = load_hand()
 
@@ -119,28 +123,96 @@ def test_files_say_what_the_posture_says(tmp_path: Path, grasps: list[ClosedGras
     assert (content["pregrasp_qpos"][7:] <= content["grasp_qpos"][7:]).all()
 
 
-def test_convex_parts_are_kept_and_a_damaged_file_is_made_again(
+def test_the_parts_of_an_object_are_cut_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, longer = (box_model(tmp_path, edges) for edges in ([0.06] * 3, [0.06, 0.06, 0.1]))
-    keep = tmp_path / "keep"
+    model = box_model(tmp_path, [0.06] * 3)
+    parts = [np.full((4 + k, 3), 0.1 * k) for k in range(11)]
+    cut: list[Any] = []
+    monkeypatch.setattr(convex_parts, "convex_parts", lambda each: cut.append(each) or parts)
+    for _ in range(2):
+        found = convex_parts.kept_convex_parts(model, tmp_path / "keep")
+        assert all(np.array_equal(a, b) for a, b in zip(parts, found, strict=True))
+    assert cut == [model]
+
+    # Another object, and other rules.
+    other = replace(model, collision_faces=model.collision_faces[::-1].copy())
+    convex_parts.kept_convex_parts(other, tmp_path / "keep")
+    monkeypatch.setitem(convex_parts.SETTINGS, "threshold", 0.03)
+    convex_parts.kept_convex_parts(other, tmp_path / "keep")
+    assert cut == [model, other, other]
+
+
+DAMAGE: dict[str, Callable[[Path], None]] = {
+    "half": lambda path: path.write_bytes(path.read_bytes()[:100]) and None,
+    "nothing": lambda path: path.write_bytes(b"") and None,
+    "no part": lambda path: np.savez(path),
+    "text": lambda path: np.savez(path, np.array(["a"] * 4)),
+    "whole numbers": lambda path: np.savez(path, np.eye(4, 3, dtype=int)),
+    "two numbers": lambda path: np.savez(path, np.zeros((4, 2))),
+    "three corners": lambda path: np.savez(path, np.zeros((3, 3))),
+    "nan": lambda path: np.savez(path, np.full((4, 3), np.nan)),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_file_of_parts_is_written_again(damage: str, tmp_path: Path) -> None:
+    model, keep = box_model(tmp_path, [0.06] * 3), tmp_path / "keep"
     parts = convex_parts.kept_convex_parts(model, keep)
-    convex_parts.kept_convex_parts(longer, keep)
-    assert len(list(keep.iterdir())) == 2
+    (path,) = keep.iterdir()
+    content = path.read_bytes()
+    DAMAGE[damage](path)
+    again = convex_parts.kept_convex_parts(model, keep)
+    assert all(np.array_equal(a, b) for a, b in zip(parts, again, strict=True))
+    assert path.read_bytes() == content
 
-    def never(model: Any) -> None:
-        raise AssertionError("it was cut again")
 
-    with monkeypatch.context() as patch:
-        patch.setattr(convex_parts, "convex_parts", never)
-        again = convex_parts.kept_convex_parts(model, keep)
-        assert all(np.array_equal(a, b) for a, b in zip(parts, again, strict=True))
+def test_workers_fit_and_cut_in_any_order(closed: tuple[Path, TrialRecord], tmp_path: Path) -> None:
+    _, record = closed
+    assert record.closed is not None
+    points, normals = record.closed.contacts.p_OQ, record.closed.contacts.nhat_Q_O
+    models = [box_model(tmp_path, [CUBE] * 3, f"1_box_{letter}") for letter in "abc"]
+    placed = [
+        PlacedGrasp(
+            index=i,
+            placed=PlacedObject(model=model, X_TO=standing(model)),
+            p_OQ=np.add(points, [0.0, 0.0, 0.004 * i]),
+            nhat_Q_O=normals,
+            method="hand",
+            config=load_config(),
+            invalid="it is none" if i == 2 else "",
+        )
+        for i, model in enumerate(models)
+    ]
 
-    for path in keep.iterdir():
-        content = path.read_bytes()
-        path.write_bytes(content[: len(content) // 2])
-        assert all(len(convex_parts.kept_convex_parts(each, keep)) == 1 for each in (model, longer))
-        assert path.read_bytes() == content
+    sent: list[int] = []
+
+    def backwards(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+        tasks = list(items)
+        sent.append(len(tasks))
+        return (function(item) for item in reversed(tasks))
+
+    # Postures are those of their grasps.
+    found = fitted_postures(placed, backwards)
+    assert [each.placed for each in found] == [each.placed for each in placed]
+    for each, grasp in zip(found[:2], placed, strict=False):
+        assert isinstance(each.posture, Posture)
+        np.testing.assert_array_equal(each.posture.X_OG, first_fit(grasp).X_OG)
+    assert found[2].posture == "it is none"
+    assert not np.array_equal(found[0].posture.X_OG, found[1].posture.X_OG)
+
+    # The object of what is no grasp is not cut.
+    told: list[tuple[int, int]] = []
+    write_grasps(
+        found,
+        HAND,
+        tmp_path / "to",
+        execute=backwards,
+        report=lambda done, total, **_: told.append((done, total)),
+    )
+    assert told == [(0, 2), (1, 2), (2, 2)] and sent == [2, 2]
+    made = sorted(path.name for path in (tmp_path / "to" / OBJECTS).iterdir())
+    assert made == sorted(model.name for model in models[:2])
 
 
 def test_what_a_file_holds_is_told_from_its_content(tmp_path: Path) -> None:
@@ -177,6 +249,7 @@ def test_score_by_a_protocol_says_so_on_the_card(
     assert result.exit_code == 0, result.output
     card = json.loads(result.stdout)
     assert card["settings"]["protocol"]["protocol"] == "dexgraspbench"
+    assert set(card["settings"]["protocol"]["versions"]) == {"drakegrasp", "mujoco", "coacd"}
     assert set(card["measures"]) == {"headline", "objects"}
     known = {"penetration", "moved", "turned", "success"}
     assert set(card["sets"]["constant"]["outcomes"]) <= known

@@ -131,6 +131,7 @@ def _grasp_files(
     """Return the MJCF of the hand, the folder of objects, and of each grasp its file and name."""
     from drakegrasp.errors import DataError, HandError
     from drakegrasp.exchange.protocol_grasps import fitted_postures, write_grasps
+    from drakegrasp.runtime.environment import require_mujoco
 
     # Files of DexGraspBench.
     path = request.grasps
@@ -147,6 +148,7 @@ def _grasp_files(
         return Path(request.hand or ""), request.assets or Path(), list(files), files
 
     # Our own grasps are written as such files.
+    require_mujoco("mujoco", "coacd")
     hand, grasps = _own_grasps(request)
     postures = fitted_postures(grasps, execute)
     hand_path, found = write_grasps(postures, hand, folder, execute=execute, report=report)
