@@ -157,7 +157,7 @@ def _method(files: object, dataset: GraspDataset) -> tuple[str, tuple[Ranked, ..
 
 
 def _versions() -> dict[str, str]:
-    """Return the versions of what makes a verdict by a protocol, which CoACD cuts objects for."""
+    """Return the versions of what makes a verdict by a protocol; CoACD cuts the objects for it."""
     return {**versions(), "coacd": metadata.version("coacd")}
 
 

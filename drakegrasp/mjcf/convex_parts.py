@@ -59,14 +59,14 @@ def _read_parts(path: Path) -> list[Array]:
     """
     with np.load(io.BytesIO(read_content(path)), allow_pickle=False) as content:
         parts = [content[f"arr_{k}"] for k in range(len(content.files))]
-    if not parts:
-        raise ValueError("it must have parts, got none")
-    for part in parts:
-        if part.dtype != float or part.shape[1:] != (3,) or len(part) < 4:
-            raise ValueError(f"a part must have corners (n, 3), got {part.dtype} {part.shape}")
-        if not np.isfinite(part).all():
-            raise ValueError("corners must be finite, got others")
+    if not parts or not all(map(_is_part, parts)):
+        raise ValueError(f"{path}: must hold the corners of convex parts, got something else")
     return parts
+
+
+def _is_part(corners: Array) -> bool:
+    shaped = corners.dtype == float and corners.shape[1:] == (3,) and len(corners) >= 4
+    return shaped and bool(np.isfinite(corners).all())
 
 
 def _digest(model: ObjectModel) -> str:

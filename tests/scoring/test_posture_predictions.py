@@ -154,3 +154,21 @@ def test_own_samples_given_back_as_postures_come_out_as_stored(
     again = score(tmp_path / "net.npz", data, references=["own"], out=tmp_path / "card")
     assert again.card == made.card
     assert (tmp_path / "card" / VERDICTS).read_bytes() == lines
+
+
+def test_a_protocol_cuts_an_object_once_for_all_that_is_scored(
+    data: GraspDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Postures and contacts are tried apart, and nothing is kept for another call."""
+    pytest.importorskip("mujoco")
+    cutting = pytest.importorskip("drakegrasp.mjcf.convex_parts")
+    cut, convex_parts = [], cutting.convex_parts
+
+    def counted(model: Any) -> Any:
+        cut.append(model.name)
+        return convex_parts(model)
+
+    monkeypatch.setattr(cutting, "convex_parts", counted)
+    np.savez(tmp_path / "net.npz", **own_postures(data, np.array([0])))
+    score(tmp_path / "net.npz", data, references=["own"], protocol="dexgraspbench", workers=1)
+    assert cut == [data.column("object_props/object_name")[0]]

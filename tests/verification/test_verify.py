@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.objects import CUBE, box_model, standing
 from scipy.spatial.transform import Rotation
-from threadpoolctl import threadpool_limits
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import drakegrasp as dg
 from drakegrasp.config import Config
@@ -317,6 +318,26 @@ def test_number_of_threads_changes_no_bit(
         fits.append(found.fit)
     np.testing.assert_array_equal(fits[0].X_OG, fits[1].X_OG)
     np.testing.assert_array_equal(fits[0].closing, fits[1].closing)
+
+
+def test_a_wrist_pose_alone_is_fitted_by_one_thread(
+    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Protocols of MuJoCo ask for it outside of a verification."""
+    fit_wrist, threads = verifying.fit_wrist, set[int]()
+
+    def fit(*given: Any, **named: Any) -> Any:
+        blas = [each for each in threadpool_info() if each["user_api"] == "blas"]
+        threads.update(each["num_threads"] for each in blas)
+        return fit_wrist(*given, **named)
+
+    monkeypatch.setattr(verifying, "fit_wrist", fit)
+    p, n = grasp
+    with threadpool_limits(2):
+        verifying.first_fit(
+            PlacedGrasp(index=0, placed=cube, p_OQ=p, nhat_Q_O=n, method="hand", config=CONFIG)
+        )
+    assert threads == {1}
 
 
 def _fail(scene: object) -> float:
