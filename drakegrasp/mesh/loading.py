@@ -11,12 +11,24 @@ import trimesh
 from drakegrasp.errors import MeshError, one_line
 from drakegrasp.foreign_files import read_content
 from drakegrasp.frames import Array
+from drakegrasp.mesh.declared.glb import declared_glb
+from drakegrasp.mesh.declared.obj import declared_obj
+from drakegrasp.mesh.declared.ply import declared_ply
+from drakegrasp.mesh.declared.polygons import Declared
+from drakegrasp.mesh.declared.stl import declared_stl
 from drakegrasp.mesh.repair import weld
-from drakegrasp.mesh.surfaces import Faces, stack
-from drakegrasp.runtime.json_text import parse_json
+from drakegrasp.mesh.surfaces import Faces, compact, stack
 
-#: Mesh files that can be read; other files are ignored.
-SUFFIXES = (".obj", ".stl", ".ply", ".glb")
+#: Mesh files that can be read, and by what; other files are ignored.
+_DECLARED = {
+    ".obj": declared_obj,
+    ".stl": declared_stl,
+    ".ply": declared_ply,
+    ".glb": declared_glb,
+}
+SUFFIXES = tuple(_DECLARED)
+#: Share of the largest coordinate by which transforms of the same vertex may differ.
+SAME = 1e-6
 #: Coordinates that are numbers, in any unit; beyond it, squares and single precision overflow.
 LARGEST = 1e9
 #: Faces from which what reading a file leaves behind is worth freeing at once: a scene of trimesh
@@ -33,14 +45,6 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     path = Path(path)
     vertices, faces = parse_mesh(path.name, read_bytes(path))
     return clean_triangles(vertices, faces, path.name)
-
-
-#: Parts of the names of extensions that change how a mesh looks, not its shape.
-_LOOKS = ("material", "texture", "light")
-#: Numbers of what places a node: trimesh makes a matrix of as many rows, however many there are.
-_PLACES = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
-#: Most nodes of a scene: trimesh takes a millisecond for each.
-MOST_NODES = 10_000
 
 
 def read_bytes(path: Path) -> bytes:
@@ -61,6 +65,7 @@ def parse_mesh(name: str, content: bytes) -> tuple[Array, Faces]:
     """Return the vertices (n, 3) and faces (m, 3) of a mesh file, in the file's units and axes.
 
     All geometries of a scene are joined, with their transforms applied; materials are not read.
+    What comes out is what the file declares, see `drakegrasp.mesh.declared`.
     The triangles are as they stand in the file: see `clean_triangles`.
 
     Args:
@@ -78,47 +83,56 @@ def parse_mesh(name: str, content: bytes) -> tuple[Array, Faces]:
 
     # Parsers raise all kinds of exceptions on foreign bytes.
     try:
-        if suffix == ".glb":
-            _refuse_description(content)
         with np.errstate(all="ignore"):
-            scene = trimesh.load_scene(
-                io.BytesIO(content), file_type=suffix[1:], process=False, skip_materials=True
-            )
-            parts = []
-            for node in scene.graph.nodes_geometry:
-                X_SN, key = scene.graph[node]
-                part = scene.geometry[key]
-                if isinstance(part, trimesh.Trimesh) and len(part.faces):
-                    part = trimesh.Trimesh(part.vertices, part.faces, process=False)
-                    parts.append(part.apply_transform(X_SN))
-            return _concatenate(parts)
+            declared = _DECLARED[suffix](content)
     except Exception as error:
-        # trimesh wants another package to guess the encoding of bytes that are no UTF-8.
-        got = "text that is not UTF-8" if isinstance(error, ImportError) else one_line(error)
-        raise MeshError(f"{name}: must be a valid {suffix} mesh, got: {got}") from error
+        raise MeshError(f"{name}: must be a valid {suffix} mesh, got: {one_line(error)}") from error
+    if suffix == ".stl":
+        return declared.vertices, declared.faces
+
+    # The order of vertices and faces that trimesh gives is that of the datasets made so far. Where
+    # it leaves something out, the file is right.
+    try:
+        vertices, faces = _read_by_trimesh(suffix[1:], content)
+        if _are_same(vertices, faces, declared):
+            return vertices, faces
+    except Exception:
+        pass  # the file was read without it
+    return compact(declared.vertices, declared.faces)
 
 
-def _refuse_description(content: bytes) -> None:
-    """Refuse a GLB that trimesh would read without what it needs, or would not end to read.
+def _read_by_trimesh(kind: str, content: bytes) -> tuple[Array, Faces]:
+    """Return the vertices and faces that trimesh finds in a file."""
+    with np.errstate(all="ignore"):
+        scene = trimesh.load_scene(
+            io.BytesIO(content), file_type=kind, process=False, skip_materials=True
+        )
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        X_SN, key = scene.graph[node]
+        part = scene.geometry[key]
+        if isinstance(part, trimesh.Trimesh) and len(part.faces):
+            part = trimesh.Trimesh(part.vertices, part.faces, process=False)
+            parts.append(part.apply_transform(X_SN))
+    return _concatenate(parts)
 
-    Raises:
-        ValueError: If its shape needs an extension, it has too many nodes, or one has no place.
-    """
-    if content[:4] != b"glTF":
-        return
-    tree = parse_json(content[20 : 20 + int.from_bytes(content[12:16], "little")])
-    needed = tree.get("extensionsRequired", []) if isinstance(tree, dict) else []
-    shapes = [name for name in needed if not any(word in name for word in _LOOKS)]
-    if shapes:
-        raise ValueError(f"the extension {shapes[0]}, which is not read; export without it")
-    nodes = tree.get("nodes", []) if isinstance(tree, dict) else []
-    if len(nodes) > MOST_NODES:
-        raise ValueError(f"{len(nodes):,} nodes, more than {MOST_NODES:,}")
-    for node in nodes:
-        for key, count in _PLACES.items():
-            numbers = node.get(key, [0] * count)
-            if not isinstance(numbers, list) or len(numbers) != count:
-                raise ValueError(f"a node whose {key} is not {count} numbers")
+
+def _are_same(vertices: Array, faces: Faces, declared: Declared) -> bool:
+    """Return whether a surface has the triangles that a file declares, in any order."""
+    if len(faces) != len(declared.faces) or not declared.fans:
+        return False
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+        return False
+    if np.array_equal(faces, declared.faces) and np.array_equal(vertices, declared.vertices):
+        return True
+    used = np.abs(declared.vertices[declared.faces])
+    size = used.max(initial=0.0, where=np.isfinite(used))
+    for axis in range(3):
+        ours = np.sort(declared.vertices[:, axis][declared.faces.reshape(-1)])
+        theirs = np.sort(vertices[:, axis][faces.reshape(-1)])
+        if not np.allclose(ours, theirs, rtol=0.0, atol=SAME * size, equal_nan=True):
+            return False
+    return True
 
 
 def clean_triangles(vertices: Array, faces: Faces, name: str) -> trimesh.Trimesh:

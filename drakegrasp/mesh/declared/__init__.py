@@ -1,0 +1,1 @@
+"""What a mesh file declares: each format read line by line, and nothing passed over in silence."""

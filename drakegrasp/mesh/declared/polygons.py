@@ -1,0 +1,85 @@
+"""Polygons of a file: their corners come in, triangles go out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import manifold3d
+import numpy as np
+
+from drakegrasp.frames import Array
+from drakegrasp.mesh.surfaces import Faces
+
+#: Share of a polygon's area by which a triangle of its fan may be turned over: rounding.
+TURNED = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Declared:
+    """The surface that a file declares.
+
+    Args:
+        vertices: (n, 3), in the file's order.
+        faces: (m, 3), in the file's order.
+        fans: No polygon needed more care than a fan from its first corner.
+    """
+
+    vertices: Array
+    faces: Faces
+    fans: bool = True
+
+
+def triangulate(vertices: Array, corners: Faces, counts: Faces) -> Declared:
+    """Return the triangles of polygons, which may be concave and slightly bent.
+
+    Args:
+        vertices: (n, 3).
+        corners: Vertices of all polygons, one polygon after the other.
+        counts: Number of corners of each polygon; those of fewer than three have no area.
+
+    Raises:
+        ValueError: If a corner is no vertex of the file.
+    """
+    if len(corners) and not (corners.min() >= 0 and corners.max() < len(vertices)):
+        bad = corners.max() if corners.min() >= 0 else corners.min()
+        raise ValueError(f"a face with vertex number {bad + 1} of {len(vertices)}")
+
+    # A fan from the first corner, as everybody reads convex polygons.
+    starts = np.cumsum(counts) - counts
+    shares = np.maximum(counts - 2, 0)
+    polygon = np.repeat(np.arange(len(counts)), shares)
+    step = np.arange(len(polygon)) - np.repeat(np.cumsum(shares) - shares, shares)
+    first = starts[polygon]
+    faces = np.stack((corners[first], corners[first + step + 1], corners[first + step + 2]), axis=1)
+    if (counts <= 3).all():
+        return Declared(vertices=vertices, faces=faces)
+
+    # It covers what lies outside of a polygon if it turns a triangle over.
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    with np.errstate(all="ignore"):
+        area = np.cross(b - a, c - a)
+        whole = np.zeros((len(counts), 3))
+        np.add.at(whole, polygon, area)
+        turned = (area * whole[polygon]).sum(axis=1) < -TURNED * (whole[polygon] ** 2).sum(axis=1)
+    concave = np.unique(polygon[turned])
+    ends = np.cumsum(shares)
+    for k in concave:
+        outline = corners[starts[k] : starts[k] + counts[k]]
+        faces[ends[k] - shares[k] : ends[k]] = outline[_cut(vertices[outline], whole[k])]
+    return Declared(vertices=vertices, faces=faces, fans=not len(concave))
+
+
+def _cut(p: Array, normal: Array) -> Faces:
+    """Return the triangles (k - 2, 3) of a concave polygon (k, 3).
+
+    Raises:
+        ValueError: If it cannot be cut.
+    """
+    # Project onto two axes that turn counter-clockwise about the normal.
+    x = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    y = np.cross(normal, x)
+    flat = np.stack([(p - p[0]) @ (axis / np.linalg.norm(axis)) for axis in (x, y)], axis=1)
+    cut = np.asarray(manifold3d.triangulate([flat], allow_convex=False), dtype=np.int64)
+    if len(cut) != len(p) - 2:
+        raise ValueError(f"a polygon of {len(p)} corners that crosses itself")
+    return cut
