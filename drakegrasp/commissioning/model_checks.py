@@ -13,7 +13,13 @@ from drakegrasp.commissioning.finding import Finding, judge
 from drakegrasp.config import Config
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits
-from drakegrasp.hand.model_text import Mimic, declared_masses, declared_mimics, read_xml
+from drakegrasp.hand.model_text import (
+    Mimic,
+    declared_masses,
+    declared_mimics,
+    impossible_inertias,
+    read_xml,
+)
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.simulation.construction import FINGER_DAMPING
@@ -28,7 +34,8 @@ SAME = 1e-3
 def check_masses(hand: Hand) -> Finding:
     """Return whether every link has a mass, and an inertia that a body can have."""
     # Drake parses the inertias; the masses are those that the file gives.
-    masses = declared_masses(read_xml(hand.model.path))
+    root = read_xml(hand.model.path)
+    masses, impossible = declared_masses(root), impossible_inertias(root)
     plant = MultibodyPlant(0.0)
     instance = add_model(plant, hand.model)
     faults = []
@@ -37,6 +44,11 @@ def check_masses(hand: Hand) -> Finding:
         mass = masses.get(body.name(), 0.0)
         if not mass > 0.0:
             faults.append(f"link {body.name()!r} must have a mass above 0 kg, got {mass:g}")
+        elif body.name() in impossible:
+            faults.append(
+                f"link {body.name()!r} must have an inertia that a body can have, got "
+                f"{impossible[body.name()]}"
+            )
         elif not body.default_spatial_inertia().IsPhysicallyValid():
             faults.append(f"link {body.name()!r} must have an inertia that a body can have")
     return judge("masses", faults, f"{len(masses)} links, {sum(masses.values()):.3g} kg in all")

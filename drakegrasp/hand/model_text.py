@@ -1,6 +1,6 @@
 """What a model file says of masses, of efforts, and of joints that follow others.
 
-In: the XML of a URDF, SDFormat or MJCF file. Out: its own figures. Drake does not tell them: it
+In: the XML of a URDF or SDFormat file. Out: its own figures. Drake does not tell them: it
 replaces a mass of zero by one of its own, and couples joints by constraints or not at all.
 """
 
@@ -11,7 +11,15 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
 from drakegrasp.errors import HandError
+
+#: Moments and products of inertia that URDF and SDFormat have where a model gives none.
+_MOMENTS = [
+    dict.fromkeys(("xx", "yy", "zz", "xy", "xz", "yz"), "0"),
+    {"xx": "1", "yy": "1", "zz": "1", "xy": "0", "xz": "0", "yz": "0"},
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +50,30 @@ def declared_masses(root: Element) -> dict[str, float]:
     return masses
 
 
+def impossible_inertias(root: Element) -> dict[str, str]:
+    """Return the links with a mass whose inertia no body can have, with what is wrong.
+
+    Drake replaces such an inertia by one of its own.
+    """
+    masses, found = declared_masses(root), {}
+    for link in root.iter("link"):
+        name, inertia = link.get("name", ""), link.find("inertial/inertia")
+        if inertia is None or not masses.get(name, 0.0) > 0.0:
+            continue
+        given = [
+            _number(_value(inertia, f"i{axes}", default), f"inertia of link {name!r}")
+            for axes, default in _MOMENTS[len(inertia) > 0].items()
+        ]
+        xx, yy, zz, xy, xz, yz = given
+        moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        slack = 1e-9 * abs(moments).max()
+        if not moments[2] > 0.0:
+            found[name] = "0"
+        elif moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
+            found[name] = "principal moments " + ", ".join(f"{m:.3g}" for m in moments)
+    return found
+
+
 def declared_efforts(root: Element) -> dict[str, float]:
     """Return the largest effort [N m or N] of each joint that the <limit>s of a model give one."""
     efforts = {}
@@ -53,8 +85,8 @@ def declared_efforts(root: Element) -> dict[str, float]:
 
 
 def declared_mimics(root: Element) -> list[Mimic]:
-    """Return the joints of a model that follow others."""
-    # URDF, SDFormat, Drake and MJCF each have their own way to write it.
+    """Return the joints of a model in URDF or SDFormat that follow others."""
+    # URDF, SDFormat and Drake each have their own way to write it.
     found = []
     for joint in root.iter("joint"):
         for tag in joint.iter():
@@ -67,21 +99,7 @@ def declared_mimics(root: Element) -> list[Mimic]:
             leader = tag.get("joint", "")
             name = joint.get("name", "")
             found.append(Mimic(joint=name, leader=leader, ratio=ratio, offset=offset))
-    for equality in root.iter("equality"):
-        found += [_equal_joints(joint) for joint in equality.iter("joint") if joint.get("joint2")]
     return found
-
-
-def _equal_joints(joint: Element) -> Mimic:
-    """Return an equality of MJCF: joint1 is a polynomial of joint2, of which a line is read."""
-    name, leader = joint.get("joint1", ""), joint.get("joint2", "")
-    what = f"polycoef of joint {name!r}"
-    offset, ratio, *rest = [
-        _number(x, what) for x in joint.get("polycoef", "0 1 0 0 0").split()
-    ] + [0.0, 0.0]
-    if any(rest):
-        raise HandError(f"model: {what} must be a line, got a curve")
-    return Mimic(joint=name, leader=leader, ratio=ratio, offset=offset)
 
 
 def _value(tag: Element, name: str, default: str) -> str:

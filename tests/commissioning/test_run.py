@@ -11,6 +11,7 @@ import pytest
 from helpers.hands import write_tongs
 
 from drakegrasp.commissioning.finding import Finding
+from drakegrasp.commissioning.model_checks import check_masses
 from drakegrasp.commissioning.run import check_hand
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import MODELS, hand_names
@@ -260,3 +261,26 @@ def test_every_hand_of_the_package_passes(name: str) -> None:
         "cylinder, level",
         "sphere, level",
     ]
+
+
+@pytest.mark.parametrize(
+    ("moments", "said"),
+    [
+        ('ixx="1e-3" iyy="1e-6" izz="1e-6"', "principal moments 1e-06, 1e-06, 0.001"),
+        ('ixx="0" iyy="0" izz="0"', "got 0"),
+    ],
+)
+def test_an_inertia_that_no_body_has_fails_the_check_of_masses(
+    tmp_path: Path, moments: str, said: str
+) -> None:
+    """Drake would replace it without a word."""
+    path = copied(tmp_path, "franka")
+    model = tmp_path / "franka_hand.urdf"
+    inertia = f'<inertia {moments} ixy="0" ixz="0" iyz="0"/>'
+    text, count = re.subn("<inertia .*?/>", inertia, model.read_text(), count=1)
+    assert count == 1
+    model.write_text(text)
+    finding = check_masses(load_hand(path))
+    assert not finding.ok
+    assert said in finding.text
+    assert check_masses(load_hand("franka")).ok

@@ -91,6 +91,88 @@ def test_mjcf_says_the_same_as_urdf(tmp_path: Path) -> None:
         )
 
 
+MOTOR = '<motor joint="left_slide" forcerange="-60 60"/>'
+JOINT = '<joint name="left_slide"'
+LINE = 'polycoef="0 1 0 0 0"'
+LEFT = JAWS_MJCF[JAWS_MJCF.index('<body name="left') : JAWS_MJCF.index('<body name="right')]
+GEARS = """<default><default class="a"><motor gear="5" ctrlrange="-3 3"/><default class="b">
+  <position kp="3"/></default></default></default><worldbody>"""
+TENDON = """<tendon><fixed name="t"><joint joint="left_slide" coef="0.5"/>
+  <joint joint="right_slide" coef="0.25"/></fixed></tendon><actuator><motor tendon="t" """
+
+
+@pytest.mark.parametrize(
+    ("changes", "effort", "ratio"),
+    [
+        ({}, 60.0, 1.0),
+        ({MOTOR: '<motor joint="left_slide" gear="-10" ctrlrange="-0.4 0.4"/>'}, 4.0, 1.0),
+        ({MOTOR: '<position joint="left_slide" kp="9" forcerange="-7 9" gear="2"/>'}, 18.0, 1.0),
+        ({MOTOR: '<position joint="left_slide" kp="9" ctrlrange="0 0.05"/>'}, 0.0, 1.0),
+        ({MOTOR: '<general joint="left_slide" gainprm="30" ctrlrange="-2 2"/>'}, 60.0, 1.0),
+        ({"<worldbody>": GEARS, MOTOR: '<motor class="a" joint="left_slide"/>'}, 15.0, 1.0),
+        ({"<actuator>" + MOTOR: TENDON + 'ctrlrange="-20 20"/>'}, 10.0, 1.0),
+        ({JOINT: f'{JOINT} actuatorfrcrange="-8 8"'}, 8.0, 1.0),
+        ({JOINT: f'{JOINT} actuatorfrcrange="-8 8" actuatorfrclimited="false"'}, 60.0, 1.0),
+        ({JOINT: f'{JOINT} ref="0.01"'}, 60.0, 1.0),
+        ({LINE: 'active="false"'}, 60.0, None),
+        ({LINE: 'polycoef="0"'}, 60.0, 1.0),
+        ({JOINT: f'{JOINT} ref="0.01"', LINE: 'polycoef="0 0.5"'}, 60.0, 0.5),
+        ({LINE: 'polycoef="0 0.5"'}, 60.0, 0.5),
+        ({LEFT: f'<frame pos="0 0.01 0"><frame euler="0 0 90">{LEFT}</frame></frame>'}, 60.0, 1.0),
+        ({LEFT: f'{LEFT}<frame pos="0 0 -0.03"><geom size="0.01" mass="0.2"/></frame>'}, 60.0, 1.0),
+        ({"<worldbody>": "<worldbody><frame>", "</worldbody>": "</frame></worldbody>"}, 60.0, 1.0),
+    ],
+)
+def test_mjcf_is_read_as_mujoco_compiles_it(
+    tmp_path: Path, changes: dict[str, str], effort: float, ratio: float | None
+) -> None:
+    """Joints with their limits, couplings, efforts, masses, and where bodies are."""
+    mujoco = pytest.importorskip("mujoco")
+    text = re.sub(r">\s+<", "><", JAWS_MJCF)
+    for old, new in changes.items():
+        old, new = re.sub(r">\s+<", "><", old.strip()), new.strip()
+        assert old in text
+        text = text.replace(old, new)
+    path = write_model(tmp_path, text, "hand.xml")
+    model, peer = read(path), mujoco.MjModel.from_xml_path(str(path))
+    assert set(model.joints) == {peer.joint(j).name for j in range(peer.njnt)}
+    for name, joint in model.joints.items():
+        if name not in model.mimics:
+            np.testing.assert_allclose(joint.limits, peer.joint(name).range, atol=1e-12)
+    assert model.joints["left_slide"].effort == pytest.approx(effort)
+    assert {m.ratio for m in model.mimics.values()} == ({ratio} - {None})
+
+    # Bodies are where MuJoCo has them at its reference, with their masses and centres.
+    drawn = {peer.joint(j).name: float(peer.qpos0[j]) for j in range(peer.njnt)}
+    for m in model.mimics.values():
+        assert drawn[m.joint] == pytest.approx(m.ratio * drawn[m.leader] + m.offset)
+    data = mujoco.MjData(peer)
+    mujoco.mj_forward(peer, data)
+    X_WR = np.eye(4)
+    X_WR[:3, :3], X_WR[:3, 3] = data.body("body").xmat.reshape(3, 3), data.body("body").xpos
+    for name, link in model.links.items():
+        assert link.inertia.get_mass() == pytest.approx(float(peer.body(name).mass[0]))
+        X_WL = X_WR @ model.pose(name, drawn)
+        centre = X_WL[:3, :3] @ link.inertia.get_com() + X_WL[:3, 3]
+        np.testing.assert_allclose(centre, data.body(name).xipos, atol=1e-9)
+
+
+@pytest.mark.parametrize("moments", ["1 1e-6 1e-6", "0 0 0", "-1e-5 1e-5 1e-5", "1e-5 1e-5 3e-5"])
+def test_an_inertia_that_no_body_has_is_replaced_and_said(tmp_path: Path, moments: str) -> None:
+    text = JAWS
+    for axes, moment in zip(("xx", "yy", "zz"), moments.split(), strict=True):
+        text = text.replace(f'i{axes}="1e-4"', f'i{axes}="{moment}"')
+    model = read(write_model(tmp_path, text))
+    assert len([n for n in model.notes if "no body has the model's inertia (" in n]) == 3
+    box = 0.05 / 12.0 * (0.012**2 + 0.06**2)
+    inertia = model.links["left_jaw"].inertia
+    central = inertia.Shift(inertia.get_com()).CalcRotationalInertia().get_moments()
+    assert central[0] == pytest.approx(box, rel=0.1)
+    # A rod is a body.
+    rod = JAWS.replace('izz="1e-4"', 'izz="0"')
+    assert read(write_model(tmp_path / "rod", rod)).notes == ()
+
+
 def test_a_class_of_mjcf_has_what_all_classes_around_it_say(tmp_path: Path) -> None:
     """Also where one in between says nothing of the tag, and by `childclass` from bodies above."""
     classes = """<default><joint type="slide"/><default class="jaw">

@@ -7,10 +7,11 @@ link that moves has a mass, and limits let mimics follow.
 from __future__ import annotations
 
 import logging
+import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -24,10 +25,17 @@ from pydrake.multibody.tree import SpatialInertia, WeldJoint
 from drakegrasp.errors import HandError, first_line
 from drakegrasp.frames import Array, invert_pose, transform_points
 from drakegrasp.hand.chains import joint_axis, joint_slides, moving_joint
-from drakegrasp.hand.model_text import declared_efforts, declared_masses, declared_mimics
+from drakegrasp.hand.model_text import (
+    declared_efforts,
+    declared_masses,
+    declared_mimics,
+    impossible_inertias,
+)
 from drakegrasp.hand.parsing import make_parser
+from drakegrasp.hand.vendor.compiled import Compiled, compile_model
 from drakegrasp.hand.vendor.couplings import find_leaders, make_room
 from drakegrasp.hand.vendor.meshes import MeshFile, MeshFolder, replace_meshes
+from drakegrasp.hand.vendor.mjcf import spell_out, trim
 from drakegrasp.hand.vendor.model import Link, VendorJoint, VendorModel
 from drakegrasp.hand.vendor.shapes import (
     Shape,
@@ -47,6 +55,14 @@ HOLLOW = 0.01
 BARE_MASS, BARE_RADIUS = 1e-3, 0.016
 
 
+#: What Drake says of parts that MuJoCo reads or that are no part of a hand, or that is said again.
+_ASIDE = re.compile(
+    "child of '(equality|actuator|tendon|contact|sensor|asset|option|default)'|'(light|camera|site|"
+    "compiler|option|tendon|equality|sensor|contact|exclude|transmission|gazebo|general)'|"
+    "effort limits|inertia|'actuatorfrc|The motor"
+)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Body:
     """A body that Drake parsed, before it is joined with those that are welded to it.
@@ -55,12 +71,14 @@ class _Body:
         name: Its name.
         inertia: M_BBo_B; None if its model gives no mass.
         collisions, visuals: Its shapes.
+        impossible: What is wrong with the inertia that its model gives; None if nothing.
     """
 
     name: str
     inertia: SpatialInertia | None
     collisions: list[Shape]
     visuals: list[Shape]
+    impossible: str | None = None
 
     @property
     def weight(self) -> tuple[float, int, int]:
@@ -76,38 +94,61 @@ def read_model(source: Source) -> VendorModel:
         HandError: If it is no tree of rigid links with meshes that can be read, in one line.
     """
     # What the text says and Drake does not keep.
-    masses = {} if source.root.tag == "mujoco" else declared_masses(source.root)
+    mjcf = source.root.tag == "mujoco"
+    masses = {} if mjcf else declared_masses(source.root)
     if negative := [name for name, mass in masses.items() if not 0.0 <= mass < np.inf]:
         raise HandError(
             f"model: link {negative[0]!r} must have a mass of 0 kg or more, "
             f"got {masses[negative[0]]:g}"
         )
-    efforts, mimics = declared_efforts(source.root), declared_mimics(source.root)
+    impossible = {} if mjcf else impossible_inertias(source.root)
 
-    # What Drake makes of it.
+    # What Drake makes of it, and of MJCF MuJoCo.
+    compiled = None
     with tempfile.TemporaryDirectory() as scratch:
         meshes = MeshFolder(Path(scratch))
+        if mjcf:
+            trim(source.root)
         notes = replace_meshes(source, meshes)
         path = Path(scratch) / f"model.{FORMATS[source.root.tag]}"
+        if mjcf:
+            ElementTree.ElementTree(source.root).write(path, encoding="utf-8")
+            compiled = compile_model(path)
+            spell_out(source.root)
         ElementTree.ElementTree(source.root).write(path, encoding="utf-8")
         plant, graph = MultibodyPlant(1e-3), SceneGraph()
         plant.RegisterAsSourceForSceneGraph(graph)
-        instance = _parse(plant, path)
+        instance, said = _parse(plant, path)
         inspector = graph.model_inspector()
         bodies = {
             index: _read_body(plant, plant.get_body(index), inspector, masses, meshes.files)
             for index in plant.GetBodyIndices(instance)
         }
-    for index in plant.GetJointActuatorIndices():
-        motor = plant.get_joint_actuator(index)
-        efforts.setdefault(motor.joint().name(), motor.effort_limit())
+    if compiled is None:
+        efforts, mimics = declared_efforts(source.root), declared_mimics(source.root)
+        for index in plant.GetJointActuatorIndices():
+            motor = plant.get_joint_actuator(index)
+            efforts.setdefault(motor.joint().name(), motor.effort_limit())
+    else:
+        efforts, mimics = compiled.efforts, compiled.mimics
+        _refuse_losses(plant, instance, compiled)
+        bodies = {
+            index: replace(body, inertia=compiled.inertias.get(body.name))
+            for index, body in bodies.items()
+        }
+        said = [*compiled.notes, *said]
+    bodies = {
+        index: replace(body, impossible=impossible.get(body.name)) for index, body in bodies.items()
+    }
+    notes += said
 
     # Links and joints, and what follows what.
     carriers = _carriers(plant, instance, bodies)
     places = _places(bodies, carriers)
     links, remarks = _links(bodies, carriers, places)
     names = {index: link.name for index, link in links.items()}
-    joints = _joints(carriers, places, names, efforts)
+    limits = {} if compiled is None else compiled.limits
+    joints = _joints(carriers, places, names, efforts, limits)
     leaders = find_leaders(mimics, joints)
     joints, widened = make_room(joints, leaders)
     (root,) = (name for index, name in names.items() if index not in carriers)
@@ -123,28 +164,46 @@ def read_model(source: Source) -> VendorModel:
     return model
 
 
-def _parse(plant: MultibodyPlant, path: Path) -> Any:
-    """Let Drake parse a model file, and return its model instance."""
+def _parse(plant: MultibodyPlant, path: Path) -> tuple[Any, list[str]]:
+    """Let Drake parse a model file; return its model instance, and notes of what it left out."""
     parser = make_parser(plant)
-    with _quiet():
+    with _heard() as messages:
         try:
             (instance,) = parser.AddModels(path)
         except (RuntimeError, ValueError, SystemExit) as error:
             text = first_line(error).replace(str(path.parent) + "/", "")
             raise HandError(f"model: must be a file of one model, got {text}") from None
-    return instance
+    lines = (" ".join(m.split()).partition(" warning: ")[2] for m in messages)
+    return instance, [f"Drake: {t}" for t in dict.fromkeys(lines) if t and not _ASIDE.search(t)]
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep Drake's remarks on tags that it does not know to itself."""
-    logger = logging.getLogger("drake")
-    before = logger.level
-    logger.setLevel(logging.ERROR)
+def _heard() -> Iterator[list[str]]:
+    """Collect Drake's warnings in place of printing them."""
+    logger, messages = logging.getLogger("drake"), []
+
+    def hear(record: logging.LogRecord) -> bool:
+        if record.levelno == logging.WARNING:
+            messages.append(record.getMessage())
+        return record.levelno > logging.WARNING
+
+    logger.addFilter(hear)
     try:
-        yield
+        yield messages
     finally:
-        logger.setLevel(before)
+        logger.removeFilter(hear)
+
+
+def _refuse_losses(plant: MultibodyPlant, instance: Any, compiled: Compiled) -> None:
+    """Refuse a model of which Drake read other joints or bodies than MuJoCo."""
+    joints = {plant.get_joint(i).name() for i in plant.GetJointIndices(instance)}
+    bodies = {plant.get_body(i).name() for i in plant.GetBodyIndices(instance)}
+    for kind, known, own in (
+        ("joint", compiled.limits, joints),
+        ("body", compiled.inertias, bodies),
+    ):
+        if lost := [name for name in known if name not in own]:
+            raise HandError(f"model: {kind} {lost[0]!r} of MuJoCo must be one of Drake, got none")
 
 
 def _read_body(
@@ -265,7 +324,9 @@ def _weld(members: Sequence[tuple[_Body, Array]]) -> tuple[Link, list[str]]:
             own = body.inertia.ReExpress(RotationMatrix(X_LB[:3, :3])).Shift(-X_LB[:3, 3])
             total = own if total is None else added(total, own)
 
-    # What has no mass gets one by its size.
+    # What has no mass gets one by its size, and what no body has is replaced.
+    wrong = [body.impossible for body, _ in members if body.impossible]
+    got = f" ({wrong[0]})" if wrong else ""
     if total is None and not collisions:
         total = point_inertia(BARE_MASS, BARE_RADIUS)
     elif total is None:
@@ -273,8 +334,8 @@ def _weld(members: Sequence[tuple[_Body, Array]]) -> tuple[Link, list[str]]:
         notes.append(
             f"link {name}: the model gives no mass; {1e3 * total.get_mass():.0f} g by its size"
         )
-    elif not total.IsPhysicallyValid():
-        notes.append(f"link {name}: no body has the model's inertia; that of its shapes")
+    elif wrong or not total.IsPhysicallyValid():
+        notes.append(f"link {name}: no body has the model's inertia{got}; that of its shapes")
         likely = solid_inertia(collisions) if collisions else point_inertia(1.0, BARE_RADIUS)
         total = with_mass(likely, total.get_mass())
     link = Link(name=name, inertia=total, collisions=tuple(collisions), visuals=tuple(visuals))
@@ -297,6 +358,7 @@ def _joints(
     places: Mapping[Any, Any],
     names: Mapping[Any, str],
     efforts: Mapping[str, float],
+    ranges: Mapping[str, Array],
 ) -> dict[str, VendorJoint]:
     """Return the joints that move, by name, each after those that carry its parent."""
     found = {}
@@ -305,7 +367,8 @@ def _joints(
         if joint is None or not moving_joint(joint):
             continue
         head, X_LP = places[joint.parent_body().index()]
-        limits = np.array([joint.position_lower_limit(), joint.position_upper_limit()])
+        drakes = np.array([joint.position_lower_limit(), joint.position_upper_limit()])
+        limits = ranges.get(joint.name(), drakes)
         if not limits[0] <= limits[1]:
             raise HandError(
                 f"model: joint {joint.name()!r} must have a lower limit below its upper one, got "

@@ -6,6 +6,7 @@ for too much (entities, depth, includes without end) is refused before anything 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,8 +26,24 @@ SUFFIXES = (".urdf", ".sdf", ".xml", ".mjcf")
 LONGEST, DEEPEST, MOST_INCLUDES = 20_000_000, 200, 50
 #: Bytes that are parsed at a time.
 BITE = 65_536
-#: Attributes that a class of MJCF gives to the elements of each tag.
-_Defaults = dict[str, dict[str, str]]
+#: Numbers of URDF (attributes) and SDFormat (elements), those of MJCF, and what may be infinite.
+_NUMBERS = frozenset(
+    {
+        *("xyz", "rpy", "ixx", "ixy", "ixz", "iyy", "iyz", "izz", "mass", "lower", "upper"),
+        *("effort", "velocity", "multiplier", "offset", "reference", "radius", "length", "size"),
+        *("scale", "rgba", "damping", "friction", "pose"),
+    }
+)
+_MJCF_NUMBERS = frozenset(
+    {
+        *("pos", "quat", "euler", "axisangle", "xyaxes", "zaxis", "axis", "fromto", "size"),
+        *("scale", "mass", "density", "diaginertia", "fullinertia", "range", "ref", "polycoef"),
+        *("coef", "kp", "gear", "ctrlrange", "forcerange", "actuatorfrcrange", "gainprm"),
+        *("biasprm", "damping"),
+    }
+)
+_ENDLESS = ("lower", "upper", "effort", "velocity", "range", "ctrlrange", "forcerange")
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 #: What an element of a model may not lead to: Drake would look for the file itself.
 _ELSEWHERE = {"robot": ("drake:include",), "sdf": ("include",), "mujoco": ("hfield", "plugin")}
 
@@ -76,15 +93,14 @@ def read_source(path: Path, packages: Mapping[str, Path], given: Sequence[Path] 
     folders = Folders(model=folder, packages=known, given=tuple(given))
     if root.tag == "mujoco":
         _include(root, folders, [0])
-        main: _Defaults = {}
-        for default in root.findall("default"):
-            main = _inherit(default, main)
     for element in root.iter():
         if element.tag in _ELSEWHERE[root.tag] and (element.get("file") or len(element)):
             raise HandError(
                 f"{path}: must be complete by itself, got <{element.tag}>: put what it names into "
                 "the file"
             )
+    _refuse_xacro(root, path)
+    _refuse_words(root, root.tag == "mujoco", f"<{root.tag}>")
     return Source(root=root, folders=folders)
 
 
@@ -116,6 +132,38 @@ def _parse(path: Path) -> Element:
     return root
 
 
+def _refuse_xacro(root: Element, path: Path) -> None:
+    """Refuse what xacro would have replaced."""
+    for element in root.iter():
+        names = [element.tag, *element.attrib]
+        texts = [element.text or "", *element.attrib.values()]
+        left = [f"<{n.rpartition('}')[2]}>" for n in names if "xacro" in n.rpartition("}")[0]]
+        left += [text.strip() for text in texts if "${" in text or "$(" in text]
+        if left:
+            raise HandError(
+                f"{path}: must be a model in which xacro left nothing to expand, got {left[0]!r}: "
+                "run `xacro` on its source"
+            )
+
+
+def _refuse_words(element: Element, mjcf: bool, owner: str) -> None:
+    """Refuse what is no number where a model has numbers: parsers read its start, or nothing."""
+    owner = f"{element.tag} {element.get('name')!r}" if "name" in element.attrib else owner
+    known = _MJCF_NUMBERS if mjcf else _NUMBERS
+    found = [(key, text) for key, text in element.attrib.items() if key in known]
+    if not mjcf and element.tag == "mass" and "value" in element.attrib:
+        found.append(("mass", element.attrib["value"]))
+    elif not mjcf and element.tag in known and not (len(element) or element.attrib):
+        found.append((element.tag, element.text or ""))
+    for key, text in found:
+        words = text.split() or [""]
+        ends = ("inf", "infinity") if key in _ENDLESS else ()
+        if not all(_NUMBER.fullmatch(w) or w.lower().lstrip("+-") in ends for w in words):
+            raise HandError(f"model: {key} of {owner} must be a number, got {text!r}")
+    for child in element:
+        _refuse_words(child, mjcf, owner)
+
+
 def _include(root: Element, folders: Folders, count: list[int]) -> None:
     """Put the content of included MJCF files in place of their <include>."""
     for parent in list(root.iter()):
@@ -128,20 +176,3 @@ def _include(root: Element, folders: Folders, count: list[int]) -> None:
             place = list(parent).index(child)
             parent.remove(child)
             parent[place:place] = list(included)
-
-
-def _inherit(default: Element, above: _Defaults) -> _Defaults:
-    """Write what a class of MJCF has from the classes around it into it; return what it gives.
-
-    Drake looks only as far as the next class: what that one does not name would be lost.
-    """
-    given = {tag: dict(attributes) for tag, attributes in above.items()}
-    own = [element for element in default if element.tag != "default"]
-    for element in own:
-        given.setdefault(element.tag, {}).update(element.attrib)
-        element.attrib.update(given[element.tag])
-    present = {element.tag for element in own}
-    default.extend(Element(tag, given[tag]) for tag in given if tag not in present)
-    for nested in default.findall("default"):
-        _inherit(nested, given)
-    return given
