@@ -193,6 +193,7 @@ def print_stats(out: Path) -> None:
         unfinished_line,
     )
     from drakegrasp.dataset.card.holding import holding_lines, holding_of
+    from drakegrasp.dataset.card.shortfall import split_shortfall
     from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, DATA_FILES
     from drakegrasp.dataset.statistics import (
@@ -213,25 +214,23 @@ def print_stats(out: Path) -> None:
         table = funnel_table(funnel, compact=True)
     console.print(table)
     console.print(hold_table(funnel))
-    if preshapes := preshapes_of(funnel, read_manifest(out).config):
+    config = read_manifest(out).config
+    if preshapes := preshapes_of(funnel, config):
         console.print(preshape_table(preshapes))
     console.print()
     if unfinished is None:
         splits = count_splits(out)
         console.print(split_table(splits))
-        say(split_line(split_rule_of(out / DATA_FILES["oto"]), funnel, splits))
-        for line in barren_lines(funnel):
+        rule = split_rule_of(out / DATA_FILES["oto"])
+        say(split_line(rule, funnel, splits))
+        for line in barren_lines(funnel, config):
             say(line)
         if (holding := holding_of(Trials(out))) is not None:
             for line in holding_lines(holding):
                 say(line)
-        samples = {row.split: row.samples for row in splits}
         of_benchmark = (out / BUILTIN_FOLDER / BENCHMARK_FILE).is_file()
-        if any(samples.values()) and not samples["train"] and not of_benchmark:
-            say(
-                "no sample is for training: by class, a class trains if two of its objects have "
-                "samples, or if split.train_classes names it; --set split.by=object trains on any"
-            )
+        if not of_benchmark and (line := split_shortfall(splits, rule, config.split)):
+            say(line)
     else:
         say(f"{out}: {unfinished_line(unfinished)}")
 

@@ -12,6 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from drakegrasp.config import Config
+from drakegrasp.dataset.card.shortfall import objects_without_samples
 from drakegrasp.dataset.statistics import (
     NO_NAME,
     Funnel,
@@ -19,7 +21,6 @@ from drakegrasp.dataset.statistics import (
     SplitCount,
     Unfinished,
     held_note,
-    why_no_samples,
 )
 from drakegrasp.errors import printable
 from drakegrasp.objects.audit import AuditRow
@@ -84,26 +85,34 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
     removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
     heads = ["poses", "attempts", *groups]
     heads += [] if compact else [f"- {r.label}".replace("_", "\n") for r in removed]
+    heads += ["+ refined"] if funnel.refined.any() else []
     table = _table("From palm poses to samples", "object", *heads, "samples")
     if funnel.refined.any():
         tried, held, samples = (f"{n:,}" for n in funnel.refined.sum(axis=0).tolist())
         table.caption = (
-            f"Besides, palm poses about those of samples (refined): {tried} attempts, {held} held, "
-            f"{samples} samples"
+            f"refined: palm poses about those of samples, {tried} attempts, {held} held, {samples} "
+            "samples; all other columns but the last are of the first round"
         )
 
-    def row(outcomes: Sequence[int], removals: Sequence[int], poses: int) -> list[str]:
-        cells = [poses, sum(outcomes), *(sum(outcomes[o] for o in g) for g in groups.values())]
-        cells += [] if compact else [removals[r] for r in removed]
-        return [f"{int(cell):,}" for cell in (*cells, removals[Removal.KEPT])]
+    def row(objects: slice) -> list[str]:
+        outcomes = funnel.outcomes[objects].sum(axis=0).tolist()
+        cells = [funnel.candidates[objects].sum(), sum(outcomes)]
+        cells += [sum(outcomes[o] for o in group) for group in groups.values()]
+        cells += [] if compact else [funnel.removals[objects, r].sum() for r in removed]
+        cells += _sample_cells(funnel, objects)
+        return [f"{int(cell):,}" for cell in cells]
 
     for i, name in enumerate(funnel.names):
-        outcomes, removals = funnel.outcomes[i].tolist(), funnel.removals[i].tolist()
-        table.add_row(_safe(name), *row(outcomes, removals, int(funnel.candidates[i])))
+        table.add_row(_safe(name), *row(slice(i, i + 1)))
     table.add_section()
-    outcomes, removals = funnel.outcomes.sum(0).tolist(), funnel.removals.sum(0).tolist()
-    table.add_row("all", *row(outcomes, removals, int(funnel.candidates.sum())))
+    table.add_row("all", *row(slice(None)))
     return table
+
+
+def _sample_cells(funnel: Funnel, objects: slice) -> list[int]:
+    """Return how many samples are refined ones, if any attempt is, and how many there are."""
+    refined = [int(funnel.refined[objects, 2].sum())] if funnel.refined.any() else []
+    return [*refined, int(funnel.samples[objects].sum())]
 
 
 def hold_table(funnel: Funnel) -> Table:
@@ -113,8 +122,9 @@ def hold_table(funnel: Funnel) -> Table:
     whole, part = held, stable
     if not funnel.all_lifted:
         head, (whole, part) = "in the audit:\nstable of held", funnel.audited.T[1:3]
-    heads = ("attempts", "held", "precision", "stable", head, "samples")
-    table = _table("How well the hand holds", "object", *heads)
+    heads = ["attempts", "held", "precision", "stable", head]
+    heads += ["+ refined"] if funnel.refined.any() else []
+    table = _table("How well the hand holds", "object", *heads, "samples")
 
     def row(objects: slice) -> list[str]:
         counts = (funnel.outcomes.sum(axis=1), held, funnel.precision, stable)
@@ -122,8 +132,8 @@ def hold_table(funnel: Funnel) -> Table:
         share = f"{all_stable / all_held:.0%}" if all_held else "-"
         if not funnel.all_lifted:
             share = f"{all_stable:,} of {all_held:,}, {share}"
-        samples = funnel.removals[objects, Removal.KEPT].sum()
-        return [*(f"{count[objects].sum():,}" for count in counts), share, f"{samples:,}"]
+        samples = (f"{n:,}" for n in _sample_cells(funnel, objects))
+        return [*(f"{count[objects].sum():,}" for count in counts), share, *samples]
 
     for i, name in enumerate(funnel.names):
         table.add_row(_safe(name), *row(slice(i, i + 1)))
@@ -147,9 +157,11 @@ def hold_table(funnel: Funnel) -> Table:
 
 def preshape_table(counts: Sequence[PreshapeCount]) -> Table:
     """Return how the attempts of each preshape ended, a row per preshape."""
-    table = _table("Preshapes", "preshape", "attempts", "held", "stable", "samples")
+    some = any(count.refined for count in counts)
+    heads = ("attempts", "held", "stable", *["+ refined"] * some, "samples")
+    table = _table("Preshapes", "preshape", *heads)
     for count in counts:
-        numbers = count.attempts, count.held, count.stable, count.samples
+        numbers = [count.attempts, count.held, count.stable, *[count.refined] * some, count.samples]
         table.add_row(_safe(count.preshape), *(f"{n:,}" for n in numbers))
     if any(count.preshape == NO_NAME for count in counts):
         table.caption = f"{NO_NAME}: postures for which all fingers close"
@@ -170,7 +182,7 @@ def split_table(counts: Sequence[SplitCount]) -> Table:
 def split_line(rule: str, funnel: Funnel, counts: Sequence[SplitCount]) -> str:
     """Return by what the samples are split, and how many objects are tested, as a line."""
     objects = {count.split: count.objects for count in counts}
-    total = np.count_nonzero(funnel.removals[:, Removal.KEPT])
+    total = np.count_nonzero(funnel.samples)
     # By class the objects that validate are those that train.
     valid = f", {objects['valid']:,} valid" if rule == "object" else ""
     return (
@@ -178,9 +190,12 @@ def split_line(rule: str, funnel: Funnel, counts: Sequence[SplitCount]) -> str:
     )
 
 
-def barren_lines(funnel: Funnel) -> list[str]:
+def barren_lines(funnel: Funnel, config: Config) -> list[str]:
     """Return why objects have no sample, a line for each of the first and one for the others."""
-    why = [f"no sample of {_safe(name)}: {text}" for name, text in why_no_samples(funnel).items()]
+    why = [
+        f"no sample of {_safe(name)}: {found.reason}. What may help: {found.advice}"
+        for name, found in objects_without_samples(funnel, config).items()
+    ]
     more = [f"no sample of {len(why) - BARREN:,} other objects"] if len(why) > BARREN else []
     return why[:BARREN] + more
 

@@ -30,11 +30,13 @@ from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError, HandError
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
-from drakegrasp.outcomes import Outcome, Removal, Stage
+from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.runtime.executor import Executor, run_here
 
 #: What stands for the name of a preshape of postures for which all fingers close.
 NO_NAME = "-"
+#: Columns of `Funnel.refined`.
+REFINED = ("attempts", "held", "samples")
 #: Columns of attempts that a funnel counts.
 _COUNTED = (
     *("object", "outcome", "removal", "generation", "standoff_index", "audited", "slip"),
@@ -46,8 +48,8 @@ _COUNTED = (
 class Funnel:
     """Numbers of candidates, outcomes and removals, by object, for m objects.
 
-    All but `refined` count palm poses of the first round: those about grasps that hold succeed far
-    more often.
+    Attempts and held grasps are those of the first round: palm poses about grasps that hold succeed
+    far more often. How many samples there are, refined ones included, only `samples` tells.
 
     Attributes:
         names, classes: (m,), of the objects.
@@ -60,7 +62,8 @@ class Funnel:
         refined: (m, 3), attempts, successes and samples of refined palm poses.
         audited: (m, 4), lifts, successes, stable ones and samples among audited attempts: they say
             how often lifts end so where others were chosen by their chance.
-        preshapes: (256, 4), attempts, successes, stable ones and samples by index of the preshape.
+        preshapes: (256, 5), by index of the preshape: attempts, successes, stable ones and samples
+            of the first round, and refined samples.
     """
 
     names: tuple[str, ...]
@@ -77,6 +80,11 @@ class Funnel:
     preshapes: npt.NDArray[np.int64]
 
     @property
+    def samples(self) -> npt.NDArray[np.int64]:
+        """(m,), all samples by object, refined ones included."""
+        return self.removals[:, Removal.KEPT] + self.refined[:, 2]
+
+    @property
     def all_lifted(self) -> bool:
         """Whether each closed hand that may lift was lifted."""
         return not self.outcomes[:, Outcome.NOT_LIFTED].any()
@@ -84,15 +92,17 @@ class Funnel:
 
 @dataclass(frozen=True)
 class PreshapeCount:
-    """Numbers of attempts, successes, stable ones and samples of a preshape, in the first round.
+    """Numbers of a preshape's attempts, successes and stable ones in the first round; its samples.
 
-    `preshape` is its name; `NO_NAME` of postures that are of none.
+    `preshape` is its name; `NO_NAME` of postures that are of none. `refined` of the samples are
+    refined ones.
     """
 
     preshape: str
     attempts: int
     held: int
     stable: int
+    refined: int
     samples: int
 
 
@@ -216,7 +226,7 @@ def funnel_of(trials: Trials) -> Funnel:
     removals = np.zeros((count, 1 + max(Removal)), dtype=np.int64)
     candidates, precision, stable = np.zeros((3, count), dtype=np.int64)
     refined, audited = np.zeros((count, 3), np.int64), np.zeros((count, 4), np.int64)
-    preshapes = np.zeros((1 + NO_PRESHAPE, 4), np.int64)
+    preshapes = np.zeros((1 + NO_PRESHAPE, 5), np.int64)
     for block in trials.blocks(_COUNTED):
         number, outcome, removal = (block[name] for name in ("object", "outcome", "removal"))
         held, sample = outcome == Outcome.SUCCESS, removal == Removal.KEPT
@@ -230,9 +240,9 @@ def funnel_of(trials: Trials) -> Funnel:
         decided = first & (removal != NONE)
         _count(removals, (number[decided], removal[decided]))
 
-        held_by = (True, held, held & block["stable"], sample)
-        for column, counted in zip(preshapes.T, held_by, strict=True):
-            _count(column, block["preshape"][first & counted])
+        held_by = (first, first & held, first & held & block["stable"], first & sample)
+        for column, counted in zip(preshapes.T, (*held_by, ~first & sample), strict=True):
+            _count(column, block["preshape"][counted])
 
         # What was refined from it, and what became of those that were lifted in any case.
         for column, counted in zip(refined.T, (True, held, sample), strict=True):
@@ -269,39 +279,17 @@ def preshapes_of(funnel: Funnel, config: Config) -> list[PreshapeCount]:
     named = list(enumerate(shape.name for shape in shapes))
     if named and funnel.preshapes[NO_PRESHAPE, 0]:
         named.append((NO_PRESHAPE, NO_NAME))
-    return [PreshapeCount(name, *funnel.preshapes[i].tolist()) for i, name in named]
+    counts = []
+    for i, name in named:
+        attempts, held, stable, kept, refined = funnel.preshapes[i].tolist()
+        counts.append(PreshapeCount(name, attempts, held, stable, refined, kept + refined))
+    return counts
 
 
 def _count(counts: npt.NDArray[np.int64], cells: Any) -> None:
     """Add to an array of counts how often each of its cells occurs."""
     flat = np.ravel_multi_index(cells, counts.shape) if counts.ndim > 1 else cells
     counts += np.bincount(flat, minlength=counts.size).reshape(counts.shape)
-
-
-def why_no_samples(funnel: Funnel) -> dict[str, str]:
-    """Return how far the attempts came of each object that has no sample, by its name."""
-    kept = funnel.removals[:, Removal.KEPT] + funnel.refined[:, 2]
-    return {funnel.names[i]: _furthest(funnel, i) for i in np.flatnonzero(kept == 0).tolist()}
-
-
-def _furthest(funnel: Funnel, i: int) -> str:
-    """Return in words where the attempts at object i end that come furthest."""
-    by = {outcome: int(funnel.outcomes[i, outcome]) for outcome in Outcome}
-    held, lifted = by[Outcome.SUCCESS], sum(by[o] for o in Outcome if o.stage is Stage.LIFTED)
-    closed = sum(by[o] for o in Outcome if o.stage is Stage.CLOSED) - by[Outcome.NOT_LIFTED]
-    if held:
-        reason = Removal(int(np.argmax(funnel.removals[i])))
-        return f"{held:,} held, none a sample: mostly {reason.label}"
-    if lifted:
-        return f"always lost: {lifted:,} lifts, none held"
-    if by[Outcome.NOT_LIFTED]:
-        count = by[Outcome.NOT_LIFTED]
-        return f"never lifted: {count:,} hands that closed with a small chance or a flat image"
-    if closed:
-        return f"never gripped: the hand closed {closed:,} times, never with fingertips alone"
-    if by[Outcome.START_COLLISION] > by[Outcome.SCREENED]:
-        return "never reached, the open hand collides: too flat or too large for it"
-    return "never reached: no palm pose from which all fingertips meet it"
 
 
 def held_note(funnel: Funnel) -> str:
@@ -389,6 +377,8 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
             "outcomes": labelled(Outcome, funnel.outcomes[i]),
             **{key: int(getattr(funnel, key)[i]) for key in ("precision", "stable")},
             "removals": labelled(Removal, funnel.removals[i]),
+            "refined": dict(zip(REFINED, funnel.refined[i].tolist(), strict=True)),
+            "samples": int(funnel.samples[i]),
         }
         for i, name in enumerate(funnel.names)
     ]

@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
+import json
+from collections import Counter
 from pathlib import Path
 
 import h5py
-import pytest
+import numpy as np
 from helpers.datasets import MISSING, SLIPPED, SUCCESS, TRIALS, change, make_dataset
 from helpers.hands import write_with_preshapes
 
+from drakegrasp.cli.tables import funnel_table, hold_table
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.schema import NO_PRESHAPE
+from drakegrasp.dataset.card.content import card_content
+from drakegrasp.dataset.layout.trial_files import NONE
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
 from drakegrasp.dataset.statistics import (
     NO_NAME,
     PreshapeCount,
     count_funnel,
     count_splits,
     count_unfinished,
+    counts_as_dict,
     preshapes_of,
-    why_no_samples,
 )
 from drakegrasp.hand.settings import load_config
+from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.visualization.figures.write import NUMBERS_FILE, write_figures
 
 
 def test_words_are_counted_by_object(out: Path) -> None:
@@ -65,13 +73,50 @@ def test_attempts_of_the_first_round_are_counted_by_preshape(out: Path, tmp_path
     hand = write_with_preshapes(tmp_path, all="F1 F2 F3", pair="F1 F3")
     counts = preshapes_of(funnel, load_config(overrides=[f"hand={hand}"]))
     assert counts == [
-        PreshapeCount("all", 32, 7, 7, 7),
-        PreshapeCount("pair", 3, 2, 1, 2),
-        PreshapeCount(NO_NAME, 1, 0, 0, 0),
+        PreshapeCount("all", 32, 7, 7, 0, 7),
+        PreshapeCount("pair", 3, 2, 1, 0, 2),
+        PreshapeCount(NO_NAME, 1, 0, 0, 0, 0),
     ]
     assert preshapes_of(funnel, load_config()) == []
     change(out, TRIALS, "trials/generation", 3, lambda _: 1)
-    assert count_funnel(out).preshapes[1].tolist() == [2, 1, 1, 1]
+    refined = preshapes_of(count_funnel(out), load_config(overrides=[f"hand={hand}"]))[1]
+    assert refined == PreshapeCount("pair", 2, 1, 1, 1, 2)
+
+
+def test_samples_are_as_many_wherever_they_are_counted(out: Path, tmp_path: Path) -> None:
+    """Two of the first object's and one of the third's are refined."""
+    with h5py.File(out / TRIALS) as file:
+        rows, objects = file["successes/trial_id"][:], file["trials/object"][:]
+    for row in (*rows[objects[rows] == 0][:2], rows[objects[rows] == 2][0]):
+        change(out, TRIALS, "trials/generation", int(row), lambda _: 1)
+
+    # The data file says which are samples.
+    found: Counter[str] = Counter()
+    for split in SPLITS:
+        data = GraspDataset(out / "grasping_oto.hdf5", split=split)
+        found.update(map(str, data.column("object_props/object_name")))
+    funnel = count_funnel(out)
+    assert funnel.refined[:, 2].tolist() == [2, 0, 1]
+    assert dict(zip(funnel.names, funnel.samples.tolist(), strict=True)) == found
+    total = found.total()
+    assert sum(row.samples for row in count_splits(out)) == total
+
+    # Tables, at any width, and `stats --json`.
+    for table in (funnel_table(funnel), funnel_table(funnel, compact=True), hold_table(funnel)):
+        last = dict(zip(table.columns[0].cells, table.columns[-1].cells, strict=True))
+        assert last == {**{name: str(n) for name, n in found.items()}, "all": str(total)}
+    counts = counts_as_dict(out)
+    assert {each["name"]: each["samples"] for each in counts["objects"]} == found
+
+    # The card, the figures and the page.
+    card = card_content(out)["counts"]
+    assert {name: row["samples"] for name, row in card["objects"].items()} == found
+    assert card["all"]["samples"] == total
+    write_figures(out, tmp_path / "figures")
+    numbers = json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())
+    assert {name: row["samples"] for name, row in numbers["objects"].items()} == found
+    assert (numbers["hold"]["samples"], numbers["hold"]["of these refined"]) == (total, 3)
+    assert np.count_nonzero(Catalog(out).current().table.split != NONE) == total
 
 
 def test_removals_are_counted_by_object(out: Path) -> None:
@@ -104,29 +149,6 @@ def test_splits_are_counted(out: Path) -> None:
     assert counts["test"] == (6, 2, 2)
     assert counts["train"][0] + counts["valid"][0] == 3
     assert counts["train"][1:] == counts["valid"][1:] == (1, 1)
-
-
-@pytest.mark.parametrize(
-    ("outcomes", "removals", "why"),
-    [
-        ({Outcome.START_COLLISION: 8, Outcome.SCREENED: 2}, {}, "never reached, the open hand"),
-        ({Outcome.START_COLLISION: 2, Outcome.SCREENED: 8}, {}, "never reached: no palm pose"),
-        ({Outcome.SCREENED: 9, Outcome.HAND_CONTACT: 1}, {}, "never gripped: the hand closed 1 "),
-        ({Outcome.HAND_CONTACT: 9, Outcome.MOVED: 3}, {}, "always lost: 3 lifts"),
-        ({Outcome.HAND_CONTACT: 9, Outcome.NOT_LIFTED: 3}, {}, "never lifted: 3 hands"),
-        ({Outcome.DROPPED: 9, Outcome.SUCCESS: 2}, {Removal.TURNED: 2}, "2 held, none a sample"),
-    ],
-)
-def test_object_without_samples_says_how_far_it_came(
-    sound: Path, outcomes: dict[Outcome, int], removals: dict[Removal, int], why: str
-) -> None:
-    funnel = count_funnel(sound)
-    assert not why_no_samples(funnel)
-    for counts, row in ((funnel.outcomes, outcomes), (funnel.removals, removals)):
-        counts[1] = 0
-        counts[1, list(row)] = list(row.values())
-    assert list(why_no_samples(funnel)) == [funnel.names[1]]
-    assert why_no_samples(funnel)[funnel.names[1]].startswith(why)
 
 
 def test_objects_of_one_class_are_one_class(tmp_path: Path) -> None:

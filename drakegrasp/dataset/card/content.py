@@ -294,9 +294,7 @@ def _row(
         "precision": int(funnel.precision[places].sum()),
         "stable": int(funnel.stable[places].sum()),
         "refined": int(funnel.refined[places, 2].sum()),
-        "samples": int(
-            funnel.removals[places, Removal.KEPT].sum() + funnel.refined[places, 2].sum()
-        ),
+        "samples": int(funnel.samples[places].sum()),
         **{split: sum(samples[split].get(name, 0) for name in names) for split in SPLITS},
     }
 

@@ -219,11 +219,17 @@ def _outcomes(data: _Dataset) -> _Drawn:
 def _hold(data: _Dataset) -> _Drawn:
     removals = data.funnel.removals.sum(axis=0)
     numbers = {name: int(group.sum()) for name, group in data.held.groups.items()}
-    numbers["samples"] = int(removals[Removal.KEPT])
+    numbers["samples"] = int(data.funnel.samples.sum())
+    if refined := int(data.funnel.refined[:, 2].sum()):
+        numbers["of these refined"] = refined
     for removal in Removal:
         if removals[removal] and removal is not Removal.KEPT:
             numbers[f"removed: {removal.label}"] = int(removals[removal])
-    colours = [*GROUPS.values(), SAMPLES_COLOUR]
+    colours = [
+        *GROUPS.values(),
+        SAMPLES_COLOUR,
+        *[SAMPLES_COLOUR] * ("of these refined" in numbers),
+    ]
     colours += [FAILED] * (len(numbers) - len(colours))
     return {"hold": draw_counts(numbers, "successes", colours=colours)}, numbers
 
@@ -233,9 +239,13 @@ def _objects(data: _Dataset) -> _Drawn:
     held = funnel.outcomes[:, Outcome.SUCCESS]
     counts = {"held": held, "precision": funnel.precision, "stable": funnel.stable}
     lists = {name: values.tolist() for name, values in counts.items()}
-    attempts = funnel.outcomes.sum(axis=1).tolist()
+    attempts, samples = funnel.outcomes.sum(axis=1).tolist(), funnel.samples.tolist()
     numbers = {
-        name: {"attempts": attempts[i], **{group: lists[group][i] for group in lists}}
+        name: {
+            "attempts": attempts[i],
+            **{group: lists[group][i] for group in lists},
+            "samples": samples[i],
+        }
         for i, name in enumerate(funnel.names)
     }
     return {"objects": draw_objects(funnel.names, lists)}, numbers
