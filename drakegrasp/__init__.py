@@ -27,7 +27,17 @@ if TYPE_CHECKING:
     from drakegrasp.dataset.reader import GraspDataset, Sample
     from drakegrasp.dataset.scenes.reader import SceneDataset
     from drakegrasp.dataset.trials import Trials
-    from drakegrasp.errors import DrakegraspError
+    from drakegrasp.errors import (
+        BlankImageError,
+        ConfigError,
+        DataError,
+        DiskFullError,
+        DrakegraspError,
+        GraspError,
+        HandError,
+        MachineError,
+        MeshError,
+    )
     from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
     from drakegrasp.hand.description import Hand, load_hand
     from drakegrasp.hand.settings import load_config
@@ -41,11 +51,19 @@ __version__ = metadata.version("drakegrasp")
 
 #: The module of each name.
 _HOMES = {
+    "BlankImageError": "errors",
     "BuildReport": "build.pipeline",
     "Config": "config",
+    "ConfigError": "errors",
+    "DataError": "errors",
+    "DiskFullError": "errors",
     "DrakegraspError": "errors",
     "GraspDataset": "dataset.reader",
+    "GraspError": "errors",
     "Hand": "hand.description",
+    "HandError": "errors",
+    "MachineError": "errors",
+    "MeshError": "errors",
     "Outcome": "outcomes",
     "PlacedObject": "api.verifying",
     "PoseTrial": "verification.result",
@@ -76,11 +94,19 @@ _HOMES = {
 }
 
 __all__ = [
+    "BlankImageError",
     "BuildReport",
     "Config",
+    "ConfigError",
+    "DataError",
+    "DiskFullError",
     "DrakegraspError",
     "GraspDataset",
+    "GraspError",
     "Hand",
+    "HandError",
+    "MachineError",
+    "MeshError",
     "Outcome",
     "PlacedObject",
     "PoseTrial",

@@ -15,6 +15,8 @@ three rows, row-major. Drake's `RigidTransform` appears only where Drake is call
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -103,6 +105,19 @@ def rotation_angle(R_AB: npt.ArrayLike) -> float:
 X_WT = make_pose(np.eye(3), P_WT)
 
 
+def without_torch(value: Any) -> Any:
+    """Return torch tensors, also those in lists, as NumPy arrays; anything else as it is.
+
+    NumPy itself refuses tensors that require gradients, and has no bfloat16.
+    """
+    if isinstance(value, list | tuple):
+        return [without_torch(each) for each in value]
+    if not hasattr(value, "is_floating_point"):
+        return value
+    tensor = value.detach().cpu()
+    return (tensor.double() if tensor.is_floating_point() else tensor).numpy()
+
+
 def as_numbers(value: npt.ArrayLike, must: str) -> Array:
     """Return an array of real numbers, of any shape; text and truth values are refused.
 
@@ -114,8 +129,8 @@ def as_numbers(value: npt.ArrayLike, must: str) -> Array:
         GraspError: If it is anything else.
     """
     try:
-        array = np.asarray(value)
-    except (TypeError, ValueError) as error:
+        array = np.asarray(without_torch(value))
+    except (TypeError, ValueError, RuntimeError) as error:
         raise GraspError(
             f"{must}, got a {type(value).__name__} that is none ({first_line(error)})"
         ) from None

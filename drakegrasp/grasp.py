@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.frames import Array, rotate_vectors, transform_points
+from drakegrasp.frames import Array, rotate_vectors, transform_points, without_torch
 
 
 def pack_grasp(p_AQ: npt.ArrayLike, nhat_Q_A: npt.ArrayLike) -> Array:
@@ -19,7 +19,8 @@ def pack_grasp(p_AQ: npt.ArrayLike, nhat_Q_A: npt.ArrayLike) -> Array:
     Raises:
         ValueError: If the two arrays are not both (k, 3) with the same k.
     """
-    points, normals = np.asarray(p_AQ, dtype=float), np.asarray(nhat_Q_A, dtype=float)
+    points = np.asarray(without_torch(p_AQ), dtype=float)
+    normals = np.asarray(without_torch(nhat_Q_A), dtype=float)
     if points.ndim != 2 or points.shape[1] != 3 or normals.shape != points.shape:
         raise ValueError(
             f"points and normals must both be (k, 3) arrays, got {points.shape} and {normals.shape}"
@@ -33,7 +34,7 @@ def unpack_grasp(grasp: npt.ArrayLike) -> tuple[Array, Array]:
     Raises:
         ValueError: If the vector's length is not a positive multiple of six.
     """
-    vector = np.asarray(grasp, dtype=float)
+    vector = np.asarray(without_torch(grasp), dtype=float)
     if vector.ndim != 1 or vector.size == 0 or vector.size % 6:
         raise ValueError(
             "a grasp must be a vector of 6 numbers per finger (18 for three fingers), "

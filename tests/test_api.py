@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -33,6 +35,7 @@ from drakegrasp.runtime.progress import silent
 from drakegrasp.verification.batch import verify_batch
 from drakegrasp.verification.hints import find_hints
 from drakegrasp.verification.placed_grasp import place_on_object, place_on_rows
+from drakegrasp.verification.result import Verification
 from drakegrasp.verification.result_files import write_results
 from drakegrasp.verification.verify import PlacedGrasp
 
@@ -163,21 +166,26 @@ def test_row_knows_the_frames_of_both_cameras(test_split: GraspDataset) -> None:
     """A grasp in the frame of the other camera is tried as it is, and gets a hint."""
     other = GraspDataset(test_split.path.with_name("grasping_otm.hdf5"), split=test_split.split)
     rows = list(range(len(test_split)))
-    placed = place_on_rows(other.column("grasps"), test_split, rows)
-    hints = [
-        find_hints(
-            g.placed.model, load_hand("barrett"), g.p_OQ, g.nhat_Q_O, X_OA=g.X_OA, X_OB=g.X_OB
-        )
-        for g in placed
-    ]
-    assert any("the frame of the dataset's other camera" in each for each in hints)
-    own = place_on_rows(test_split.column("grasps"), test_split, rows)
-    assert not any(
-        find_hints(
-            g.placed.model, load_hand("barrett"), g.p_OQ, g.nhat_Q_O, X_OA=g.X_OA, X_OB=g.X_OB
-        )
-        for g in own
-    )
+
+    def hints(grasps: np.ndarray, frame: str) -> set[str]:
+        placed = place_on_rows(grasps, test_split, rows, frame=frame)
+        return {
+            hint
+            for g in placed
+            for hint in find_hints(
+                g.placed.model,
+                load_hand("barrett"),
+                g.p_OQ,
+                g.nhat_Q_O,
+                X_OA=g.X_OA,
+                frames=g.frames,
+            )
+        }
+
+    own = test_split.column("grasps")
+    assert "the frame of the dataset's other camera" in hints(other.column("grasps"), "camera")
+    assert hints(own, "object") == hints(own, "workspace") == {"the camera's frame (camera)"}
+    assert not hints(own, "camera")
 
 
 @pytest.mark.parametrize(
@@ -196,18 +204,21 @@ def test_wrong_rows_are_refused(test_split: GraspDataset, rows: list | None, wor
         verify_rows(test_split, grasps, rows)
 
 
-@pytest.mark.filterwarnings("ignore:verify_grasps will be gone")
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"units": "cm"}, "units must be None with a dataset"),
-        ({"X_TC": np.eye(4)}, "X_TC must be None with a dataset"),
-        ({"mesh": "cup.obj"}, "mesh must be None with a dataset"),
-        ({"dataset": "grasps.hdf5"}, "data must be a GraspDataset, .*, got a str"),
-        ({"dataset": None}, "a mesh or a dataset must be given, got neither"),
-        ({"dataset": None, "mesh": "cup.obj"}, "rows must be None without a dataset, got rows"),
+        ({"units": "cm"}, "units must be None on a GraspDataset, which defines it, got a value"),
+        ({"X_TC": np.eye(4)}, "X_TC must be None on a GraspDataset"),
+        ({"X_TO": np.eye(4)}, "X_TO must be None on a GraspDataset"),
+        (
+            {"on": "OUT/data.hdf5"},
+            r"on must be GraspDataset\('OUT/data.hdf5', split=...\) for a data",
+        ),
+        ({"on": None}, "on must be the path of a mesh, .* or a GraspDataset, got a NoneType"),
+        ({"on": "cup.obj"}, r"rows must be given with a GraspDataset only, got \[0\]"),
         ({"config": "paper"}, "config must be a Config, see load_config, got a str"),
         ({"config": {}}, "config must be a Config, see load_config, got a dict"),
+        ({"frame": "palm"}, "frame must be one of object, camera, workspace, got 'palm'"),
         ({"rows": []}, r"rows must be one per grasp \(1\), got 0"),
         # Its objects are prepared: what the configuration says of them could not be kept.
         (
@@ -219,27 +230,88 @@ def test_wrong_rows_are_refused(test_split: GraspDataset, rows: list | None, wor
 def test_what_does_not_go_together_is_refused(
     test_split: GraspDataset, options: dict, words: str
 ) -> None:
-    asked = {"dataset": test_split, "rows": [0], **options}
+    asked = {"on": test_split, "rows": [0], **options}
     with pytest.raises((GraspError, ConfigError), match=words):
         verify_grasps(test_split.column("grasps")[:1], **asked)
 
 
-def test_calls_of_the_version_before_give_the_same_with_a_warning(cube: PlacedObject) -> None:
-    (new,) = cube.verify(GRASP.ravel(), method="forces")
-    with pytest.warns(FutureWarning, match=r"use place_object\(mesh, ...\).verify\(grasps\)"):
-        (old,) = verify_grasps(GRASP.reshape(1, 18), cube, method="forces")
-    with pytest.warns(FutureWarning, match="verify_grasp will be gone"):
-        one = verify_grasp(GRASP.ravel(), cube, method="forces", frame="object")
-    shares = [verdict.forces.planned_share for verdict in (new, old, one)]
-    assert len(set(shares)) == 1
+def test_one_grasp_of_a_dataset_names_its_row(test_split: GraspDataset) -> None:
+    grasp = test_split[0].grasp
+    with pytest.raises(
+        GraspError, match=r"row must be given with a GraspDataset, 0 to \d+, got None"
+    ):
+        verify_grasp(grasp, test_split)
+    with pytest.raises(GraspError, match=r"row must be one whole number, got \[0\]"):
+        verify_grasp(grasp, test_split, row=[0])
+    with pytest.raises(GraspError, match=r"one grasp must be a vector, .*\(1, 18\); many go into"):
+        verify_grasp(grasp[None], test_split, row=0)
+    with pytest.raises(GraspError, match="rows must be None on a Sample, which is one row, got"):
+        verify_grasp(grasp, test_split[0], row=0)
 
 
-def test_row_of_a_dataset_may_be_given_to_the_call_of_the_version_before(
-    test_split: GraspDataset,
-) -> None:
-    with pytest.warns(FutureWarning, match="use verify_rows"):
-        verdict = verify_grasp(np.full(18, np.nan), dataset=test_split, row=0)
-    assert verdict.outcome is Outcome.INVALID
+def same(one: Verification, other: Verification) -> bool:
+    """Return whether two verdicts are the same, to the bit."""
+    return (
+        one.outcome is other.outcome
+        and one.placed.model.name == other.placed.model.name
+        and np.array_equal(one.p_OQ, other.p_OQ)
+        and np.array_equal(one.placed.X_TO, other.placed.X_TO)
+        and one.epsilon == other.epsilon
+        and one.config == other.config
+    )
+
+
+def test_everything_that_a_grasp_can_be_on(test_split: GraspDataset, tmp_path: Path) -> None:
+    """A mesh as file and in memory, a placed object, a row, and a sample are the same object."""
+    box = trimesh.creation.box([EDGE] * 3)
+    box.export(tmp_path / "cube.obj")
+    scaled = trimesh.creation.box([100.0 * EDGE] * 3)
+    placed = place_object(box)
+    on_mesh = [
+        verify_grasp(GRASP.ravel(), on, units=units, method="forces")
+        for on, units in [(tmp_path / "cube.obj", None), (str(tmp_path / "cube.obj"), "m"),
+                          (box, None), (scaled, "cm"), (placed, None)]
+    ]  # fmt: skip
+    assert all(verdict.success for verdict in on_mesh)
+    assert len({verdict.epsilon for verdict in on_mesh}) == 1
+    (by_object,) = placed.verify(GRASP.ravel(), method="forces")
+    assert same(by_object, on_mesh[-1])
+
+    # A sample is its row, also as a copy, in another process, and of a slice.
+    row = len(test_split) - 1
+    sample = test_split[row]
+    by_row = verify_grasp(sample.grasp, test_split, row=row, method="forces")
+    assert by_row.config.hand == "barrett" and by_row.surface_distance.max() < 0.005
+    copies = [
+        sample,
+        test_split[row:][0],
+        copy.deepcopy(sample),
+        pickle.loads(pickle.dumps(sample)),
+    ]
+    copies.append(replace(sample, trial_id=0))
+    for each in copies:
+        assert same(by_row, verify_grasp(sample.grasp, each, method="forces"))
+    pair = verify_grasps([sample.grasp, sample.grasp], sample, method="forces")
+    assert [same(by_row, each) for each in pair] == [True, True]
+    (by_rows,) = verify_rows(test_split, sample.grasp, [row], method="forces")
+    assert same(by_row, by_rows)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32", "float16", "bfloat16"])
+def test_tensors_go_in(cube: PlacedObject, dtype: str) -> None:
+    torch = pytest.importorskip("torch")
+    rounded = torch.tensor(GRASP.ravel(), dtype=getattr(torch, dtype), requires_grad=True)
+    numbers = rounded.detach().double().numpy()
+    due = verify_grasp(numbers, cube, method="forces")
+    X_TC = torch.tensor(cube.X_TO, dtype=torch.float32, requires_grad=True)
+    assert same(due, verify_grasp(rounded, cube, method="forces"))
+    on_table = verify_grasps(rounded[None], cube, frame="camera", X_TC=X_TC, method="forces")
+    assert same(due, on_table[0])
+    both = verify_grasps([rounded, rounded], cube, method="forces")
+    lists = verify_grasps([list(rounded), numbers.tolist()], cube, method="forces")
+    assert all(same(due, each) for each in [*both, *lists])
+    uneven = verify_grasps([rounded, rounded[:3]], cube, method="forces")
+    assert same(due, uneven[0]) and uneven[1].outcome is Outcome.INVALID
 
 
 def test_object_keeps_the_rules_that_it_was_placed_by() -> None:

@@ -39,7 +39,7 @@ def main() -> None:
     angles = np.deg2rad([60.0, -60.0, 180.0])
     nhat_Q_O = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(3)])
     p_OQ = 0.026 * nhat_Q_O + [0.0, 0.0, 0.02]  # [m]
-    (verdict,) = vase.verify(dg.pack_grasp(p_OQ, nhat_Q_O))
+    verdict = dg.verify_grasp(dg.pack_grasp(p_OQ, nhat_Q_O), on=vase)
 
     print(verdict.explain())
     verdict.figure().savefig("example/03_own_mesh.png")

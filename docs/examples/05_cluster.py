@@ -30,7 +30,7 @@ def main() -> None:
 
         # Verification takes the client itself. The dataset's own grasps stand for predictions.
         data = dg.GraspDataset(DATASET, split="test")
-        verdicts = dg.verify_rows(data, data.column("grasps"), client=client)
+        verdicts = dg.verify_grasps(data.column("grasps"), on=data, client=client)
     Path("example/scheduler.json").unlink()
 
     # The smallest friction coefficient at which forces at the contacts can hold the object: the

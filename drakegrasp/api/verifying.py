@@ -1,17 +1,18 @@
 """Verifying grasps, on Dask workers or in this process.
 
-Grasps are verified through two doors: `place_object(...).verify(...)` for those of one object, and
-`verify_rows` for those of a dataset's rows.
+`verify_grasp` and `verify_grasps` are the calls for everything that a grasp can be on: a mesh, an
+object that was placed before, a sample, a dataset. The others are short forms of them.
 """
 
 from __future__ import annotations
 
-import warnings
+import multiprocessing
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
 import numpy.typing as npt
 import trimesh
 
@@ -19,7 +20,7 @@ from drakegrasp.api.workers import connection, end_imported_script
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.config import Config
-from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.reader import GraspDataset, Sample
 from drakegrasp.errors import GraspError
 from drakegrasp.frames import as_numbers
 from drakegrasp.hand.settings import override_config
@@ -33,6 +34,7 @@ from drakegrasp.verification.placed_grasp import (
     place_on_object,
     place_on_rows,
 )
+from drakegrasp.verification.prediction import HDF5_SUFFIXES
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.verify import PlacedGrasp
 
@@ -41,12 +43,221 @@ if TYPE_CHECKING:
 
 #: What an object on the table is made of: a mesh file, a mesh, or an object that was placed before.
 ObjectMesh: TypeAlias = str | Path | trimesh.Trimesh | Placed
+#: What a grasp can be on: an object, or what says of each grasp which object it is for.
+GraspTarget: TypeAlias = ObjectMesh | Sample | GraspDataset
 
 #: Up to this many grasps are verified in this process: starting workers would take longer.
 FEW_GRASPS = 4
 #: Grasps of one object are verified together, at most so many, as long as each worker has some
 #: tasks, so that none is idle in the end.
 MOST_TOGETHER, TASKS_PER_WORKER = 16, 4
+
+
+def verify_grasp(
+    grasp: npt.ArrayLike,
+    on: GraspTarget,
+    *,
+    row: int | None = None,
+    frame: str | None = None,
+    X_TC: npt.ArrayLike | None = None,
+    units: str | None = None,
+    X_TO: npt.ArrayLike | None = None,
+    hand: str | Path | None = None,
+    method: str = "hand",
+    snap_points: bool = False,
+    config: Config | None = None,
+) -> Verification:
+    """Return whether a predicted grasp holds its object in the simulator, why not, and how.
+
+    >>> verdict = verify_grasp(grasp, "mug.obj", units="cm")          # doctest: +SKIP
+    >>> verdict = verify_grasp(my_network(sample.image), on=sample)   # doctest: +SKIP
+
+    Args:
+        grasp: (6k,) for a hand of k fingers (18 for the Barrett Hand): k contact points [m], then
+            k normals out of the object, in the finger order of the hand file. A list, an array, or
+            a tensor of torch.
+        on: What the grasp is on, see `verify_grasps`.
+        row: The grasp's row, if `on` is a `GraspDataset`.
+        frame: See `verify_grasps`, as all that follows.
+        X_TC: (4, 4), pose of the camera.
+        units: Of a mesh.
+        X_TO: (4, 4), pose of the object.
+        hand: Name or YAML file.
+        method: "hand" or "forces".
+        snap_points: Whether to move the points to the surface first.
+        config: Hand, physics, lift and rules.
+
+    Returns:
+        The verdict. Numbers that are no grasp, e.g. NaN, have the outcome `invalid`.
+
+    Raises:
+        GraspError: If the grasp is no vector, else as `verify_grasps`.
+        MeshError, ConfigError, HandError, DataError: As `verify_grasps`.
+    """
+    # One grasp, and one row where a row is needed.
+    vector = as_numbers(grasp, "a grasp must be a vector of numbers")
+    if vector.ndim != 1:
+        raise GraspError(
+            f"one grasp must be a vector, got an array of shape {vector.shape}; many go into "
+            "verify_grasps"
+        )
+    if row is not None and np.ndim(row):
+        raise GraspError(f"row must be one whole number, got {row!r}")
+    if row is None and isinstance(on, GraspDataset):
+        raise GraspError(f"row must be given with a GraspDataset, 0 to {len(on) - 1}, got None")
+
+    # In this process: to start workers would take longer.
+    (placed,) = _place(
+        vector,
+        on,
+        None if row is None else [row],
+        frame=frame,
+        X_TC=X_TC,
+        units=units,
+        X_TO=X_TO,
+        hand=hand,
+        method=method,
+        snap_points=snap_points,
+        config=config,
+    )
+    (verdict,) = _verify_on(None, [placed], show=False)
+    return verdict
+
+
+def verify_grasps(
+    grasps: npt.ArrayLike,
+    on: GraspTarget,
+    *,
+    rows: Sequence[int] | None = None,
+    frame: str | None = None,
+    X_TC: npt.ArrayLike | None = None,
+    units: str | None = None,
+    X_TO: npt.ArrayLike | None = None,
+    hand: str | Path | None = None,
+    method: str = "hand",
+    snap_points: bool = False,
+    config: Config | None = None,
+    client: Client | None = None,
+    show: bool = False,
+) -> list[Verification]:
+    """Return the verdicts on predicted grasps, in their order; see `verify_grasp`.
+
+    | `on` | the grasps are on | default frame | friction and mass |
+    |---|---|---|---|
+    | path of a mesh, `trimesh.Trimesh` | this object, dropped on the table | object | of `config` |
+    | `PlacedObject` | this object as it lies | object | as it was placed with |
+    | `Sample` | its object as it lies in its row, all of them | camera | drawn for its row |
+    | `GraspDataset` | the objects of `rows`, as they lie there | camera | drawn for each row |
+
+    Args:
+        grasps: (n, 6k), or (6k,) for one. A row that is no grasp has the outcome `invalid`, and
+            spoils no other.
+        on: What they are on.
+        rows: Only of a `GraspDataset`: the row of its split for each grasp; all rows, in order, if
+            None.
+        frame: The frame of the grasps: "object" {O}, whose origin is the centre of the bounding
+            box, "camera" {C} or "workspace" {T}, the centre of the table top. The default if None.
+        X_TC: Only of an object, with frame "camera": pose of the camera in {T}, (4, 4), or one
+            per grasp (n, 4, 4). Rows have their own.
+        units: Only of a mesh: unit of its lengths, m, cm or mm; metres if None. An `objects.yaml`
+            beside a file wins. Grasps are always in metres.
+        X_TO: Only of an object: its pose on the table, (4, 4).
+        hand: Name or YAML file of the hand; that of the configuration or of the dataset if None.
+        method: "hand" closes a simulated hand on the contacts and lifts; "forces" asks whether
+            forces at the contacts of the surface that they select can lift the object.
+        snap_points: Whether to move the points, not the normals, to the nearest ones of the
+            object's surface first.
+        config: Hand, physics, lift and rules. If None, those of the placed object or of the
+            dataset, else the defaults. In place of a dataset's, nothing drawn for a row counts.
+        client: A Dask client whose workers share the work. If None, this process verifies up to
+            four grasps, and workers of this machine more.
+        show: Whether to show progress on standard error.
+
+    Raises:
+        GraspError: If the array is none of grasps, `on` is nothing of these, an argument does not
+            go with it, rows do not exist or are not one per grasp, or a frame, pose or method
+            cannot be used.
+        MeshError: If a mesh cannot be simulated or does not come to rest.
+        ConfigError: If config is none, or the object was prepared with other values.
+        HandError: If the hand cannot be used.
+        DataError: If the dataset cannot be used, or has changed since the sample was read.
+        MachineError: If a worker would give other results than this machine.
+    """
+    placed = _place(
+        grasps,
+        on,
+        rows,
+        frame=frame,
+        X_TC=X_TC,
+        units=units,
+        X_TO=X_TO,
+        hand=hand,
+        method=method,
+        snap_points=snap_points,
+        config=config,
+    )
+    # A worker of somebody's pool may not start processes.
+    alone = len(placed) <= FEW_GRASPS or multiprocessing.current_process().daemon
+    if client is not None or alone:
+        return _verify_on(client, placed, show=show)
+    return run_verification(placed, show=show)
+
+
+def _place(
+    grasps: npt.ArrayLike,
+    on: GraspTarget,
+    rows: Sequence[int] | None,
+    *,
+    frame: str | None,
+    X_TC: npt.ArrayLike | None,
+    units: str | None,
+    X_TO: npt.ArrayLike | None,
+    hand: str | Path | None,
+    method: str,
+    snap_points: bool,
+    config: Config | None,
+) -> list[PlacedGrasp]:
+    """Return grasps on what they are on; arguments that do not go with it are refused."""
+    _refuse_other_targets(on)
+    how: dict[str, Any] = {"method": method, "snap_points": snap_points}
+    if not isinstance(on, Sample | GraspDataset):
+        if rows is not None:
+            raise GraspError(f"rows must be given with a GraspDataset only, got {rows!r}")
+        thing = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
+        return place_on_object(grasps, thing, frame=frame or "object", X_TC=X_TC, **how)
+
+    # Rows of a dataset define the object, how it lies, and the cameras.
+    for name, value in {"X_TC": X_TC, "units": units, "X_TO": X_TO}.items():
+        if value is not None:
+            raise GraspError(
+                f"{name} must be None on a {type(on).__name__}, which defines it, got a value"
+            )
+    if isinstance(on, Sample) and rows is not None:
+        raise GraspError(f"rows must be None on a Sample, which is one row, got {rows!r}")
+    data, chosen = (on.dataset, on.row) if isinstance(on, Sample) else (on, rows)
+    placed = place_on_rows(
+        grasps, data, chosen, frame=frame or "camera", hand=hand, config=config, **how
+    )
+
+    # The object of a verdict can verify more grasps.
+    things = {id(grasp.placed): grasp.placed for grasp in placed}
+    doors = {
+        key: PlacedObject(model=thing.model, X_TO=thing.X_TO, config=thing.config)
+        for key, thing in things.items()
+    }
+    return [replace(grasp, placed=doors[id(grasp.placed)]) for grasp in placed]
+
+
+def _refuse_other_targets(on: object) -> None:
+    if not isinstance(on, str | Path | trimesh.Trimesh | Placed | Sample | GraspDataset):
+        raise GraspError(
+            "on must be the path of a mesh, a trimesh.Trimesh, a placed object, a Sample or a "
+            f"GraspDataset, got a {type(on).__name__}"
+        )
+    if isinstance(on, str | Path) and Path(on).suffix.lower() in HDF5_SUFFIXES:
+        raise GraspError(
+            f"on must be GraspDataset({str(on)!r}, split=...) for a data file, got its path"
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -57,44 +268,16 @@ class PlacedObject(ObjectOnTable):
         self,
         grasps: npt.ArrayLike,
         *,
-        frame: str = "object",
+        frame: str | None = None,
         X_TC: npt.ArrayLike | None = None,
         method: str = "hand",
         snap_points: bool = False,
         client: Client | None = None,
         show: bool = False,
     ) -> list[Verification]:
-        """Return whether predicted grasps hold the object in the simulator, why not, and how.
-
-        A grasp is 6k numbers for a hand of k fingers (18 for the Barrett Hand): k contact points
-        [m], then k unit normals out of the object, in the finger order of the hand file. A row of
-        numbers that is no grasp has the outcome `invalid`, and spoils no other.
-
-        Args:
-            grasps: (n, 6k), or (6k,) for one.
-            frame: The frame of the grasps: "object" {O}, whose origin is the centre of the
-                bounding box, "camera" {C} or "workspace" {T}.
-            X_TC: With frame "camera": pose of the camera in the table-top frame, (4, 4), or one
-                per grasp (n, 4, 4).
-            method: "hand" closes a simulated hand on the contacts and lifts; "forces" asks whether
-                forces at the contacts of the surface that they select can lift the object.
-            snap_points: Whether to move the points, not the normals, to the nearest ones of the
-                object's surface first.
-            client: A Dask client whose workers share the work; this process does it if None.
-            show: Whether to show progress on standard error.
-
-        Returns:
-            The verdicts, in the order of the grasps.
-
-        Raises:
-            GraspError: If the whole array has another shape, or the frame, the camera's pose or
-                the method cannot be used.
-            MachineError: If a worker would give other results than this machine.
-        """
-        placed = place_on_object(
-            grasps, self, frame=frame, X_TC=X_TC, method=method, snap_points=snap_points
-        )
-        return _verify_on(client, placed, show=show)
+        """Return `verify_grasps(grasps, self, ...)`, the verdicts on grasps of this object."""
+        how: dict[str, Any] = {"method": method, "snap_points": snap_points}
+        return verify_grasps(grasps, self, frame=frame, X_TC=X_TC, **how, client=client, show=show)
 
 
 def place_object(
@@ -135,7 +318,7 @@ def verify_rows(
     predictions: npt.ArrayLike,
     rows: Sequence[int] | None = None,
     *,
-    frame: str = "camera",
+    frame: str | None = None,
     method: str = "hand",
     snap_points: bool = False,
     hand: str | Path | None = None,
@@ -143,106 +326,10 @@ def verify_rows(
     client: Client | None = None,
     show: bool = False,
 ) -> list[Verification]:
-    """Return the verdicts on grasps that were predicted for rows of a dataset, in their order.
-
-    A row says which object it is, how it lies on the table, where the camera was, and what
-    friction and mass were drawn. See `PlacedObject.verify`.
-
-    Args:
-        data: A data file of a dataset, with its split.
-        predictions: (n, 6k), or (6k,) for one.
-        rows: The row of the split for each grasp; all rows, in order, if None.
-        frame: "camera" of this data file, "object" or "workspace".
-        method: "hand" or "forces".
-        snap_points: Whether to move the points to the object's surface first.
-        hand: Name or YAML file of the hand; the dataset's if None.
-        config: Physics, lift and rules instead of the dataset's, with what its rows drew.
-        client: A Dask client whose workers share the work; this process does it if None.
-        show: Whether to show progress on standard error.
-
-    Raises:
-        GraspError: As `PlacedObject.verify`, or if rows do not exist or are not one per grasp.
-        ConfigError, HandError, DataError: If configuration, hand or dataset cannot be used.
-        MachineError: If a worker would give other results than this machine.
-    """
-    if not isinstance(data, GraspDataset):
-        raise GraspError(
-            "data must be a GraspDataset, which has a file and a split, "
-            f"got a {type(data).__name__}"
-        )
+    """Return `verify_grasps(predictions, data, rows=rows, ...)`, the verdicts on rows' grasps."""
     how: dict[str, Any] = {"frame": frame, "method": method, "snap_points": snap_points}
-    placed = place_on_rows(predictions, data, rows, hand=hand, config=config, **how)
-
-    # The object of a verdict can verify more grasps.
-    things = {id(grasp.placed): grasp.placed for grasp in placed}
-    doors = {
-        key: PlacedObject(model=thing.model, X_TO=thing.X_TO, config=thing.config)
-        for key, thing in things.items()
-    }
-    placed = [replace(grasp, placed=doors[id(grasp.placed)]) for grasp in placed]
-    return _verify_on(client, placed, show=show)
-
-
-def verify_grasp(
-    grasp: npt.ArrayLike,
-    mesh: ObjectMesh | None = None,
-    *,
-    row: int | None = None,
-    **options: Any,
-) -> Verification:
-    """Return the verdict on one grasp: the call of version 0.2, see `verify_grasps`."""
-    vector = as_numbers(grasp, "a grasp must be a vector of numbers")
-    if vector.ndim != 1:
-        raise GraspError(f"one grasp must be a vector, got an array of shape {vector.shape}")
-    rows = None if row is None else [row]
-    (result,) = _verify_as_before("verify_grasp", vector, mesh, rows=rows, **options)
-    return result
-
-
-def verify_grasps(
-    grasps: npt.ArrayLike, mesh: ObjectMesh | None = None, **options: Any
-) -> list[Verification]:
-    """Return the verdicts on many grasps: the call of version 0.2, which the next one drops.
-
-    Use `place_object(mesh, units=…, X_TO=…, hand=…, config=…).verify(grasps, …)`, or
-    `verify_rows(dataset, grasps, rows, …)`; their arguments have the same names.
-    """
-    return _verify_as_before("verify_grasps", grasps, mesh, **options)
-
-
-def _verify_as_before(
-    name: str,
-    grasps: npt.ArrayLike,
-    mesh: ObjectMesh | None,
-    *,
-    dataset: GraspDataset | None = None,
-    rows: Sequence[int] | None = None,
-    frame: str | None = None,
-    X_TC: npt.ArrayLike | None = None,
-    **options: Any,
-) -> list[Verification]:
-    """Verify grasps by one of the two new calls, with a warning that says which."""
-    new = "place_object(mesh, ...).verify(grasps)" if dataset is None else "verify_rows"
-    warnings.warn(f"{name} will be gone in the next version, use {new}", FutureWarning, 3)
-
-    # Rows of a dataset define what the others name.
-    if dataset is not None:
-        names = ("units", "X_TO")
-        given = {"mesh": mesh, "X_TC": X_TC, **{n: options.pop(n, None) for n in names}}
-        for key, value in given.items():
-            if value is not None:
-                raise GraspError(
-                    f"{key} must be None with a dataset, which defines it, got a value"
-                )
-        return verify_rows(dataset, grasps, rows, frame=frame or "camera", **options)
-    if mesh is None:
-        raise GraspError("a mesh or a dataset must be given, got neither")
-    if rows is not None:
-        raise GraspError("rows must be None without a dataset, got rows")
-
-    of_object = {"units", "X_TO", "hand", "config"} & options.keys()
-    placed = place_object(mesh, **{n: options.pop(n) for n in of_object})
-    return placed.verify(grasps, frame=frame or "object", X_TC=X_TC, **options)
+    how |= {"hand": hand, "config": config}
+    return verify_grasps(predictions, data, rows=rows, **how, client=client, show=show)
 
 
 def run_verification(

@@ -10,11 +10,12 @@ from __future__ import annotations
 import hashlib
 import operator
 import os
+import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 from weakref import WeakSet
 
 import h5py
@@ -25,7 +26,7 @@ from drakegrasp.dataset.hdf5 import ImageRows, open_hdf5, says_damage
 from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS
 from drakegrasp.errors import DataError, MachineError, first_line
-from drakegrasp.grasp import unused_fingers
+from drakegrasp.grasp import unpack_grasp, unused_fingers
 
 if TYPE_CHECKING:
     from drakegrasp.dataset.loaders.torch_samples import TorchSamples
@@ -34,9 +35,9 @@ if TYPE_CHECKING:
 FIELDS = {field.name: field for field in DATA_FIELDS}
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Sample:
-    """One grasp with the image of its camera.
+    """One grasp with the image of its camera; `print` shows it on one screen.
 
     Attributes:
         image: (4, S, S) float32: R, G, B in 0..1 and depth [m].
@@ -50,6 +51,8 @@ class Sample:
         grasp_props: Fields of `grasp_props` by name: how well it holds, forces, palm, joints.
         props: Fields of `object_props` by name: names, mass properties, frames.
         conditions: Fields of `conditions` by name: friction, colours, light, camera, noise.
+        dataset, row: Where it is from: the dataset and the row of its split. Copies and pickles
+            keep both.
     """
 
     image: npt.NDArray[np.float32]
@@ -61,6 +64,21 @@ class Sample:
     grasp_props: dict[str, Any]
     props: dict[str, Any]
     conditions: dict[str, Any]
+    dataset: GraspDataset
+    row: int
+
+    def __repr__(self) -> str:
+        return (
+            f"Sample({self.props['object_name']!r}, row {self.row} of {self.dataset.split} in "
+            f"{self.dataset.path.name}, trial {self.trial_id})"
+        )
+
+    def __str__(self) -> str:
+        lines = (
+            textwrap.fill(text, 100, initial_indent=f"  {name:<13}", subsequent_indent=15 * " ")
+            for name, text in _lines_of(self)
+        )
+        return "\n".join([repr(self), *lines])
 
 
 class GraspDataset:
@@ -121,8 +139,23 @@ class GraspDataset:
     def __len__(self) -> int:
         return self._length
 
-    def __getitem__(self, index: int) -> Sample:
-        row = self.row_of(index)
+    @overload
+    def __getitem__(self, index: int | np.integer) -> Sample: ...
+
+    @overload
+    def __getitem__(
+        self, index: slice | Sequence[int] | npt.NDArray[np.integer]
+    ) -> list[Sample]: ...
+
+    def __getitem__(
+        self, index: int | np.integer | slice | Sequence[int] | npt.NDArray[np.integer]
+    ) -> Sample | list[Sample]:
+        """Return the sample of an index, or a list of those of a slice or a list of indices."""
+        if isinstance(index, slice):
+            return [self[i] for i in range(len(self))[index]]
+        if np.ndim(index) == 1 and not isinstance(index, tuple):  # type: ignore[arg-type]
+            return [self[i] for i in index]  # type: ignore[union-attr]
+        row = self.row_of(index)  # type: ignore[arg-type]
         values = {field.name: self.value(field.name, row) for field in DATA_FIELDS}
         return Sample(
             image=values["images"],
@@ -134,9 +167,11 @@ class GraspDataset:
             grasp_props=_group(values, "grasp_props/"),
             props=_group(values, "object_props/"),
             conditions=_group(values, "conditions/"),
+            dataset=self,
+            row=row,
         )
 
-    def row_of(self, index: int) -> int:
+    def row_of(self, index: int | np.integer) -> int:
         """Return the row of an index, which counts from the end if it is negative.
 
         Raises:
@@ -160,7 +195,7 @@ class GraspDataset:
             value: Any = self._field(name)[row]
             return value.decode() if FIELDS[name].dtype == "str" else value
         except Exception as error:
-            raise self._told(error) from None
+            raise self._as_damage(error) from None
 
     def read_images(self, name: str, rows: Sequence[int], images: npt.NDArray[Any]) -> None:
         """Read images of some rows into an array, without a copy on the way.
@@ -180,7 +215,7 @@ class GraspDataset:
             for image, row in zip(images, rows, strict=True):
                 field.read_into(row, image)
         except Exception as error:
-            raise self._told(error) from None
+            raise self._as_damage(error) from None
 
     def column(self, name: str) -> npt.NDArray[Any]:
         """Return all rows (n, ...) of a field, e.g. `grasps` or `grasp_props/stable`.
@@ -205,7 +240,7 @@ class GraspDataset:
                 return np.asarray(dataset.asstr()[start:stop])
             return np.asarray(dataset[start:stop])
         except Exception as error:
-            raise self._told(error) from None
+            raise self._as_damage(error) from None
 
     def to_torch(self, fields: Sequence[str] = ("images", "grasps")) -> TorchSamples:
         """Return the split as a `torch.utils.data.Dataset` of tensors.
@@ -266,7 +301,7 @@ class GraspDataset:
         _open_readers.add(self)
         return file
 
-    def _told(self, error: Exception) -> Exception:
+    def _as_damage(self, error: Exception) -> Exception:
         """Return an error as a `DataError` that names the file if the file is damaged."""
         if isinstance(error, DataError) or not says_damage(error):
             return error
@@ -293,6 +328,35 @@ def _refuse_other_fields(names: Sequence[str]) -> None:
     for name in names:
         if name not in FIELDS:
             raise DataError(f"field must be one of {', '.join(FIELDS)}, got {name!r}")
+
+
+def _lines_of(sample: Sample) -> Iterator[tuple[str, str]]:
+    """Yield names and texts that say what a sample holds: shapes and main values."""
+    depth = sample.image[3]
+    yield "image", f"{sample.image.shape} float32, depth {depth.min():.3f} to {depth.max():.3f} m"
+    yield "mask", f"{sample.mask.shape} uint8, {np.count_nonzero(sample.mask):,} px of the object"
+
+    # Contacts by finger.
+    points, normals = unpack_grasp(sample.grasp)
+    yield "grasp", f"{sample.grasp.shape} float32, p_CQ [m] and nhat_Q_C of each finger:"
+    for point, normal in zip(points, normals, strict=True):
+        yield "", "  ".join(" ".join(f"{x:7.4f}" for x in vector) for vector in (point, normal))
+    yield "grasp_held", f"{sample.grasp_held.shape} float32, the same after the lift"
+
+    # Of groups, single numbers and texts by their values, arrays by their shapes.
+    for name in ("grasp_props", "props", "conditions"):
+        values = getattr(sample, name)
+        texts, arrays = [], []
+        for key, value in values.items():
+            if np.ndim(value):
+                arrays.append(f"{key} {np.shape(value)}")
+            else:
+                texts.append(
+                    f"{key} {value:.3g}"
+                    if np.issubdtype(type(value), np.floating)
+                    else f"{key} {value}"
+                )
+        yield name, ", ".join([*texts, *arrays])
 
 
 def _group(values: dict[str, Any], prefix: str) -> dict[str, Any]:

@@ -24,11 +24,13 @@ class SurfaceFit:
         nearest: (k, 3), the points of the surface nearest to them, in {O} [m].
         agreement: (k,), cosine between each normal and the outward normal of a face next to its
             point, of the face where it is largest; negative where the normal points inwards.
+        normals: (k, 3), outward unit normals in {O} of the faces nearest to the points.
     """
 
     distance: Array
     nearest: Array
     agreement: Array
+    normals: Array
 
 
 def fit_surface(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> SurfaceFit:
@@ -58,4 +60,5 @@ def fit_surface(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> SurfaceFit:
         distance=distance,
         nearest=near.reshape(k, m, 3)[np.arange(k), face],
         agreement=np.where(beside, cosine, -1.0).max(axis=1),
+        normals=model.collision.face_normals[face],
     )

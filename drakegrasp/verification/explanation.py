@@ -1,7 +1,8 @@
 """The verdict on a grasp in sentences, for people.
 
 In: a `Verification`. Out: a few sentences: whether the grasp holds and why, what moved, how close
-the contacts are to those asked for, and what forces at them alone could do.
+the contacts are to those asked for, and what forces at them alone could do. Numbers that are in
+another frame or unit, or normals that point inwards, come first.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from drakegrasp.arithmetic import norm
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.simulation.lift import Lift
+from drakegrasp.verification.hints import FAR, REVERSED
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
@@ -26,6 +28,16 @@ def explain(verified: Verification) -> str:
 
 
 def _sentences(verified: Verification) -> Iterator[str]:
+    # What is wrong with the numbers comes first: all else is of another grasp than was meant.
+    inwards = REVERSED in verified.hints
+    if verified.misplaced:
+        yield from _misplaced(verified)
+    elif inwards:
+        yield (
+            "The normals point into the object; a grasp has normals that point out of it. This "
+            f"would fit much better: {verified.hint_text}."
+        )
+
     # The verdict, and what was done to the row of numbers.
     verdict = "holds" if verified.held else f"fails ({verified.outcome.label})"
     yield f"The grasp of {verified.placed.model.name} {verdict}: {verified.reason}."
@@ -44,15 +56,47 @@ def _sentences(verified: Verification) -> Iterator[str]:
         yield _other_poses(verified)
     if verified.trial is not None and verified.trial.lift is not None:
         yield _in_the_hand(verified, verified.trial.lift)
+    if verified.misplaced:
+        return
     if verified.removal is not None:
         yield _as_a_sample(verified, verified.removal)
         yield from _loads(verified)
 
-    # What forces at the contacts alone can do, and what may be wrong with the numbers.
+    # What forces at the contacts alone can do, and what else may be wrong with the numbers.
     if not np.isnan(verified.smallest_friction):
         yield _margin(verified)
+    if verified.hints and not inwards:
+        yield f"This would fit much better: {verified.hint_text}."
+
+
+def _misplaced(verified: Verification) -> Iterator[str]:
+    """Yield how far the contacts or the posture are off the object, and where they would fit."""
+    # What is how far away.
+    distance = verified.surface_distance
+    all_far = bool(np.all(distance > FAR))
+    more = ", so the grasp that was asked for does not touch it"
+    if verified.fingertip_distance is not None:
+        distance, all_far = verified.fingertip_distance, True
+        what, more = "The posture's fingertips are", ""
+    elif all_far:
+        what = "The points lie"
+    else:
+        far = int(np.sum(distance > FAR))
+        what = f"{far} of {len(distance)} points {'lies' if far == 1 else 'lie'}"
+        distance, more = distance[distance > FAR], f"{more} there"
+    between = in_mm(distance.max())
+    if len(distance) > 1 and in_mm(distance.min()) != between:
+        between = f"{1e3 * distance.min():.1f} to {between}"
+    yield f"{what} {between} off the object{more}."
+
+    # Where it would fit. Where some points are near, the frame is hardly wrong.
     if verified.hints:
         yield f"This would fit much better: {verified.hint_text}."
+    elif all_far:
+        yield (
+            "They fit in no other frame or unit that is known here; are they in the frame of a "
+            "camera whose pose is not given, or for another object?"
+        )
 
 
 def _contacts(verified: Verification) -> Iterator[str]:
@@ -61,11 +105,12 @@ def _contacts(verified: Verification) -> Iterator[str]:
     fit, limit = verified.fit, verified.config.verify.max_contact_error
     errors = verified.contact_error, verified.normal_error
     assert fit is not None and errors[0] is not None and errors[1] is not None
-    yield (
-        f"Before closing, the fingertips are within {in_mm(fit.residual.max())} of the predicted "
-        f"points, and the pads within {np.rad2deg(fit.normal_error).max():.0f}° of the predicted "
-        "normals."
-    )
+    if not verified.misplaced:
+        yield (
+            f"Before closing, the fingertips are within {in_mm(fit.residual.max())} of the "
+            f"predicted points, and the pads within {np.rad2deg(fit.normal_error).max():.0f}° of "
+            "the predicted normals."
+        )
     if np.isnan(verified.farthest_contact):
         return
 

@@ -7,7 +7,7 @@ before anything is simulated; a row that is no grasp is none of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,8 +35,12 @@ from drakegrasp.simulation.placement import (
     refuse_no_config,
     refuse_other_objects,
 )
+from drakegrasp.verification.hints import known_frames
 from drakegrasp.verification.prediction import GraspRows, frame_poses, read_grasps
 from drakegrasp.verification.verify import METHODS, PlacedGrasp
+
+#: What to call the frames of a dataset's cameras: of the data file's, and of the other file's.
+CAMERA, OTHER_CAMERA = "the camera's frame (camera)", "the frame of the dataset's other camera"
 
 
 def place_on_object(
@@ -48,14 +52,16 @@ def place_on_object(
     method: str = "hand",
     snap_points: bool = False,
 ) -> list[PlacedGrasp]:
-    """Return grasps in {O} of one object, in their order; see `api.PlacedObject.verify`."""
+    """Return grasps in {O} of one object, in their order; see `api.verify_grasps`."""
     rows = _read(grasps, method, placed.config)
+    given = None if X_TC is None else read_pose(X_TC, "X_TC")
     return _placed(
         placed,
         np.arange(len(rows.invalid)),
         rows,
         frame=frame,
-        X_TC=None if X_TC is None else read_pose(X_TC, "X_TC"),
+        X_TC=given,
+        stated=given,
         method=method,
         snap_points=snap_points,
         config=placed.config,
@@ -65,7 +71,7 @@ def place_on_object(
 def place_on_rows(
     grasps: npt.ArrayLike,
     dataset: GraspDataset,
-    rows: Sequence[int] | None = None,
+    rows: Sequence[int] | int | None = None,
     *,
     frame: str = "camera",
     hand: str | Path | None = None,
@@ -77,32 +83,26 @@ def place_on_rows(
     """Return grasps in {O} of the objects of a dataset's rows.
 
     Those of the same object stand together, so that its scene is built once. Arguments and errors
-    are those of `api.verify_rows`, and of `dataset_config`. Where no configuration is given, each
-    grasp has the friction and mass that were drawn for its row, but for what is overridden.
+    are those of `api.verify_grasps`, and of `dataset_config`; one row may be for all grasps. Where
+    no configuration is given, each grasp has the friction and mass that were drawn for its row, but
+    for what is overridden.
     """
     # Read all grasps before any object: a wrong number is reported at once.
     used = dataset_config(dataset, config, hand, overrides)
     read = _read(grasps, method, used)
     chosen = choose_rows(dataset, rows, len(read.invalid))
 
-    # The cameras of each row.
-    X_TC = {
-        camera: unpack_pose(dataset.column(f"object_props/frame_work2cam_{camera}")[chosen])
-        for camera in {dataset.camera, *(CAMERAS if dataset.camera in CAMERAS else ())}
-    }
-    # The cameras of scenes stand alone.
-    other = next(iter(X_TC.keys() - {dataset.camera}), None)
-
     # Each object in each resting pose once, with its grasps.
-    placed_grasps, in_camera = list[PlacedGrasp](), frame == "camera"
+    placed_grasps, cameras = list[PlacedGrasp](), cameras_of_rows(dataset, chosen)
     for placed, indices in objects_of_rows(dataset, chosen):
+        own = {name: X_TC[indices] for name, X_TC in cameras.items()}
         placed_grasps += _placed(
             placed,
             indices,
             read,
             frame=frame,
-            X_TC=_camera_poses(X_TC[dataset.camera][indices]) if in_camera else None,
-            X_TC_other=_camera_poses(X_TC[other][indices]) if in_camera and other else None,
+            X_TC=own[CAMERA] if frame == "camera" else None,
+            cameras=own,
             method=method,
             snap_points=snap_points,
             config=used,
@@ -111,6 +111,23 @@ def place_on_rows(
     if config is not None:
         return placed_grasps
     return as_drawn(placed_grasps, dataset, chosen, overrides)
+
+
+def cameras_of_rows(dataset: GraspDataset, rows: npt.NDArray[np.int64]) -> dict[str, Array]:
+    """Return the poses X_TC (n, 4, 4) of a dataset's cameras in some rows (n,), by their frames.
+
+    The first is that of the data file. The cameras of scenes stand alone.
+    """
+    names = {dataset.camera: CAMERA}
+    if dataset.camera in CAMERAS:
+        names |= {camera: OTHER_CAMERA for camera in CAMERAS if camera != dataset.camera}
+    return {
+        name: read_pose(
+            unpack_pose(dataset.column(f"object_props/frame_work2cam_{camera}")[rows]),
+            "the camera's pose",
+        )
+        for camera, name in names.items()
+    }
 
 
 def objects_of_rows(
@@ -190,10 +207,6 @@ def _refuse_other_hand(dataset: GraspDataset, config: Config) -> None:
         )
 
 
-def _camera_poses(X_TC: Array) -> Array:
-    return read_pose(X_TC, "the camera's pose")
-
-
 def _read(grasps: npt.ArrayLike, method: str, config: Config) -> GraspRows:
     """Return the rows of numbers as grasps of the configuration's hand."""
     if method not in METHODS:
@@ -208,18 +221,34 @@ def _placed(
     *,
     frame: str,
     X_TC: Array | None,
-    X_TC_other: Array | None = None,
+    stated: Array | None = None,
+    cameras: Mapping[str, Array] | None = None,
     method: str,
     snap_points: bool,
     config: Config,
 ) -> list[PlacedGrasp]:
-    """Return the grasps of one object: those of the rows with the given indices."""
-    # The frame of the numbers in {O}, and that of the other camera.
+    """Return the grasps of one object: those of the rows with the given indices.
+
+    Args:
+        placed: The object.
+        indices: (n,), into the rows of numbers.
+        rows: All of them.
+        frame: Of the numbers, see `frame_poses`.
+        X_TC: Of the camera, see `frame_poses`.
+        stated: X_TC if a caller states it, who may mean another pose by it.
+        cameras: (n, 4, 4), poses of the cameras that are known, by their frames.
+        method: Of each `PlacedGrasp`.
+        snap_points: Of each `PlacedGrasp`.
+        config: Of each `PlacedGrasp`.
+    """
+    # The frame of the numbers in {O}, and others that they could be in.
     count = len(indices)
     X_OA = frame_poses(frame=frame, X_TC=X_TC, X_TO=placed.X_TO, count=count)
-    X_OB = None
-    if X_TC_other is not None:
-        X_OB = frame_poses(frame=frame, X_TC=X_TC_other, X_TO=placed.X_TO, count=count)
+    poses = None if stated is None else np.broadcast_to(stated, (count, 4, 4))
+
+    def others(i: int) -> dict[str, Array]:
+        own = {name: X[i] for name, X in (cameras or {}).items()}
+        return known_frames(placed.X_TO, own, None if poses is None else poses[i])
 
     return [
         PlacedGrasp(
@@ -233,7 +262,7 @@ def _placed(
             normalised=bool(rows.normalised[index]),
             snap_points=snap_points,
             X_OA=X_OA[i],
-            X_OB=None if X_OB is None else X_OB[i],
+            frames=others(i),
         )
         for i, index in enumerate(indices)
     ]
@@ -284,9 +313,9 @@ def as_drawn(
 
 
 def choose_rows(
-    dataset: GraspDataset, rows: Sequence[int] | None, count: int
+    dataset: GraspDataset, rows: Sequence[int] | int | None, count: int
 ) -> npt.NDArray[np.int64]:
-    """Return the row (n,) of the dataset's split for each of `count` grasps.
+    """Return the row (n,) of the dataset's split for each of `count` grasps; one may be for all.
 
     Raises:
         GraspError: If there is not exactly one row per grasp, or a row does not exist.
@@ -295,7 +324,8 @@ def choose_rows(
     # NumPy takes an empty list for real numbers.
     if chosen.size and chosen.dtype.kind not in "iu":
         raise GraspError(f"rows must be whole numbers, got values of type {chosen.dtype}")
-    chosen = chosen.astype(np.int64).ravel()
+    chosen = chosen.astype(np.int64)
+    chosen = np.full(count, chosen) if chosen.ndim == 0 else chosen.ravel()
 
     # One row per grasp.
     if len(chosen) != count:

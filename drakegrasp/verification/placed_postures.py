@@ -7,7 +7,7 @@ an invalid grasp.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,11 +17,15 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.frames import Array, invert_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.postures.table import PostureTable, misfits, unknown_objects
+from drakegrasp.verification.hints import known_frames
 from drakegrasp.verification.placed_grasp import (
+    CAMERA,
     as_drawn,
+    cameras_of_rows,
     choose_rows,
     dataset_config,
     objects_of_rows,
@@ -96,24 +100,38 @@ def place_postures_on_rows(
         dataset_config(dataset, overrides=overrides),
         choose_rows(dataset, rows, len(table)),
     )
-    placed = list[PlacedGrasp]()
+    placed, cameras = list[PlacedGrasp](), cameras_of_rows(dataset, chosen)
     table = replace(table, resting=np.zeros_like(table.resting))
     for thing, indices in objects_of_rows(dataset, chosen):
         named = replace(table, objects=(thing.model.name,) * len(table))
-        placed += _placed(named, indices.tolist(), [thing], config)
+        placed += _placed(named, indices.tolist(), [thing], config, cameras)
     return as_drawn(placed, dataset, chosen, overrides)
 
 
 def _placed(
-    table: PostureTable, rows: Sequence[int], things: Sequence[PlacedObject], config: Config
+    table: PostureTable,
+    rows: Sequence[int],
+    things: Sequence[PlacedObject],
+    config: Config,
+    cameras: Mapping[str, Array] | None = None,
 ) -> list[PlacedGrasp]:
-    """Return some rows of a table on one object, which is there in each of its resting poses."""
+    """Return some rows of a table on one object, which is there in each of its resting poses.
+
+    `cameras` are poses X_TC (n, 4, 4) for the rows of the table, by their frames.
+    """
+    # The cameras that are known, and what no posture has.
     model, found = things[0].model, list[PlacedGrasp]()
     table = table.refuse(misfits(table, model.name, model.scale, len(things)))
+    known = dict(cameras or {})
+    if table.X_TC is not None:
+        known[CAMERA] = table.X_TC
     nothing = np.full((load_hand(config.hand_source).num_fingers, 3), np.nan)
+
     for i in rows:
         reason = table.invalid[i]
         thing = things[0 if reason else int(table.resting[i])]
+        posture = None if reason else table.posture(i, thing.X_TO)
+        own = {name: X_TC[i] for name, X_TC in known.items()}
         found.append(
             PlacedGrasp(
                 index=i,
@@ -123,7 +141,9 @@ def _placed(
                 method="posture",
                 config=config,
                 invalid=reason,
-                posture=None if reason else table.posture(i, thing.X_TO),
+                posture=posture,
+                X_OA=None if posture is None else posture.X_OG @ invert_pose(table.X_FG[i]),
+                frames=known_frames(thing.X_TO, own),
             )
         )
     return found

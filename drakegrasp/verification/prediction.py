@@ -19,7 +19,7 @@ from drakegrasp.config import LARGEST
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.errors import GraspError, MachineError, first_line
 from drakegrasp.foreign_files import read_text, refuse_irregular
-from drakegrasp.frames import FARTHEST, Array, as_numbers, invert_pose
+from drakegrasp.frames import FARTHEST, Array, as_numbers, invert_pose, without_torch
 
 Frame = Literal["object", "camera", "workspace"]
 FRAMES: tuple[str, ...] = get_args(Frame)
@@ -96,8 +96,9 @@ def read_grasps(grasps: npt.ArrayLike, fingers: int) -> GraspRows:
 def _read_rows(grasps: npt.ArrayLike, size: int, fingers: int) -> tuple[Array, list[str]]:
     """Return rows (n, 6k), NaN where a row has another length, and the reasons."""
     # Rows of different lengths come as a list, or as an array of objects.
-    rows: Any = grasps if isinstance(grasps, list | tuple) else np.asarray(grasps)
-    if isinstance(rows, list | tuple) or (rows.dtype == object and rows.ndim == 1):
+    rows = without_torch(grasps)
+    rows = rows if isinstance(rows, list) else np.asarray(rows)
+    if isinstance(rows, list) or (rows.dtype == object and rows.ndim == 1):
         shapes = [_shape(row) for row in rows]
         if len(set(shapes)) > 1 and any(shapes):
             array, invalid = np.full((len(rows), size), np.nan), [""] * len(rows)

@@ -19,6 +19,7 @@ from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.verification.explanation import explain
 from drakegrasp.verification.forces.verdict import ForceVerdict
+from drakegrasp.verification.hints import FAR, FAR_POSTURE
 from drakegrasp.verification.wrist.solver import WristFit
 
 if TYPE_CHECKING:
@@ -70,6 +71,8 @@ class Verification:
         p_OQ, nhat_Q_O: (k, 3), the contact points [m] and unit normals in {O} that were tried; NaN
             where an invalid row or a posture has none.
         surface_distance: (k,), of the predicted points from the object's surface [m].
+        fingertip_distance: Of a posture that fails, distances of the fingertips of its grasp from
+            the surface [m], one per finger that it closes; None of all else.
         normalised: Whether a predicted normal was not of unit length, and was normalised.
         snapped: Whether the points were moved to the nearest points of the surface.
         hints: What would make a grasp that fails fit much better, see `verification.hints`.
@@ -89,6 +92,7 @@ class Verification:
     p_OQ: Array
     nhat_Q_O: Array
     surface_distance: Array
+    fingertip_distance: Array | None = None
     normalised: bool = False
     snapped: bool = False
     hints: tuple[str, ...] = ()
@@ -124,6 +128,18 @@ class Verification:
     def held_by(self) -> int | None:
         """Index of the first wrist pose that holds the object, None if none does."""
         return next((i for i, each in enumerate(self.tries) if each.held), None)
+
+    @property
+    def misplaced(self) -> bool:
+        """Whether a contact is more than 10 mm off the surface: frame or unit may be wrong.
+
+        A posture that fails is misplaced if that is so of all its fingertips, and hints say more or
+        it is 50 mm.
+        """
+        if self.fingertip_distance is not None:
+            limit = FAR if self.hints else FAR_POSTURE
+            return bool(self.fingertip_distance.size and self.fingertip_distance.min() > limit)
+        return bool(np.any(self.surface_distance > FAR))
 
     @property
     def precision(self) -> bool:

@@ -10,8 +10,8 @@ lost object are outcomes, not exceptions.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,7 @@ from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.contact_surface import fit_surface
 from drakegrasp.verification.forces.quality import force_margin
 from drakegrasp.verification.forces.verdict import hand_contacts, judge_forces
-from drakegrasp.verification.hints import FAR, find_hints
+from drakegrasp.verification.hints import find_hints, find_posture_hints
 from drakegrasp.verification.result import PoseTrial, Verification
 from drakegrasp.verification.wrist.solver import WristFit, fit_wrist
 
@@ -82,7 +82,7 @@ class PlacedGrasp:
         normalised: Whether a normal was not of unit length.
         snap_points: Whether to move the points to the surface.
         X_OA: (4, 4), pose of the frame in which the numbers were given.
-        X_OB: (4, 4), pose of the dataset's other camera; None if there is none.
+        frames: (4, 4), poses X_OF of other frames that they could be in, see `hints.known_frames`.
         posture: With method "posture": wrist and joints, in place of contacts; None if invalid.
     """
 
@@ -96,7 +96,7 @@ class PlacedGrasp:
     normalised: bool = False
     snap_points: bool = False
     X_OA: Array | None = None
-    X_OB: Array | None = None
+    frames: Mapping[str, Array] = field(default_factory=dict)
     posture: Posture | None = None
 
 
@@ -117,7 +117,7 @@ def verify_placed(grasp: PlacedGrasp) -> Verification:
     if grasp.invalid:
         return base
     if grasp.posture is not None:
-        return _try_posture(base, grasp.posture)
+        return _try_posture(base, grasp, grasp.posture)
 
     # How the contacts lie on the surface, and what forces at them alone can do.
     base = _on_surface(base, grasp)
@@ -129,13 +129,18 @@ def verify_placed(grasp: PlacedGrasp) -> Verification:
 
     # The trial; where it fails, or the points are far away, what may be wrong with the numbers.
     result = _lift_by_hand(base) if grasp.method == "hand" else _lift_by_forces(base)
-    fits = result.success and base.surface_distance.mean() < FAR
-    if fits or result.outcome.inconclusive:
+    if (result.success and not result.misplaced) or result.outcome.inconclusive:
         return result
     with timed(base.seconds, "hints"):
-        X_OA = np.eye(4) if grasp.X_OA is None else grasp.X_OA
-        model, hand = base.placed.model, load_hand(base.config.hand_source)
-        hints = find_hints(model, hand, grasp.p_OQ, base.nhat_Q_O, X_OA=X_OA, X_OB=grasp.X_OB)
+        hints = find_hints(
+            base.placed.model,
+            load_hand(base.config.hand_source),
+            grasp.p_OQ,
+            base.nhat_Q_O,
+            X_OA=np.eye(4) if grasp.X_OA is None else grasp.X_OA,
+            frames=grasp.frames,
+            fits=result.success,
+        )
     return replace(result, hints=hints)
 
 
@@ -190,7 +195,7 @@ def _lift_by_hand(base: Verification) -> Verification:
     return _judged(base, tries)
 
 
-def _try_posture(base: Verification, posture: Posture) -> Verification:
+def _try_posture(base: Verification, grasp: PlacedGrasp, posture: Posture) -> Verification:
     """Try a posture, which says wrist and joints itself."""
     with timed(base.seconds, "simulate"):
         trial = run_trial(base.placed, posture, base.config)
@@ -204,7 +209,20 @@ def _try_posture(base: Verification, posture: Posture) -> Verification:
         normal_error=nothing,
         removal=judge_sample(base.placed.model, trial, base.config),
     )
-    return _judged(base, (tried,))
+    result = _judged(base, (tried,))
+    if result.held or result.outcome.inconclusive:
+        return result
+
+    # Where it fails, what may be wrong with the numbers.
+    with timed(base.seconds, "hints"):
+        hints, distance = find_posture_hints(
+            base.placed.model,
+            load_hand(base.config.hand_source),
+            posture,
+            X_OA=np.eye(4) if grasp.X_OA is None else grasp.X_OA,
+            frames=grasp.frames,
+        )
+    return replace(result, hints=hints, fingertip_distance=distance)
 
 
 def _of_all_fingers(trial: TrialRecord, unused: int, fingers: int) -> TrialRecord:

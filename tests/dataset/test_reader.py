@@ -74,6 +74,40 @@ def test_samples_come_by_index(data_file: Path) -> None:
     assert [s.trial_id for s in data] == [0, 1, 2, 3, 4]
 
 
+def test_several_samples_come_as_a_list(data_file: Path) -> None:
+    data = GraspDataset(data_file)
+    for index, rows in [
+        (slice(0, 3), [0, 1, 2]),
+        (slice(None, None, -2), [4, 2, 0]),
+        (slice(3, 99), [3, 4]),
+        ([4, -5], [4, 0]),
+        (np.array([1, 1]), [1, 1]),
+        (range(2), [0, 1]),
+    ]:
+        assert [sample.trial_id for sample in data[index]] == rows
+    assert data[np.int64(-2)].trial_id == 3
+    for wrong in ("grasps", 1.0, (0, 1), [0.5]):
+        with pytest.raises(TypeError):
+            data[wrong]
+    with pytest.raises(IndexError, match="index must be below 5, got 7"):
+        data[[0, 7]]
+
+
+def test_sample_is_printed_on_one_screen(data_file: Path) -> None:
+    sample = GraspDataset(data_file)[3]
+    lines = str(sample).splitlines()
+    assert len(lines) < 30 and max(map(len, lines)) <= 100
+    assert lines[0] == repr(sample)
+    assert repr(sample) == "Sample('object 3 ü', row 3 of train in grasping_oto.hdf5, trial 3)"
+    for text in (
+        "(4, 16, 16) float32, depth 3.000 to 3.000 m",
+        "256 px",
+        "slip 3",
+        "work2com (3,)",
+    ):
+        assert text in str(sample)
+
+
 @pytest.mark.parametrize("index", [5, -6])
 def test_index_beyond_the_end_is_refused(data_file: Path, index: int) -> None:
     with pytest.raises(IndexError, match="index must be below 5"):

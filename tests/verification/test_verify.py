@@ -157,6 +157,104 @@ def test_normals_that_point_inwards_are_tried_and_get_a_hint(
     found = verify(cube, p, -n)
     assert not found.success and found.trial is not None
     assert found.hints == ("normals that point the other way, out of the object",)
+    assert found.explain().startswith("The normals point into the object; a grasp has normals that")
+
+
+X_TC = make_pose(Rotation.from_euler("xyz", [2.0, 0.4, -1.0]).as_matrix(), [0.1, 0.3, 0.4])
+
+
+@pytest.mark.parametrize(
+    ("meant", "given", "factor", "hint"),
+    [
+        ("workspace", {"frame": "object"}, 1.0, "the table's frame (workspace)"),
+        ("object", {"frame": "workspace"}, 1.0, "the object's frame (object)"),
+        ("object", {"frame": "camera", "X_TC": X_TC}, 1.0, "the object's frame (object)"),
+        (X_TC, {"frame": "camera", "X_TC": invert_pose(X_TC)}, 1.0, "the inverse of X_TC"),
+        ("object", {}, 1e3, "points in millimetres instead of metres"),
+        ("object", {}, 1e2, "points in centimetres instead of metres"),
+        ("object", {}, 1e-3, "points 1000 times as large"),
+        (X_TC, {"frame": "camera", "X_TC": X_TC}, 1e3, "points in millimetres instead of metres"),
+        (
+            "workspace",
+            {"frame": "object"},
+            1e3,
+            "the table's frame (workspace), with points in millimetres instead of metres",
+        ),
+        # Without the camera's pose nobody can know.
+        (X_TC, {"frame": "object"}, 1.0, None),
+    ],
+)
+def test_misplaced_points_are_told_first_with_where_they_would_fit(
+    cube: PlacedObject,
+    grasp: tuple[np.ndarray, np.ndarray],
+    meant: str | np.ndarray,
+    given: dict[str, Any],
+    factor: float,
+    hint: str | None,
+) -> None:
+    # Of a cube that stands upright in the middle, the frames differ by their height alone.
+    X_TO = make_pose(Rotation.from_euler("z", 0.7).as_matrix(), [0.2, -0.1, 0.0]) @ cube.X_TO
+    X_FO = {"object": np.eye(4), "workspace": X_TO}[meant] if isinstance(meant, str) else None
+    X_FO = invert_pose(X_TC) @ X_TO if X_FO is None else X_FO
+    numbers = dg.transform_grasp(X_FO, dg.pack_grasp(*grasp))
+    numbers[:9] *= factor
+    found = dg.verify_grasp(numbers, dg.place_object(cube, X_TO=X_TO), **given, method="forces")
+    assert found.misplaced and not found.success
+    distance = 1e3 * found.surface_distance
+    text = found.explain()
+    assert f"{distance.max():.1f} mm off the object" in text.split(". ")[0]
+    assert "friction" not in text  # of points in the air nothing is said that reassures
+    if hint is None:
+        assert found.hints == () and "They fit in no other frame or unit" in text
+    else:
+        assert found.hints == (hint,)
+        assert f". This would fit much better: {hint}. The grasp of" in text
+
+
+def test_one_point_in_the_air_is_told(
+    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+) -> None:
+    p, n = grasp[0].copy(), grasp[1]
+    p[1] += 0.012 * n[1]
+    found = verify(cube, p, n)
+    assert found.held and found.misplaced and found.hints == ()
+    text = found.explain()
+    assert text.startswith("1 of 3 points lies 12.0 mm off the object, so the grasp that was")
+    assert "After closing, they touch" in text
+    assert not any(word in text for word in ("Before closing", "friction", "In a dataset"))
+
+
+@pytest.mark.parametrize(
+    ("X_FO", "factor", "frames", "hint"),
+    [
+        (np.eye(4), 1e3, {}, "positions of the palm in millimetres instead of metres"),
+        (X_TC, 1.0, {"the camera's frame (camera)": invert_pose(X_TC)}, None),
+        (np.eye(4), 1.0, {}, ""),
+    ],
+)
+def test_posture_in_another_frame_or_unit_is_told(
+    held: dg.Verification,
+    cube: PlacedObject,
+    X_FO: np.ndarray,
+    factor: float,
+    frames: dict[str, np.ndarray],
+    hint: str | None,
+) -> None:
+    assert held.trial is not None and held.trial.closed is not None
+    X_OG = X_FO @ held.trial.X_OG
+    X_OG[:3, 3] *= factor
+    nothing = np.full((3, 3), np.nan)
+    asked = PlacedGrasp(index=0, placed=cube, p_OQ=nothing, nhat_Q_O=nothing, method="posture",
+                        config=CONFIG, posture=dg.Posture(X_OG, held.trial.closed.q),
+                        frames=frames)  # fmt: skip
+    found = verify_placed(asked)
+    if hint == "":
+        assert found.held and not found.misplaced and found.hints == ()
+        return
+    assert not found.held and found.misplaced
+    assert found.hints == (hint or next(iter(frames)),)
+    assert found.explain().startswith("The posture's fingertips are ")
+    assert f"This would fit much better: {found.hint_text}." in found.explain()
 
 
 @pytest.mark.parametrize("method", ["hand", "forces"])

@@ -202,3 +202,9 @@ def _verify_by_lift(
         make_console(stderr=True).print(verdict_table(results))
         for hint, count in count_hints(result.hints for result in results):
             say(f"{count} of {len(results)} grasps would fit much better: {hint}", err=True)
+        if lost := sum(result.misplaced and not result.hints for result in results):
+            say(
+                f"{lost} of {len(results)} grasps are off the object, in every frame and unit that "
+                "is known here",
+                err=True,
+            )

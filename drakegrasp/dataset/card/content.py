@@ -21,7 +21,7 @@ from drakegrasp.dataset.hdf5 import read_names
 from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE, TRIALS_FILE
-from drakegrasp.dataset.scenes.reader import AnyScenes, count_scenes
+from drakegrasp.dataset.scenes.reader import SceneDataset, count_scenes
 from drakegrasp.dataset.scenes.rows import refuse_other_state
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, SPLITS
 from drakegrasp.dataset.statistics import (
@@ -158,7 +158,7 @@ def _count_scenes(out: Path) -> dict[str, dict[str, int]] | None:
         return None
     try:
         refuse_other_state(path, Trials(out, any_name=True))
-        return count_scenes(AnyScenes(path, points=None).tables)
+        return count_scenes(SceneDataset(path, points=None).tables)
     except DataError:
         return None  # `drakegrasp check` says why
 

@@ -61,7 +61,8 @@ class SceneDataset:
     """Views of one split with grasps, as a sequence of items: dictionaries of NumPy arrays.
 
     An item is a view, and some grasps of its scene that are drawn for it: good ones and bad ones in
-    turns, good ones by their weights. The frame A is {T}, the table's, or {C}, the view's camera.
+    turns, good ones by their weights. The frame A is {T}, the table's, or {C}, the view's camera. A
+    split without a grasp to draw has length 0.
 
     | key | shape, type | what |
     |---|---|---|
@@ -119,12 +120,9 @@ class SceneDataset:
         epoch: Changes what is drawn.
 
     Raises:
-        DataError: If the file is missing, damaged or differs from the schema, an argument is
-            unknown, or the split has no grasp to draw.
+        DataError: If the file is missing, damaged or differs from the schema, or an argument is
+            unknown.
     """
-
-    #: Whether a split may have no grasp to draw.
-    may_be_empty = False
 
     def __init__(
         self,
@@ -181,8 +179,6 @@ class SceneDataset:
         self._number()
         self._choose(negatives, positives)
         self.views, self._order = self._order_of(balance, objects)
-        if not len(self.views) and not self.may_be_empty:
-            raise DataError(f"{self.path}: {split} must have grasps to draw, got none")
 
     def __len__(self) -> int:
         return len(self._order)
@@ -472,12 +468,6 @@ def _column(group: h5py.Group, field: Field) -> AnyArray:
     if field.optional and field.name not in group:
         return field.empty(len(group["scene"]), {})
     return np.asarray(group[field.name][:])
-
-
-class AnyScenes(SceneDataset):
-    """Scenes and views of a file, also where the split has no grasp to draw."""
-
-    may_be_empty = True
 
 
 def count_scenes(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, int]]:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.layout.opening import opened, refuse_other_codes
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.scenes.reader import AnyScenes
+from drakegrasp.dataset.scenes.reader import SceneDataset
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.frames import X_WT, invert_pose, pack_pose, unpack_pose
@@ -65,7 +65,7 @@ class SceneRows(GraspDataset):
         self.path, self.split, self.camera = Path(path), split, CAMERA
         self._file: h5py.File | None = None
         self._fields, self._process = {}, -1
-        self._data = data = AnyScenes(
+        self._data = data = SceneDataset(
             path, points=None, split=split, negatives="none", balance="view", grasps=1
         )
         self.views = data.views

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.paths import SCENES_FILE
-from drakegrasp.dataset.scenes.reader import AnyScenes
+from drakegrasp.dataset.scenes.reader import SceneDataset
 from drakegrasp.dataset.scenes.rows import refuse_other_state
 from drakegrasp.dataset.schema import (
     SCENE_FIELDS,
@@ -67,7 +67,7 @@ def scene_tables(out: Path) -> list[HubTable]:
     path = out / SCENES_FILE
     if not os.path.lexists(path):
         return []
-    data = AnyScenes(path, points=None)
+    data = SceneDataset(path, points=None)
     refuse_other_state(path, Trials(out))
     return [
         *(_table(data, "views", "views", VIEW_COLUMNS, split) for split in SPLITS),
@@ -75,7 +75,7 @@ def scene_tables(out: Path) -> list[HubTable]:
     ]
 
 
-def _table(data: AnyScenes, config: str, group: str, columns: Columns, split: str) -> HubTable:
+def _table(data: SceneDataset, config: str, group: str, columns: Columns, split: str) -> HubTable:
     """Return the rows of a group that are of a split."""
     of_rows = data.tables["scenes"]["split"][data.tables[group]["scene"]]
     rows = np.flatnonzero(of_rows == SPLITS.index(split))
@@ -94,7 +94,7 @@ def _table(data: AnyScenes, config: str, group: str, columns: Columns, split: st
 
 
 def _read(
-    data: AnyScenes, group: str, columns: Columns, rows: npt.NDArray[np.int64]
+    data: SceneDataset, group: str, columns: Columns, rows: npt.NDArray[np.int64]
 ) -> dict[str, list[Any]]:
     """Return the columns of some rows of a group, see `HubTable.read`."""
     own, scenes = data.tables[group], data.tables["scenes"]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from drakegrasp.dataset.layout.opening import refuse_other_codes
 from drakegrasp.dataset.layout.trial_files import Stamp, stamp
 from drakegrasp.dataset.paths import SCENES_FILE
-from drakegrasp.dataset.scenes.reader import AnyScenes
+from drakegrasp.dataset.scenes.reader import SceneDataset
 from drakegrasp.dataset.scenes.rows import refuse_other_state
 from drakegrasp.dataset.schema import VIEW_KINDS
 from drakegrasp.errors import DataError
@@ -38,7 +38,7 @@ class Scenes:
 
     snapshot: Snapshot
     stamp: Stamp
-    data: AnyScenes
+    data: SceneDataset
 
     def __len__(self) -> int:
         return len(self.split)
@@ -128,7 +128,7 @@ class SceneFile:
 
 def _read_scenes(path: Path, read_at: Stamp, snapshot: Snapshot) -> Scenes:
     refuse_other_state(path, snapshot.trials)
-    data = AnyScenes(path, points=None)
+    data = SceneDataset(path, points=None)
     grasps, views = data.tables["grasps"], data.tables["views"]
     refuse_other_codes(path, "/grasps/outcome", grasps["outcome"], list(Outcome))
     refuse_other_codes(path, "/grasps/trial_id", grasps["trial_id"], len(snapshot.table))

@@ -43,12 +43,9 @@ def scene_views(path: Path) -> tuple[Figure, list[dict[str, int]]]:
     """
     lines: list[tuple[SceneDataset, npt.NDArray[np.int64]]] = []
     for split in SPLITS:
-        try:
-            data = SceneDataset(path, points=None, split=split, negatives="none", grasps=1)
-        except DataError as error:
-            if "must have grasps to draw" in str(error):
-                continue
-            raise
+        data = SceneDataset(path, points=None, split=split, negatives="none", grasps=1)
+        if not len(data):
+            continue
         scenes = data.tables["views"]["scene"][data.views]
         objects = data.tables["scenes"]["object"][scenes, 0]
         _, first = np.unique(objects, return_index=True)

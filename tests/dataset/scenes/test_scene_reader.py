@@ -149,5 +149,10 @@ def test_another_file_and_unknown_arguments_are_refused(path: Path, tmp_path: Pa
         SceneDataset(copy, points=32)
     with pytest.raises(DataError, match="frame must be one of table, camera, got 'palm'"):
         SceneDataset(path, frame="palm")  # type: ignore[arg-type]
-    with pytest.raises(DataError, match="valid must have grasps to draw"):
-        SceneDataset(path, split="valid")
+
+
+def test_split_without_grasps_has_length_0(path: Path) -> None:
+    data = SceneDataset(path, split="valid")
+    assert len(data) == 0 and list(data) == [] and list(data.rounds()) == []
+    with pytest.raises(IndexError, match="index must be below 0, got 0"):
+        data[0]
