@@ -106,7 +106,7 @@ def score(
         require_mujoco("mujoco", "coacd")
     request = Request(
         data=dataset,
-        train=type(dataset)(dataset.path, split="train") if train is None else train,
+        train=_training_rows(dataset, references) if train is None else train,
         predictions=ranked,
         name=name,
         against=other,
@@ -159,6 +159,13 @@ def _method(files: object, dataset: GraspDataset) -> tuple[str, tuple[Ranked, ..
 def _versions() -> dict[str, str]:
     """Return the versions of what makes a verdict by a protocol; CoACD cuts the objects for it."""
     return {**versions(), "coacd": metadata.version("coacd")}
+
+
+def _training_rows(dataset: GraspDataset, references: Sequence[str]) -> GraspDataset:
+    """Return the training rows of the file of a split; contacts count for reference rows only."""
+    if type(dataset) is GraspDataset:
+        return GraspDataset(dataset.path, split="train", fewer_fingers=not references)
+    return type(dataset)(dataset.path, split="train")
 
 
 def _try_by_protocol(

@@ -156,7 +156,7 @@ def verify_grasps(
         rows: Only of a `GraspDataset`: the row of its split for each grasp; all rows, in order, if
             None.
         frame: The frame of the grasps: "object" {O}, whose origin is the centre of the bounding
-            box, "camera" {C} or "workspace" {T}, the centre of the table top. The default if None.
+            box, "camera" {C} or "table" {T}, the centre of the table top. The default if None.
         X_TC: Only of an object, with frame "camera": pose of the camera in {T}, (4, 4), or one
             per grasp (n, 4, 4). Rows have their own.
         units: Only of a mesh: unit of its lengths, m, cm or mm; metres if None. An `objects.yaml`

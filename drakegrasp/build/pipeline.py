@@ -43,6 +43,7 @@ from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import ConfigError, DataError, DrakegraspError, GraspError, listed
+from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.carried import carry_hand
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.parsing import position_order
@@ -308,7 +309,8 @@ def _refused_postures(postures: PostureTable, manifest: Manifest) -> str:
         GraspError: If none is left.
     """
     for entry in manifest.objects:
-        reasons = misfits(postures, entry.name, entry.scale, len(entry.resting))
+        poses = unpack_pose([pose.X_TO for pose in entry.resting])
+        reasons = misfits(postures, entry.name, entry.scale, poses)
         postures = postures.refuse(reasons)
     if all(postures.invalid):
         raise GraspError(postures.refused)

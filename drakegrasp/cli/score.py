@@ -10,17 +10,18 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import FILE, PATH, chosen_workers, connection_options, shared
+from drakegrasp.cli.options import PATH, PathType, chosen_workers, connection_options, shared
 
 if TYPE_CHECKING:
     from drakegrasp.scoring.run import Score
 
+EXISTING = PathType(path_type=Path, exists=True)
 #: Where files are written if --out does not say.
 DEFAULT_FOLDER = Path("score")
 
 
 @click.command()
-@click.argument("predictions", type=FILE, metavar="[PREDICTIONS]...", nargs=-1)
+@click.argument("predictions", type=EXISTING, metavar="[PREDICTIONS]...", nargs=-1)
 @click.option(
     "--dataset",
     type=PATH,
@@ -38,7 +39,7 @@ DEFAULT_FOLDER = Path("score")
 )
 @click.option(
     "--against",
-    type=FILE,
+    type=EXISTING,
     multiple=True,
     metavar="FILE",
     help="Predictions of another method for the same rows: the card says by how much the headline "
@@ -100,8 +101,8 @@ def score(
 
     Each of PREDICTIONS is a .npy, HDF5 or Parquet file: (n, 6k) numbers, one grasp per row of the
     split, or (n, m, 6k), m per row, in the camera's frame; or a file of postures with the `row`
-    that each is for. Several files are of one method that was trained several times. Without any,
-    the reference rows are scored alone.
+    that each is for; or a file or a folder of samples that were exported. Several files are of one
+    method that was trained several times. Without any, the reference rows are scored alone.
 
     DIR gets card.json, card.md, card.png, and the verdicts, so that an interrupted score goes on.
     """
@@ -110,6 +111,7 @@ def score(
     from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.dataset.scenes.rows import open_rows
     from drakegrasp.errors import DataError, GraspError
+    from drakegrasp.exchange.posture_files import holds_postures
     from drakegrasp.scoring.references import REFERENCES
 
     workers = chosen_workers(options)
@@ -117,10 +119,15 @@ def score(
     # A bad dataset is wrong usage, as for `verify`.
     try:
         read_manifest(dataset.parent)
-        data = open_rows(dataset, split=split)
+        bare = not references and bool(predictions) and all(map(holds_postures, predictions))
+        data = open_rows(dataset, split=split, fewer_fingers=bare)
         trained = None if train is None else open_rows(train, split="train")
     except DataError as error:
         raise GraspError(str(error)) from None
+    chosen = references or tuple(REFERENCES)
+    if data.has_fewer_fingers:
+        say("no reference rows: some samples leave fingers out", err=True)
+        chosen = ()
     again = _command(
         predictions, dataset, split, against, train, references, per_object, overrides, protocol
     )
@@ -129,7 +136,7 @@ def score(
         data,
         against=against or None,
         train=trained,
-        references=references or tuple(REFERENCES),
+        references=chosen,
         per_object=per_object,
         overrides=overrides,
         protocol=protocol,

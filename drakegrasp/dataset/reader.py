@@ -107,6 +107,9 @@ class GraspDataset:
             unknown, or it has grasps of fewer fingers that were not asked for.
     """
 
+    #: Whether some samples leave fingers out.
+    has_fewer_fingers: bool = False
+
     def __init__(
         self, path: str | Path, *, split: str = "train", fewer_fingers: bool = False
     ) -> None:
@@ -128,6 +131,7 @@ class GraspDataset:
             fewer = 0 if unused is None else np.count_nonzero(unused[:])
 
         # NaN must be asked for.
+        self.has_fewer_fingers = bool(fewer)
         if fewer and not fewer_fingers:
             raise DataError(
                 f"{self.path}: {split} must have contacts of all fingers, got {fewer} of "

@@ -14,8 +14,11 @@ import numpy as np
 from drakegrasp.dataset.layout.opening import refuse_other_codes
 from drakegrasp.dataset.layout.trial_files import sample_ids
 from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.schema import NO_PRESHAPE
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.frames import Array, unpack_pose
+from drakegrasp.hand.description import Hand
+from drakegrasp.simulation.postures.table import CONDITIONS
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,6 +33,8 @@ class ClosedGrasp:
         q: (n,), positions of the hand's joints [rad or m], in the plant's order.
         spread: Angle of the spread joints [rad].
         unused: Fingers that its preshape leaves out, as bits: 1 for the first finger.
+        preshape: Index of the hand's preshape; None: it is of none.
+        conditions: (3,), friction of hand and table and mass [kg] of the trial; None: not known.
     """
 
     trial_id: int
@@ -40,6 +45,13 @@ class ClosedGrasp:
     q: Array
     spread: float
     unused: int = 0
+    preshape: int | None = None
+    conditions: Array | None = None
+
+    def preshape_name(self, hand: Hand) -> str:
+        """Return the name of its preshape of a hand; empty if it is of none."""
+        none = self.preshape is None or not hand.preshapes
+        return "" if none else hand.preshape_names[self.preshape or 0]
 
 
 def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
@@ -56,8 +68,9 @@ def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
     refuse_other_codes(out / DATA_FILES["oto"], "trial_id", rows, len(trials))
 
     # Their postures.
-    names = ("object_name", "X_TO", "X_OG", "closed_q", "spread", "unused")
-    samples = trials[rows].columns(names)
+    names = ("object_name", "X_TO", "X_OG", "closed_q", "spread", "unused", "preshape")
+    samples = trials[rows].columns((*names, *CONDITIONS))
+    conditions = np.column_stack([samples[name] for name in CONDITIONS])
     X_TO, X_OG = (unpack_pose(samples[name]) for name in ("X_TO", "X_OG"))
     for i, row in enumerate(rows.tolist()):
         yield ClosedGrasp(
@@ -69,4 +82,6 @@ def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
             q=samples["closed_q"][i],
             spread=float(samples["spread"][i]),
             unused=int(samples["unused"][i]),
+            preshape=None if (k := int(samples["preshape"][i])) == NO_PRESHAPE else k,
+            conditions=conditions[i],
         )

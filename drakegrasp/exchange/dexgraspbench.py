@@ -11,8 +11,10 @@ and the units of `joint_units`, rad or m:
 * `squeeze_qpos`: the same joints closed further by `APART`: the command of a position controller
   that presses. The benchmark's own grasps go on from pregrasp and grasp by equal steps, too.
 
-All poses are over the table, in {T}. The hand is `mjcf.hand_model`: gains, torques and damping are
-those of the benchmark's Shadow Hand.
+Keys that the benchmark does not read say under what the sample held: `hand`, `preshape`,
+`trial_id`, `start_qpos` (the joints of the open hand) and `conditions` (friction of hand and table,
+mass). All poses are over the table, in {T}. The hand is `mjcf.hand_model`: gains, torques and
+damping are those of the benchmark's Shadow Hand.
 """
 
 from __future__ import annotations
@@ -178,6 +180,10 @@ def grasp_dictionary(
             ]
         return np.concatenate([X_TB, q])
 
+    known: dict[str, Any] = {"preshape": grasp.preshape_name(hand)}
+    if grasp.conditions is not None:
+        known["conditions"] = np.asarray(grasp.conditions)
+    start = [open_at[name] if step[name] else closed[name] for name in joints]
     return {
         "obj_pose": pose_vector(grasp.X_TO),
         "obj_scale": 1.0,
@@ -187,6 +193,10 @@ def grasp_dictionary(
         "squeeze_qpos": posture(1.0),
         "joint_names": list(joints),
         "joint_units": [hand.joint_units[name] for name in joints],
+        "hand": hand.name,
+        "trial_id": grasp.trial_id,
+        "start_qpos": np.array(start),
+        **known,
     }
 
 

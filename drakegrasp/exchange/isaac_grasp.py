@@ -2,6 +2,8 @@
 
 In: a dataset. Out: `<object>.yaml`, with the pose of the palm link in {O} of each sample, the
 joints after closing and those of the open hand, and `meshes/<object>.obj`, the object in {O} [m].
+The format allows more keys: those of ours say under what the sample held, so that the file read
+back gives the same trial.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import load_object
 from drakegrasp.runtime.progress import Report
 from drakegrasp.simulation.postures.posture import joint_order
+from drakegrasp.simulation.postures.table import CONDITIONS
 
 
 def write_isaac_grasp(out: Path, folder: Path, progress: Report) -> int:
@@ -47,6 +50,7 @@ def write_isaac_grasp(out: Path, folder: Path, progress: Report) -> int:
             "created_with": CREATED_WITH,
             "object_frame": "centre of the bounding box, as in meshes/",
             "gripper_frame": hand.palm_link,
+            "hand": hand.name,
             "grasps": entries,
         }
         text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=1000)
@@ -68,10 +72,20 @@ def grasp_entry(hand: Hand, grasp: ClosedGrasp) -> dict[str, Any]:
     moved = np.asarray(hand.joint_gain[:, 1:][:, used].any(axis=1))
     moves = dict(zip(hand.joint_names, moved.tolist(), strict=True))
     opened = joint_positions(hand, grasp.spread, [0.0] * hand.num_fingers)
-    return {
+    entry: dict[str, Any] = {
         "confidence": 1.0,
         "position": [x, y, z],
         "orientation": {"w": w, "xyz": xyz},
         "cspace_position": closed,
         "pregrasp_cspace_position": {n: opened[n] if moves[n] else closed[n] for n in order},
+        "trial_id": grasp.trial_id,
     }
+
+    # How the object lay, and what else the trial had.
+    x, y, z, w, *xyz = pose_vector(grasp.X_TO).tolist()
+    entry["resting_pose"] = {"position": [x, y, z], "orientation": {"w": w, "xyz": xyz}}
+    if name := grasp.preshape_name(hand):
+        entry["preshape"] = name
+    if grasp.conditions is not None:
+        entry["conditions"] = dict(zip(CONDITIONS, grasp.conditions.tolist(), strict=True))
+    return entry

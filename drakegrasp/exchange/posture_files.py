@@ -7,10 +7,13 @@ in one line that names the file and what is wrong. docs/how-to/postures.md lists
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 from zipfile import ZipFile
 
 import h5py
@@ -24,7 +27,8 @@ from drakegrasp.exchange.posture_rows import Rows, quaternion_poses, table_of
 from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
-from drakegrasp.simulation.postures.table import PostureTable, join_tables
+from drakegrasp.protocols.grasp_file import is_grasp_file
+from drakegrasp.simulation.postures.table import CONDITIONS, PostureTable, join_tables
 
 #: Suffixes of the layouts.
 ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml", ".yml")
@@ -32,35 +36,55 @@ ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml"
 MOST_BYTES = 1_000_000_000
 #: The arrays of our own layout that are neither poses nor joints.
 _TEXTS = ("object", "joints", "source", "frame", "link", "preshape")
+_SCALARS = ("resting", "log_density", "scale")
 _KNOWN = (
     *_TEXTS,
-    *("X_FG", "position", "quaternion", "q_grasp", "q_pregrasp", "q_squeeze", "resting"),
-    *("log_density", "X_TC", "scale", "row", "confidence"),
+    *("X_FG", "position", "quaternion", "q_grasp", "q_pregrasp", "q_squeeze"),
+    *_SCALARS,
+    *CONDITIONS,
+    *("X_TC", "X_TO", "row", "confidence"),
 )
 
 
-def read_postures(path: Path, hand: Hand) -> PostureTable:
+def read_postures(path: Path, hand: Hand, *, of: str | None = None) -> PostureTable:
     """Return the postures of a file, or of all files of a folder.
 
     A row that is none stays in the table, with the reason; in a folder a file may be none. What a
     file says for a score, `row` and `confidence`, is not asked.
 
+    Args:
+        path: The file or the folder.
+        hand: The hand.
+        of: Name of the object of rows that name none; None: each must.
+
     Raises:
         GraspError: If it is no file of postures of this hand, or names no object.
         MachineError: If a package is missing that the format needs.
     """
-    if path.is_dir():
-        return _of_folder(path, hand)
-    with named(path):
-        rows = read_rows(path, hand)
+
+    def table(rows: Rows) -> PostureTable:
+        if of is not None:
+            rows = replace(rows, objects=[name or of for name in rows.objects])
         if rows.of_row is not None and not any(rows.objects):
             raise GraspError(
                 "postures must name an object in each row, got rows of a dataset alone"
             )
         return table_of(hand, rows)
 
+    if not path.is_dir():
+        with named(path):
+            return table(read_rows(path, hand, nameless=of is not None))
+    found = list[PostureTable | str]()
+    for each in files_in(path):
+        try:
+            with named(each):
+                found.append(table(read_rows(each, hand)))
+        except GraspError as error:
+            found.append(str(error))
+    return join_tables(found)
 
-def read_rows(path: Path, hand: Hand) -> Rows:
+
+def read_rows(path: Path, hand: Hand, *, nameless: bool = False) -> Rows:
     """Return what a file says of its postures, before it is compared with the hand.
 
     Raises:
@@ -72,9 +96,9 @@ def read_rows(path: Path, hand: Hand) -> Rows:
         raise GraspError(f"postures must be a file or a folder of files, got {str(path)!r}")
     with named(path):
         if suffix in ARRAYS:
-            return _of_arrays(_read_arrays(path))
+            return _of_arrays(_read_arrays(path), nameless)
         if suffix in TABLES:
-            return _of_columns(*_read_columns(path))
+            return _of_columns(*_read_columns(path), nameless)
         if suffix == ".npy":
             return read_dexgraspbench(path, hand)
         if suffix in YAMLS:
@@ -96,11 +120,17 @@ def named(path: Path) -> Iterator[None]:
 def holds_postures(path: Path) -> bool:
     """Return whether a file that holds postures or predictions of contacts holds postures.
 
+    A folder does: no layout of contacts is one.
+
     Raises:
         GraspError: If it cannot be read.
     """
+    if path.is_dir():
+        return True
     suffix = path.suffix.lower()
     try:
+        if suffix == ".npy" and path.is_file():
+            return is_grasp_file(path)
         if suffix in ARRAYS[1:] and path.is_file():
             with open_hdf5(path) as file:
                 return "q_grasp" in file
@@ -119,27 +149,35 @@ def has_rows(path: Path) -> bool:
     Raises:
         GraspError: If it cannot be read.
     """
+    if path.is_dir():
+        return False
     with named(path):
         if path.suffix.lower() in ARRAYS:
             return "row" in _read_arrays(path)
         return path.suffix.lower() in TABLES and "row" in _column_names(path)
 
 
-def _of_folder(folder: Path, hand: Hand) -> PostureTable:
-    """Return the postures of all files of one foreign layout in a folder and those below."""
-    for pattern, read in (("*.npy", read_dexgraspbench), ("*.y*ml", read_isaac_grasp)):
-        if paths := sorted(folder.rglob(pattern)):
-            return join_tables([_of_file(path, hand, read) for path in paths])
+def files_in(folder: Path) -> list[Path]:
+    """Return the files of one foreign layout in a folder and those below.
+
+    Raises:
+        GraspError: If there is none.
+    """
+    for suffixes in ((".npy",), YAMLS):
+        paths = (path for path in folder.rglob("*") if path.suffix.lower() in suffixes)
+        if found := sorted(paths):
+            return found
     raise GraspError(f"{folder}: must hold .npy or .yaml files of grasps, got none")
 
 
-def _of_file(path: Path, hand: Hand, read: Callable[[Path, Hand], Rows]) -> PostureTable | str:
-    """Return the postures of a file in a folder, or why it is none."""
-    try:
-        with named(path):
-            return table_of(hand, read(path, hand))
-    except GraspError as error:
-        return str(error)
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 of a file, or of all files of postures in a folder."""
+    if path.is_file():
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    digest = hashlib.sha256()
+    for each in files_in(path):
+        digest.update(hashlib.sha256(each.read_bytes()).digest())
+    return digest.hexdigest()
 
 
 # Arrays
@@ -171,23 +209,30 @@ def _dataset(item: h5py.Dataset | h5py.Group) -> Any:
     return item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()]
 
 
-def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
-    """Return the rows of our own layout."""
+def _of_arrays(arrays: Mapping[str, Any], nameless: bool) -> Rows:
+    """Return the rows of our own layout, which may name no object if they are `nameless`."""
     if unknown := [name for name in arrays if name not in _KNOWN]:
-        raise GraspError(f"arrays must be some of {', '.join(_KNOWN)}, got {unknown[0]!r}")
-    for name in ("object", "q_grasp"):
-        if name not in arrays and not (name == "object" and "row" in arrays):
-            raise GraspError(f"{name} must be there, got only {listed(sorted(arrays))}")
+        raise GraspError(
+            f"arrays must be some of {', '.join(_KNOWN)}, got {', '.join(map(repr, unknown))}"
+            f"{_leading_on(arrays, unknown)}"
+        )
+    needed = ["q_grasp"] if nameless or "row" in arrays else ["object", "q_grasp"]
+    missing = [name for name in needed if name not in arrays]
+    if "X_FG" not in arrays and not {"position", "quaternion"} <= set(arrays):
+        missing.append("X_FG (or position and quaternion)")
+    if missing:
+        raise GraspError(f"{', '.join(missing)} must be there, got only {listed(sorted(arrays))}")
     texts = {name: _texts(arrays[name], name) for name in _TEXTS if name in arrays}
 
     # The palm's poses, in either form.
     invalid = None
     if "X_FG" in arrays:
         X_FG = _stacked(arrays["X_FG"], "X_FG")
-    elif {"position", "quaternion"} <= set(arrays):
-        X_FG, invalid = quaternion_poses(arrays["position"], arrays["quaternion"])
     else:
-        raise GraspError("X_FG, or position and quaternion, must be there, got none")
+        X_FG, invalid = quaternion_poses(arrays["position"], arrays["quaternion"])
+    numbers = {name: arrays[name] for name in _SCALARS if name in arrays}
+    if "X_TO" in arrays:
+        numbers["X_TO"] = _stacked(arrays["X_TO"], "X_TO")
 
     return Rows(
         objects=texts["object"] if "object" in texts else [""] * len(X_FG),
@@ -201,13 +246,40 @@ def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
         },
         joints=texts.get("joints"),
         X_TC=None if "X_TC" not in arrays else _stacked(arrays["X_TC"], "X_TC"),
-        numbers={n: arrays[n] for n in ("resting", "log_density", "scale") if n in arrays},
+        numbers=numbers | _conditions(arrays, len(X_FG)),
         said=texts.get("source"),
         invalid=invalid,
         of_row=arrays.get("row"),
         confidence=arrays.get("confidence"),
         preshape=texts.get("preshape"),
     )
+
+
+def _leading_on(arrays: Mapping[str, Any], unknown: Sequence[str]) -> str:
+    """Return what to do with arrays that are none of postures; empty if nobody knows."""
+    for name in unknown:
+        shape = np.shape(arrays[name])
+        if name == "grasps" or (len(shape) == 2 and shape[1] % 6 == 0):
+            return (
+                f": contact points and normals go into a .npy file, or as `grasps` into an HDF5 "
+                f"file; {name} is of shape {shape}"
+            )
+        if shape[-2:] in ((4, 4), (3, 4)):
+            return f": poses of the palm go by the name X_FG, with object and q_grasp, not {name}"
+    return ""
+
+
+def _conditions(columns: Mapping[str, Any], count: int) -> dict[str, Any]:
+    """Return the conditions (n, 3) of rows that tell some."""
+    if not set(CONDITIONS) & set(columns):
+        return {}
+    unknown = np.full(count, np.nan)
+    try:
+        told = [np.asarray(columns.get(n, unknown), dtype=float) for n in CONDITIONS]
+        return {"conditions": np.column_stack(told)}
+    except (TypeError, ValueError):
+        must = f"{', '.join(CONDITIONS)} must be {count} numbers each"
+        raise GraspError(f"{must}, got something else") from None
 
 
 def _texts(value: Any, name: str) -> list[str]:
@@ -255,8 +327,19 @@ def _column_names(path: Path) -> list[str]:
     """Return the names of a table's columns; the first line of a CSV file, whatever it is."""
     if path.suffix.lower() == ".parquet":
         return list(_parquet().read_schema(path).names)
-    with path.open(encoding="utf-8", newline="") as file:
-        return next(csv.reader(file), [])
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        return next(_cells(file), [])
+
+
+def _cells(file: TextIO) -> Iterator[list[str]]:
+    """Yield the cells of each line of a CSV file, without the blanks around them.
+
+    Cells are separated as in the first line: by commas, or by semicolons if it has none.
+    """
+    first = file.readline()
+    comma = "," if "," in first or ";" not in first else ";"
+    for row in csv.reader(chain([first], file), delimiter=comma, skipinitialspace=True):
+        yield [cell.strip() for cell in row]
 
 
 def _parquet() -> Any:
@@ -282,8 +365,8 @@ def _read_columns(path: Path) -> tuple[dict[str, list[Any]], list[str]]:
     # CSV, whose names stand in the first line.
     try:
         refuse_irregular(path, LARGEST_TEXT)
-        with path.open(encoding="utf-8", newline="") as file:
-            header, *rows = csv.reader(file)
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            header, *rows = _cells(file)
     except (OSError, ValueError, csv.Error) as error:
         raise GraspError(f"must be a table with a header, got: {one_line(error)}") from None
     if twice := [name for name in header if header.count(name) > 1]:
@@ -297,12 +380,15 @@ def _read_columns(path: Path) -> tuple[dict[str, list[Any]], list[str]]:
     return {name: [row[i] for row in cells] for i, name in enumerate(header)}, invalid
 
 
-def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str]) -> Rows:
-    """Return the rows of a plain table, with a column for each number."""
+def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str], nameless: bool) -> Rows:
+    """Return the rows of a plain table, with a column for each number; see `_of_arrays`."""
     place = [*("x", "y", "z"), *("qw", "qx", "qy", "qz")]
-    needed = place if "row" in columns else ["object", *place]
-    if missing := [name for name in needed if name not in columns]:
-        raise GraspError(f"columns must include {missing[0]}, got {listed(list(columns))}")
+    needed = place if nameless or "row" in columns else ["object", *place]
+    missing = [name for name in needed if name not in columns]
+    if not any(name.startswith("grasp_") for name in columns):
+        missing.append("a grasp_JOINT for each joint")
+    if missing:
+        raise GraspError(f"columns must include {', '.join(missing)}, got {listed(list(columns))}")
 
     def told(name: str) -> list[str | None]:
         return [v for v, none in zip(columns.get(name, ()), invalid, strict=False) if not none]
@@ -317,12 +403,10 @@ def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str]) -> Rows:
             if set(names) != set(joints):
                 raise GraspError(f"{stage}_ columns must be of the joints of grasp_, got others")
             q[stage] = np.column_stack([_floats(columns, f"{stage}_{n}", invalid) for n in joints])
-    if "grasp" not in q:
-        raise GraspError("columns must include one grasp_JOINT for each joint, got none")
-
     numbers = np.column_stack([_floats(columns, name, invalid) for name in place])
-    scalars = [n for n in ("resting", "log_density", "scale") if n in columns]
-    known = {n: _floats(columns, n, invalid) for n in scalars}
+    known = {n: _floats(columns, n, invalid) for n in _SCALARS if n in columns}
+    told_under = {n: _floats(columns, n, invalid) for n in CONDITIONS if n in columns}
+    known |= _conditions(told_under, len(numbers))
     X_FL, reasons = quaternion_poses(numbers[:, :3], numbers[:, 3:])
     said = {n: _floats(columns, n, invalid) for n in ("row", "confidence") if n in columns}
     whole = "row" in said and np.array_equal(said["row"], np.floor(said["row"]))

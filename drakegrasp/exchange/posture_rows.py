@@ -7,7 +7,7 @@ joints in the plant's order.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -38,12 +38,15 @@ class Rows:
         joints: (m,), names of the joints; None: all, in the plant's order. A joint that the hand
             file couples, or that the preshapes of all rows keep, may be missing.
         X_TC: (n, 4, 4), for the frame "camera".
-        numbers: `resting`, `log_density` and `scale`, (n,) each, as far as they are known.
+        numbers: `resting`, `log_density` and `scale`, (n,) each, `X_TO` (n, 4, 4) and `conditions`
+            (n, 3), as far as they are known; see `PostureTable`.
         said: (n,), where each comes from.
         invalid: (n,), why a row is known to be none; None: no row is.
         of_row: (n,), of predictions: the row of a dataset's split that each is for.
         confidence: (n,), of predictions: greater is better.
         preshape: (n,), name of the hand's preshape; empty or None: all fingers close.
+        of_trial: (n,), of samples that were exported: the trial that each was.
+        hand: Name of the hand; None: the file does not say.
     """
 
     objects: Sequence[str]
@@ -59,6 +62,29 @@ class Rows:
     of_row: Any = None
     confidence: Any = None
     preshape: Sequence[str | None] | None = None
+    of_trial: npt.NDArray[np.int64] | None = None
+    hand: str | None = None
+
+    def at(self, rows: Sequence[int]) -> Rows:
+        """Return some of the rows, in the given order."""
+        chosen: dict[str, Any] = {
+            name: None if (value := getattr(self, name)) is None else _chosen(value, rows)
+            for name in _OF_EACH
+        }
+        return replace(self, **chosen)
+
+
+#: What `Rows` has of each row, as a sequence or as a mapping of arrays.
+_OF_EACH = (
+    *("objects", "X_FL", "q", "X_TC", "numbers", "said", "invalid", "of_row", "confidence"),
+    *("preshape", "of_trial"),
+)
+
+
+def _chosen(value: Any, rows: Sequence[int]) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _chosen(each, rows) for name, each in value.items()}
+    return value[rows] if isinstance(value, np.ndarray) else [value[i] for i in rows]
 
 
 def table_of(hand: Hand, rows: Rows) -> PostureTable:
@@ -67,6 +93,10 @@ def table_of(hand: Hand, rows: Rows) -> PostureTable:
     Raises:
         GraspError: If the file is none of this hand.
     """
+    if rows.hand not in (None, hand.name):
+        raise GraspError(f"hand must be {rows.hand}, as the file says, got {hand.name} (--hand)")
+
+    # Poses and joints as the hand has them.
     q = _in_order(hand, rows)
     try:
         return make_table(

@@ -111,9 +111,15 @@ def fitted_postures(
     contacts = [(i, g) for i, g in enumerate(grasps) if not g.invalid and g.posture is None]
     fitted = dict(execute(_fit, contacts))
     return [
-        PlacedPosture(placed=g.placed, posture=g.invalid or g.posture or fitted[i])
+        PlacedPosture(placed=g.placed, posture=g.invalid or _told(g) or g.posture or fitted[i])
         for i, g in enumerate(grasps)
     ]
+
+
+def _told(grasp: PlacedGrasp) -> str:
+    """Return why a posture cannot be tried: nobody named its resting pose; empty if it can."""
+    count = 1 + len(grasp.others)
+    return f"resting must be 0 to {count - 1} with a protocol, got none" if count > 1 else ""
 
 
 def _fit(task: tuple[int, PlacedGrasp]) -> tuple[int, Posture]:

@@ -38,7 +38,12 @@ class StoredGrasps:
         object_path: Folder of the object.
         object_scale: (n,), its scale; NaN if the file does not say.
         joints: (m,), their names; None if the file does not say.
-        exported: Whether drakegrasp wrote the file.
+        exported: Whether drakegrasp wrote the file. Then the object lies on the table, and the rest
+            may be known:
+        hand, preshape: Names; empty if the file does not say.
+        trial_id: The trial that the sample was.
+        start: (m,), the joints from which the fingers closed.
+        conditions: (3,), friction of hand and table, and mass [kg].
     """
 
     postures: Mapping[str, Array]
@@ -47,6 +52,24 @@ class StoredGrasps:
     object_scale: Array
     joints: tuple[str, ...] | None
     exported: bool
+    hand: str = ""
+    preshape: str = ""
+    trial_id: int | None = None
+    start: Array | None = None
+    conditions: Array | None = None
+
+
+def is_grasp_file(path: Path) -> bool:
+    """Return whether a .npy file holds Python objects, as such files do, and no numbers."""
+    try:
+        with path.open("rb") as file:
+            version = np.lib.format.read_magic(file)
+            read = np.lib.format.read_array_header_1_0
+            if version != (1, 0):
+                read = np.lib.format.read_array_header_2_0
+            return bool(read(file)[2].hasobject)
+    except (OSError, EOFError, ValueError, TypeError, ArithmeticError, MemoryError):
+        return False
 
 
 def read_grasp_file(path: Path) -> StoredGrasps:
@@ -79,7 +102,24 @@ def read_grasp_file(path: Path) -> StoredGrasps:
         object_scale=np.broadcast_to(scale, (count,)),
         joints=_names(content.get("joint_names")),
         exported="joint_units" in content,
+        **(_of_export(content, grasp.shape[1] - 7) if "joint_units" in content else {}),
     )
+
+
+def _of_export(content: Mapping[str, Any], joints: int) -> dict[str, Any]:
+    """Return what a file of ours says of its sample, as far as it does."""
+    found: dict[str, Any] = {n: str(content[n]) for n in ("hand", "preshape") if n in content}
+    if "trial_id" in content:
+        trial = content["trial_id"]
+        if not isinstance(trial, int | np.integer):
+            raise DataError(f"trial_id must be a whole number, got {trial!r}")
+        found["trial_id"] = int(trial)
+    for name, key, size in (("start", "start_qpos", joints), ("conditions", "conditions", 3)):
+        if key in content:
+            found[name] = _numbers(content, key)
+            if found[name].shape != (size,):
+                raise DataError(f"{key} must be {size} numbers, got {found[name].shape}")
+    return found
 
 
 def one_motion(grasps: StoredGrasps) -> GraspMotion:

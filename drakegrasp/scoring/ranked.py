@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
-from drakegrasp.exchange.posture_files import holds_postures
+from drakegrasp.exchange.posture_files import digest_of, holds_postures
 from drakegrasp.exchange.predicted_postures import read_predicted_postures
 from drakegrasp.frames import Array, as_numbers
 from drakegrasp.simulation.postures.table import PostureTable
@@ -182,7 +182,7 @@ def rank_postures(path: Path, data: GraspDataset) -> Ranked:
         length=len(data),
         rows=rows,
         confidence=confidence,
-        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        sha256=digest_of(path),
         table=table,
     )
 

@@ -43,13 +43,13 @@ def verify_batch(
         together: Most grasps of one object that are one task: they share its meshes on the way to
             a worker, and what a worker derives from them.
     """
-    objects = {grasp.index: grasp.placed for grasp in grasps}
+    objects = {g.index: (g.placed, *(placed for placed, _ in g.others)) for g in grasps}
     results: dict[int, Verification] = {}
     delivered = holding = 0
     report(0, len(grasps), holding=holding)
     for verdicts in execute(_verify_together, _tasks(grasps, together)):
         for index, result in verdicts:
-            results[index] = replace(result, placed=objects[index])
+            results[index] = replace(result, placed=objects[index][result.stand])
             holding += result.success
 
         # Deliver these results, and later ones that were waiting for them.

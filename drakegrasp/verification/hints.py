@@ -72,7 +72,7 @@ def known_frames(
     X_OT = invert_pose(X_TO)
     frames = {
         "the object's frame (object)": np.eye(4),
-        "the table's frame (workspace)": X_OT,
+        "the table's frame (table)": X_OT,
         "the world's frame": multiply(X_OT, invert_pose(X_WT)),
     }
     frames |= {name: multiply(X_OT, X) for name, X in (cameras or {}).items()}

@@ -300,16 +300,34 @@ def as_drawn(
         i, placed, config = grasp.index, grasp.placed, grasp.config
         if drawn_friction:
             used = {name: float(values[i]) for name, values in frictions.items()}
-            physics = config.physics.model_copy(update=used)
-            config = config.model_copy(update={"physics": physics})
-            # They come from the object's own, which would win otherwise.
-            placed = replace(placed, model=replace(placed.model, friction=None))
+            placed, config = with_friction(placed, config, used)
         if rules.mass is not None:
-            mass, known = float(masses[i]), placed.model
-            inertia = mass / known.mass * known.I_OOcm_O
-            placed = replace(placed, model=replace(known, mass=mass, I_OOcm_O=inertia))
+            placed = with_mass(placed, float(masses[i]))
         tried.append(replace(grasp, placed=placed, config=config))
     return tried
+
+
+def with_friction(
+    placed: PlacedObject, config: Config, used: Mapping[str, float]
+) -> tuple[PlacedObject, Config]:
+    """Return an object and a configuration with other coefficients of friction.
+
+    Args:
+        placed: The object, whose own friction gives way.
+        config: How it is tried.
+        used: Coefficients by `friction_hand` and `friction_table`; what lacks keeps its value.
+    """
+    physics = config.physics.model_copy(update=dict(used))
+    config = config.model_copy(update={"physics": physics})
+    # They come from the object's own, which would win otherwise.
+    return replace(placed, model=replace(placed.model, friction=None)), config
+
+
+def with_mass(placed: PlacedObject, mass: float) -> PlacedObject:
+    """Return an object with another mass [kg], and its inertia in proportion."""
+    known = placed.model
+    inertia = mass / known.mass * known.I_OOcm_O
+    return replace(placed, model=replace(known, mass=mass, I_OOcm_O=inertia))
 
 
 def choose_rows(
@@ -333,7 +351,8 @@ def choose_rows(
     if rows is None and count != len(dataset):
         raise GraspError(
             f"without rows there must be a grasp for each of the {len(dataset)} rows of "
-            f"{dataset.split} in {dataset.path.name}, got {count} grasps"
+            f"{dataset.split} in {dataset.path.name}, got {count} grasps (`rows` in the file, or "
+            "--rows, says for which rows they are)"
         )
 
     # Rows that exist.

@@ -17,10 +17,19 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.errors import GraspError
 from drakegrasp.frames import Array, invert_pose
 from drakegrasp.hand.description import load_hand
-from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.postures.table import PostureTable, misfits, unknown_objects
+from drakegrasp.simulation.placement import PlacedObject, canonical_pose, place_object
+from drakegrasp.simulation.postures.posture import Posture
+from drakegrasp.simulation.postures.table import (
+    CONDITIONS,
+    UNTOLD,
+    PostureTable,
+    misfits,
+    unknown_objects,
+)
+from drakegrasp.simulation.settle import find_resting_poses
 from drakegrasp.verification.hints import known_frames
 from drakegrasp.verification.placed_grasp import (
     CAMERA,
@@ -29,22 +38,43 @@ from drakegrasp.verification.placed_grasp import (
     choose_rows,
     dataset_config,
     objects_of_rows,
+    overridden_keys,
+    with_friction,
+    with_mass,
 )
 from drakegrasp.verification.verify import PlacedGrasp
 
+#: Poses of an object at rest that differ by less are one: what is left of rounding in a file.
+SAME_POSE = 1e-6
 
-def place_postures_on_object(table: PostureTable, placed: PlacedObject) -> list[PlacedGrasp]:
+
+def place_postures_on_object(
+    table: PostureTable, placed: PlacedObject, *, overrides: Sequence[str] = ()
+) -> list[PlacedGrasp]:
     """Return the postures of a table on one object, whatever they call it.
+
+    Args:
+        table: The postures.
+        placed: The object as it is dropped; its other resting poses are those of a build.
+        overrides: What the caller sets, which is stronger than the conditions of a posture.
 
     Raises:
         GraspError: If they are in the frame of a mesh file.
     """
     named = replace(table, objects=(placed.model.name,) * len(table))
-    return _placed(named, range(len(table)), [placed], placed.config)
+    things, config = [placed], placed.config
+    if config.objects.resting_poses > 1:
+        others = find_resting_poses(placed.model, config)[1:]
+        things += [replace(placed, X_TO=resting.X_TO) for resting in others]
+    return _placed(named, range(len(table)), things, config, overrides)
 
 
 def place_postures_on_dataset(
-    table: PostureTable, out: Path, config: Config | None = None
+    table: PostureTable,
+    out: Path,
+    config: Config | None = None,
+    *,
+    overrides: Sequence[str] = (),
 ) -> list[PlacedGrasp]:
     """Return the postures of a table on the objects of a dataset that they name.
 
@@ -52,6 +82,7 @@ def place_postures_on_dataset(
         table: The postures.
         out: Directory of the dataset.
         config: By which they are tried; that of each object if None.
+        overrides: What the caller sets, which is stronger than the conditions of a posture.
 
     Raises:
         GraspError: If they are in the frames of mesh files.
@@ -73,7 +104,7 @@ def place_postures_on_dataset(
             nobody = replace(prepared.model, name=name)
             things = [PlacedObject(model=nobody, X_TO=np.full((4, 4), np.nan), config=own)]
         rows = [i for i, each in enumerate(table.objects) if each == name]
-        placed += _placed(table, rows, things, config or own)
+        placed += _placed(table, rows, things, config or own, overrides)
     return placed
 
 
@@ -101,10 +132,15 @@ def place_postures_on_rows(
         choose_rows(dataset, rows, len(table)),
     )
     placed, cameras = list[PlacedGrasp](), cameras_of_rows(dataset, chosen)
-    table = replace(table, resting=np.zeros_like(table.resting))
+    table = replace(
+        table,
+        resting=np.zeros_like(table.resting),
+        X_TO=np.full_like(table.X_TO, np.nan),
+        conditions=np.full_like(table.conditions, np.nan),
+    )
     for thing, indices in objects_of_rows(dataset, chosen):
         named = replace(table, objects=(thing.model.name,) * len(table))
-        placed += _placed(named, indices.tolist(), [thing], config, cameras)
+        placed += _placed(named, indices.tolist(), [thing], config, cameras=cameras)
     return as_drawn(placed, dataset, chosen, overrides)
 
 
@@ -113,6 +149,7 @@ def _placed(
     rows: Sequence[int],
     things: Sequence[PlacedObject],
     config: Config,
+    overrides: Sequence[str] = (),
     cameras: Mapping[str, Array] | None = None,
 ) -> list[PlacedGrasp]:
     """Return some rows of a table on one object, which is there in each of its resting poses.
@@ -121,29 +158,90 @@ def _placed(
     """
     # The cameras that are known, and what no posture has.
     model, found = things[0].model, list[PlacedGrasp]()
-    table = table.refuse(misfits(table, model.name, model.scale, len(things)))
-    known = dict(cameras or {})
+    known_cameras = dict(cameras or {})
     if table.X_TC is not None:
-        known[CAMERA] = table.X_TC
-    nothing = np.full((load_hand(config.hand_source).num_fingers, 3), np.nan)
+        known_cameras[CAMERA] = table.X_TC
 
+    # A row that tells how the object lies is tried so, whether or not it was dropped so.
+    anywhere = replace(table, X_TO=np.full_like(table.X_TO, np.nan))
+    poses = np.array([thing.X_TO for thing in things])
+    table = table.refuse(misfits(anywhere, model.name, model.scale, poses))
+    nothing = np.full((load_hand(config.hand_source).num_fingers, 3), np.nan)
+    stands, known = _Stands(things), overridden_keys(overrides)
     for i in rows:
-        reason = table.invalid[i]
-        thing = things[0 if reason else int(table.resting[i])]
-        posture = None if reason else table.posture(i, thing.X_TO)
-        own = {name: X_TC[i] for name, X_TC in known.items()}
+        tried, used, reason = list[tuple[PlacedObject, Posture]](), config, table.invalid[i]
+        if not reason:
+            try:
+                for thing in stands.of(table, i):
+                    posture = table.posture(i, thing.X_TO)
+                    told, used = stands.under(thing, config, table.conditions[i], known)
+                    tried.append((told, posture))
+            except GraspError as error:
+                if table.frame == "mesh":
+                    raise
+                tried, reason = [], str(error)
+        first = tried[0][1] if tried else None
+        stood = tried[0][0] if tried else things[0]
+        own = {name: X_TC[i] for name, X_TC in known_cameras.items()}
         found.append(
             PlacedGrasp(
                 index=i,
-                placed=thing,
+                placed=stood,
                 p_OQ=nothing,
                 nhat_Q_O=nothing,
                 method="posture",
-                config=config,
+                config=used,
                 invalid=reason,
-                posture=posture,
-                X_OA=None if posture is None else posture.X_OG @ invert_pose(table.X_FG[i]),
-                frames=known_frames(thing.X_TO, own),
+                posture=first,
+                others=tuple(tried[1:]),
+                X_OA=None if first is None else first.X_OG @ invert_pose(table.X_FG[i]),
+                frames=known_frames(stood.X_TO, own),
             )
         )
     return found
+
+
+class _Stands:
+    """An object in its resting poses, and as rows tell: one `PlacedObject` for all equal ones."""
+
+    def __init__(self, things: Sequence[PlacedObject]) -> None:
+        self._dropped, self._told = list(things), list[PlacedObject]()
+        self._known: dict[tuple[int, bytes], tuple[PlacedObject, Config]] = {}
+
+    def of(self, table: PostureTable, i: int) -> list[PlacedObject]:
+        """Return the object as a row may be for it.
+
+        Raises:
+            GraspError: If the row tells a pose in which it does not stand on the table.
+        """
+        X_TO = table.X_TO[i]
+        if np.isnan(X_TO).any():
+            named = int(table.resting[i])
+            return self._dropped if named == UNTOLD else [self._dropped[named]]
+        stood = canonical_pose(X_TO)
+        for thing in (*self._dropped, *self._told):
+            if np.abs(thing.X_TO_simulated - stood).max() < SAME_POSE:
+                return [thing]
+        self._told.append(place_object(self._dropped[0], X_TO=X_TO))
+        return self._told[-1:]
+
+    def under(
+        self, thing: PlacedObject, config: Config, conditions: Array, overridden: set[str]
+    ) -> tuple[PlacedObject, Config]:
+        """Return the object and the configuration under the conditions of a row."""
+        key = (id(thing), conditions.tobytes())
+        if key not in self._known:
+            told = dict(zip(CONDITIONS, conditions.tolist(), strict=True))
+            mass, placed, own = told.pop("mass"), thing, thing.model.friction
+            if np.isfinite(list(told.values())).any():
+                frictions = {n: v if np.isfinite(v) else own for n, v in told.items()}
+                used = {
+                    name: value
+                    for name, value in frictions.items()
+                    if value is not None and f"physics.{name}" not in overridden
+                }
+                placed, config = with_friction(placed, config, used)
+            if np.isfinite(mass) and "objects.mass" not in overridden and mass != thing.model.mass:
+                placed = with_mass(placed, mass)
+            self._known[key] = placed, config
+        return self._known[key]

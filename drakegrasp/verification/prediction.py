@@ -21,8 +21,10 @@ from drakegrasp.errors import GraspError, MachineError, first_line
 from drakegrasp.foreign_files import read_text, refuse_irregular
 from drakegrasp.frames import FARTHEST, Array, as_numbers, invert_pose, without_torch
 
-Frame = Literal["object", "camera", "workspace"]
+Frame = Literal["object", "camera", "table"]
 FRAMES: tuple[str, ...] = get_args(Frame)
+#: An earlier name of the frame "table", which is read still.
+WORKSPACE = "workspace"
 
 #: A normal whose length differs from one by more is said to have been normalised.
 NORMAL_TOLERANCE = 0.01
@@ -31,6 +33,8 @@ SHORTEST_NORMAL = 1e-6
 #: Suffixes of files with grasps.
 HDF5_SUFFIXES = (".h5", ".hdf5")
 SUFFIXES = (".npy", ".csv", *HDF5_SUFFIXES, ".parquet")
+#: What to do with poses in place of contacts.
+_POSES = ": poses of the palm go with joints into a file of postures, as X_FG, object and q_grasp"
 #: Names of the arrays in an HDF5 file, and of the columns in a Parquet file.
 GRASPS, ROWS, CONFIDENCE = "grasps", "rows", "confidence"
 
@@ -132,7 +136,7 @@ def frame_poses(*, frame: str, X_TC: Array | None, X_TO: Array, count: int) -> A
     """Return the poses X_OA (n, 4, 4) of the frame {A} of n grasps in {O} of the object.
 
     Args:
-        frame: "object" {O}, "camera" {C} or "workspace" {T}.
+        frame: "object" {O}, "camera" {C} or "table" {T}.
         X_TC: With the frame "camera": pose of the camera, (4, 4), or one per grasp (n, 4, 4).
         X_TO: (4, 4), pose of the object.
         count: Number of grasps, n.
@@ -141,6 +145,7 @@ def frame_poses(*, frame: str, X_TC: Array | None, X_TO: Array, count: int) -> A
         GraspError: If the frame is unknown, a camera's pose is missing, or one is given for
             another frame, or not one per grasp.
     """
+    frame = "table" if frame == WORKSPACE else frame
     if frame not in FRAMES:
         raise GraspError(f"frame must be one of {', '.join(FRAMES)}, got {frame!r}")
     if frame == "camera" and X_TC is None:
@@ -340,7 +345,7 @@ def _grasps(array: Array, where: str, axes: int) -> Array:
     if not 1 <= array.ndim <= axes:
         raise GraspError(
             f"{where}: must be an array with a row per grasp, or one grasp, "
-            f"got an array of shape {array.shape}"
+            f"got an array of shape {array.shape}{_POSES if array.shape[-2:] == (4, 4) else ''}"
         )
     return np.atleast_2d(array)
 

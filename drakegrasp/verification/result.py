@@ -82,6 +82,7 @@ class Verification:
         smallest_friction: Smallest friction coefficient at which forces within the hand's limit
             hold the object at the contacts; inf if none does.
         seconds: Wall-clock time by stage [s].
+        stand: Which of the resting poses that a posture may be for gave this verdict, the best.
     """
 
     method: str
@@ -101,6 +102,7 @@ class Verification:
     epsilon: float = np.nan
     smallest_friction: float = np.nan
     seconds: dict[str, float] = field(default_factory=dict)
+    stand: int = 0
 
     @property
     def success(self) -> bool:

@@ -18,7 +18,7 @@ import numpy as np
 
 from drakegrasp.build.columns import judge_sample
 from drakegrasp.config import Config, with_whole_lifts
-from drakegrasp.frames import Array
+from drakegrasp.frames import Array, invert_pose
 from drakegrasp.grasp import for_all_fingers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits
@@ -35,7 +35,7 @@ from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.contact_surface import fit_surface
 from drakegrasp.verification.forces.quality import force_margin
 from drakegrasp.verification.forces.verdict import hand_contacts, judge_forces
-from drakegrasp.verification.hints import find_hints, find_posture_hints
+from drakegrasp.verification.hints import find_hints, find_posture_hints, known_frames
 from drakegrasp.verification.result import PoseTrial, Verification
 from drakegrasp.verification.wrist.solver import WristFit, fit_wrist
 
@@ -84,6 +84,8 @@ class PlacedGrasp:
         X_OA: (4, 4), pose of the frame in which the numbers were given.
         frames: (4, 4), poses X_OF of other frames that they could be in, see `hints.known_frames`.
         posture: With method "posture": wrist and joints, in place of contacts; None if invalid.
+        others: Of a posture that names no resting pose: the object in the others, and the same
+            posture in {O} there.
     """
 
     index: int
@@ -98,6 +100,7 @@ class PlacedGrasp:
     X_OA: Array | None = None
     frames: Mapping[str, Array] = field(default_factory=dict)
     posture: Posture | None = None
+    others: tuple[tuple[PlacedObject, Posture], ...] = ()
 
 
 @one_thread
@@ -117,7 +120,7 @@ def verify_placed(grasp: PlacedGrasp) -> Verification:
     if grasp.invalid:
         return base
     if grasp.posture is not None:
-        return _try_posture(base, grasp, grasp.posture)
+        return _best_stand(base, grasp, grasp.posture)
 
     # How the contacts lie on the surface, and what forces at them alone can do.
     base = _on_surface(base, grasp)
@@ -193,6 +196,23 @@ def _lift_by_hand(base: Verification) -> Verification:
         tries = _try_poses(base, fits, pass_collisions=hand.num_fingers == 2)
 
     return _judged(base, tries)
+
+
+def _best_stand(base: Verification, grasp: PlacedGrasp, posture: Posture) -> Verification:
+    """Try a posture in each resting pose that it may be for, and return the best verdict."""
+    found = [replace(_try_posture(base, grasp, posture), stand=0)]
+    for k, (placed, each) in enumerate(grasp.others, start=1):
+        # In another resting pose other frames lie elsewhere in {O}.
+        X_OA = None
+        if grasp.X_OA is not None:
+            X_OA = each.X_OG @ invert_pose(posture.X_OG) @ grasp.X_OA
+        there = replace(grasp, X_OA=X_OA, frames=known_frames(placed.X_TO, {}))
+        found.append(replace(_try_posture(replace(base, placed=placed), there, each), stand=k))
+    best = max(found, key=lambda v: (v.held, v.stable, v.precision, v.outcome.stage, -v.stand))
+    if len(found) == 1:
+        return best
+    told = f"the best of {len(found)} resting poses, as none is named: {best.stand}"
+    return replace(best, reason=f"{best.reason} ({told})")
 
 
 def _try_posture(base: Verification, grasp: PlacedGrasp, posture: Posture) -> Verification:

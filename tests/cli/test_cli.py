@@ -498,7 +498,7 @@ def test_camera_ties_the_frame_to_the_table(cube: Path, tmp_path: Path) -> None:
         (pinch(), ["--hand", "octopus"], "octopus"),
         (pinch(), ["--workers", "0"], "workers must be at least 1, got 0"),
         (pinch(), ["--workers", "some"], "'some' is not a valid integer"),
-        (pinch(), ["--frame", "world"], "'world' is not one of 'object', 'camera', 'workspace'"),
+        (pinch(), ["--frame", "world"], "'world' is not one of 'object', 'camera', 'table'"),
         (pinch(), ["--split", "test"], "--split must be given with --dataset or grasps in an HDF5"),
         (pinch(), ["--set", "verify.max_tries=9"], "max_tries: must be less than or equal to 5"),
         (pinch(), ["--workers", "2", "--scheduler", "x"], "must not be given with a scheduler"),

@@ -7,6 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from helpers.commands import run
 from helpers.datasets import OTO, make_dataset
 from helpers.hands import write_with_optional_fingers
 
@@ -176,3 +177,34 @@ def test_grasps_of_others_are_tried_on_rows_that_leave_fingers_out(tmp_path: Pat
     assert len(grasps) == len(predicted) > 0
     with pytest.raises(GraspError, match="test must have contacts of all fingers, got "):
         place_requested(request(out, split="test"))
+
+
+def test_the_rows_of_an_array_are_those_of_the_option(drawn: Path, tmp_path: Path) -> None:
+    data = GraspDataset(drawn / OTO, split="test")
+    path = tmp_path / "some.npy"
+    np.save(path, data.column("grasps")[[2, 0, 1]])
+    given = {"grasps": path, "dataset": drawn / OTO}
+    with pytest.raises(GraspError, match=r"a grasp for each of the .*, got 3 grasps .*--rows"):
+        place_requested(request(drawn, **given))
+    np.save(tmp_path / "rows.npy", [2, 0, 1])
+    for rows in ("2,0-1", str(tmp_path / "rows.npy")):
+        asked = request(drawn, **given, rows=rows)
+        grasps, _ = place_requested(asked)
+        masses = {grasp.index: grasp.placed.model.mass for grasp in grasps}
+        true = data.column("object_props/work2mass")[[2, 0, 1], 0]
+        assert [masses[i] for i in range(3)] == pytest.approx(true.tolist())
+        stated = requested_rows(asked, 3)
+        assert stated is not None
+        assert stated.row.tolist() == [2, 0, 1]
+    for rows in ("2,0", "2,x,1", "-1", "1-", "0-99999999999"):
+        with pytest.raises(GraspError, match="rows must be"):
+            place_requested(request(drawn, **given, rows=rows))
+
+
+def test_the_frame_of_the_table_has_one_name_and_its_earlier_one_is_read(tmp_path: Path) -> None:
+    np.save(tmp_path / "g.npy", np.zeros((1, 18)))
+    given = (tmp_path / "g.npy", "--object", tmp_path / "none.obj", "--frame")
+    told = [run("verify", *given, frame).stderr for frame in ("table", "workspace", "world")]
+    assert told[0] == told[1]
+    assert "none.obj" in told[0]
+    assert "is not one of 'object', 'camera', 'table'" in told[2]

@@ -31,6 +31,10 @@ PREGRASP, SQUEEZE = GRASP - 0.05, GRASP + 0.05
 OBJECTS = ["mug", "can"]
 
 
+#: A file of postures in the folder of an export.
+ONE_FILE = {"isaac_grasp": "*.yaml", "dexgraspbench": "*.npy"}
+
+
 def quaternion(X: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(X[:3, :3]).as_quat(scalar_first=True)
 
@@ -459,7 +463,10 @@ def test_dictionaries_that_are_no_grasps_are_refused_in_a_line(tmp_path, changes
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("a.csv", "x,y\n1,2\n", "columns must include object, got x, y"),
+        (
+            *("a.csv", "x,y\n1,2\n"),
+            "columns must include object, z, qw, qx, qy, qz, a grasp_JOINT for each joint, got",
+        ),
         ("a.csv", "x,x\n1,2\n", "columns must have different names, got x twice"),
         ("a.npz", "junk", "must be a readable file of arrays"),
         ("a.npz", "", "must be a readable file of arrays"),
@@ -520,15 +527,68 @@ def test_what_is_not_there_is_refused(tmp_path):
         read_postures(tmp_path, HAND)
 
 
+@pytest.mark.parametrize(
+    ("comma", "blank", "mark"),
+    [(",", "", "\ufeff"), (",", " ", ""), (";", "", ""), (";", " ", "\ufeff"), (",", "\t", "")],
+)
+def test_a_table_from_a_spreadsheet_is_read(tmp_path, comma, blank, mark):
+    """With a byte-order mark, blanks around cells, semicolons and Windows' ends of lines."""
+    plain = read_postures(write_csv(tmp_path), HAND)
+    text = (tmp_path / "p.csv").read_text().replace(",", f"{blank}{comma}{blank}")
+    path = tmp_path / "sheet.csv"
+    path.write_bytes((mark + text.replace("\n", "\r\n")).encode())
+    assert posture_files.holds_postures(path)
+    assert read_postures(path, HAND).digest() == plain.digest()
+
+
+def test_all_that_is_missing_is_told_at_once(tmp_path):
+    np.savez(tmp_path / "p.npz", joints=np.array(ORDER))
+    with pytest.raises(GraspError, match=r"object, q_grasp, X_FG \(or position and .* must"):
+        read_postures(tmp_path / "p.npz", HAND)
+    (tmp_path / "p.csv").write_text("x,y,z,qw\n0,0,0,1\n")
+    with pytest.raises(GraspError, match="include object, qx, qy, qz, a grasp_JOINT for each jo"):
+        read_postures(tmp_path / "p.csv", HAND)
+    # With the name of the object, none is needed in the file.
+    with pytest.raises(GraspError, match="include qx, qy, qz, a grasp_JOINT for each joint, got"):
+        read_postures(tmp_path / "p.csv", HAND, of="mug")
+
+
+def test_rows_without_an_object_are_of_the_one_that_is_named(tmp_path):
+    content = arrays()
+    del content["object"]
+    np.savez(tmp_path / "p.npz", **content)
+    assert read_postures(tmp_path / "p.npz", HAND, of="cup").objects == ("cup", "cup")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("grasps", np.zeros((2, 18)), r"points and normals go into a \.npy file.* \(2, 18\)"),
+        ("poses", POSES, "poses of the palm go by the name X_FG, .* not poses"),
+    ],
+)
+def test_arrays_of_other_things_get_a_line_that_leads_on(tmp_path, name, value, words):
+    np.savez(tmp_path / "p.npz", **{name: value})
+    with pytest.raises(GraspError, match=words):
+        read_postures(tmp_path / "p.npz", HAND)
+
+
 def test_samples_that_were_exported_come_back(exported, grasps):
     hand = load_hand()
-    for form in ("isaac_grasp", "dexgraspbench"):
+    spread = hand.spread.joints[0]
+    for form in ONE_FILE:
         table = read_postures(exported(form), hand)
         assert table.frame == "object"
         assert sorted(table.objects) == sorted(grasp.object_name for grasp in grasps)
-        for X_OG, q, name in zip(table.X_FG, table.q_grasp, table.objects, strict=True):
+        assert np.abs(table.q_pregrasp[:, joint_order(hand).index(spread)]).min() > 0.0
+        for i, name in enumerate(table.objects):
             assert any(
-                np.allclose(grasp.X_TO @ X_OG, grasp.X_TG, atol=1e-9) and (grasp.q == q).all()
+                np.allclose(grasp.X_TO @ table.X_FG[i], grasp.X_TG, atol=1e-9)
+                and np.allclose(grasp.X_TO, table.X_TO[i], atol=1e-9)
+                and (grasp.q == table.q_grasp[i]).all()
+                and (grasp.conditions == table.conditions[i]).all()
                 for grasp in grasps
                 if grasp.object_name == name
             )
+        with pytest.raises(GraspError, match="hand must be barrett, as the file says"):
+            read_postures(next(exported(form).rglob(ONE_FILE[form])), HAND)

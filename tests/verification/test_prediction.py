@@ -161,7 +161,7 @@ def test_the_three_frames_agree(single: bool, cameras: int) -> None:
     each = np.broadcast_to(X, (4, 4, 4))
     grasps = {
         "object": grasps_O,
-        "workspace": np.array([transform_grasp(X_TO, g) for g in grasps_O]),
+        "table": np.array([transform_grasp(X_TO, g) for g in grasps_O]),
         "camera": np.array(
             [transform_grasp(invert_pose(C) @ X_TO, g) for C, g in zip(each, grasps_O, strict=True)]
         ),
@@ -193,12 +193,12 @@ def test_no_grasps_have_no_contacts_in_any_frame(frame: str) -> None:
 @pytest.mark.parametrize(
     ("frame", "X", "message"),
     [
-        ("world", None, "frame must be one of object, camera, workspace, got 'world'"),
-        ("", None, "frame must be one of object, camera, workspace, got ''"),
-        (None, None, "frame must be one of object, camera, workspace, got None"),
+        ("world", None, "frame must be one of object, camera, table, got 'world'"),
+        ("", None, "frame must be one of object, camera, table, got ''"),
+        (None, None, "frame must be one of object, camera, table, got None"),
         ("camera", None, "X_TC must be the camera's pose in the table-top frame"),
         ("object", np.eye(4), "X_TC must be None if frame is object, got a pose"),
-        ("workspace", np.eye(4), "X_TC must be None if frame is workspace, got a pose"),
+        ("table", np.eye(4), "X_TC must be None if frame is table, got a pose"),
         (
             "camera",
             np.tile(np.eye(4), (3, 1, 1)),

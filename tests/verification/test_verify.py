@@ -166,7 +166,7 @@ X_TC = make_pose(Rotation.from_euler("xyz", [2.0, 0.4, -1.0]).as_matrix(), [0.1,
 @pytest.mark.parametrize(
     ("meant", "given", "factor", "hint"),
     [
-        ("workspace", {"frame": "object"}, 1.0, "the table's frame (workspace)"),
+        ("workspace", {"frame": "object"}, 1.0, "the table's frame (table)"),
         ("object", {"frame": "workspace"}, 1.0, "the object's frame (object)"),
         ("object", {"frame": "camera", "X_TC": X_TC}, 1.0, "the object's frame (object)"),
         (X_TC, {"frame": "camera", "X_TC": invert_pose(X_TC)}, 1.0, "the inverse of X_TC"),
@@ -178,7 +178,7 @@ X_TC = make_pose(Rotation.from_euler("xyz", [2.0, 0.4, -1.0]).as_matrix(), [0.1,
             "workspace",
             {"frame": "object"},
             1e3,
-            "the table's frame (workspace), with points in millimetres instead of metres",
+            "the table's frame (table), with points in millimetres instead of metres",
         ),
         # Without the camera's pose nobody can know.
         (X_TC, {"frame": "object"}, 1.0, None),

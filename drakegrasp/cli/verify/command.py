@@ -24,6 +24,14 @@ if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
 
 
+class _Frame(click.Choice):  # type: ignore[type-arg]
+    """The frames of grasps; `workspace` is an earlier name of `table`."""
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Return the frame of a word."""
+        return super().convert("table" if value == "workspace" else value, param, ctx)
+
+
 @click.command()
 @click.argument("grasps", type=PATH, metavar="GRASPS")
 @click.option(
@@ -47,8 +55,14 @@ if TYPE_CHECKING:
     help="Rows of the dataset, and group in an HDF5 file of grasps.  [default: test]",
 )
 @click.option(
+    "--rows",
+    metavar="0,4,7-9|FILE.npy",
+    help="With --dataset: the row of the split that each grasp is for, where the file does not "
+    "say.  [default: all rows]",
+)
+@click.option(
     "--frame",
-    type=click.Choice(["object", "camera", "workspace"]),
+    type=_Frame(["object", "camera", "table"]),
     help="Frame of the grasps.  [default: object; with --dataset camera]",
 )
 @click.option(
@@ -128,8 +142,8 @@ def verify(
     points in metres, then the unit normals out of the object, in the order of the hand's
     fingers.
 
-    GRASPS may also be a file of postures as `build --postures` reads it, on --object or on the
-    objects of --dataset that it names, or that its `row` says.
+    GRASPS may also be a file or a folder of postures as `build --postures` reads it, on --object
+    or on the objects of --dataset that it names, or that its `row` says.
 
     With another protocol than lift, the first wrist pose that fits contacts is tried. There GRASPS
     may be a .npy file of DexGraspBench or a folder of such files, and --hand an MJCF, whose world

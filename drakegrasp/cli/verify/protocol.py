@@ -44,8 +44,10 @@ class ProtocolRequest:
         import numpy as np
 
         path = self.grasps
-        if Path(self.hand or "").suffix == ".xml" or self.assets is not None or path.is_dir():
+        if Path(self.hand or "").suffix == ".xml" or self.assets is not None:
             return True
+        if path.is_dir():
+            return any(path.rglob("*.npy"))
         try:
             return path.suffix == ".npy" and np.load(path, mmap_mode="r") is None
         except ValueError:  # an array of Python objects

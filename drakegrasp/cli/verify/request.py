@@ -10,12 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
+from drakegrasp.cli.errors import say
 from drakegrasp.config import Config
 from drakegrasp.dataset.layout.predicted_rows import PredictedRows
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import DataError, GraspError
+from drakegrasp.errors import DataError, GraspError, listed
 from drakegrasp.exchange.posture_files import has_rows, holds_postures, read_postures
 from drakegrasp.exchange.predicted_postures import read_predicted_postures
 from drakegrasp.frames import Array
@@ -23,6 +25,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.settings import load_config, override_config
+from drakegrasp.objects.sources import find_mesh
 from drakegrasp.simulation.placement import place_object
 from drakegrasp.verification.placed_grasp import dataset_config, place_on_object, place_on_rows
 from drakegrasp.verification.placed_postures import (
@@ -39,6 +42,8 @@ from drakegrasp.verification.prediction import (
 from drakegrasp.verification.result_files import refuse_unwritable
 from drakegrasp.verification.verify import PlacedGrasp
 
+#: No split has so many rows.
+MOST_ROWS = 10_000_000
 #: The split of a dataset if none is named.
 DEFAULT_SPLIT = "test"
 
@@ -60,6 +65,7 @@ class VerifyRequest:
     config: str | None = None
     overrides: tuple[str, ...] = ()
     out: Path | None = None
+    rows: str | None = None
 
 
 def place_requested(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
@@ -87,15 +93,15 @@ def requested_rows(request: VerifyRequest, count: int) -> PredictedRows | None:
     if holds_postures(request.grasps):
         if request.dataset is None or not has_rows(request.grasps):
             return None
-        data = GraspDataset(request.dataset, split=split)
+        data = GraspDataset(request.dataset, split=split, fewer_fingers=True)
         return PredictedRows.of(
             request.dataset, split, read_predicted_postures(request.grasps, data)[1]
         )
     path = _dataset_path(request)
     if path is None:
         return None
-    rows = read_predictions(request.grasps, split=split).rows
-    return PredictedRows.of(path, split, np.arange(count) if rows is None else rows.ravel())
+    rows = _rows_of(request, read_predictions(request.grasps, split=split).rows)
+    return PredictedRows.of(path, split, np.arange(count) if rows is None else np.asarray(rows))
 
 
 def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
@@ -115,13 +121,14 @@ def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
         others = path != request.grasps
         data = GraspDataset(path, split=split or DEFAULT_SPLIT, fewer_fingers=others)
     predicted = read_predictions(request.grasps, split=split)
+    rows = _rows_of(request, predicted.rows)
 
     # Without a dataset all grasps are for the one mesh.
     overrides, given = request.overrides, None
     if path is None or request.config is not None:
         given, overrides = load_config(request.config, overrides), ()
     if data is None:
-        if predicted.rows is not None:
+        if rows is not None:
             raise GraspError("rows must be in a file of grasps for --dataset only, got rows")
         assert request.mesh is not None and given is not None
         config = given if request.hand is None else override_config(given, [], hand=request.hand)
@@ -142,7 +149,7 @@ def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
     placed = place_on_rows(
         predicted.grasps,
         data,
-        None if predicted.rows is None else predicted.rows.tolist(),
+        rows,
         frame=request.frame or "camera",
         hand=request.hand,
         method=request.method,
@@ -153,12 +160,40 @@ def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
     return placed, config
 
 
+def _rows_of(request: VerifyRequest, known: npt.NDArray[np.int64] | None) -> list[int] | None:
+    """Return the row of each grasp, as the file or the option says; None if neither does."""
+    text = request.rows
+    if text is None:
+        return None if known is None else [int(row) for row in np.ravel(known)]
+    if known is not None:
+        raise GraspError(f"--rows must be left out with a file that has rows, got {text}")
+    if request.dataset is None:
+        raise GraspError(f"--rows must be given with --dataset only, got {text}")
+    if text.endswith(".npy"):
+        rows = read_numbers(Path(text)).ravel()
+        if not (np.isfinite(rows).all() and (rows == np.floor(rows)).all()):
+            raise GraspError(f"{text}: must hold whole numbers, got others")
+        return [int(row) for row in rows]
+
+    # Rows, and ranges that include both ends.
+    found = list[int]()
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        if not first.isdecimal() or (dash and not last.isdecimal()):
+            raise GraspError(f"--rows must be as 0,4,7-9 or a .npy file, got {text!r}")
+        if max(len(first), len(last)) > len(str(MOST_ROWS)) or int(last or first) >= MOST_ROWS:
+            raise GraspError(f"--rows must be below {MOST_ROWS:,}, got {part.strip()[:40]}")
+        found += range(int(first), int(last or first) + 1)
+    return found
+
+
 def _place_postures(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
     """Return the postures of a file on their objects, and the configuration."""
     # They say their frame themselves, and need no fit.
     idle: dict[str, object] = {"--frame": request.frame, "--camera": request.camera}
     idle["--method"] = None if request.method == "hand" else request.method
     idle["--snap-points"] = request.snap_points or None
+    idle["--rows"] = request.rows
     for name, value in idle.items():
         if value is not None:
             raise GraspError(f"{name} must be left out with postures, got {value}")
@@ -170,9 +205,17 @@ def _place_postures(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
         raise GraspError(f"--split must be given with --dataset only, got {request.split}")
     config = load_config(request.config, request.overrides)
     config = config if request.hand is None else override_config(config, [], hand=request.hand)
-    table = read_postures(request.grasps, load_hand(config.hand_source))
+
+    # All are tried on the one object, which they need not name.
+    assert request.mesh is not None
+    name = find_mesh(request.mesh, units=request.units or "m").name
+    table = read_postures(request.grasps, load_hand(config.hand_source), of=name)
     thing = place_object(request.mesh, units=request.units, config=config)
-    return place_postures_on_object(table, thing), config
+    others = sorted({each for each in table.objects if each not in ("", name)})
+    if others:
+        told = f"postures of {listed(others)} are tried on {name}, the --object"
+        say(f"{request.grasps}: {told}", err=True)
+    return place_postures_on_object(table, thing, overrides=request.overrides), config
 
 
 def _postures_on(dataset: Path, request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
@@ -182,7 +225,7 @@ def _postures_on(dataset: Path, request: VerifyRequest) -> tuple[list[PlacedGras
         if value is not None:
             raise GraspError(f"{name} must be left out with postures and --dataset, got {value}")
     if has_rows(request.grasps):
-        data = GraspDataset(dataset, split=request.split or DEFAULT_SPLIT)
+        data = GraspDataset(dataset, split=request.split or DEFAULT_SPLIT, fewer_fingers=True)
         table, rows, _ = read_predicted_postures(request.grasps, data)
         placed = place_postures_on_rows(table, data, rows.tolist(), overrides=request.overrides)
         return placed, dataset_config(data, overrides=request.overrides)
@@ -192,7 +235,7 @@ def _postures_on(dataset: Path, request: VerifyRequest) -> tuple[list[PlacedGras
     config = override_config(read_manifest(out).config, request.overrides)
     table = read_postures(request.grasps, load_hand(config.hand_source))
     own = config if request.overrides else None
-    return place_postures_on_dataset(table, out, own), config
+    return place_postures_on_dataset(table, out, own, overrides=request.overrides), config
 
 
 def _refuse_no_grasps(path: Path, grasps: Array, config: Config) -> None:

@@ -30,15 +30,22 @@ CAMERA = "view"
 _OWN = 4
 
 
-def open_rows(path: Path, *, split: str) -> GraspDataset:
+def open_rows(path: Path, *, split: str, fewer_fingers: bool = False) -> GraspDataset:
     """Return a split of a data file, or of scenes.hdf5, by what the file holds.
+
+    Args:
+        path: The file.
+        split: Its split.
+        fewer_fingers: Whether a data file may have samples that leave fingers out.
 
     Raises:
         DataError: See `GraspDataset` and `SceneDataset`.
     """
     with opened(path, "a data file or scenes of drakegrasp") as file:
         of_scenes = "scenes" in file
-    return SceneRows(path, split=split) if of_scenes else GraspDataset(path, split=split)
+    if of_scenes:
+        return SceneRows(path, split=split)
+    return GraspDataset(path, split=split, fewer_fingers=fewer_fingers)
 
 
 class SceneRows(GraspDataset):

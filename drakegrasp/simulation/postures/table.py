@@ -31,12 +31,17 @@ from drakegrasp.simulation.candidates import (
     is_audited,
 )
 from drakegrasp.simulation.postures.posture import Posture, exact_pose, preshape_index, start_of
+from drakegrasp.simulation.settle import SAME_UP
 
 #: Frames of a table: those of a posture, and {M}, the axes and the origin of the mesh file.
 TableFrame = Literal["object", "table", "camera", "world", "mesh"]
 TABLE_FRAMES: tuple[str, ...] = get_args(TableFrame)
 #: No object has so many resting poses.
 MOST_POSES = 1e6
+#: What `resting` is where nobody named a resting pose: all of the object are tried.
+UNTOLD = -1
+#: What an attempt may have drawn, in the order of `PostureTable.conditions`.
+CONDITIONS = ("friction_hand", "friction_table", "mass")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,7 +50,9 @@ class PostureTable:
 
     Attributes:
         objects: (n,), name of the object of each.
-        resting: (n,), index of its resting pose.
+        resting: (n,), index of its resting pose; `UNTOLD` where none is named.
+        X_TO: (n, 4, 4), its pose on the table, which names the resting pose by itself; NaN: not
+            told.
         X_FG: (n, 4, 4), pose of the palm in the frame.
         q_grasp: (n, j), joint positions of the grasp [rad or m].
         q_pregrasp, q_squeeze: (n, j); a row of NaN: not given.
@@ -55,12 +62,15 @@ class PostureTable:
         log_density: (n,), logarithm of the density of the draw; NaN: not known.
         said: (n,), where it comes from, in words.
         preshape: (n,), name of the hand's preshape; empty: all fingers close.
+        conditions: (n, 3), the `CONDITIONS` under which it held; NaN: not told. A verdict is
+            reached under them; a build draws its own.
         row: (n,), row in the file.
         invalid: (n,), why a row is no posture; empty where it is one.
     """
 
     objects: tuple[str, ...]
     resting: npt.NDArray[np.int64]
+    X_TO: Array
     X_FG: Array
     q_grasp: Array
     q_pregrasp: Array
@@ -71,6 +81,7 @@ class PostureTable:
     log_density: Array
     said: tuple[str, ...]
     preshape: tuple[str, ...]
+    conditions: Array
     row: npt.NDArray[np.int64]
     invalid: tuple[str, ...]
 
@@ -123,6 +134,18 @@ class PostureTable:
             return X_OT
         return multiply(X_OT, invert_pose(X_WT) if self.X_TC is None else self.X_TC[i])
 
+    def stands(self, i: int, poses: Array) -> list[int]:
+        """Return which resting poses (r, 4, 4) of its object a row is for, as indices.
+
+        That is the one that it names, and all where it names none; empty if the object lacks it.
+        """
+        if np.isfinite(X_TO := self.X_TO[i]).all():
+            cosines = poses[:, 2, :3] @ X_TO[2, :3]
+            nearest = int(np.argmax(cosines))
+            return [nearest] if cosines[nearest] > np.cos(SAME_UP) else []
+        named, known = int(self.resting[i]), list(range(len(poses)))
+        return known if named == UNTOLD else known[named : named + 1]
+
     def numbers(self) -> Array:
         """Return all numbers (n, m) that say what each posture is, NaN where it lacks some."""
         X = [X for X in (self.X_FG, self.X_TC) if X is not None]
@@ -153,10 +176,14 @@ class PostureTable:
         """Return a hash (16 hex digits) of all that the table says."""
         digest = hashlib.sha256()
         for f in fields(self):
-            # Why a row is none follows from the others, and from the meshes; a table without
-            # preshapes is as before there were any.
+            # Why a row is none follows from the others, and from the meshes; a build draws its own
+            # conditions. A table without preshapes or poses is as before there were any.
             value = getattr(self, f.name)
-            if f.name == "invalid" or (f.name == "preshape" and not any(value)):
+            if f.name in ("invalid", "conditions"):
+                continue
+            if f.name == "preshape" and not any(value):
+                continue
+            if f.name == "X_TO" and np.isnan(value).all():
                 continue
             is_array = isinstance(value, np.ndarray)
             digest.update(value.tobytes() if is_array else json.dumps(value).encode())
@@ -172,6 +199,7 @@ def make_table(
     q_pregrasp: npt.ArrayLike | None = None,
     q_squeeze: npt.ArrayLike | None = None,
     resting: npt.ArrayLike | None = None,
+    X_TO: npt.ArrayLike | None = None,
     frame: str = "object",
     X_TC: npt.ArrayLike | None = None,
     scale: npt.ArrayLike | None = None,
@@ -179,6 +207,7 @@ def make_table(
     said: Sequence[str] | None = None,
     invalid: Sequence[str] | None = None,
     preshape: Sequence[str | None] | None = None,
+    conditions: npt.ArrayLike | None = None,
 ) -> PostureTable:
     """Return a table of postures, after checking every row by itself.
 
@@ -189,7 +218,8 @@ def make_table(
         q_grasp: (n, j), in the plant's order.
         q_pregrasp: (n, j); rows of NaN are not given.
         q_squeeze: (n, j); rows of NaN are not given.
-        resting: (n,), index of the object's resting pose; 0 if None.
+        resting: (n,), index of the object's resting pose; where NaN, or None, all are tried.
+        X_TO: (n, 4, 4), poses of the objects on the table, instead; rows of NaN are not given.
         frame: One of `TABLE_FRAMES`.
         X_TC: (n, 4, 4), with the frame "camera".
         scale: (n,), metres per unit of length of the mesh file.
@@ -197,6 +227,7 @@ def make_table(
         said: (n,), where each comes from.
         invalid: (n,), why a row is known to be no posture; empty where it may be one.
         preshape: (n,), names of the hand's preshapes; empty: all fingers close.
+        conditions: (n, 3), `CONDITIONS`; NaN: those of the object and of the configuration.
 
     Raises:
         GraspError: If there is no row, or the arrays differ in length.
@@ -211,9 +242,13 @@ def make_table(
 
     # Numbers that every row must have, and those that a row may lack.
     bad = [""] * count if invalid is None else list(invalid)
-    where = np.zeros(count) if resting is None else _numbers(resting, (count,), "resting", bad)
-    for i in np.flatnonzero(~((where >= 0) & (where < MOST_POSES) & (where == np.floor(where)))):
+    where = _numbers(resting, (count,), "resting", bad, some=True)
+    named = (where >= 0) & (where < MOST_POSES) & (where == np.floor(where))
+    for i in np.flatnonzero(~(named | np.isnan(where))):
         bad[i] = bad[i] or f"resting must be the index of a resting pose, got {where[i]:g}"
+    known = _numbers(conditions, (count, len(CONDITIONS)), "conditions", bad, each=True)
+    for i, k in np.argwhere(known <= 0.0):
+        bad[i] = bad[i] or f"{CONDITIONS[k]} must be positive, got {known[i, k]:g}"
     pregrasp, squeeze = (
         _numbers(q, (count, joints), name, bad, some=True)
         for name, q in (("q_pregrasp", q_pregrasp), ("q_squeeze", q_squeeze))
@@ -230,8 +265,10 @@ def make_table(
         log_density=_numbers(log_density, (count,), "log_density", bad, some=True),
         said=("",) * count if said is None else tuple(said),
         preshape=("",) * count if preshape is None else known_preshapes(preshape, count, hand, bad),
+        conditions=known,
         row=np.arange(count, dtype=np.int64),
-        resting=np.where([not reason for reason in bad], where, 0).astype(np.int64),
+        resting=np.where(named, where, UNTOLD).astype(np.int64),
+        X_TO=_poses(X_TO, count, "X_TO", bad, some=True),
         invalid=tuple(bad),
     )
 
@@ -271,10 +308,11 @@ def _numbers(
     bad: list[str],
     *,
     some: bool = False,
+    each: bool = False,
 ) -> Array:
     """Return an array of a shape; `bad` gets the reason for each row of it that is not finite.
 
-    Where `some` are enough, a row may be all NaN.
+    Where `some` are enough, a row may be all NaN; where `each` is by itself, any number may be.
     """
     if value is None:
         return np.full(shape, np.nan)
@@ -285,7 +323,10 @@ def _numbers(
     if array.shape != shape:
         raise GraspError(f"{name} must be of shape {shape}, got {array.shape}")
     rows = array.reshape(len(array), -1)
-    for i in np.flatnonzero(~np.isfinite(rows).all(axis=1) & ~(some & np.isnan(rows).all(axis=1))):
+    missing = np.isnan(rows)
+    if each:
+        rows = np.where(missing, 0.0, rows)
+    for i in np.flatnonzero(~np.isfinite(rows).all(axis=1) & ~(some & missing.all(axis=1))):
         bad[i] = bad[i] or f"{name} must be finite numbers, got others"
     return np.ascontiguousarray(array)
 
@@ -310,11 +351,13 @@ def known_preshapes(
     return tuple(name or "" for name in names)
 
 
-def _poses(value: npt.ArrayLike, count: int, name: str, bad: list[str]) -> Array:
-    """Return poses (n, 4, 4); `bad` gets the reason for each that is none."""
-    array = _numbers(value, (count, 4, 4), name, bad).copy()
+def _poses(
+    value: npt.ArrayLike | None, count: int, name: str, bad: list[str], *, some: bool = False
+) -> Array:
+    """Return poses (n, 4, 4); `bad` gets the reason for each that is none, see `_numbers`."""
+    array = _numbers(value, (count, 4, 4), name, bad, some=some).copy()
     for i, X in enumerate(array):
-        if bad[i]:
+        if bad[i] or (some and np.isnan(X).all()):
             continue
         try:
             array[i] = exact_pose(X, name)
@@ -331,24 +374,27 @@ def unknown_objects(table: PostureTable, names: Sequence[str]) -> list[str]:
     return ["" if each in known else f"{must}, got {each!r}" for each in table.objects]
 
 
-def misfits(table: PostureTable, name: str, scale: float, resting: int) -> list[str]:
+def misfits(table: PostureTable, name: str, scale: float, poses: Array) -> list[str]:
     """Return for each row why it does not fit an object that it is of; empty where it does.
 
     Args:
         table: Rows, of any objects.
         name: The object.
         scale: Metres per unit of length of its mesh file.
-        resting: How many resting poses it has.
+        poses: Its resting poses, (r, 4, 4).
     """
-    must = f"0 to {resting - 1}" if resting > 1 else "0, the only one"
+    must = f"0 to {len(poses) - 1}" if len(poses) > 1 else "0, the only one"
     found = [""] * len(table)
     for i, each in enumerate(table.objects):
         if each != name:
             continue
-        if table.resting[i] >= resting:
+        if table.invalid[i]:
+            continue
+        if not table.stands(i, poses):
+            told = np.isfinite(table.X_TO[i]).all()
             found[i] = (
                 f"resting pose of {name} must be {must} (objects.resting_poses drops more), "
-                f"got {table.resting[i]}"
+                f"got {'another X_TO' if told else table.resting[i]}"
             )
         elif np.isfinite(table.scale[i]) and not np.isclose(table.scale[i], scale, rtol=1e-3):
             found[i] = (
@@ -372,27 +418,30 @@ def given_candidates(
         X_OM: Pose of its mesh file's frame in {O}, (4, 4).
         config: All the rules.
     """
-    # Its rows, in {O}.
-    table = table.refuse(misfits(table, model.name, model.scale, len(X_TO))).of_object(model.name)
-    count = min(len(table), config.candidates.max)
-    X_OG = [table.posture(i, X_TO[table.resting[i]], X_OM).X_OG for i in range(count)]
+    # Its rows, in {O}; one that names no resting pose is tried in each.
+    table = table.refuse(misfits(table, model.name, model.scale, X_TO)).of_object(model.name)
+    tried = [(i, k) for i in range(len(table)) for k in table.stands(i, X_TO)]
+    tried = tried[: config.candidates.max]
+    count, table = len(tried), table.at([i for i, _ in tried])
+    resting = np.array([k for _, k in tried], dtype=np.int64)
+    X_OG = [table.posture(i, X_TO[k], X_OM).X_OG for i, k in enumerate(resting)]
 
     return Candidates(
         X_OG=np.array(X_OG).reshape(-1, 4, 4),
         distance=np.full(count, np.nan),
-        resting=table.resting[:count],
+        resting=resting,
         source=np.full(count, Source.POSTURES, dtype=np.int64),
-        log_density=table.log_density[:count],
+        log_density=table.log_density,
         combinations=count,
         valid=count,
         distinct=count,
         postures=GivenPostures(
-            q_grasp=table.q_grasp[:count],
-            q_pregrasp=table.q_pregrasp[:count],
-            q_squeeze=table.q_squeeze[:count],
-            row=table.row[:count],
-            said=table.said[:count],
-            preshape=table.preshape[:count],
+            q_grasp=table.q_grasp,
+            q_pregrasp=table.q_pregrasp,
+            q_squeeze=table.q_squeeze,
+            row=table.row,
+            said=table.said,
+            preshape=table.preshape,
         ),
     )
 
