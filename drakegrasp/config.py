@@ -278,6 +278,9 @@ class CloseConfig(_Section):
     max_time: Positive = 2.5  # [s], a little more than 140 degrees at 60 degrees per second
     stop_speed: Positive = 0.01  # [rad/s, or 0.1 m/s], slower fingers have stopped
     check_period: Positive = 0.1  # [s] of simulation between two checks
+    # [m], a hand that comes farther below the table's top while it closes or lifts is a
+    # `table_contact`. Null: not measured, as in datasets of versions without this key.
+    scrape_depth: NonNegative | None = 5e-4
 
 
 class LiftConfig(_Section):
@@ -596,7 +599,7 @@ class Config(_Section):
         """Return the resolved values as plain JSON types.
 
         `filters.own` and `candidates.postures` leave no trace where there are none, nor do `scenes`
-        that are the defaults.
+        that are the defaults. `parse_stored` reads it.
         """
         tree = self.model_dump(mode="json")
         if not self.filters.own:
@@ -607,6 +610,8 @@ class Config(_Section):
             del tree["scenes"]
         if self.physics.finger_load is None:
             del tree["physics"]["finger_load"]
+        if self.close.scrape_depth is None:
+            del tree["close"]["scrape_depth"]
         if not self.certified:
             for key in CertifyConfig.NEW:
                 del tree["certify"][key]
@@ -693,6 +698,20 @@ def with_whole_lifts(config: Config) -> Config:
     return config.model_copy(update={"lift": lift})
 
 
+def continued(config: Config, known: Config) -> Config:
+    """Return the configuration with which a build continues a dataset: by the rules it began with.
+
+    Args:
+        config: Of the build. A rule that it only has by default gives way to that of the dataset.
+        known: Of the dataset.
+    """
+    by_default = config.close.scrape_depth == CloseConfig().scrape_depth
+    if known.close.scrape_depth is None and by_default:
+        close = config.close.model_copy(update={"scrape_depth": None})
+        return config.model_copy(update={"close": close})
+    return config
+
+
 def parse_config(tree: dict[str, Any]) -> Config:
     """Return the configuration that a tree of plain values describes.
 
@@ -719,7 +738,8 @@ def parse_stored(tree: Any) -> Config:
     """Return the configuration that a file of a dataset holds, as JSON.
 
     Without `split.by` it was written when there was the split by class alone; without
-    `certify.share`, when successes were certified otherwise. With one of
+    `certify.share`, when successes were certified otherwise; without `close.scrape_depth`, when
+    hands might come below the table's top while they closed. With one of
     `OLD_LIMITS`, `verify.max_contact_error` decided what is tried, too, and does not count.
 
     Raises:
@@ -730,6 +750,8 @@ def parse_stored(tree: Any) -> Config:
     certify = tree.get("certify") if isinstance(tree, dict) else None
     if isinstance(certify, dict) and certify.get("repeats"):
         tree = {**tree, "certify": {"share": None, **certify}}
+    if isinstance(tree, dict) and isinstance(close := tree.get("close"), dict):
+        tree = {**tree, "close": {"scrape_depth": None, **close}}
     if isinstance(tree, dict) and isinstance(verify := tree.get("verify"), dict):
         old = {*OLD_LIMITS, "max_contact_error"} if verify.keys() & {*OLD_LIMITS} else set()
         tree = {**tree, "verify": {k: v for k, v in verify.items() if k not in old}}

@@ -23,7 +23,9 @@ class Outcome(IntEnum):
     SCREENED = 4  # geometry shows that not every fingertip can reach the object
     MISSING_FINGERTIP = 5  # after closing, a fingertip does not touch the object
     HAND_CONTACT = 6  # after closing, a hand link other than a fingertip touches the object
-    TABLE_CONTACT = 7  # after closing the hand touches the table, or after the lift the object does
+    # After closing the hand touches the table, or after the lift the object does; or the hand came
+    # too far below the table's top on its way (`close.scrape_depth`).
+    TABLE_CONTACT = 7
     # A fingertip lost contact during the lift, and none holds the object off the table; in datasets
     # of older versions, also what is PARTLY_HELD now.
     SLIPPED = 8

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ValidationError
 from drakegrasp.config import (
     Config,
     apply_override,
+    continued,
     parse_config,
     parse_stored,
     with_whole_lifts,
@@ -86,6 +87,7 @@ close:
   max_time: 3.0
   stop_speed: 0.02
   check_period: 0.2
+  scrape_depth: 0.001
 lift:
   drive: locked
   release_time: 0.1
@@ -478,21 +480,37 @@ def test_simulation_hash_changes_with_what_is_simulated_and_nothing_else(key: st
 
 
 def test_datasets_that_were_begun_with_the_defaults_go_on() -> None:
-    """A new setting whose default changes nothing must not change what manifests say."""
-    assert load_config().simulation_hash() == "48ceb34ff99d5962"
+    """A new setting that is off must not change what manifests say."""
+    before = load_config(overrides=["close.scrape_depth=null"])
+    assert before.simulation_hash() == "48ceb34ff99d5962"
+    assert load_config().simulation_hash() != before.simulation_hash()
+    assert "scrape_depth" not in before.to_dict()["close"]
     assert "finger_load" not in load_config().to_dict()["physics"]
     assert not {"share", "share_others", "share_tested"} & load_config().to_dict()["certify"].keys()
 
 
+def test_rule_that_a_dataset_lacks_stays_off_when_it_goes_on() -> None:
+    """Read from its manifest, with other filters, and against the defaults of today."""
+    old = parse_stored(load_config(overrides=["close.scrape_depth=null"]).to_dict())
+    assert old.close.scrape_depth is None
+    filtered = override_config(old, ["filters.outlier_sigma=3"])
+    assert filtered.simulation_hash() == old.simulation_hash()
+    assert continued(load_config(), old) == old
+    stated = load_config(overrides=["close.scrape_depth=0.001"])
+    assert continued(stated, old) == stated
+    assert continued(load_config(), stated) == load_config()
+
+
 def test_dataset_that_an_older_version_certified_is_read_as_it_is() -> None:
     """Its shards have that hash; nothing is drawn for what it does not have."""
-    tree = load_config(overrides=["certify.repeats=2"]).to_dict()
+    tree = load_config(overrides=["certify.repeats=2", "close.scrape_depth=null"]).to_dict()
     for key in ("share", "share_others", "share_tested"):
         del tree["certify"][key]
     old = parse_stored(tree)
     assert old.simulation_hash() == "eff81440c269adb2"
     assert old.to_dict() == tree
     assert not old.certified
+    assert override_config(old, []) == old
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from drakegrasp.build.pipeline import (
 from drakegrasp.build.request import BUILTIN, refuse_unknown
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
-from drakegrasp.config import Config
+from drakegrasp.config import Config, continued
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import claim_directory, release_directory
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
@@ -162,6 +162,7 @@ def build_on(
     with build_lock(out) as dead, ExitStack() as stack:
         # A directory that cannot be used is refused before workers start.
         before = claim_directory(out, config)
+        config = config if before is None else continued(config, before.config)
 
         # Workers read the hand in the directory.
         config = carry_hand(out, config, before.config.hand if before else None)

@@ -21,7 +21,7 @@ from drakegrasp.build.scenes.make import make_scenes_locked
 from drakegrasp.build.target import Target, refuse_two_ends, target_of
 from drakegrasp.build.warnings import nothing_trains, too_heavy
 from drakegrasp.build.work_unit import WorkUnit, run_unit
-from drakegrasp.config import Config, is_own_class
+from drakegrasp.config import Config, continued, is_own_class
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.assembly.split import rank_in_split
 from drakegrasp.dataset.assembly.survey import headers_by_object
@@ -208,6 +208,7 @@ def build_locked(
         known = claim_directory(out, config)
         if known is not None:
             refuse_missing(known, [source.name for source in sources], out)
+            config = continued(config, known.config)
         config = carry_hand(out, config, known.config.hand if known else None)
 
         notices = [] if dead is None else [f"the lock of a dead build was taken over: {dead}"]

@@ -31,6 +31,7 @@ from drakegrasp.config import (
     Positive,
     Seed,
     Share,
+    continued,
     parse_stored,
 )
 from drakegrasp.dataset import lock, log
@@ -498,6 +499,7 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
     same_hand = is_hand(config.hand_source, manifest.versions.get("hand"))
     if same_hand:  # wherever its files are
         config = config.with_hand(manifest.config.hand)
+    config = continued(config, manifest.config)
     if manifest.config.simulation_hash() != config.simulation_hash():
         raise DataError(
             f"{out}: must be empty or hold this configuration's dataset, got one that differs in "

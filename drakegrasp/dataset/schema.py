@@ -314,6 +314,15 @@ _TIME_LIFT = Field(
     "time_lift", "", "float64", "s", "-",
     "simulated time of the lift with its hold; shorter where it ended early",
     of="trial.lift.duration", shown=Shown("time of the lift", "s", 2))
+#: Files of datasets that do not measure it lack these, see `close.scrape_depth`.
+_CLEARANCE = {
+    when: Field(f"clearance_{when}", "", "float64", "m", "T",
+                f"least height of the hand above the table's top {during}, negative below it; NaN "
+                "in datasets that do not measure it", some=True, since=4, optional=True,
+                of=f"trial.{of}.clearance", shown=Shown(f"least height {during}", "mm"))
+    for when, of, during in (("close", "closed", "from the start of closing to its end"),
+                             ("lift", "lift", "during the lift"))
+}
 _SLIP = _measured(
     "trial.lift",
     Field("slip", "", "float64", "m", "G",
@@ -484,6 +493,7 @@ TRIAL_FIELDS: tuple[Field, ...] = (
     *_since(
         Stage.CLOSED,
         _TIME_CLOSE,
+        _CLEARANCE["close"],
         *_CLOSED,
         *_new(Field("chance", "", "float64", "-", "-",
                     "chance of a sample, of a closed hand that may lift; NaN for hands without "
@@ -499,6 +509,7 @@ TRIAL_FIELDS: tuple[Field, ...] = (
               "ahead if it agrees better", per_finger=True, of="fit.normal_angle",
               shown=Shown("normal angle", "°")),
         _TIME_LIFT,
+        _CLEARANCE["lift"],
         *_LIFTED,
         Field("X_TO_lifted", "12", "float64", "m, -", "T", "pose of the object after the lift",
               of="trial.lift.X_TO"),

@@ -7,6 +7,8 @@ angles [rad], those of joints that slide are lengths [m].
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import numpy.typing as npt
 
@@ -108,6 +110,27 @@ def link_poses(hand: Hand, link: str, *, spread: npt.ArrayLike, closing: npt.Arr
         ValueError: If `closing` is not one position per finger.
     """
     return _chain_pose(hand.link_chains[link], _coordinates(hand, spread, closing))
+
+
+def posed_links(hand: Hand, positions: Mapping[str, Array]) -> dict[str, Array]:
+    """Return the poses X_GL (..., 4, 4) of all links that the palm carries, in the palm frame.
+
+    Args:
+        hand: The hand.
+        positions: Of each of its joints (...,) [rad or m], whatever the couplings say.
+    """
+    # Links of a finger share the joints next to the palm.
+    (shape,) = {np.shape(q) for q in positions.values()}
+    posed: dict[tuple[str, ...], Array] = {(): np.broadcast_to(np.eye(4), (*shape, 4, 4))}
+    for chain in sorted(hand.link_chains.values(), key=lambda chain: len(chain.joints)):
+        for j, name in enumerate(chain.joints):
+            inner, outer = chain.joints[:j], chain.joints[: j + 1]
+            if outer not in posed:
+                X = multiply(posed[inner], chain.X_PJ[j])
+                posed[outer] = multiply(X, _motion(chain, j, positions[name]))
+    return {
+        link: multiply(posed[chain.joints], chain.X_JFi) for link, chain in hand.link_chains.items()
+    }
 
 
 def joint_frames(hand: Hand, finger: int, *, spread: float, closing: npt.ArrayLike) -> Array:

@@ -75,7 +75,8 @@ def override_config(config: Config, overrides: Sequence[str], **values: Any) -> 
     Raises:
         ConfigError, HandError: See `load_config`.
     """
-    tree, known = config.to_dict(), config.to_dict()
+    # All keys: what `to_dict` leaves out would become the default.
+    tree, known = config.model_dump(mode="json"), config.to_dict()
     for text in overrides:
         apply_override(tree, text)
     tree.update({key: value for key, value in values.items() if value is not None})

@@ -72,6 +72,42 @@ def _link_shapes(model: ModelFile) -> dict[str, tuple[Array, ...]]:
     return shapes
 
 
+def link_rims(hand: Hand) -> dict[str, Array]:
+    """Return what a link's collision shapes are the convex hulls of, exactly, in the link's frame.
+
+    A row (p, a, r) of the result (n, 7) is the corner p [m] if the radius r is 0 [m], a ball about
+    p if the axis a is zero, and else the disc about p across the unit axis a.
+    """
+    return _link_rims(hand.model)
+
+
+@lru_cache(maxsize=KEPT_HANDS)
+def _link_rims(model: ModelFile) -> dict[str, Array]:
+    plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    instance = add_model(plant, model)
+    inspector, rims = scene_graph.model_inspector(), {}
+    for index in plant.GetBodyIndices(instance):
+        body = plant.get_body(index)
+        geometries = plant.GetCollisionGeometriesForBody(body)
+        found = [_rims(inspector, geometry) for geometry in geometries]
+        rims[body.name()] = np.concatenate([np.zeros((0, 7)), *found])
+    return rims
+
+
+def _rims(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
+    """Return the rows of `link_rims` of one shape."""
+    shape = inspector.GetShape(geometry)
+    if not isinstance(shape, Cylinder | Capsule | Sphere):
+        corners = _corners(inspector, geometry)
+        return np.column_stack([corners, np.zeros((len(corners), 4))])
+    X_BS = inspector.GetPoseInFrame(geometry).GetAsMatrix4()
+    half = 0.0 if isinstance(shape, Sphere) else shape.length() / 2.0
+    ends = transform_points(X_BS, np.array([[0.0, 0.0, half], [0.0, 0.0, -half]]))
+    axis = X_BS[:3, 2] if isinstance(shape, Cylinder) else np.zeros(3)
+    return np.column_stack([ends, np.tile([*axis, shape.radius()], (2, 1))])
+
+
 def pad_surfaces(hand: Hand) -> tuple[Array, ...]:
     """Return the surface (t, 3, 3) [m] of each fingertip's pad as triangles, in its link's frame.
 

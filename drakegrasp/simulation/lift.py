@@ -25,6 +25,7 @@ from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle, transform_points
 from drakegrasp.hand.finger_sweep import pad_points
+from drakegrasp.simulation.clearance import Way
 from drakegrasp.simulation.contacts import Contacts, bodies_on_object, hand_bodies, read_contacts
 from drakegrasp.simulation.drive import disengage, drive_of, engage, hand_over
 from drakegrasp.simulation.randomization.materials import copy_materials
@@ -68,6 +69,8 @@ class Lift:
         turn: Angle that it turned in {G} since then [rad].
         slip_released, turn_released: The same before the wrist moved.
         moved: Whether it was ended early because the object moved too far in the hand.
+        clearance: Least height of the hand above the table's top [m], negative below it; NaN if it
+            is not measured.
     """
 
     contacts: Contacts
@@ -80,6 +83,7 @@ class Lift:
     slip_released: float
     turn_released: float
     moved: bool
+    clearance: float = np.nan
 
 
 def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
@@ -99,6 +103,9 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
     # `scene` takes fine steps, `current` is the one that takes the steps that are needed now.
     now, current, monitor, used = start, scene, _Monitor(scene), [scene]
     slip_released, turn_released, certain, moved = 0.0, 0.0, False, False
+    way = Way() if config.close.scrape_depth is not None else None
+    if way is not None:
+        way.look(scene)
     try:
         # Free the object in the hand; later the wrist goes to its target.
         release(scene)
@@ -115,6 +122,8 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
             limits.advance(current, check - margin - current.time)
             certain = monitor.update(current, check - now, config.close.stop_speed)
             now = check
+            if way is not None:
+                way.look(current)
 
             # How far the object moved in the hand, and how far of it before the wrist moves.
             X_GO = _object_in_hand(current)
@@ -150,6 +159,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
         slip_released=slip_released,
         turn_released=turn_released,
         moved=moved,
+        clearance=np.nan if way is None else way.clearance(),
     )
 
 

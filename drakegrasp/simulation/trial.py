@@ -21,6 +21,7 @@ from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import JointPath, Pregrasp
+from drakegrasp.simulation.clearance import Way
 from drakegrasp.simulation.contacts import (
     Contacts,
     open_hand_collides,
@@ -42,7 +43,13 @@ from drakegrasp.simulation.scene import (
 )
 from drakegrasp.simulation.screen import Prediction, predict
 from drakegrasp.simulation.stepping import TrialLimits, TrialTimeout, start_limits
-from drakegrasp.simulation.verdict import is_precision, is_stable, judge_closed, judge_lifted
+from drakegrasp.simulation.verdict import (
+    is_precision,
+    is_stable,
+    judge_closed,
+    judge_lifted,
+    scrapes,
+)
 
 #: Far below a time step, far above the rounding of a sum of them [s].
 ROUNDING = 1e-9
@@ -59,11 +66,14 @@ class Closed:
         contacts: Contacts at the end.
         q: Positions of the hand's joints [rad or m], in the plant's order.
         duration: Simulated time [s].
+        clearance: Least height of the hand above the table's top from the start on [m], negative
+            below it; NaN if it is not measured.
     """
 
     contacts: Contacts
     q: Array
     duration: float
+    clearance: float = np.nan
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -165,19 +175,33 @@ def run_attempt(
             return replace(start, outcome=screened)
 
         # Close: from just before the fingers meet something, where geometry knows that.
+        way = Way() if config.close.scrape_depth is not None else None
+        if way is not None:
+            way.look(scene)
         if prediction is not None:
             reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=prediction.closing)
+            if way is not None:
+                way.look(scene)
         if path is not None and path.own_motors:
-            _follow_path(scene, limits, config, path)
+            _follow_path(scene, limits, config, path, way)
         else:
-            _close(scene, limits, config, prediction)
+            _close(scene, limits, config, prediction, way)
         contacts = read_contacts(scene)
-        closed = Closed(contacts=contacts, q=hand_positions(scene), duration=scene.time)
+        closed = Closed(
+            contacts=contacts,
+            q=hand_positions(scene),
+            duration=scene.time,
+            clearance=np.nan if way is None else way.clearance(),
+        )
         record = replace(start, closed=closed)
 
         # Judge the closed hand: it lifts only what it holds with all fingertips and nothing else.
         verdict = judge_closed(
-            contacts.touching, contacts.other_links, contacts.hand_on_table, required=required
+            contacts.touching,
+            contacts.other_links,
+            contacts.hand_on_table,
+            required=required,
+            scraped=scrapes(closed.clearance, config.close),
         )
         if verdict != Outcome.SUCCESS:
             return replace(record, outcome=Outcome(int(verdict)))
@@ -197,7 +221,11 @@ def run_attempt(
             return replace(record, outcome=Outcome.MOVED)
         contacts = end.contacts
         verdict = judge_lifted(
-            contacts.touching, contacts.other_links, contacts.object_on_table, required=required
+            contacts.touching,
+            contacts.other_links,
+            contacts.object_on_table,
+            required=required,
+            scraped=scrapes(end.clearance, config.close),
         )
         return replace(record, outcome=Outcome(int(verdict)))
     except TrialTimeout:
@@ -252,7 +280,11 @@ def _materials(scene: Scene, attempt: Pregrasp) -> Materials:
 
 
 def _close(
-    scene: Scene, limits: TrialLimits, config: Config, prediction: Prediction | None
+    scene: Scene,
+    limits: TrialLimits,
+    config: Config,
+    prediction: Prediction | None,
+    way: Way | None,
 ) -> None:
     """Close the fingers on the static object until they stop, or one has missed it."""
     # Closing that geometry skipped counts as time, and an angle beyond its last contact as a miss.
@@ -266,13 +298,17 @@ def _close(
     # The last check may fall short of the end by rounding, never by a step.
     while end - scene.time > ROUNDING:
         limits.advance(scene, min(config.close.check_period, end - scene.time))
+        if way is not None:
+            way.look(scene)
         stopped = finger_speed(scene) < config.close.stop_speed
         closing = multiply(scene.hand.closing_ratio, closing_angles(scene))
         if stopped or np.any(closing > last):
             break
 
 
-def _follow_path(scene: Scene, limits: TrialLimits, config: Config, path: JointPath) -> None:
+def _follow_path(
+    scene: Scene, limits: TrialLimits, config: Config, path: JointPath, way: Way | None
+) -> None:
     """Move each joint by its own motor to the grasp and on to the squeeze, until all have stopped.
 
     The joints move in step: that with the longest way moves at the hand's closing speed.
@@ -291,5 +327,7 @@ def _follow_path(scene: Scene, limits: TrialLimits, config: Config, path: JointP
     end = float(times[-1]) + config.close.max_time
     while end - scene.time > ROUNDING:
         limits.advance(scene, min(config.close.check_period, end - scene.time))
+        if way is not None:
+            way.look(scene)
         if scene.time > times[-1] and finger_speed(scene) < config.close.stop_speed:
             break

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.config import LiftConfig
+from drakegrasp.config import CloseConfig, LiftConfig
 from drakegrasp.outcomes import Outcome
 
 Outcomes = npt.NDArray[np.int64]
@@ -26,6 +26,7 @@ def judge_closed(
     hand_on_table: npt.ArrayLike,
     *,
     required: npt.ArrayLike = True,
+    scraped: npt.ArrayLike = False,
 ) -> Outcomes:
     """Return the outcomes (...,) of closed hands: `SUCCESS` where the hand may lift.
 
@@ -36,11 +37,12 @@ def judge_closed(
         other_links: (...,), number of other links of the hand that touch the object.
         hand_on_table: (...,), whether the hand touches the table.
         required: (k,), whether each fingertip must touch the object; all if one value.
+        scraped: (...,), whether it came too far below the table's top on the way, see `scrapes`.
     """
     return _first(
         (_misses(touching, required), Outcome.MISSING_FINGERTIP),
         (np.asarray(other_links) > 0, Outcome.HAND_CONTACT),
-        (hand_on_table, Outcome.TABLE_CONTACT),
+        (np.asarray(hand_on_table) | np.asarray(scraped), Outcome.TABLE_CONTACT),
     )
 
 
@@ -50,6 +52,7 @@ def judge_lifted(
     object_on_table: npt.ArrayLike,
     *,
     required: npt.ArrayLike = True,
+    scraped: npt.ArrayLike = False,
 ) -> Outcomes:
     """Return the outcomes (...,) of attempts after the lift.
 
@@ -60,6 +63,7 @@ def judge_lifted(
         other_links: (...,), number of other links of the hand that touch the object.
         object_on_table: (...,), whether the object touches the table.
         required: (k,), whether each fingertip must touch the object; all if one value.
+        scraped: (...,), whether the hand came too far below the table's top, see `scrapes`.
     """
     touching = np.asarray(touching)
     some, misses = touching.any(axis=-1), _misses(touching, required)
@@ -67,8 +71,19 @@ def judge_lifted(
         (~some & (np.asarray(other_links) == 0), Outcome.DROPPED),
         (misses & some & ~np.asarray(object_on_table), Outcome.PARTLY_HELD),
         (misses, Outcome.SLIPPED),
-        (object_on_table, Outcome.TABLE_CONTACT),
+        (np.asarray(object_on_table) | np.asarray(scraped), Outcome.TABLE_CONTACT),
     )
+
+
+def scrapes(clearance: npt.ArrayLike, rules: CloseConfig) -> Flags:
+    """Return (...,) whether a hand came too far below the table's top on its way.
+
+    Args:
+        clearance: (...,), its least height above the top [m]; NaN where it was not measured.
+        rules: How far is too far.
+    """
+    depth = np.inf if rules.scrape_depth is None else rules.scrape_depth
+    return np.asarray(np.asarray(clearance) < -depth)
 
 
 def is_lost_sample(slip: npt.ArrayLike, turn: npt.ArrayLike, rules: LiftConfig) -> Flags:

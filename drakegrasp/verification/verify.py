@@ -56,7 +56,7 @@ _REASONS = {
     Outcome.SCREENED: "geometry shows that not every fingertip can reach the object",
     Outcome.MISSING_FINGERTIP: "a fingertip closes without touching the object",
     Outcome.HAND_CONTACT: "a part of the hand that is not a fingertip touches the object",
-    Outcome.TABLE_CONTACT: "the closing hand or the lifted object touches the table",
+    Outcome.TABLE_CONTACT: "the closing or lifting hand, or the lifted object, touches the table",
     Outcome.DROPPED: "the hand loses the object during the lift",
     Outcome.SLIPPED: "a fingertip loses contact during the lift, and no other holds the object",
     Outcome.PARTLY_HELD: "a fingertip loses contact during the lift; others still hold the object",

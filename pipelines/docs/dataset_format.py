@@ -139,7 +139,8 @@ and normals, and how they fit the mesh, are also NaN for a finger that does not 
 a row follows from its outcome: `success`, `slipped`, `partly_held`, `dropped` and `moved` were
 lifted;
 `missing_fingertip` and `hand_contact` were closed; `table_contact` was closed, and lifted if
-`time_lift` is a number (then it is the object that still touches the table); all others were only
+`time_lift` is a number (then it is the object that still touches the table, or the hand that
+scraped it in the lift); all others were only
 placed. "After the lift" is when it ended: of `moved`, the moment at which it was ended.
 `solver_error`, `timeout` and `crashed` say that the simulator failed: never count them as failed
 grasps. `moved` says that the attempt is no sample, not that the hand would have lost the object.

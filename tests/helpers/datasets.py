@@ -66,6 +66,8 @@ SUCCESS, MISSING, BELOW, SLIPPED, HAND, AFTER_LIFT = 0, 1, 2, 4, 6, 10
 
 #: By how much every lifted object moved in the hand [m].
 SLIP = 2e-3
+#: Of the hand above the table on its way [m].
+CLEARANCE = 5e-3
 
 
 SIZES = sizes(fingers=3, joints=8, image=32)
@@ -164,9 +166,11 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
     after_lift = number == AFTER_LIFT
     stage = Stage.LIFTED if after_lift else outcome.stage
     touch = np.array([True, True, outcome is not Outcome.MISSING_FINGERTIP])
+    clearance = np.nan if config.close.scrape_depth is None else CLEARANCE
     if stage >= Stage.CLOSED:
         row |= {f"closed_{k}": v for k, v in contacts(model, touch).items()}
-        row |= {"time_close": 1.0, "closed_other_links": outcome is Outcome.HAND_CONTACT}
+        row |= {"time_close": 1.0, "clearance_close": clearance}
+        row |= {"closed_other_links": outcome is Outcome.HAND_CONTACT}
         row["closed_hand_on_table"] = outcome is Outcome.TABLE_CONTACT and not after_lift
     if stage >= Stage.LIFTED:
         row["chance"] = chance_of(model, row)
@@ -175,7 +179,8 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
         touch[0] &= outcome is not Outcome.SLIPPED
         row |= {f"lifted_{k}": v for k, v in contacts(model, touch, SLIP, 1.25).items()}
         row["lifted_q"] = np.full(SIZES["j"], 0.6)
-        row |= {"time_lift": 1.0, "lifted_object_on_table": after_lift}
+        row |= {"time_lift": 1.0, "clearance_lift": clearance}
+        row["lifted_object_on_table"] = after_lift
         row |= {"surface_distance": np.zeros(3), "normal_angle": np.zeros(3), **hold(row)}
         raised = make_pose(np.eye(3), [0.0, 0.0, 0.25]) @ X_TG
         row["X_TO_lifted"] = pack_pose(raised @ invert_pose(unpack_pose(row["X_OG_lifted"])))
@@ -210,6 +215,8 @@ def make_shard(model: ObjectModel, header: ShardHeader, X_TO: Array, config: Con
     for i, row in enumerate(rows):
         for name, value in row.items():
             trials[name][i] = value
+    if config.close.scrape_depth is None:  # shards of versions without it lack the columns
+        trials = {n: values for n, values in trials.items() if not n.startswith("clearance_")}
     hits = [i for i, row in enumerate(rows) if row["outcome"] is Outcome.SUCCESS]
     looks = {f.name: f.empty(len(hits), SIZES) for f in LOOK_FIELDS}
     for k, i in enumerate(hits):

@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
+from drakegrasp.config import CloseConfig
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.verdict import (
@@ -17,6 +18,7 @@ from drakegrasp.simulation.verdict import (
     is_stable,
     judge_closed,
     judge_lifted,
+    scrapes,
 )
 
 ALL, ONE_OFF, NONE = [True, True, True], [True, False, True], [False, False, False]
@@ -125,3 +127,18 @@ def test_a_fingertip_that_is_not_required_may_miss() -> None:
     assert closed.tolist() == [Outcome.SUCCESS, Outcome.MISSING_FINGERTIP]
     lifted = judge_lifted(touching, [0, 0], [False, False], required=required)
     assert lifted.tolist() == [Outcome.SUCCESS, Outcome.PARTLY_HELD]
+
+
+def test_hand_that_scraped_the_table_is_refused_last() -> None:
+    """Where nothing else refuses it; one that was not measured is not refused."""
+    rules = CloseConfig(scrape_depth=5e-4)
+    scraped = scrapes([-6e-4, -5e-4, np.nan, -6e-4], rules)
+    assert scraped.tolist() == [True, False, False, True]
+    assert not scrapes(-1.0, CloseConfig(scrape_depth=None))
+    touching = np.array([ALL, ALL, ALL, [True, False, True]])
+    none = np.zeros(4, dtype=bool)
+    ends = (Outcome.TABLE_CONTACT, Outcome.SUCCESS, Outcome.SUCCESS)
+    closed = judge_closed(touching, none, none, scraped=scraped)
+    assert closed.tolist() == [*ends, Outcome.MISSING_FINGERTIP]
+    lifted = judge_lifted(touching, none, none, scraped=scraped)
+    assert lifted.tolist() == [*ends, Outcome.PARTLY_HELD]

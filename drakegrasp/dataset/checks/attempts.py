@@ -26,7 +26,7 @@ from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp, LiftChance,
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.randomization.draws import draw_conditions
-from drakegrasp.simulation.verdict import judge_closed
+from drakegrasp.simulation.verdict import judge_closed, scrapes
 
 #: Objects whose meshes, with their search trees, stay in memory during a task; samples are ordered
 #: by object.
@@ -116,7 +116,11 @@ def chances(
 
     # A hand that was never closed has no `time_close`.
     fields = ("closed_touching", "closed_other_links", "closed_hand_on_table")
-    verdict = judge_closed(*(batch[name] for name in fields), required=required_of(batch, required))
+    verdict = judge_closed(
+        *(batch[name] for name in fields),
+        required=required_of(batch, required),
+        scraped=scrapes(batch["clearance_close"], manifest.config.close),
+    )
     lifts = np.isfinite(batch["time_close"]) & (verdict == Outcome.SUCCESS)
     due = np.where(lifts & (chance is not None), batch["chance"], np.nan)
     for _, known, rows in _by_object(batch, manifest, model):

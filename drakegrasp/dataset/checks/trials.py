@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from drakegrasp.config import LiftConfig
+from drakegrasp.config import CloseConfig, LiftConfig
 from drakegrasp.dataset.checks.findings import Violation
 from drakegrasp.dataset.checks.rows import AnyArray, Batch, all_per_row, rotation, unit_length
 from drakegrasp.dataset.schema import NO_PRESHAPE, TRIAL_FIELDS
@@ -25,6 +25,7 @@ from drakegrasp.simulation.verdict import (
     is_stable,
     judge_closed,
     judge_lifted,
+    scrapes,
 )
 
 #: Slip [m] and turn [rad] are as exact as the poses that they follow from; the angle of a rotation
@@ -95,9 +96,16 @@ def numbers(
         yield from batch.follows("parent", parent, "child")
 
 
-def stages(batch: Batch) -> Iterator[Violation]:
-    """The fields of a stage have values if the attempt reached it, and none otherwise."""
-    stage = _stages(batch)
+def stages(batch: Batch, close: CloseConfig | None) -> Iterator[Violation]:
+    """The fields of a stage have values if the attempt reached it, and none otherwise.
+
+    Args:
+        batch: Rows of `/trials`.
+        close: How hands close, if known.
+    """
+    stage = _stages(batch, close)
+    if close is not None:
+        yield from _clearances(batch, stage, close.scrape_depth is not None)
     for f in TRIAL_FIELDS:
         values = batch[f.name]
         reached = stage >= f.stage
@@ -121,6 +129,16 @@ def stages(batch: Batch) -> Iterator[Violation]:
             what = f"{f.name} must be finite from the stage {f.stage.name.lower()} on"
             what += "" if f.stage is Stage.PLACED else " and NaN before"
         yield from batch.broken(what, bad, lambda i: _outcome(batch, i))
+
+
+def _clearances(batch: Batch, stage: AnyArray, measured: bool) -> Iterator[Violation]:
+    """Heights above the table are there where the configuration says so, and nowhere else."""
+    state = "finite" if measured else "NaN"
+    must = f"must be {state} with close.scrape_depth {'given' if measured else 'null'}"
+    for name, reached in (("close", Stage.CLOSED), ("lift", Stage.LIFTED)):
+        values = batch[f"clearance_{name}"]
+        bad = (stage >= reached) & (np.isfinite(values) != measured)
+        yield from batch.broken(f"clearance_{name} {must}", bad, values)
 
 
 def repeats(batch: Batch, most: int | None) -> Iterator[Violation]:
@@ -147,7 +165,10 @@ def repeats(batch: Batch, most: int | None) -> Iterator[Violation]:
 
 
 def verdicts(
-    batch: Batch, required: Sequence[bool], rules: LiftConfig | None
+    batch: Batch,
+    required: Sequence[bool],
+    rules: LiftConfig | None,
+    close: CloseConfig | None,
 ) -> Iterator[Violation]:
     """The outcome is what follows from the recorded contacts and motion (`simulation.verdict`).
 
@@ -155,6 +176,7 @@ def verdicts(
         batch: Rows of `/trials`.
         required: Whether a grasp needs each fingertip on the object.
         rules: When lifts end, if known.
+        close: How hands close, if known.
     """
     # What the contacts of each stage say.
     own = required_of(batch, required)
@@ -163,12 +185,14 @@ def verdicts(
         batch["closed_other_links"],
         batch["closed_hand_on_table"],
         required=own,
+        scraped=_scraped(batch, "close", close),
     )
     lifted = judge_lifted(
         batch["lifted_touching"],
         batch["lifted_other_links"],
         batch["lifted_object_on_table"],
         required=own,
+        scraped=_scraped(batch, "lift", close),
     )
 
     # Older versions called slipped what is partly held.
@@ -188,7 +212,7 @@ def verdicts(
         )
 
     # Neither has a closed hand that was not lifted.
-    judged, left = _stages(batch) >= Stage.CLOSED, batch["outcome"] == Outcome.NOT_LIFTED
+    judged, left = _stages(batch, close) >= Stage.CLOSED, batch["outcome"] == Outcome.NOT_LIFTED
     lifted = np.where(left, Outcome.NOT_LIFTED.value, lifted)
     if rules is not None:
         may_lift, audited = judged & (closed == Outcome.SUCCESS), batch["audited"]
@@ -211,10 +235,10 @@ def verdicts(
     # A hand that may not lift has no second verdict.
     expected = np.where(closed != Outcome.SUCCESS, closed, lifted)
     yield from batch.broken(
-        "outcome must follow from the contacts",
+        "outcome must follow from the contacts and the clearance",
         judged & (expected != batch["outcome"]),
         lambda i: (
-            f"{Outcome(int(batch['outcome'][i])).label} where the contacts say "
+            f"{Outcome(int(batch['outcome'][i])).label} where these say "
             f"{Outcome(int(expected[i])).label}"
         ),
     )
@@ -297,12 +321,20 @@ def _as_due(values: AnyArray, due: AnyArray) -> AnyArray:
     return np.asarray(np.where(due, np.isfinite(values), np.isnan(values)))
 
 
-def _stages(batch: Batch) -> AnyArray:
+def _scraped(batch: Batch, when: str, close: CloseConfig | None) -> AnyArray:
+    """Return (n,) whether the hand came too far below the table's top; not where unknown."""
+    if close is None:
+        return np.zeros(len(batch), dtype=np.bool_)
+    return scrapes(batch[f"clearance_{when}"], close)
+
+
+def _stages(batch: Batch, close: CloseConfig | None) -> AnyArray:
     """Return the stage (n,) that each attempt reached."""
     table = np.zeros(max(Outcome) + 1, dtype=int)
     table[[o.value for o in Outcome]] = [o.stage.value for o in Outcome]
-    # The table can be touched by the hand at closing, or by the object after the lift.
-    lifted = (batch["outcome"] == Outcome.TABLE_CONTACT) & ~batch["closed_hand_on_table"]
+    # The table can be touched by the hand as it closes, or in the lift.
+    by_hand = batch["closed_hand_on_table"] | _scraped(batch, "close", close)
+    lifted = (batch["outcome"] == Outcome.TABLE_CONTACT) & ~by_hand
     return np.where(lifted, Stage.LIFTED.value, table[batch["outcome"]])
 
 

@@ -104,8 +104,9 @@ def _rules(trials: CheckedFile, dataset: Dataset | None) -> list[list[Rule]]:
     )
 
     # What follows from the dataset needs all of its objects.
+    close, lift = (config.close, config.lift) if config else (None, None)
     finite: list[Rule] = [
-        partial(trial_rules.verdicts, required=required, rules=config.lift if config else None),
+        partial(trial_rules.verdicts, required=required, rules=lift, close=close),
         trial_rules.contacts,
         trial_rules.poses,
     ]
@@ -120,7 +121,10 @@ def _rules(trials: CheckedFile, dataset: Dataset | None) -> list[list[Rule]]:
             partial(attempt_rules.chances, required=required, manifest=manifest, model=model)
         )
     most = None if config is None else config.certify.repeats
-    stages: list[Rule] = [trial_rules.stages, partial(trial_rules.repeats, most=most)]
+    stages: list[Rule] = [
+        partial(trial_rules.stages, close=close),
+        partial(trial_rules.repeats, most=most),
+    ]
     return [[numbers], stages, finite, sound]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from helpers.datasets import (
@@ -30,6 +31,10 @@ from helpers.datasets import (
     set_at,
 )
 
+from drakegrasp.dataset.manifest import claim_directory, read_manifest
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import DataError
+from drakegrasp.hand.settings import override_config
 from drakegrasp.outcomes import Outcome
 
 TRIAL_CASES: Mapping[str, tuple[str, int, Edit, str]] = {
@@ -91,6 +96,10 @@ TRIAL_CASES: Mapping[str, tuple[str, int, Edit, str]] = {
     "other link": ("closed_other_links", SUCCESS, lambda _: 1, "outcome must follow from the con"),
     "hand on table": ("closed_hand_on_table", SUCCESS, lambda _: True, "outcome must follow from"),
     "on table": ("lifted_object_on_table", SUCCESS, lambda _: True, "outcome must follow"),
+    "scraped": ("clearance_close", SUCCESS, lambda _: -6e-4, "outcome must follow from"),
+    "scraped in the lift": ("clearance_lift", SUCCESS, lambda _: -6e-4, "outcome must follow"),
+    "no clearance": ("clearance_close", HAND, lambda _: np.nan, "clearance_close must be finite"),
+    "early clearance": ("clearance_lift", HAND, lambda _: 0.1, "clearance_lift must be NaN before"),
     "chance": ("chance", SUCCESS, lambda c: c - 0.01, "chance must follow from the contacts aft"),
     "chance of none": ("chance", HAND, lambda _: 0.5, "chance must follow from the contacts after"),
     "early chance": ("chance", BELOW, lambda _: 0.5, "chance must be NaN before the stage closed"),
@@ -250,3 +259,19 @@ def test_chance_of_fewer_fingers_is_not_derived_from_contacts_of_all(out: Path) 
     change(out, TRIALS, "trials/unused", SUCCESS, lambda _: 0b001)
     what = "grasp_props/unused must follow from its trial"
     must_find_without_shards(out, *((name, "/valid", 0, what) for name in (OTO, OTM)))
+
+
+def test_dataset_that_did_not_measure_the_table_is_sound_and_goes_on(tmp_path: Path) -> None:
+    """Its shards lack the columns; a build with today's rule continues it by its own."""
+    rules = "close.scrape_depth=null"
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", rules)
+    with h5py.File(next((out / "shards").rglob("*.h5"))) as shard:
+        assert "clearance_close" not in shard["trials"]
+    must_find(out)
+    assert np.isnan(Trials(out)["clearance_close"]).all()
+    begun = read_manifest(out)
+    today = override_config(begun.config, ["close.scrape_depth=0.0005"])
+    assert claim_directory(out, today) == begun
+    stated = override_config(begun.config, ["close.scrape_depth=0.001"])
+    with pytest.raises(DataError, match=r"close\.scrape_depth \(None there, 0\.001 here\)"):
+        claim_directory(out, stated)
