@@ -82,6 +82,11 @@ def one_line(error: BaseException) -> str:
     return " ".join(str(error).split())[:LONGEST_MESSAGE] or type(error).__name__
 
 
+def counted(count: int, noun: str, plural: str | None = None) -> str:
+    """Return a number with its noun: `1 hand`, `2,000 hands`; `plural` if an s is not enough."""
+    return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
+
+
 def listed(names: Sequence[str], total: int | None = None) -> str:
     """Return names in a line, of many only the first `NAMED` and how many more there are.
 

@@ -93,7 +93,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     Its lifts are certified, so that it has all columns that there are.
     """
     folders = tmp_path_factory.mktemp("sound"), tmp_path_factory.mktemp("meshes")
-    return make_dataset(*folders, *CERTIFIED)
+    return make_dataset(*folders, overrides=CERTIFIED)
 
 
 @pytest.fixture

@@ -154,6 +154,26 @@ def test_each_stop_of_a_walk_is_a_function_of_its_module() -> None:
         assert re.search(rf"^(def|class) {name}\b", source, re.MULTILINE), f"{module} {name}"
 
 
+def guards(page: Path) -> Iterator[str]:
+    """Yield the tests that a page names as guards, by `pytest -k`: in its tables, or in prose."""
+    table = False
+    for line in read(page).splitlines():
+        table = line.startswith("|") and (table or line.endswith("| guarded by |"))
+        if table:
+            yield from re.findall(r"`(\w+)`", line.split("|")[-2])
+    text = " ".join(read(page).split())
+    yield from re.findall(r"guarded by `(\w+)`", text)
+    yield from re.findall(r"`(\w+)` guards", text)
+
+
+def test_tests_that_the_docs_name_exist() -> None:
+    sources = [path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py")]
+    tests = [name for source in sources for name in re.findall(r"^def (test_\w+)", source, re.M)]
+    named = {name for page in DOCS for name in guards(page)}
+    assert len(named) > 30
+    assert not {name for name in named if not any(name in test for test in tests)}
+
+
 def _bases(page: Path, name: str) -> list[Path]:
     """Return the folders in which a file that the docs name may lie."""
     package = ROOT / "drakegrasp"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drakegrasp.errors import LONGEST_MESSAGE, first_line, one_line
+from drakegrasp.errors import LONGEST_MESSAGE, counted, first_line, one_line
 
 
 @pytest.mark.parametrize(
@@ -23,3 +23,10 @@ def test_message_of_another_library_becomes_one_line(
 ) -> None:
     assert first_line(error) == first
     assert one_line(error) == whole
+
+
+def test_one_is_no_plural() -> None:
+    assert [counted(n, "hand") for n in (0, 1, 2, 1000)] == [
+        *("0 hands", "1 hand", "2 hands", "1,000 hands")
+    ]
+    assert [counted(n, "mesh", "meshes") for n in (1, 2)] == ["1 mesh", "2 meshes"]

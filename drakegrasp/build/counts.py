@@ -7,6 +7,7 @@ figures of the progress bar, and whether an object needs more grasps.
 from __future__ import annotations
 
 from collections import Counter
+from math import ceil
 
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.shards import ShardHeader
@@ -52,10 +53,15 @@ class Counts:
         self._pool, self._report = pool, report
         standoffs = len(manifest.config.candidates.standoffs)
         self._total = standoffs * sum(entry.candidates for entry in manifest.objects)
-        self._standoffs, self._done, self._samples = standoffs, 0, 0
-        self._wanted = manifest.config.samples
+        self._standoffs, self._done = standoffs, 0
         self._outcomes: Counter[Outcome] = Counter()
         self._reused_attempts = 0
+
+        # What ends a build before all attempts are made: samples in all, and by object samples, or
+        # grasps.
+        config = manifest.config
+        self._wanted, self._each = config.samples, config.samples_per_object or config.max_grasps
+        self._found = Counter(dict.fromkeys((entry.name for entry in manifest.objects), 0))
 
         # By object: all attempts, and those that the machine ended and not the physics.
         self._attempts: Counter[str] = Counter()
@@ -82,7 +88,8 @@ class Counts:
         samples: int | None = None,
     ) -> None:
         """Count the attempts of a unit that is done, now or before (`reused`), and its samples."""
-        self._samples += samples or 0
+        grasps = outcomes.get(Outcome.SUCCESS, 0)
+        self._found[header.object_name] += grasps if samples is None else samples
         self._outcomes.update(outcomes)
         self._attempts[header.object_name] += sum(outcomes.values())
         self._ended[header.object_name] += sum(outcomes.get(outcome, 0) for outcome in ENDED)
@@ -90,7 +97,7 @@ class Counts:
         self._done += first_round
         self._reused_attempts += reused * first_round
         if self._max_grasps is not None:
-            self._close_gap(header, outcomes.get(Outcome.SUCCESS, 0))
+            self._close_gap(header, grasps)
         self.show()
 
     def unexplained(self) -> list[str]:
@@ -113,10 +120,24 @@ class Counts:
             if self._outcomes[outcome]:
                 figures[outcome.label] = self._outcomes[outcome]
         if self._wanted is not None:
-            figures["samples"] = self._samples
+            figures[f"of {self._wanted:,} samples"] = self._found.total()
         if self._pool is not None:
             figures["workers"] = self._pool.size
-        self._report(self._done, self._total, found=self._reused_attempts, **figures)
+        self._report(self._done, self._expected(), found=self._reused_attempts, **figures)
+
+    def _expected(self) -> int:
+        """Return how many attempts the build will make, if it goes on to find as much as it did.
+
+        It makes all of them, or ends when it has found what is wanted.
+        """
+        ends = []
+        if self._wanted is not None:
+            ends.append((self._found.total(), self._wanted))
+        if self._each is not None:
+            enough = sum(min(found, self._each) for found in self._found.values())
+            ends.append((enough, self._each * len(self._found)))
+        made = [self._done * max(wanted / found, 1.0) for found, wanted in ends if found]
+        return min(self._total, *map(ceil, made)) if made else self._total
 
     def needs(self, header: ShardHeader) -> bool:
         """Return whether a unit's object has too few grasps in the units before the first gap."""

@@ -13,7 +13,7 @@ from drakegrasp.build.request import BUILTIN, BuildRequest, refuse_unknown
 from drakegrasp.build.stage_times import MEASURED, StageTimes
 from drakegrasp.config import Config
 from drakegrasp.dataset.assembly.pack import TASK_ROWS
-from drakegrasp.errors import ConfigError
+from drakegrasp.errors import ConfigError, counted
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.environment import available_cores
 from drakegrasp.shapes.catalog import draw_builtin
@@ -157,11 +157,11 @@ def plan_lines(plan: Plan) -> list[str]:
     """Return a plan as the lines that are printed."""
     stages = ", ".join(f"{name} {_duration(seconds)}" for name, seconds in plan.stages.items())
     return [
-        f"from the beginning: {plan.objects:,} objects, {plan.attempts:,} attempts "
-        f"in {plan.units:,} work units",
-        f"expected {_duration(plan.seconds)} on {plan.workers:,} workers ({stages})",
+        f"from the beginning: {counted(plan.objects, 'object')}, "
+        f"{counted(plan.attempts, 'attempt')} in {counted(plan.units, 'work unit')}",
+        f"expected {_duration(plan.seconds)} on {counted(plan.workers, 'worker')} ({stages})",
         f"expected {plan.core_hours:,.2f} core-hours",
-        f"expected {plan.samples:,} samples, {_size(plan.bytes)} on disk",
+        f"expected {counted(plan.samples, 'sample')}, {_size(plan.bytes)} on disk",
         f"times and sizes: {plan.source}",
     ]
 

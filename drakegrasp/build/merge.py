@@ -17,6 +17,7 @@ from pathlib import Path, PurePath
 from drakegrasp.config import CarriedHand, Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked
 from drakegrasp.dataset.assembly.survey import headers_by_object
+from drakegrasp.dataset.filters import own_filters
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (
     REQUIRED_VERSIONS,
@@ -25,6 +26,7 @@ from drakegrasp.dataset.manifest import (
     differences,
     read_manifest,
     refuse_older,
+    with_postprocessing,
     write_manifest,
 )
 from drakegrasp.dataset.paths import model_path, plan_path, shards_folder
@@ -61,6 +63,7 @@ def merge(
     into: Path,
     outs: Sequence[Path],
     *,
+    overrides: Sequence[str] = (),
     execute: Executor = run_here,
     progress: Report = silent,
 ) -> Assembly:
@@ -72,10 +75,12 @@ def merge(
     Args:
         into: Directory of the merged dataset, new or empty.
         outs: Directories of the datasets, whose objects come in this order.
+        overrides: As for `assemble`, for all of them: they may differ in what these set.
         execute: Does the work of assembling.
         progress: Called with the number of its tasks that are done and to do.
 
     Raises:
+        ConfigError: If an override or a filter of the user's own cannot be used.
         DataError: If the directory is in use, a dataset is not complete, or two of them are not of
             one configuration, one hand and one version, or differ in what both have.
         HandError: If the files of the hand in a dataset have changed.
@@ -84,10 +89,11 @@ def merge(
     # Refuse what cannot be done before anything is written.
     if into.exists() and (not into.is_dir() or any(into.iterdir())):
         raise DataError(f"{into}: must be a new or empty directory, got one that is in use")
-    manifests = {out: _read_complete(out, execute) for out in outs}
+    manifests = {out: with_postprocessing(_read_complete(out, execute), overrides) for out in outs}
     _refuse_differences(manifests)
     parts = _parts(manifests)
     manifest = _merged_manifest(manifests, parts)
+    own_filters(manifest.config.filters)
 
     with disk_full_named(into), atomic_folder(into) as folder, build_lock(folder):
         for part in parts:

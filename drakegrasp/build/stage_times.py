@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from drakegrasp.config import Config, NonNegative, NonNegativeCount
 from drakegrasp.dataset.log import FILE_NAME, read_log
-from drakegrasp.errors import DataError, one_line
+from drakegrasp.errors import DataError, counted, one_line
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.json_text import read_json
 
@@ -145,5 +145,6 @@ def logged_times(out: Path, config: Config) -> StageTimes | None:
         attempt=(seconds["try"] + seconds["measure"] + seconds["write"]) / attempts,
         look=seconds["look"] / successes if successes else MEASURED.look,
         successes=successes / attempts,
-        source=f"{attempts:,} attempts of {len(objects)} objects in {out / FILE_NAME}",
+        source=f"{counted(attempts, 'attempt')} of {counted(len(objects), 'object')} in "
+        f"{out / FILE_NAME}",
     )

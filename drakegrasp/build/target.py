@@ -92,7 +92,7 @@ class Target:
         if wanted is not None and total >= wanted:
             return lines
         if wanted is not None and per_object is None:
-            lines.append(f"{total:,} samples were found of {wanted:,}")
+            lines.append(f"{total:,} of {wanted:,} samples were found")
 
         # Each object ended at its last palm pose, or after many in vain.
         short = [n for n in self.units if per_object is None or counts[n] < per_object]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from drakegrasp.cli.errors import say, say_json
+from drakegrasp.cli.help import Command
 from drakegrasp.cli.options import (
     FILE,
     PATH,
@@ -17,8 +18,11 @@ from drakegrasp.cli.options import (
     connection_options,
     dataset_argument,
     parse_request,
+    postprocessing_options,
+    scenes_options,
     shared,
 )
+from drakegrasp.errors import counted
 
 if TYPE_CHECKING:
     from drakegrasp.build.pipeline import BuildReport
@@ -26,7 +30,7 @@ if TYPE_CHECKING:
     from drakegrasp.build.scenes.make import Scenes
 
 
-@click.command()
+@click.command(cls=Command)
 @build_options
 @connection_options
 @click.option(
@@ -71,11 +75,7 @@ def build(plan: bool, times: Path | None, **options: Any) -> None:
     help="Trials that must not become samples: the reject.json of an inspection, or a text file "
     "with an id per line; # starts a comment.",
 )
-@shared(
-    "--set",
-    help="Change a setting of the filters or the split, e.g. filters.outlier_sigma=3; may be given "
-    "several times.",
-)
+@postprocessing_options
 @shared("--workers")
 def assemble(
     out: Path, reject: Path | None, overrides: tuple[str, ...], workers: int | None
@@ -109,18 +109,18 @@ def assemble(
 
 @click.command()
 @dataset_argument()
-@shared("--set", "--workers", "--quiet")
+@scenes_options
+@shared("--workers", "--quiet")
 def scenes(out: Path, overrides: tuple[str, ...], workers: int | None, quiet: bool) -> None:
     """Render scenes whose cameras know no grasp, to train on.
 
     The command writes OUT/scenes.hdf5: each object of OUT in each resting pose, seen by sixteen
-    cameras (five fixed ones to test), with all hands that closed on it. --set changes keys of
-    `scenes`, e.g. scenes.views=8.
+    cameras (five fixed ones to test), with all hands that closed on it.
     """
     made = write_scenes(out, overrides=overrides, workers=workers, show=not quiet)
     for split, count in made.scenes.items():
-        say(f"{split}: {count:,} scenes, {made.views[split]:,} views")
-    say(f"{made.grasps:,} grasps in {made.path}")
+        say(f"{split}: {counted(count, 'scene')}, {counted(made.views[split], 'view')}")
+    say(f"{counted(made.grasps, 'grasp')} in {made.path}")
 
 
 def write_scenes(
@@ -145,19 +145,22 @@ def write_scenes(
 @click.command()
 @click.argument("into", type=PATH, metavar="INTO")
 @click.argument("outs", type=PATH, metavar="OUTS...", nargs=-1, required=True)
+@postprocessing_options
 @shared("--workers")
-def merge(into: Path, outs: tuple[Path, ...], workers: int | None) -> None:
+def merge(
+    into: Path, outs: tuple[Path, ...], overrides: tuple[str, ...], workers: int | None
+) -> None:
     """Make one dataset of several that were built apart.
 
-    Their objects or their seeds may differ, and nothing else. INTO must be new or empty, and
-    appears when it is complete; OUTS stay as they are.
+    Their objects or their seeds may differ, and nothing else but what --set says for all. INTO
+    must be new or empty, and appears when it is complete; OUTS stay as they are.
     """
     from drakegrasp.build.merge import merge as merge_datasets
     from drakegrasp.runtime.executor import processes
     from drakegrasp.runtime.progress import progress_bar
 
     with processes(workers) as execute, progress_bar("merge", "tasks") as progress:
-        merge_datasets(into, outs, execute=execute, progress=progress)
+        merge_datasets(into, outs, overrides=overrides, execute=execute, progress=progress)
     print_stats(into)
 
 
@@ -255,12 +258,13 @@ def print_report(report: BuildReport) -> None:
     print_stats(report.out)
     if report.simulated:
         reused = f" ({report.reused} had been done before)" if report.reused else ""
-        say(f"{report.simulated} work units simulated{reused}")
+        say(f"{counted(report.simulated, 'work unit')} simulated{reused}")
     else:
         again = "; the files were written again" * report.assembled
-        say(f"all {report.reused} work units had been done before: nothing was simulated{again}")
+        units = counted(report.reused, "work unit")
+        say(f"all {units} had been done before: nothing was simulated{again}")
     for message, count in report.errors.items():
-        say(f"solver error in {count} attempts: {message}")
+        say(f"solver error in {counted(count, 'attempt')}: {message}")
     for notice in report.notices:
         say(notice)
     for entry in report.refused:

@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 
 import click
 
+from drakegrasp.cli.help import Command
 from drakegrasp.errors import (
     ConfigError,
     DrakegraspError,
@@ -57,7 +58,7 @@ def say_json(document: Mapping[str, Any]) -> None:
     click.echo(json.dumps(document, allow_nan=False))
 
 
-class OneCommand(click.Command):
+class OneCommand(Command):
     """The only command of a script that builds, with errors in one line."""
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
@@ -78,6 +79,10 @@ class Commands(OneCommand, click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the commands' names."""
         return list(self.commands)
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options and the commands; called by click."""
+        click.Group.format_options(self, ctx, formatter)
 
 
 @contextmanager

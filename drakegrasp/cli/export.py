@@ -8,6 +8,7 @@ import click
 
 from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import PATH, dataset_argument, shared
+from drakegrasp.errors import counted
 
 #: The formats as the help lists them; loading them would take longer than printing the help.
 FORMATS = ("hf", "original", "dexgraspbench", "isaac_grasp", "glb", "mjcf")
@@ -70,6 +71,6 @@ def export(
         refuse_link(directory)
     with progress_bar("export", "sample", show=not quiet) as progress:
         count = export_dataset(out, directory, form, publication=publication, progress=progress)  # type: ignore[arg-type]
-    say(f"{count:,} samples in {directory}")
+    say(f"{counted(count, 'sample')} in {directory}")
     if form == "hf" and (missing := not_said(publication)):
         say(f"before it is published, --about should say: {', '.join(missing)}")

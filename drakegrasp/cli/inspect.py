@@ -8,6 +8,7 @@ import click
 
 from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import PATH, dataset_argument, shared
+from drakegrasp.errors import counted
 
 #: Port without --port; the same every time, so that a tunnel to another machine can stay.
 PORT = 8321
@@ -70,7 +71,7 @@ def inspect_(
     with progress_bar("inspect", "grasps") as progress:
         site = write_site(out, folder, results=results, progress=progress)
     rest = "" if site.grasps == site.successes else f", the most suspicious of {site.successes:,}"
-    say(f"{site.grasps:,} grasps in {folder / 'index.html'}{rest}")
+    say(f"{counted(site.grasps, 'grasp')} in {folder / 'index.html'}{rest}")
 
 
 @click.command()
@@ -122,4 +123,4 @@ def figures(
         )
     for name, why in written.left_out.items():
         say(f"{name} is left out: {why}")
-    say(f"{len(written.names)} figures in {written.folder}")
+    say(f"{counted(len(written.names), 'figure')} in {written.folder}")

@@ -26,9 +26,10 @@ from drakegrasp.cli.hand import hand
 from drakegrasp.cli.inspect import figures, inspect_
 from drakegrasp.cli.morph import morph
 from drakegrasp.cli.options import PATH, chosen_settings, dataset_argument, shared
+from drakegrasp.cli.restart import restart_with_utf8
 from drakegrasp.cli.score import bench_set, score
 from drakegrasp.cli.verify.command import verify
-from drakegrasp.errors import printable
+from drakegrasp.errors import counted, printable
 from drakegrasp.runtime.allocator import restart_with_jemalloc
 
 
@@ -89,7 +90,7 @@ def export_objects(directory: Path, **options: Any) -> None:
     config = load_config(overrides=chosen_settings({"objects": BUILTIN, **options}))
     with progress_bar("objects", "meshes") as progress:
         paths = export_builtin(directory, config=config.builtin, progress=progress)
-    say(f"{len(paths)} meshes in {directory}")
+    say(f"{counted(len(paths), 'mesh', 'meshes')} in {directory}")
 
 
 @click.command()
@@ -112,7 +113,8 @@ def check(path: Path, workers: int | None, as_json: bool) -> None:
     else:
         for violation in violations:
             say(str(violation))
-        say(f"{path}: {len(violations) or 'no'} broken invariants")
+        found = counted(len(violations), "broken invariant")
+        say(f"{path}: {found if violations else 'no broken invariants'}")
     if violations:
         sys.exit(1)
 
@@ -163,6 +165,7 @@ for _command in (
 
 def run() -> None:
     """Run the program; commands that may simulate in this process have jemalloc for it."""
+    restart_with_utf8()
     # A terminal of another encoding shows ? where it has no such character.
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

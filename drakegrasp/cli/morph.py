@@ -8,6 +8,7 @@ import click
 
 from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import PATH, shared
+from drakegrasp.errors import counted
 
 
 @click.command()
@@ -47,6 +48,7 @@ def morph(
     for reason in report.refused:
         say(f"no morphs of {reason}", err=True)
     for name, count in report.crossing.items():
-        say(f"{name} passes through itself in {count} faces, and so do its morphs", err=True)
+        faces = counted(count, "face")
+        say(f"{name} passes through itself in {faces}, and so do its morphs", err=True)
     share = report.first_draws / report.morphs
-    say(f"{report.morphs} morphs in {out}; {share:.0%} by the first draw")
+    say(f"{counted(report.morphs, 'morph')} in {out}; {share:.0%} by the first draw")

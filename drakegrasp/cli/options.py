@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import click
 
 from drakegrasp.build.request import BUILTIN, BuildRequest
+from drakegrasp.cli.help import Option
 from drakegrasp.errors import first_line
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -44,6 +45,11 @@ FILE = PathType(path_type=Path, exists=True, dir_okay=False)
 def _row(metavar: str | None, text: str, **attributes: Any) -> dict[str, Any]:
     """Return a row of the table: what click calls metavar and help, and its other attributes."""
     return {"metavar": metavar, "help": text, **attributes}
+
+
+def _set_text(what: str, example: str) -> str:
+    """Return the help of a `--set`, with a value that its command takes."""
+    return f"Change {what}, e.g. {example}; may be given several times."
 
 
 #: The options that more than one command has.
@@ -83,11 +89,7 @@ _TABLE = {
         "Configuration: a file, or the preset paper, fast, randomized or released.  [default: "
         "paper, but with split.by=auto]",
     ),
-    "--set": _row(
-        "KEY=VALUE",
-        "Change one setting, e.g. lift.hold_time=1; may be given several times.",
-        multiple=True,
-    ),
+    "--set": _row("KEY=VALUE", _set_text("one setting", "lift.hold_time=1"), multiple=True),
     "--candidates": _row("N", "Palm poses per object.  [default: 10000]", type=int),
     "--max-grasps": _row("N", "Stop an object after N successes.  [default: no limit]", type=int),
     "--samples": _row(
@@ -160,6 +162,8 @@ _BUILD = (
 )
 _TLS_FILES = ("--tls-ca-file", "--tls-cert", "--tls-key")
 _TLS = ("--tls/--no-tls", *_TLS_FILES)
+#: Options that the help lists behind all others.
+_CLUSTER = ("--scheduler", "--scheduler-file", *_TLS)
 _CONNECTION = ("--workers", "--scheduler", "--scheduler-file")
 
 
@@ -174,7 +178,9 @@ def shared(*names: str, **changes: Any) -> Callable[[F], F]:
     def give(command: F) -> F:
         for name in reversed(names):
             words = (name, _PARAMETERS[name]) if name in _PARAMETERS else (name,)
-            command = click.option(*words, **(_TABLE[name] | changes))(command)
+            heading = {"heading": "Cluster options"} if name in _CLUSTER else {}
+            row = _TABLE[name] | heading | changes
+            command = click.option(*words, cls=Option, **row)(command)
         return command
 
     return give
@@ -183,6 +189,18 @@ def shared(*names: str, **changes: Any) -> Callable[[F], F]:
 def build_options(command: F) -> F:
     """Give a command the options of a build; it passes them on to `parse_request`."""
     return shared(*_BUILD)(command)
+
+
+def postprocessing_options(command: F) -> F:
+    """Give a command the `--set` of what is decided after the simulation."""
+    text = _set_text("a setting of the filters or the split", "filters.outlier_sigma=3")
+    again = "Filters of your own must be given again: filters.own=FILE.py:NAME."
+    return shared("--set", help=f"{text} {again}")(command)
+
+
+def scenes_options(command: F) -> F:
+    """Give a command the `--set` of the scenes."""
+    return shared("--set", help=_set_text("a key of `scenes`", "scenes.views=8"))(command)
 
 
 def tls_options(command: F) -> F:

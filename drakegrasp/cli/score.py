@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from drakegrasp.cli.errors import say
+from drakegrasp.cli.help import Command
 from drakegrasp.cli.options import PATH, PathType, chosen_workers, connection_options, shared
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ EXISTING = PathType(path_type=Path, exists=True)
 DEFAULT_FOLDER = Path("score")
 
 
-@click.command()
+@click.command(cls=Command)
 @click.argument("predictions", type=EXISTING, metavar="[PREDICTIONS]...", nargs=-1)
 @click.option(
     "--dataset",
@@ -189,7 +190,7 @@ def _command(
     return shlex.join(words)
 
 
-@click.command("bench-set")
+@click.command("bench-set", cls=Command)
 @click.argument("out", type=PATH, metavar="OUT")
 @shared("--only", "--set")
 @connection_options

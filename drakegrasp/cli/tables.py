@@ -22,7 +22,7 @@ from drakegrasp.dataset.statistics import (
     Unfinished,
     held_note,
 )
-from drakegrasp.errors import printable
+from drakegrasp.errors import counted, printable
 from drakegrasp.objects.audit import AuditRow
 from drakegrasp.objects.memory import needed_limit
 from drakegrasp.outcomes import Outcome, Removal
@@ -88,10 +88,11 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
     heads += ["+ refined"] if funnel.refined.any() else []
     table = _table("From palm poses to samples", "object", *heads, "samples")
     if funnel.refined.any():
-        tried, held, samples = (f"{n:,}" for n in funnel.refined.sum(axis=0).tolist())
+        tried, held, samples = funnel.refined.sum(axis=0).tolist()
         table.caption = (
-            f"refined: palm poses about those of samples, {tried} attempts, {held} held, {samples} "
-            "samples; all other columns but the last are of the first round"
+            f"refined: palm poses about those of samples, {counted(tried, 'attempt')}, "
+            f"{held:,} held, {counted(samples, 'sample')}; all other columns but the last are of "
+            "the first round"
         )
 
     def row(objects: slice) -> list[str]:
@@ -185,9 +186,8 @@ def split_line(rule: str, funnel: Funnel, counts: Sequence[SplitCount]) -> str:
     total = np.count_nonzero(funnel.samples)
     # By class the objects that validate are those that train.
     valid = f", {objects['valid']:,} valid" if rule == "object" else ""
-    return (
-        f"split by {rule}: {total:,} objects with samples, {objects['test']:,} of them test{valid}"
-    )
+    some = counted(int(total), "object")
+    return f"split by {rule}: {some} with samples, {objects['test']:,} of them test{valid}"
 
 
 def barren_lines(funnel: Funnel, config: Config) -> list[str]:
@@ -196,8 +196,8 @@ def barren_lines(funnel: Funnel, config: Config) -> list[str]:
         f"no sample of {_safe(name)}: {found.reason}. What may help: {found.advice}"
         for name, found in objects_without_samples(funnel, config).items()
     ]
-    more = [f"no sample of {len(why) - BARREN:,} other objects"] if len(why) > BARREN else []
-    return why[:BARREN] + more
+    left = len(why) - BARREN
+    return why[:BARREN] + ([f"no sample of {counted(left, 'other object')}"] if left > 0 else [])
 
 
 def unfinished_line(unfinished: Unfinished) -> str:
@@ -265,7 +265,7 @@ def audit_line(rows: Sequence[AuditRow]) -> str:
     counts = Counter(row.status for row in rows)
     told = ", ".join(f"{counts[status]} {status}" for status in ("fit", "repaired", "refused"))
     warned = sum(bool(row.warnings) for row in rows)
-    return f"{len(rows)} meshes: {told}; {warned} with a warning (!)"
+    return f"{counted(len(rows), 'mesh', 'meshes')}: {told}; {warned} with a warning (!)"
 
 
 def memory_line(rows: Sequence[AuditRow]) -> str:

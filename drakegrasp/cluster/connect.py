@@ -19,6 +19,7 @@ from drakegrasp.cluster.local import PrivateCluster, undisturbed_loop
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.runtime.allocator import PRELOAD, SETTINGS, kept_variables
 from drakegrasp.runtime.environment import available_cores
+from drakegrasp.runtime.executor import refuse_to_start_workers
 
 #: How long to wait for a scheduler to answer [s].
 CONNECT_SECONDS = 10
@@ -153,6 +154,7 @@ def _address_of(file: Path) -> str | None:
 def _start_local(
     workers: int | None, security: Security | None, memory: str | None
 ) -> Iterator[Client]:
+    refuse_to_start_workers()
     with undisturbed_loop() as loop:
         try:
             cluster = PrivateCluster(
@@ -161,7 +163,7 @@ def _start_local(
         except RuntimeError as error:
             raise MachineError(
                 f"worker processes must start, got: {error}; in a script, the call must be under "
-                "if __name__ == '__main__'"
+                'if __name__ == "__main__":'
             ) from None
         with closing_cluster(cluster), Client(cluster) as client:
             yield client

@@ -20,6 +20,9 @@ from drakegrasp.frames import Array
 from drakegrasp.outcomes import Removal
 from drakegrasp.runtime.user_code import own_class, run_own
 
+#: The setting that names filters of the user's own.
+_OWN = "filters.own"
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Successes:
@@ -172,8 +175,19 @@ def own_filters(config: FilterConfig) -> list[type[Any]]:
         ConfigError: If one cannot be imported, or is of another signature.
     """
     return [
-        own_class(name, config.code, method="keep", takes=("successes",)) for name in config.own
+        own_class(name, config.code, key=_OWN, method="keep", takes=("successes",))
+        for name in config.own
     ]
+
+
+def own_setting(config: FilterConfig) -> str:
+    """Return the setting `KEY=VALUE` that gives the user's own filters again; empty without any.
+
+    A dataset knows their files by name and no folder.
+    """
+    names = [name.partition("@")[0] for name in config.own]
+    value = names[0] if len(names) == 1 else f"[{', '.join(names)}]"
+    return f"{_OWN}={value}" if names else ""
 
 
 def _removed_by_own(config: FilterConfig, successes: Successes) -> npt.NDArray[np.bool_]:

@@ -560,7 +560,7 @@ def with_postprocessing(manifest: Manifest, overrides: Sequence[str]) -> Manifes
     config = override_config(manifest.config, overrides)
     if config.simulation_hash() != manifest.config.simulation_hash():
         raise ConfigError(
-            "assemble may change values of filters and split only, got one that changes what was "
+            "only values of filters and split can change, got one that changes what was "
             f"simulated: {differences(manifest.config, config)}"
         )
     return replace(manifest, config=config)

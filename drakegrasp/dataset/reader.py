@@ -96,7 +96,8 @@ class GraspDataset:
             split is refused. `Sample.fingers` says which are there.
 
     Attributes:
-        path, split: As given.
+        path: Of the file, absolute: the working directory may change.
+        split: As given.
         camera: Camera of the images and of the grasps' frame, `oto` or `otm`.
         K: Camera matrix (3, 3) [px].
         image_size: Edge of the square images [px].
@@ -115,7 +116,7 @@ class GraspDataset:
     ) -> None:
         if split not in SPLITS:
             raise DataError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
-        self.path, self.split = Path(path), split
+        self.path, self.split = Path(path).absolute(), split
         self._file: h5py.File | None = None
         self._fields: dict[str, h5py.Dataset | ImageRows | npt.NDArray[Any]] = {}
         self._process = -1

@@ -27,7 +27,7 @@ from drakegrasp.dataset.manifest import read_manifest, refuse_older
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import NO_PRESHAPE, SCHEMA_VERSION, SPLITS
 from drakegrasp.dataset.trials import Trials
-from drakegrasp.errors import DataError, HandError
+from drakegrasp.errors import DataError, HandError, counted
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
 from drakegrasp.outcomes import Outcome, Removal
@@ -241,15 +241,15 @@ def funnel_of(trials: Trials) -> Funnel:
         _count(removals, (number[decided], removal[decided]))
 
         held_by = (first, first & held, first & held & block["stable"], first & sample)
-        for column, counted in zip(preshapes.T, (*held_by, ~first & sample), strict=True):
-            _count(column, block["preshape"][counted])
+        for column, chosen in zip(preshapes.T, (*held_by, ~first & sample), strict=True):
+            _count(column, block["preshape"][chosen])
 
         # What was refined from it, and what became of those that were lifted in any case.
-        for column, counted in zip(refined.T, (True, held, sample), strict=True):
-            _count(column, number[~first & counted])
+        for column, chosen in zip(refined.T, (True, held, sample), strict=True):
+            _count(column, number[~first & chosen])
         fair, lifted = first & block["audited"], np.isfinite(block["slip"])
-        for column, counted in zip(audited.T, (lifted, held, block["stable"], sample), strict=True):
-            _count(column, number[fair & counted])
+        for column, chosen in zip(audited.T, (lifted, held, block["stable"], sample), strict=True):
+            _count(column, number[fair & chosen])
 
     return Funnel(
         names=tuple(names.tolist()),
@@ -305,7 +305,7 @@ def held_note(funnel: Funnel) -> str:
         lifts, held, stable, samples = funnel.audited.sum(axis=0).tolist()
         # Before the files are assembled nobody knows what is a sample.
         found = [f"{held:,} are held", f"{stable:,} stable"]
-        found += [f"{samples:,} samples"] if funnel.removals.any() else []
+        found += [counted(samples, "sample")] if funnel.removals.any() else []
         reasons.append(
             f"closed hands that were not lifted, as their chance of a sample is small or their "
             f"image too flat: {left:,}; "

@@ -70,7 +70,7 @@ class Trials:
     """
 
     def __init__(self, out: str | Path, *, any_name: bool = False) -> None:
-        self._files = whole_file(Path(out), any_name)
+        self._files = whole_file(Path(out).absolute(), any_name)
         self._rows: npt.NDArray[np.int64] | None = None
 
     @classmethod
@@ -94,7 +94,7 @@ class Trials:
 
     @property
     def path(self) -> Path:
-        """The directory of the dataset, or its trials.hdf5, as it was given."""
+        """The directory of the dataset, or its trials.hdf5, absolute."""
         return self._files.out
 
     @property

@@ -192,7 +192,7 @@ def load_hand(source: HandSource = "barrett") -> Hand:
     """
     # Use a hand that was loaded before, if its files did not change.
     path = hand_file(source)
-    key = source if isinstance(source, CarriedHand) else path
+    key = source if isinstance(source, CarriedHand) else path.absolute()
     known = _loaded.pop(key, None)
     if known is not None and known[0].model.stamp == _stamp(known[1]):
         _loaded[key] = known

@@ -14,11 +14,12 @@ import numpy as np
 import numpy.typing as npt
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
+from drakegrasp.dataset.filters import own_setting
 from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.rejections import FILE_NAME, Decisions
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.suspicion import PARTS
-from drakegrasp.errors import printable
+from drakegrasp.errors import counted, printable
 from drakegrasp.inspection.catalog import Snapshot
 from drakegrasp.inspection.forms import attempt_form
 from drakegrasp.inspection.links import Links
@@ -47,6 +48,7 @@ TEMPLATES = Environment(
 )
 #: Colours of fingers, and of kinds of contacts in the order in which they are drawn.
 TEMPLATES.globals["colours"] = FINGER_COLOURS
+TEMPLATES.globals["counted"] = counted
 TEMPLATES.globals["kinds"] = {"true": TRUE, "asked": PREDICTED, "reached": REACHED}
 
 
@@ -135,9 +137,14 @@ def neighbours(chosen: Places, i: int, address: Callable[[int], str]) -> dict[st
 
 
 def decision_values(snapshot: Snapshot, decisions: Decisions) -> dict[str, Any]:
-    """Return how much is decided, and the command that takes rejected grasps out."""
+    """Return how much is decided, and the command that takes rejected grasps out.
+
+    Filters of the user's own are given to it again: a dataset has their names alone.
+    """
     out = snapshot.out
     words = ["drakegrasp", "assemble", str(out), "--reject", str(out / FILE_NAME)]
+    if own := own_setting(snapshot.config.filters):
+        words += ["--set", own]
     return {
         "counts": count_decisions(snapshot, decisions),
         "assemble": shlex.join(words),

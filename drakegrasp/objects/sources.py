@@ -248,7 +248,7 @@ def _source(path: Path, stem: str, table: _Manifest, units: str) -> MeshSource:
     said = entry.model_dump(exclude={"units", "scale"}, exclude_none=True)
     usual = {"name": stem, "class_name": _class_of(stem), "licence": table.licence}
     scale = UNITS[entry.units or table.units or units] * entry.scale
-    return MeshSource(path=path, scale=scale, **(usual | said))
+    return MeshSource(path=path.absolute(), scale=scale, **(usual | said))
 
 
 def _refuse_units(units: str) -> None:

@@ -150,7 +150,7 @@ def find_protocol(name: str, code: Mapping[str, str] | None = None) -> tuple[Pro
         code = {stored: text}
     else:
         stored = name
-    found = own_class(stored, code, method="run", takes=("scene", "motion"))
+    found = own_class(stored, code, key="protocol", method="run", takes=("scene", "motion"))
     made = run_own(stored, found)
     if not isinstance(made, MujocoProtocol):
         raise ConfigError(f"{name}: must be a subclass of MujocoProtocol, got {found.__name__}")

@@ -12,7 +12,7 @@ import ctypes
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -89,17 +89,20 @@ def _serves(preload: str, settings: str) -> bool:
 
 
 def restart_with_jemalloc() -> None:
-    """Start this program again with jemalloc, where it is there and this process has another.
-
-    Call it before anything is opened or started: nothing of this process remains but its number.
-    """
+    """Start this program again with jemalloc, where it is there and this process has another."""
     if has_jemalloc() or "libjemalloc" in os.environ.get(PRELOAD, ""):
         return
     found = jemalloc_environment()
     if found:
-        # As it was called, with Python's own options.
-        arguments = [sys.executable, *sys.orig_argv[1:]]
-        os.execve(sys.executable, arguments, {**os.environ, **found})
+        restart(found)
+
+
+def restart(variables: Mapping[str, str]) -> None:
+    """Start this program again as it was called, with Python's own options.
+
+    Call it before anything is opened or started: nothing of this process remains but its number.
+    """
+    os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], {**os.environ, **variables})
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -105,6 +106,28 @@ def count_workers(workers: int | None) -> int:
     return available_cores() if workers is None else workers
 
 
+def refuse_to_start_workers() -> None:
+    """Refuse to start processes where they cannot start, whatever the caller's script looks like.
+
+    Raises:
+        MachineError: If this process may have no children, or its script is no file, which each
+            process that Python starts would import.
+    """
+    if multiprocessing.current_process().daemon:
+        raise MachineError(
+            "workers must be started by a process that may have children, got one of a "
+            "multiprocessing Pool or a Dask worker: make the call outside of it, under "
+            'if __name__ == "__main__":'
+        )
+    main = sys.modules["__main__"]
+    script = getattr(main, "__file__", None)
+    if getattr(main, "__spec__", None) is None and script and not os.path.isfile(script):
+        raise MachineError(
+            f"a script that starts workers must be a file, as each of them imports it, got "
+            f'{script}: save it, with the call under if __name__ == "__main__":'
+        )
+
+
 @contextmanager
 def processes(workers: int | None = None) -> Iterator[Executor]:
     """Run tasks in processes of this machine while the block runs; one worker is this process.
@@ -150,7 +173,7 @@ class _PoolExecutor:
         """Yield function(item) of every item as they are done.
 
         Raises:
-            MachineError: If a process died.
+            MachineError: If a process died or cannot start.
             Exception: What the function raised.
         """
         remaining, pending = iter(items), set[Future[R]]()
@@ -160,6 +183,7 @@ class _PoolExecutor:
             while True:
                 for item in islice(remaining, self.in_flight - len(pending)):
                     # The first submission starts the processes.
+                    refuse_to_start_workers()
                     with _interrupts_blocked():
                         pending.add(self.pool.submit(function, item))
                 if not pending:

@@ -47,6 +47,7 @@ def own_class(
     stored: str,
     code: Mapping[str, str],
     *,
+    key: str,
     arguments: Sequence[str] = (),
     method: str,
     takes: Sequence[str] = (),
@@ -56,6 +57,7 @@ def own_class(
     Args:
         stored: Its name in a configuration.
         code: Text of the file by such names; empty for what was read from a dataset.
+        key: The setting that names the class.
         arguments: Of its constructor, by position.
         method: What its instances must have.
         takes: Arguments of the method, by position.
@@ -66,8 +68,8 @@ def own_class(
     """
     if stored not in code:
         raise ConfigError(
-            f"{stored}: must be given again as FILE.py:NAME, because code of a dataset is never "
-            "imported, got its name alone"
+            f"{stored}: must be given again, --set {key}=FILE.py:NAME, because code of a dataset "
+            "is never imported, got its name alone"
         )
     found = _import(stored, code[stored])
     name = stored.partition("@")[0]

@@ -29,6 +29,7 @@ import trimesh
 
 from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
 from drakegrasp.config import CandidateConfig, RefineConfig
+from drakegrasp.errors import ConfigError
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.mesh.rays import first_hits
 from drakegrasp.mesh.surfaces import on_faces
@@ -40,6 +41,8 @@ from drakegrasp.simulation.sampling.rotations import above_table, make_poses, ro
 
 #: Surface points that `normals` draws together; another number is another draw.
 BLOCK = 1000
+#: Distance of a palm from the object from which on it must face it [m]; no hand is so large.
+FAR = 1.0
 #: Log-densities are multiples of this: the last bits of a logarithm depend on the machine.
 _DENSITY_GRID = 2.0**-32
 #: Last numbers of the places of streams: of a sampler at a resting pose, of a child, and of the
@@ -282,6 +285,9 @@ def sample_candidates(
         X_TO: Its resting poses in the table-top frame, (r, 4, 4), or one (4, 4).
         config: Samplers, rotations and number.
         seed: Of the dataset.
+
+    Raises:
+        ConfigError: If a sampler of the user's own cannot be run, or all its poses are far away.
     """
     # A sampler for each method at each resting pose; they take turns.
     resting = np.asarray(X_TO, dtype=float).reshape(-1, 4, 4)
@@ -300,9 +306,13 @@ def sample_candidates(
     poses = np.array([drawn[place][i] for place, i in turns]).reshape(-1, 4, 4)
     counts = [sampler.counts(used[place]) for place, sampler in samplers.items()]
     combinations, valid, distinct = (sum(numbers) for numbers in zip(*counts, strict=True))
+    distance = palm_ray_distance(model.collision, poses)
+    for method in set(config.methods) - SAMPLERS.keys():
+        of_method = [of == method for (_, of), _ in turns]
+        _refuse_far(method, model, poses[of_method], distance[of_method])
     return Candidates(
         X_OG=poses,
-        distance=palm_ray_distance(model.collision, poses),
+        distance=distance,
         resting=np.array([k for (k, _), _ in turns], dtype=np.int64),
         source=np.array([_source(method) for (_, method), _ in turns], dtype=np.int64),
         log_density=np.array([samplers[place].log_density for place, _ in turns], dtype=float),
@@ -310,6 +320,23 @@ def sample_candidates(
         valid=valid,
         distinct=distinct,
     )
+
+
+def _refuse_far(method: str, model: ObjectModel, poses: Array, distance: Array) -> None:
+    """Refuse a sampler of the user's own whose palms are all far away and do not face the object.
+
+    Raises:
+        ConfigError: If it is one, with the distance of the nearest.
+    """
+    if not len(poses) or np.isfinite(distance).any():
+        return
+    outside = np.maximum(np.abs(poses[:, :3, 3]) - model.half_extents, 0.0)
+    nearest = float(np.linalg.norm(outside, axis=1).min())
+    if nearest > FAR:
+        raise ConfigError(
+            f"{method.partition('@')[0]}: poses must be X_OG in metres, within {FAR:g} m of the "
+            f"object or facing it, got the nearest {nearest:.3g} m from {model.name}"
+        )
 
 
 def _sampler(method: str) -> Callable[[ObjectModel, Array, CandidateConfig, Stream], Sampler]:

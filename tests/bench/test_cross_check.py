@@ -56,7 +56,7 @@ def test_drawn_lifts_are_what_the_dataset_says(dataset):
 def test_drawn_lifts_have_their_own_friction_and_mass(tmp_path):
     (tmp_path / "meshes").mkdir()
     ranges = ("randomize.mass=[0.5,1.5]", "randomize.friction_hand=[0.7,1.3]")
-    out = make_dataset(tmp_path / "data", tmp_path / "meshes", *ranges)
+    out = make_dataset(tmp_path / "data", tmp_path / "meshes", overrides=ranges)
     lifts = draw_lifts(out, 10)
     with h5py.File(out / TRIALS) as file:
         for lift in lifts:
@@ -97,7 +97,7 @@ def test_draw_depends_on_the_seed_alone(dataset, tmp_path):
         return [lift.trial_id for lift in draw_lifts(out, 8)]
 
     assert drawn(dataset) == drawn(dataset)
-    other = make_dataset(tmp_path / "data", tmp_path, "seed=5")
+    other = make_dataset(tmp_path / "data", tmp_path, overrides=["seed=5"])
     assert drawn(other) != drawn(dataset)
 
 

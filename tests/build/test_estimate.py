@@ -68,7 +68,7 @@ def test_certificates_cost_their_trials() -> None:
 def test_a_plan_is_of_the_objects_that_are_named(tmp_path: Path) -> None:
     words = ("build", "--objects", "builtin", "--out", tmp_path / "out", "--plan", "--only")
     result = run(*words, "1_mug_1", "--only", "1_mug_1")
-    assert result.stdout.startswith("from the beginning: 1 objects, "), result.output
+    assert result.stdout.startswith("from the beginning: 1 object, "), result.output
     result = run(*words, "1_jug_1")
     assert (result.exit_code, result.stdout) == (2, "")
     assert error_line(result).endswith("got '1_jug_1'")

@@ -55,7 +55,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same under another seed. Read only."""
     folder = tmp_path_factory.mktemp("other")
-    return make_dataset(folder / "out", folder, "seed=1")
+    return make_dataset(folder / "out", folder, overrides=["seed=1"])
 
 
 @pytest.fixture
@@ -140,7 +140,7 @@ def test_a_hand_counts_by_its_files_and_not_by_their_folder(tmp_path: Path) -> N
     for seed in "01":
         folder = shutil.copytree(MODELS, tmp_path / f"hands{seed}")
         changed = (f"seed={seed}", f"hand={folder / 'barrett_hand.yaml'}")
-        outs.append(make_dataset(tmp_path / seed, tmp_path / "meshes", *changed))
+        outs.append(make_dataset(tmp_path / seed, tmp_path / "meshes", overrides=changed))
     merge(tmp_path / "into", outs)
     assert check_dataset(tmp_path / "into") == []
 
@@ -149,7 +149,8 @@ def test_a_hand_counts_by_its_files_and_not_by_their_folder(tmp_path: Path) -> N
 def test_a_mesh_under_two_seeds_is_in_one_split(rule: str, tmp_path: Path) -> None:
     split = f"split.by={rule}"
     outs = [
-        make_dataset(tmp_path / seed, tmp_path / "meshes", f"seed={seed}", split) for seed in "01"
+        make_dataset(tmp_path / seed, tmp_path / "meshes", overrides=[f"seed={seed}", split])
+        for seed in "01"
     ]
     merge(tmp_path / "into", outs)
     assert check_dataset(tmp_path / "into") == []
@@ -237,7 +238,7 @@ def with_manifest(edit: Callable[[dict], object]) -> Callable[[Path, Path], list
 
 def built_with(*overrides: str) -> Callable[[Path, Path], list[Path]]:
     def build_other(sound: Path, copy: Path) -> list[Path]:
-        return [sound, make_dataset(copy.parent / "b", copy.parent / "meshes", *overrides)]
+        return [sound, make_dataset(copy.parent / "b", copy.parent / "meshes", overrides=overrides)]
 
     return build_other
 
@@ -265,7 +266,7 @@ def under_another_seed(edit: Callable[[dict], object]) -> Callable[[Path, Path],
     """Return two datasets, the second of another seed and with another manifest."""
 
     def spoil(sound: Path, copy: Path) -> list[Path]:
-        other = make_dataset(copy.parent / "b", copy.parent / "meshes", "seed=1")
+        other = make_dataset(copy.parent / "b", copy.parent / "meshes", overrides=["seed=1"])
         return with_manifest(edit)(sound, other)
 
     return spoil

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import html
 import pickle
 import re
+import shlex
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import trimesh
+from helpers.commands import error_line, run
+from helpers.datasets import make_dataset
 from helpers.meshes import SMALL, write_fixed
 from helpers.successes import good
+from starlette.testclient import TestClient
 
 from drakegrasp.build.pipeline import build, refuse_unusable
 from drakegrasp.build.replay import replay_trial
@@ -20,8 +25,10 @@ from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.filters import judge_successes
 from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.hand.settings import load_config, override_config
+from drakegrasp.inspection.app import Inspection, make_app
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Removal
@@ -171,6 +178,58 @@ def test_what_is_no_pose_is_refused_in_one_line(
     with pytest.raises(ConfigError, match=message) as caught:
         draw(box, sampler(text))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("metres", [(0.0, 0.0, 100.0), (0.0, 0.0, 1.05), (80.0, -60.0, 0.0)])
+def test_a_sampler_far_away_is_told_how_far(
+    own: Path, box: ObjectModel, metres: tuple[float, float, float]
+) -> None:
+    pose = "X = np.eye(4); X[:3, 3] = {}; yield X"
+    wrong = r"^mine\.py:Mine: poses must be X_OG in metres, within 1 m .*nearest {:.3g} m from box$"
+    distance = np.linalg.norm(np.maximum(np.abs(metres) - box.half_extents, 0.0))
+    with pytest.raises(ConfigError, match=wrong.format(distance)):
+        draw(box, sampler(pose.format(metres)))
+    # One that faces the object is moved to its stand-offs, and one that is near may miss.
+    facing = f"X = np.diag([1.0, -1, -1, 1]); X[2, 3] = {metres[2] + 0.1}; yield X"
+    assert np.isfinite(draw(box, sampler(facing)).distance).all()
+    near = draw(box, sampler(pose.format((0.0, 0.0, 0.5))))
+    assert len(near) == 1 and np.isnan(near.distance).all()
+
+
+def test_a_set_with_filters_of_its_own_is_merged_and_assembled_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever runs them takes the same option, and so do the lines that other commands print."""
+    monkeypatch.chdir(tmp_path)
+    rule = "class {}:\n  def keep(self, successes): return successes.trial_id.argsort() % 2 == 0\n"
+    for name in ("Even", "Half"):
+        Path(f"{name.lower()}.py").write_text(rule.format(name))
+    own = "filters.own=[even.py:Even, half.py:Half]"
+    outs = [
+        make_dataset(tmp_path / seed, tmp_path / "meshes", overrides=[f"seed={seed}"])
+        for seed in "01"
+    ]
+    for out in outs:
+        assemble(out, overrides=[own])
+    refused = run("merge", "into", *outs)
+    assert refused.exit_code == 2
+    again = r"even\.py:Even@\w+: must be given again, --set filters\.own=FILE\.py:NAME, because"
+    assert re.search(again, error_line(refused))
+    assert not Path("into").exists()
+
+    merged = run("merge", "into", *outs, "--set", own)
+    assert merged.exit_code == 0, merged.output
+    assert check_dataset(Path("into")) == []
+
+    # The line that the page prints, as it is.
+    write_decisions(Path("into/reject.json"), Decisions(rejected={AttemptKey("2_box_b", 0, 0)}))
+    with TestClient(make_app(Inspection(Path("into"))), base_url="http://localhost") as client:
+        (line,) = re.findall(r"<code[^>]*>drakegrasp (assemble .*?)</code>", client.get("/").text)
+    done = run(*shlex.split(html.unescape(line)))
+    assert done.exit_code == 0, done.output
+    kept = read_manifest(Path("into"))
+    assert [key.object for key in kept.rejected] == ["2_box_b"]
+    assert len(kept.config.filters.own) == 2
 
 
 @pytest.mark.parametrize("name", WRONG_FILTERS)

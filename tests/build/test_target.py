@@ -126,7 +126,7 @@ def test_shortfall_names_what_was_tried_to_its_end() -> None:
 def test_shortfall_tells_how_many_there_are_of_a_total() -> None:
     target = make_target(1000)
     run(target)
-    assert target.shortfall()[0] == "228 samples were found of 1,000"
+    assert target.shortfall()[0] == "228 of 1,000 samples were found"
 
 
 def test_grasps_and_samples_are_not_both_an_end() -> None:

@@ -64,7 +64,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sound dataset with meshes, a hand file, decisions and predictions."""
     base = tmp_path_factory.mktemp("sound")
     (base / "meshes").mkdir()
-    out = make_dataset(base / "out", base / "meshes", *CERTIFIED)
+    out = make_dataset(base / "out", base / "meshes", overrides=CERTIFIED)
     manifest = json.loads((out / MANIFEST).read_text())
     del manifest["sha256"]  # other rules find what is wrong
     key = {"object": "1_box_a", "candidate": 0, "standoff_index": 0}
@@ -260,7 +260,7 @@ def test_log_is_skipped_where_no_build_wrote_it(base: Path, tmp_path: Path) -> N
     sound = "".join(f"{json.dumps(event)}\n" for event in (started, {**done, **seconds}))
     (out / LOG).write_text(sound)
     expected = run(COMMANDS["build --plan"], **places)
-    assert "3 attempts of 1 objects" in expected.stdout
+    assert "3 attempts of 1 object " in expected.stdout
     wrong = {}
     for kind in manifests.LOG:
         (out / LOG).write_text(sound)

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -236,6 +237,34 @@ def test_few_crashes_are_no_error(whole: Path) -> None:
     for crashed, said in ((9, 0), (1, 1)):
         counts.add(header, {Outcome.SUCCESS: 100, Outcome.CRASHED: crashed})
         assert len(counts.unexplained()) == said
+
+
+@pytest.mark.parametrize(
+    ("ends", "expected"),
+    [
+        ({}, 36),
+        ({"samples": 10}, 15),  # two of ten after three attempts
+        ({"samples": 1000}, 36),  # all palm poses end before
+        ({"samples_per_object": 1}, 9),  # one object of three has its sample
+        ({"max_grasps": 1}, 9),
+        ({"samples": 2, "samples_per_object": 4}, 3),  # the first end is there
+    ],
+)
+def test_bar_ends_where_the_build_does(whole: Path, ends: dict[str, int], expected: int) -> None:
+    """A time left that is by all attempts would be hours beside a target that is met in seconds."""
+    manifest, shown = read_manifest(whole), dict[str, int]()
+
+    def report(done: int, total: int, *, found: int = 0, **figures: int) -> None:
+        shown.update(done=done, total=total, **figures)
+
+    changed = manifest.config.model_copy(update=ends)
+    counts = Counts(replace(manifest, config=changed), None, report)
+    header = replace(next(manifest.headers()), start=0, stop=1)
+    samples = None if "max_grasps" in ends else 2
+    counts.add(header, {Outcome.SUCCESS: 2, Outcome.RAY_MISS: 1}, samples=samples)
+    assert (shown["done"], shown["total"]) == (3, expected)
+    if "samples" in ends:
+        assert shown[f"of {ends['samples']:,} samples"] == 2
 
 
 @pytest.mark.parametrize("address", ["", " "])

@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+from helpers import datasets
 from helpers.assertions import arrays_of
 from helpers.commands import error_line, run
 from helpers.datasets import make_dataset
@@ -28,10 +29,14 @@ from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.frames import make_pose
+from drakegrasp.hand.settings import load_config
 from drakegrasp.protocols.protocol import Simulator
 from drakegrasp.shapes.catalog import BuiltinObject
 from drakegrasp.verification.prediction import FRAMES
 from drakegrasp.verification.verify import METHODS
+
+#: Commands that take any setting of a configuration.
+SETTINGS_OF = ("build", "verify", "score", "bench-set", "bench")
 
 
 def test_help_answers_without_loading_the_simulator() -> None:
@@ -43,6 +48,72 @@ def test_help_answers_without_loading_the_simulator() -> None:
         "assert not heavy & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+@pytest.mark.parametrize(
+    "locale",
+    [
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "latin-1"},
+        {"PYTHONIOENCODING": "latin-1"},
+    ],
+    ids=" ".join,
+)
+def test_a_name_that_the_locale_cannot_encode_is_no_error(
+    locale: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of files and folders as well as on the terminal, which shows ? for it."""
+    monkeypatch.setattr(datasets, "BOXES", {"0_\u7897\u2192": ((0.06, 0.05, 0.1), "box")})
+    out = make_dataset(tmp_path / "Sch\u00fcssel \u2192", tmp_path / "meshes")
+    for command in ("check", "stats"):
+        done = subprocess.run(
+            [sys.executable, "-m", "drakegrasp", command, os.fspath(out)],
+            env={**os.environ, **locale},
+            capture_output=True,
+        )
+        assert done.returncode == 0, done.stderr
+        assert b"Traceback" not in done.stderr
+    # Drake reads its own files by the locale.
+    code = (
+        "from drakegrasp.cli import main as cli; "
+        "cli.main = lambda: __import__('pydrake.common'); cli.run()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, **locale}, capture_output=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_options_of_clusters_come_last() -> None:
+    """A newcomer reads those of everyday first."""
+    for name in ("build", "verify", "score", "bench-set"):
+        daily, cluster = run(name, "--help").stdout.split("\nCluster options:\n")
+        for option in ("--scheduler ", "--scheduler-file", "--tls ", "--tls-ca-file", "--tls-key"):
+            assert option in cluster and option not in daily, (name, option)
+        assert {"--workers", "--quiet", "--help"} <= set(re.findall(r"--[a-z-]+", daily))
+    assert "\nCommands:\n" in run("--help").stdout
+
+
+@pytest.mark.sim
+def test_examples_in_help_texts_are_taken(sound: Path, tmp_path: Path) -> None:
+    """Each `KEY=VALUE` that a help text shows is one that its command does not refuse."""
+    found = {}
+    for name, command in main.commands.items():
+        for option in command.params:
+            text = getattr(option, "help", None) or ""
+            for example in re.findall(r"(?:e\.g\.|as in --set) ([\w.]+=\w+)", text):
+                found[name] = example
+    assert found.keys() == {*SETTINGS_OF, "assemble", "merge", "scenes"}
+    for name in SETTINGS_OF:
+        assert load_config(overrides=[found[name]])
+    out = Path(shutil.copytree(sound, tmp_path / "out"))
+    for name, words in (
+        ("assemble", [out]),
+        ("merge", [tmp_path / "into", sound]),
+        ("scenes", [out]),
+    ):
+        result = run(name, *words, "--set", found[name])
+        assert result.exit_code == 0, result.output
 
 
 @pytest.mark.parametrize(
@@ -201,10 +272,10 @@ def test_build_reports_and_says_when_nothing_is_left_to_do(
     command += ["--workers", "1", "--candidates", "4", "--quiet"]
     first = run(*command)
     assert first.exit_code == 0, first.output
-    assert "1 work units simulated" in first.stdout
+    assert "1 work unit simulated" in first.stdout
     assert "grasping_oto.hdf5" in first.stdout
     second = run(*command)
-    assert "all 1 work units had been done before: nothing was simulated" in second.stdout
+    assert "all 1 work unit had been done before: nothing was simulated" in second.stdout
 
 
 @pytest.mark.sim

@@ -29,7 +29,7 @@ DRAWN = [
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset with drawn friction and mass. Read only."""
     folder = tmp_path_factory.mktemp("drawn")
-    return make_dataset(folder / "out", folder, *DRAWN)
+    return make_dataset(folder / "out", folder, overrides=DRAWN)
 
 
 def request(out: Path, **options: object) -> VerifyRequest:
@@ -142,7 +142,7 @@ def test_a_hand_whose_files_have_changed_is_refused_unless_it_is_named(
     monkeypatch.chdir(tmp_path)
     config = load_config(overrides=[f"hand={hand.name}"])
     assert config.hand == str(hand) == load_config(hand=hand.name).hand
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes", f"hand={hand.name}")
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=[f"hand={hand.name}"])
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     grasps, used = place_requested(request(out))

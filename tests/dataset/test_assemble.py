@@ -63,7 +63,7 @@ def test_assembling_again_gives_the_same_bytes(out: Path) -> None:
 def test_shard_without_a_success_has_trials_only(tmp_path: Path) -> None:
     """The third of the four candidates fails at each stand-off: its shard has no success."""
     (tmp_path / "meshes").mkdir()
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes", "unit_candidates=1")
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=["unit_candidates=1"])
     assert len(list(out.glob("shards/*/*.h5"))) == 12
     assert assemble(out).removed == {Removal.KEPT: 9}
 
@@ -225,7 +225,9 @@ def test_limits_of_the_hold_change_without_a_simulation(out: Path) -> None:
 @pytest.mark.parametrize("override", ["filters.require=held", "filters.max_slip=null"])
 def test_filters_that_lifts_were_ended_by_cannot_be_looser(tmp_path: Path, override: str) -> None:
     """Of the lifts that ended nobody knows whether they would be samples then."""
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes", "lift.stop_when=lost_sample")
+    out = make_dataset(
+        tmp_path / "out", tmp_path / "meshes", overrides=["lift.stop_when=lost_sample"]
+    )
     before = {path: path.read_bytes() for path in out.iterdir() if path.is_file()}
     with pytest.raises(ConfigError, match=rf"{override.partition('=')[0]} must be"):
         assemble(out, overrides=[override])

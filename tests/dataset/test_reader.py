@@ -57,6 +57,17 @@ def data_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_data_file(tmp_path_factory.mktemp("data") / "grasping_oto.hdf5", range(5))
 
 
+def test_the_working_directory_may_change(
+    data_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A loader is often made by a script that goes elsewhere before the first batch."""
+    monkeypatch.chdir(data_file.parent)
+    data = GraspDataset(data_file.name)
+    monkeypatch.chdir(tmp_path)
+    assert data[0].trial_id == GraspDataset(data_file)[0].trial_id
+    assert pickle.loads(pickle.dumps(data)).path == data_file
+
+
 def test_samples_come_by_index(data_file: Path) -> None:
     data = GraspDataset(data_file, split="train")
     assert len(data) == 5

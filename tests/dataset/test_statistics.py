@@ -154,6 +154,6 @@ def test_splits_are_counted(out: Path) -> None:
 def test_objects_of_one_class_are_one_class(tmp_path: Path) -> None:
     """Two objects of three are boxes, and all three train."""
     shares = ("split.by=object", "split.test_fraction=0", "split.valid_fraction=0")
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes", *shares)
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=shares)
     (train,) = (count for count in count_splits(out) if count.split == "train")
     assert (train.samples, train.objects, train.classes) == (9, 3, 2)

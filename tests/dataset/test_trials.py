@@ -244,3 +244,12 @@ def test_attempts_in_shards_are_those_of_the_file(sound: Path) -> None:
     assert (building["split"] == NONE).all()
     part, row = building.part_of(15)
     assert (part.header, row) == (parts[2].header, 3)
+
+
+def test_the_working_directory_may_change(
+    sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(sound.parent)
+    trials = Trials(sound.name)
+    monkeypatch.chdir(tmp_path)
+    assert len(trials.columns(("outcome",))["outcome"]) == len(trials)

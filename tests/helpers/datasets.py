@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
@@ -265,9 +265,9 @@ _KEPT = TemporaryDirectory(prefix="datasets-")
 CERTIFIED = ("certify.repeats=4", "certify.share_others=0.5")
 
 
-def make_dataset(out: Path, meshes: Path, *overrides: str) -> Path:
+def make_dataset(out: Path, meshes: Path, *, overrides: Iterable[str] = ()) -> Path:
     """Write the small dataset, with some values of the configuration, and its meshes."""
-    kept_out, kept_meshes = _made(overrides, tuple(BOXES))
+    kept_out, kept_meshes = _made(tuple(overrides), tuple(BOXES))
     shutil.copytree(kept_out, out, dirs_exist_ok=True)
     shutil.copytree(kept_meshes, meshes, dirs_exist_ok=True)
     return out

@@ -440,7 +440,7 @@ def test_page_of_a_grasp_has_friction_certificate_and_text_to_copy(
 
 
 def test_p_hold_is_shown_and_filtered_by(tmp_path: Path) -> None:
-    out = make_dataset(tmp_path / "certified", tmp_path, *CERTIFIED)
+    out = make_dataset(tmp_path / "certified", tmp_path, overrides=CERTIFIED)
     change(out, TRIALS, "trials/p_hold_samples", 0, lambda _: 1)
     client = TestClient(make_app(Inspection(out)), base_url="http://127.0.0.1:8321")
     page = get(client, "/grasp/0-0-0").text

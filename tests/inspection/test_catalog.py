@@ -257,7 +257,7 @@ def test_files_of_an_earlier_state_are_told(out: Path, monkeypatch: pytest.Monke
 @pytest.mark.parametrize("wanted", [1, 2])
 def test_attempts_beyond_the_wanted_grasps_are_not_shown(tmp_path: Path, wanted: int) -> None:
     """Assembly takes none of them, so they cannot be rejected either."""
-    out = make_dataset(tmp_path / "out", tmp_path, f"max_grasps={wanted}")
+    out = make_dataset(tmp_path / "out", tmp_path, overrides=[f"max_grasps={wanted}"])
     assembled = Catalog(out).current().table
     build_again(out)
     building = Catalog(out).current().table

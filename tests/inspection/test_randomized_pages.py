@@ -25,7 +25,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The boxes, each attempt with a mass and cameras of its own. Read only."""
     folder = tmp_path_factory.mktemp("drawn")
     draws = ("mass=[0.5, 1.5]", "camera_shift=0.02", "camera_turn_deg=10")
-    return make_dataset(folder / "out", folder, *(f"randomize.{draw}" for draw in draws))
+    return make_dataset(folder / "out", folder, overrides=[f"randomize.{draw}" for draw in draws])
 
 
 def imbalance(out: Path) -> np.ndarray:
@@ -52,7 +52,9 @@ def test_the_filters_of_suspicion_are_of_the_drawn_mass(drawn: Path, tmp_path: P
         values = imbalance(drawn)[file["successes/trial_id"][:]]
     limit = float(np.median(values))
     draw = "randomize.mass=[0.5, 1.5]"
-    out = make_dataset(tmp_path / "out", tmp_path, draw, f"filters.max_imbalance={limit}")
+    out = make_dataset(
+        tmp_path / "out", tmp_path, overrides=[draw, f"filters.max_imbalance={limit}"]
+    )
     with h5py.File(out / TRIALS) as file:
         np.testing.assert_array_equal(file["successes/removal"][:] == 12, values > limit)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -14,6 +15,7 @@ from typing import TypeVar
 
 import pytest
 
+from drakegrasp.cluster.connect import connect
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.runtime import executor
 from drakegrasp.runtime.executor import in_order, processes
@@ -88,6 +90,45 @@ def test_results_come_in_the_order_of_the_items() -> None:
     next(results)
     results.close()  # type: ignore[attr-defined]
     assert taken[-1] == "closed"
+
+
+GUARDED = """
+from drakegrasp.errors import MachineError
+from drakegrasp.runtime.executor import processes
+if __name__ == "__main__":
+    try:
+        with processes(2) as execute:
+            list(execute(abs, [1.0] * 60))
+    except MachineError as error:
+        print(error)
+"""
+
+
+def test_script_that_is_no_file_is_told_to_be_one() -> None:
+    """Its guard is there, and no other would help."""
+    done = subprocess.run([sys.executable, "-"], input=GUARDED, capture_output=True, text=True)
+    assert done.stdout == (
+        "a script that starts workers must be a file, as each of them imports it, got <stdin>: "
+        'save it, with the call under if __name__ == "__main__":\n'
+    )
+
+
+def refusals(_: int) -> list[str]:
+    """Return how this process refuses to start workers, of both kinds."""
+    with pytest.raises(MachineError) as caught, processes(2) as execute:
+        list(execute(abs, [1]))
+    first = str(caught.value)
+    with pytest.raises(MachineError) as caught, connect(1):
+        pass
+    return [first, str(caught.value)]
+
+
+def test_worker_of_a_pool_is_told_to_start_none() -> None:
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        ((first, second),) = pool.map(refusals, [0])
+    assert first == second
+    assert first.startswith("workers must be started by a process that may have children, got one")
+    assert 'under if __name__ == "__main__":' in first
 
 
 def test_process_that_dies_is_one_error() -> None:

@@ -179,7 +179,7 @@ def test_all_objects_test(part: Path) -> None:
 def test_a_card_says_whether_all_rows_are_the_published_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out = make_dataset(tmp_path / "out", tmp_path, "split.train_classes=[]")
+    out = make_dataset(tmp_path / "out", tmp_path, overrides=["split.train_classes=[]"])
     (out / BUILTIN_FOLDER).mkdir()
     about = {"objects": 3, "of": 3, "different_meshes": []}
     (out / BUILTIN_FOLDER / BENCHMARK_FILE).write_text(json.dumps(about))

@@ -47,7 +47,7 @@ def camera_poses(data: GraspDataset, rows: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> GraspDataset:
     folder = tmp_path_factory.mktemp("scored")
-    out = make_dataset(folder / "out", folder / "meshes", "split.by=class")
+    out = make_dataset(folder / "out", folder / "meshes", overrides=["split.by=class"])
     return GraspDataset(out / OTO, split="test")
 
 

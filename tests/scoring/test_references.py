@@ -16,7 +16,7 @@ from drakegrasp.scoring.references import REFERENCES, Scene
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     folder = tmp_path_factory.mktemp("scene")
-    out = make_dataset(folder / "out", folder / "meshes", "split.by=class")
+    out = make_dataset(folder / "out", folder / "meshes", overrides=["split.by=class"])
     data = GraspDataset(out / OTO, split="test")
     return Scene(
         data=data, rows=list(range(len(data))), train=GraspDataset(out / OTO, split="train")

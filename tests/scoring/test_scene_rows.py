@@ -26,7 +26,7 @@ pytestmark = pytest.mark.sim
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scenes")
-    out = make_dataset(folder / "out", folder / "meshes", "split.by=class")
+    out = make_dataset(folder / "out", folder / "meshes", overrides=["split.by=class"])
     return make_scenes(out, overrides=["scenes.views=3"]).path
 
 

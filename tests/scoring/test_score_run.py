@@ -27,7 +27,7 @@ from drakegrasp.verification.placed_grasp import dataset_config, place_on_rows
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> GraspDataset:
     folder = tmp_path_factory.mktemp("scored")
-    out = make_dataset(folder / "out", folder / "meshes", "split.by=class")
+    out = make_dataset(folder / "out", folder / "meshes", overrides=["split.by=class"])
     return GraspDataset(out / OTO, split="test")
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from drakegrasp.cli.errors import say
+from drakegrasp.cli.help import Command
 from drakegrasp.cli.options import PATH, chosen_workers, connection_options, shared
 from drakegrasp.cli.verify.protocol import (
     PLACES,
@@ -32,7 +33,7 @@ class _Frame(click.Choice):  # type: ignore[type-arg]
         return super().convert("table" if value == "workspace" else value, param, ctx)
 
 
-@click.command()
+@click.command(cls=Command)
 @click.argument("grasps", type=PATH, metavar="GRASPS")
 @click.option(
     "--object",

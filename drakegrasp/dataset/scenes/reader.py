@@ -112,7 +112,8 @@ class SceneDataset:
         cache: Memory for points or images of views, per process [byte]; others are read again.
 
     Attributes:
-        path, split, frame: As given.
+        path: Of the file, absolute: the working directory may change.
+        split, frame: As given.
         names, classes: Of the objects, by their rows.
         joints, fingers: Names of the hand's joints and fingers, in the order of the arrays.
         views: Rows of /views that items are of: those of scenes with a grasp to draw.
@@ -151,7 +152,8 @@ class SceneDataset:
                 raise DataError(f"{name} must be 1 or more, got {count}")
         if not 0.0 <= on_object <= 1.0:
             raise DataError(f"on_object must be 0 to 1, got {on_object}")
-        self.path, self.split, self.frame, self.epoch = Path(path), split, frame, 0
+        self.path = Path(path).absolute()
+        self.split, self.frame, self.epoch = split, frame, 0
         self._points, self._grasps, self._seed = points, grasps, seed
         self._on_object, self._noise, self._cache = on_object, noise, cache
         # Of views: images, or of some pixels in random order `uv`, `depth`, `rgb` and `mask`.

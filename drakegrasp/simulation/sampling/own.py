@@ -28,7 +28,8 @@ def own_sampler(stored: str, code: Mapping[str, str]) -> type[Any]:
     Raises:
         ConfigError: If it cannot be imported, or is of another signature.
     """
-    return own_class(stored, code, arguments=("model", "X_TO", "stream"), method="poses")
+    key, arguments = "candidates.method", ("model", "X_TO", "stream")
+    return own_class(stored, code, key=key, arguments=arguments, method="poses")
 
 
 class OwnPoses:

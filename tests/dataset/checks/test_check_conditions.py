@@ -39,7 +39,7 @@ DRAWN = (
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of boxes in which everything is drawn. Read only."""
     folder = tmp_path_factory.mktemp("drawn")
-    return make_dataset(folder, tmp_path_factory.mktemp("meshes"), *DRAWN)
+    return make_dataset(folder, tmp_path_factory.mktemp("meshes"), overrides=DRAWN)
 
 
 @pytest.fixture

@@ -55,7 +55,7 @@ def test_a_sound_file_passes_alone(sound: Path, tmp_path: Path, name: str) -> No
 
 def test_shards_after_the_last_wanted_grasp_may_be_missing(tmp_path: Path) -> None:
     (tmp_path / "meshes").mkdir()
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes", "max_grasps=1")
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=["max_grasps=1"])
     for path in out.glob("shards/*/0000002-*.h5"):
         path.unlink()
     assert check_dataset(out) == []

@@ -143,7 +143,7 @@ def test_lift_is_ended_only_where_the_configuration_says_so(
     tmp_path: Path, override: str, slip: float, sound: bool
 ) -> None:
     """Whatever its contacts say then."""
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes", override)
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=[override])
     end_lift(out, SLIPPED, slip)
     what = (TRIALS, "/trials", SLIPPED, "outcome must be moved only where lift.stop_when")
     must_find(out / TRIALS, *([] if sound else [what]))
@@ -163,7 +163,9 @@ def test_lift_is_ended_only_where_the_configuration_says_so(
 def test_hand_is_not_lifted_where_its_chance_says_so_and_nowhere_else(
     tmp_path: Path, least: float, audited: bool, left: bool, sound: bool
 ) -> None:
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes", f"lift.least_chance={least}")
+    out = make_dataset(
+        tmp_path / "out", tmp_path / "meshes", overrides=[f"lift.least_chance={least}"]
+    )
     others = [row for row in range(36) if row != SLIPPED] if least > 0.5 else []
     for row in others:
         change(out, TRIALS, "trials/audited", row, lambda _: True)
@@ -179,7 +181,7 @@ def test_hand_that_is_likely_to_hold_is_not_lifted_only_for_its_image(
     tmp_path: Path, audited: bool
 ) -> None:
     settings = ("lift.least_depth_variance=1e-9", "filters.min_depth_variance=1e-9")
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes", *settings)
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=settings)
     change(out, TRIALS, "trials/audited", SLIPPED, lambda _: audited)
     leave_closed(out, SLIPPED)
     what = (TRIALS, "/trials", SLIPPED, "outcome must be not_lifted only where the")
@@ -187,7 +189,9 @@ def test_hand_that_is_likely_to_hold_is_not_lifted_only_for_its_image(
 
 
 def test_hand_that_may_not_lift_ends_no_lift(tmp_path: Path) -> None:
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes", "lift.stop_when=lost_sample")
+    out = make_dataset(
+        tmp_path / "out", tmp_path / "meshes", overrides=["lift.stop_when=lost_sample"]
+    )
     end_lift(out, SLIPPED, 0.02)
     change(out, TRIALS, "trials/closed_other_links", SLIPPED, lambda _: 1)
     must_find(out / TRIALS, (TRIALS, "/trials", SLIPPED, "outcome must follow from the contacts"))
@@ -247,7 +251,9 @@ def test_force_that_pulls_at_a_mean_normal_is_wrong_where_friction_is_usual(
     tmp_path: Path, friction: float, reported: bool
 ) -> None:
     (tmp_path / "meshes").mkdir()
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes", f"physics.friction_hand={friction}")
+    out = make_dataset(
+        tmp_path / "out", tmp_path / "meshes", overrides=[f"physics.friction_hand={friction}"]
+    )
     change(out, TRIALS, "trials/lifted_f_Q_O", SUCCESS, lambda f: -f)
     said = [what for *_, what in found(out / TRIALS)]
     assert any("must push into the object" in what for what in said) == reported

@@ -45,7 +45,9 @@ def test_objects_without_trials_are_left_out(sound: Path, tmp_path: Path) -> Non
 
 
 def test_both_samplers_have_numbers_of_their_own_datasets(sound: Path, tmp_path: Path) -> None:
-    other = make_dataset(tmp_path / "other", tmp_path, *CERTIFIED, "candidates.method=normals")
+    other = make_dataset(
+        tmp_path / "other", tmp_path, overrides=[*CERTIFIED, "candidates.method=normals"]
+    )
     for first, second in ((sound, other), (other, sound)):
         numbers = compare_samplers(first, second).numbers
         for method in ("normals", "rotations"):
@@ -59,9 +61,15 @@ def test_datasets_must_differ_by_the_sampler_alone(sound: Path, tmp_path: Path) 
     for folder in (tmp_path / "a", tmp_path / "b"):
         folder.mkdir()
     rough = make_dataset(
-        tmp_path / "a" / "out", tmp_path / "a", *CERTIFIED,
-        "candidates.method=normals", "physics.friction_hand=0.9", "filters.max_slip=0.02",
-    )  # fmt: skip
+        tmp_path / "a" / "out",
+        tmp_path / "a",
+        overrides=[
+            *CERTIFIED,
+            "candidates.method=normals",
+            "physics.friction_hand=0.9",
+            "filters.max_slip=0.02",
+        ],
+    )
     with pytest.raises(DataError, match=r"got another physics.friction_hand$"):
         compare_samplers(sound, rough)
 
