@@ -81,7 +81,7 @@ def _nothing(out: Path) -> None:
         (_nothing, ["--reject", "ids.txt"], "rejected trials must be successes, got trial 1"),
         (_cut_shard, [], "damaged or cut off"),
         (_nothing, ["--set", "filters.max_slip=-1"], "must be greater than 0"),
-        (_nothing, ["--set", "lift.hold_time=9"], "values of filters and split only"),
+        (_nothing, ["--set", "lift.hold_time=9"], "only values of filters and split can change"),
     ],
     ids=["reject", "shard", "value", "key"],
 )

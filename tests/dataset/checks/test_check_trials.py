@@ -269,8 +269,8 @@ def test_chance_of_fewer_fingers_is_not_derived_from_contacts_of_all(out: Path) 
 
 def test_dataset_that_did_not_measure_the_table_is_sound_and_goes_on(tmp_path: Path) -> None:
     """Its shards lack the columns; a build with today's rule continues it by its own."""
-    rules = "close.scrape_depth=null"
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes", rules)
+    rules = ["close.scrape_depth=null"]
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=rules)
     with h5py.File(next((out / "shards").rglob("*.h5"))) as shard:
         assert "clearance_close" not in shard["trials"]
     must_find(out)
