@@ -38,6 +38,7 @@ from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.schema import HOLD_FIELDS
 from drakegrasp.dataset.shards import Shard, ShardHeader, read_trials, write_shard
 from drakegrasp.errors import DataError, MachineError
+from drakegrasp.hand.description import Hand
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.environment import trim_memory
@@ -57,6 +58,7 @@ from drakegrasp.simulation.robustness import Certificate, certify, is_drawn
 from drakegrasp.simulation.scene_cache import cached_scene
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord
+from drakegrasp.simulation.verdict import judge_closed
 from drakegrasp.vision.camera import intrinsics
 
 #: An attempt that takes this many times its limit of computing time hangs: it never looks at it.
@@ -173,7 +175,10 @@ def _run_experiment(unit: WorkUnit, journal: Journal) -> UnitSummary:
         if config.certified:
             with timed(seconds, "certify"):
                 _certify_lifts(setup, rounds[-1], first, journal, likely_tested=unit.likely_tested)
-        attempts = _children_of_samples(setup, rounds[-1]) if unit.refined else []
+        attempts = []
+        if unit.refined and config.refine.children:
+            with timed(seconds, "try"):
+                attempts = _children(setup, rounds[-1], journal, first)
 
     # Write the shard: all of it or nothing.
     with _stage(journal, "write", header.object_name, seconds):
@@ -225,16 +230,52 @@ def _run_round(
     return _Round(attempts=attempts, records=records, trials=trials, looks=looks)
 
 
-def _children_of_samples(setup: TrialSetup, done: _Round) -> list[Attempt]:
-    """Return attempts about each of a round that is a sample by the default filters."""
-    config = setup.config
-    if not config.refine.children:
-        return []
+def _children(setup: TrialSetup, done: _Round, journal: Journal, first: int) -> list[Attempt]:
+    """Return attempts about each of a round that is a sample by the default filters.
+
+    Or would be one if it did not scrape the table: most palm poses about such a one do not.
+    """
+    parents = {*_samples(setup, done)}
+    for row, (attempt, record) in enumerate(zip(done.attempts, done.records, strict=True)):
+        if _only_scrapes(setup.scene_of(attempt).hand, record):
+            step = f"lift {first + row}"
+            if _is_sample_but_for_scraping(setup, attempt, journal, step):
+                parents.add(row)
     return [
         child
-        for row in _samples(setup, done)
-        for child in list_children(setup.prepared, done.attempts[row], config)
+        for row in sorted(parents)
+        for child in list_children(setup.prepared, done.attempts[row], setup.config)
     ]
+
+
+def _only_scrapes(hand: Hand, record: TrialRecord) -> bool:
+    """Return whether a hand would have been lifted if it had not scraped the table."""
+    if record.outcome is not Outcome.TABLE_CONTACT or record.closed is None or record.lift:
+        return False
+    contacts = record.closed.contacts
+    verdict = judge_closed(
+        contacts.touching,
+        contacts.other_links,
+        contacts.hand_on_table,
+        required=hand.required,
+    )
+    return bool(verdict == Outcome.SUCCESS)
+
+
+def _is_sample_but_for_scraping(
+    setup: TrialSetup, attempt: Attempt, journal: Journal, step: str
+) -> bool:
+    """Lift a hand that scrapes the table; return whether a trial alone shows it no sample."""
+    # If that ended its process, it costs the children.
+    if journal.verdict(step) is not None:
+        return False
+    close = setup.config.close.model_copy(update={"scrape_depth": None})
+    rules = setup.config.model_copy(update={"close": close, "filters": PARENT_FILTERS})
+    free = replace(setup, config=rules)
+    with journal.step(step, HANG_FACTOR * rules.attempt_seconds):
+        record = try_attempt(free, attempt)
+    setup.scene = free.scene  # one in which Drake failed was replaced
+    return judge_sample(setup.prepared.model, record, rules) is Removal.KEPT
 
 
 def _samples(setup: TrialSetup, done: _Round) -> list[int]:

@@ -16,6 +16,11 @@ from drakegrasp.cli.options import PATH, shared
 @click.argument("mesh_dir", type=PATH)
 @shared("--units", "--manifest")
 @click.option(
+    "--hand",
+    metavar="HAND",
+    help="Hand whose opening the sizes are compared with (default: barrett).",
+)
+@click.option(
     "--json", "json_file", type=PATH, metavar="FILE", help="Write all findings as JSON too."
 )
 @click.option(
@@ -25,7 +30,12 @@ from drakegrasp.cli.options import PATH, shared
     help="Write a picture of every object with its status (.png).",
 )
 def audit(
-    mesh_dir: Path, units: str, manifest: Path | None, json_file: Path | None, sheet: Path | None
+    mesh_dir: Path,
+    units: str,
+    manifest: Path | None,
+    hand: str | None,
+    json_file: Path | None,
+    sheet: Path | None,
 ) -> None:
     """Check which meshes are fit, repaired or refused.
 
@@ -34,12 +44,19 @@ def audit(
     Exit code 1 if every mesh is refused.
     """
     from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console, memory_line
+    from drakegrasp.hand.description import load_hand
+    from drakegrasp.hand.kinematics import opening
+    from drakegrasp.hand.settings import load_config
     from drakegrasp.objects.audit import audit as audit_meshes
     from drakegrasp.runtime.files import atomic_path, write_atomic
     from drakegrasp.runtime.progress import progress_bar
 
+    config = load_config(overrides=[f"hand={hand}"] if hand else [])
+    wide = opening(load_hand(config.hand_source))
     with progress_bar("audit", "meshes") as progress:
-        rows = audit_meshes(mesh_dir, units=units, manifest=manifest, progress=progress)
+        rows = audit_meshes(
+            mesh_dir, units=units, manifest=manifest, opening=wide, progress=progress
+        )
     console = make_console()
     console.print(audit_table(rows, compact=console.width < ROOMY))
     say(audit_line(rows))

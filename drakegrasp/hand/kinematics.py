@@ -8,14 +8,20 @@ angles [rad], those of joints that slide are lengths [m].
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.distance import cdist
 
 from drakegrasp.arithmetic import Array, multiply
-from drakegrasp.frames import rotation_about
+from drakegrasp.frames import rotation_about, transform_points
 from drakegrasp.hand.chains import Chain
 from drakegrasp.hand.description import Hand
+from drakegrasp.hand.shapes import pad_surfaces
+
+#: Positions of each coordinate at which the opening of a hand is measured.
+OPENING_STEPS = 9
 
 
 def coordinate_limits(hand: Hand) -> Array:
@@ -131,6 +137,29 @@ def posed_links(hand: Hand, positions: Mapping[str, Array]) -> dict[str, Array]:
     return {
         link: multiply(posed[chain.joints], chain.X_JFi) for link, chain in hand.link_chains.items()
     }
+
+
+def opening(hand: Hand) -> float:
+    """Return the largest distance [m] between the pads of two fingers, over spread and closing.
+
+    The postures are `OPENING_STEPS` of each coordinate, from limit to limit.
+
+    Raises:
+        HandError: See `hand.shapes.link_shapes`.
+    """
+    low, high = coordinate_limits(hand).T
+    corners = [np.unique(pad.reshape(-1, 3), axis=0) for pad in pad_surfaces(hand)]
+    share = np.linspace(0.0, 1.0, OPENING_STEPS)
+    closing, largest = low[1:] + share[:, None] * (high - low)[1:], 0.0
+    for spread in low[0] + share * (high - low)[0]:
+        X_GF = fingertip_poses(hand, spread=np.full(len(share), spread), closing=closing)
+        points = [
+            np.concatenate([transform_points(X, pad) for X in X_GF[:, i]])
+            for i, pad in enumerate(corners)
+        ]
+        for p, q in combinations([p for p in points if len(p)], 2):
+            largest = max(largest, float(cdist(p, q).max()))
+    return largest
 
 
 def joint_frames(hand: Hand, finger: int, *, spread: float, closing: npt.ArrayLike) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -51,6 +52,11 @@ DENSITIES = (20.0, 8000.0)
 GYRATION = (0.5, 2.0)
 #: Faces up to which self-intersections are looked for: beyond it takes minutes.
 MOST_CROSSED = 60_000
+#: Points between which a hand is looked for that can close, and how much farther than the sides
+#: of the object such points may be, as they do not lie exactly opposite.
+SIDE_POINTS, SIDE_SLACK = 500, 1.1
+#: Sides of an object are opposed if the product of their outward normals is at most this.
+OPPOSED = -0.3
 #: Volume that a repair may change without a word, as a fraction.
 NOTED_CHANGE = 0.02
 #: Memory of scenes, distances and renderer [B]: of any object, and per face for contact and of the
@@ -85,6 +91,7 @@ class AuditRow:
         collision_error: Largest distance of these from the solid [m].
         memory: Of a worker for this object, beside what it needs anyway [B].
         preparing: Most memory of a worker while it prepares the mesh, in all [B].
+        width: Least distance of two opposed sides [m], see `least_width`.
         model: The object.
     """
 
@@ -109,6 +116,7 @@ class AuditRow:
     collision_error: float | None = None
     memory: float | None = None
     preparing: float | None = None
+    width: float | None = None
     model: ObjectModel | None = field(default=None, repr=False, compare=False)
 
     def to_json(self) -> dict[str, Any]:
@@ -121,6 +129,7 @@ def audit(
     *,
     units: str = "m",
     manifest: str | Path | None = None,
+    opening: float = np.inf,
     progress: Report = silent,
 ) -> list[AuditRow]:
     """Return, mesh by mesh, whether it is fit to be simulated, needs repair, or is refused.
@@ -131,6 +140,8 @@ def audit(
         directory: The meshes, as for `find_meshes`.
         units: Unit of their lengths.
         manifest: Their YAML file, if it is not beside them.
+        opening: Largest distance of the hand's fingertips [m], see `hand.shapes.opening`; objects
+            that are wider everywhere get a warning.
         progress: Is told of each mesh.
 
     Raises:
@@ -138,12 +149,12 @@ def audit(
     """
     sources, rows = find_meshes(directory, units=units, manifest=manifest), list[AuditRow]()
     for source in sources:
-        rows.append(_audit_one(source))
+        rows.append(_audit_one(source, opening))
         progress(len(rows), len(sources))
     return rows
 
 
-def _audit_one(source: MeshSource) -> AuditRow:
+def _audit_one(source: MeshSource, opening: float) -> AuditRow:
     """Return the row of a mesh: what the file holds, then what becomes of it."""
     known: dict[str, Any] = {"name": source.name, "class_name": source.class_name}
     try:
@@ -174,7 +185,7 @@ def _audit_one(source: MeshSource) -> AuditRow:
     known["units_guess"] = guess_units(diagonal(model.visual_vertices), source.scale)
     status: Status = "repaired" if model.notes else "fit"
     row = AuditRow(**known, status=status, notes=model.notes, model=model)
-    return replace(row, warnings=tuple(_warnings(row)))
+    return replace(row, warnings=(*_warnings(row), *_too_wide(row, opening)))
 
 
 def guess_units(size: float, scale: float) -> str | None:
@@ -208,6 +219,24 @@ def wall_thickness(vertices: Array, faces: Faces) -> float:
     return float(np.quantile(through[np.isfinite(through)], WALL_SHARE))
 
 
+def least_width(vertices: Array, faces: Faces) -> float:
+    """Return the least distance of two opposed sides of a solid [m], which a hand must span.
+
+    It is looked for among even points of the surface, so it is a little too large.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3).
+    """
+    p, picked = on_faces(vertices, faces, even_points(SIDE_POINTS))
+    n = unit_normals(vertices[faces[picked]])
+    between = p[None] - p[:, None]  # (i, j): from point i to point j
+    # The solid is between them: the normal of each points away from the other.
+    outward = np.einsum("ik,ijk->ij", n, between) < 0.0
+    opposed = (n @ n.T <= OPPOSED) & outward & outward.T
+    return float(np.sqrt(np.sum(between**2, axis=2)[opposed].min(initial=np.inf)))
+
+
 def _measures(model: ObjectModel, vertices: Array, faces: Faces) -> dict[str, Any]:
     """Return what is measured on an object, and on its file's surface (n, 3) [m], (m, 3)."""
     # Volume of the file, inertia of the hull per mass, and size of the solid.
@@ -223,6 +252,7 @@ def _measures(model: ObjectModel, vertices: Array, faces: Faces) -> dict[str, An
         "volume_change": model.volume / before - 1.0 if model.notes and before > 0.0 else 0.0,
         "crossing": len(crossing_faces(own, solid)) if len(solid) <= MOST_CROSSED else None,
         "wall": wall_thickness(own, solid),
+        "width": least_width(own, solid),
         "mass": model.mass,
         "density": model.density,
         "gyration": float(np.sqrt(np.trace(model.I_OOcm_O) / model.mass / np.trace(round_hull))),
@@ -252,3 +282,12 @@ def _warnings(row: AuditRow) -> list[str]:
     if row.volume_change is not None and abs(row.volume_change) > NOTED_CHANGE:
         warnings.append(f"repair changed the volume by {row.volume_change:+.0%}")
     return warnings
+
+
+def _too_wide(row: AuditRow, opening: float) -> Iterator[str]:
+    """Yield that the fingertips cannot meet two opposed sides of an object, if so."""
+    if row.width is not None and row.width > SIDE_SLACK * opening:
+        yield (
+            f"its opposed sides are at least {row.width * 1e3:.0f} mm apart, and the hand opens "
+            f"{opening * 1e3:.0f} mm: another unit, or a larger hand"
+        )

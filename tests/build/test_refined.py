@@ -10,8 +10,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import trimesh
 from helpers.assertions import assert_same_dataset
 from helpers.meshes import write_fixed
+from helpers.objects import CUBE
 
 from drakegrasp.bench.cross_check import cross_check
 from drakegrasp.build import attempts
@@ -31,6 +33,7 @@ from drakegrasp.dataset.rejections import (
     write_decisions,
 )
 from drakegrasp.dataset.statistics import count_funnel, count_splits
+from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import MachineError
 from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.settings import load_config, override_config
@@ -341,3 +344,29 @@ def test_assembling_again_gives_the_same(refined: Path, tmp_path: Path) -> None:
     shutil.copytree(refined, copy)
     assemble(copy)
     assert_same_dataset(copy, refined)
+
+
+def test_palm_poses_about_one_that_only_scrapes_the_table_are_tried(tmp_path: Path) -> None:
+    """It is no sample; those about it may be."""
+    (tmp_path / "meshes").mkdir()
+    can = trimesh.creation.cylinder(CUBE / 2, CUBE, sections=64)
+    can.export(tmp_path / "meshes" / "1_can.obj")
+    (tmp_path / "above.py").write_text(
+        "import numpy as np\n"
+        "from drakegrasp.frames import make_pose\n"
+        "from drakegrasp.simulation.sampling.rotations import R_OG0\n"
+        "class Above:\n"
+        "  def __init__(self, model, X_TO, stream):\n"
+        "    self.height = float(model.half_extents[2]) + 0.042\n"
+        "  def poses(self):\n"
+        "    yield make_pose(R_OG0, [0.0, 0.0, self.height])\n"
+    )
+    rules = [f"candidates.method={tmp_path}/above.py:Above", "candidates.standoffs=[0.042]"]
+    rules += ["refine.children=3", "candidates.max=1"]
+    out = tmp_path / "out"
+    build(find_meshes(tmp_path / "meshes"), out, load_config(overrides=rules), run_here, show=False)
+    trials = Trials(out)
+    scraped = trials["outcome"][0], trials["clearance_close"][0] < -0.5e-3
+    assert scraped == (Outcome.TABLE_CONTACT, True)
+    assert trials["child"].tolist() == [0, 1, 2, 3]
+    assert check_dataset(out) == []

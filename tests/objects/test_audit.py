@@ -9,6 +9,8 @@ import pytest
 import trimesh
 from helpers.meshes import G3DB, box, flipped, needs_g3db, open_box, write
 
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.kinematics import opening
 from drakegrasp.objects.audit import audit, guess_units
 from drakegrasp.objects.memory import forecast_memory, needed_limit
 from drakegrasp.objects.model import prepare_object
@@ -119,3 +121,20 @@ def test_memory_of_preparing_grows_with_the_faces_and_names_a_limit():
     for faces, peak in measured.items():
         assert peak < forecast_memory(faces) < 1.12 * peak
     assert needed_limit(569e6) == 600e6 and needed_limit(571e6) == 650e6
+
+
+def test_objects_that_are_too_wide_for_the_hand_get_a_warning(tmp_path: Path) -> None:
+    """A crate is as wide as it is large, but its wall is thin: the hand can close on that."""
+    block = trimesh.creation.box([0.45, 0.42, 0.40])
+    block.export(tmp_path / "1_block.stl")
+    hollow = trimesh.creation.box([0.42, 0.39, 0.40])
+    hollow.apply_translation([0.0, 0.0, 0.02])
+    block.difference(hollow).export(tmp_path / "2_crate.stl")
+    opening_m = opening(load_hand())
+    for wide, name in ((False, "2_crate"), (True, "1_block")):
+        (row,) = (r for r in audit(tmp_path, opening=opening_m) if r.name == name)
+        said = [w for w in row.warnings if "mm apart" in w]
+        assert bool(said) == wide, row.warnings
+    assert "at least 40" in said[0]
+    assert "the hand opens 385 mm" in said[0]
+    assert not any("apart" in w for r in audit(tmp_path) for w in r.warnings)
