@@ -123,11 +123,11 @@ def test_memory_of_preparing_grows_with_the_faces_and_names_a_limit():
     assert needed_limit(569e6) == 600e6 and needed_limit(571e6) == 650e6
 
 
-def test_objects_that_are_too_wide_for_the_hand_get_a_warning(tmp_path: Path) -> None:
+def test_objects_that_are_too_wide_for_the_hand_get_a_warning(tmp_path):
     """A crate is as wide as it is large, but its wall is thin: the hand can close on that."""
-    block = trimesh.creation.box([0.45, 0.42, 0.40])
+    block = trimesh.creation.box([0.60, 0.58, 0.56])
     block.export(tmp_path / "1_block.stl")
-    hollow = trimesh.creation.box([0.42, 0.39, 0.40])
+    hollow = trimesh.creation.box([0.57, 0.55, 0.56])
     hollow.apply_translation([0.0, 0.0, 0.02])
     block.difference(hollow).export(tmp_path / "2_crate.stl")
     opening_m = opening(load_hand())
@@ -135,6 +135,6 @@ def test_objects_that_are_too_wide_for_the_hand_get_a_warning(tmp_path: Path) ->
         (row,) = (r for r in audit(tmp_path, opening=opening_m) if r.name == name)
         said = [w for w in row.warnings if "mm apart" in w]
         assert bool(said) == wide, row.warnings
-    assert "at least 40" in said[0]
+    assert "at least 56" in said[0]
     assert "the hand opens 385 mm" in said[0]
     assert not any("apart" in w for r in audit(tmp_path) for w in r.warnings)
