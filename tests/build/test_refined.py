@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from drakegrasp.build import attempts
 from drakegrasp.build.pipeline import NEAR_BORDER, build
 from drakegrasp.build.replay import record_trial, replay_trial
 from drakegrasp.build.work_unit import WorkUnit, run_unit
-from drakegrasp.config import Config
+from drakegrasp.config import CloseConfig, Config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.assembly.split import rank_in_split, split_samples
 from drakegrasp.dataset.checks.run import check_dataset
@@ -149,19 +150,27 @@ def test_children_are_those_of_samples_and_near_them(refined: Path) -> None:
     assert set(columns["generation"][later].tolist()) == {1, 2}
     for row in later.tolist():
         parent = row_of[*keys[row][:3], int(columns["parent"][row])]
-        assert columns["outcome"][parent] == Outcome.SUCCESS and columns["precision"][parent]
+        if columns["outcome"][parent] == Outcome.SUCCESS:
+            assert columns["precision"][parent]
+        else:
+            # One that the scraping of the table alone kept from being a sample.
+            assert columns["outcome"][parent] == Outcome.TABLE_CONTACT
+            assert columns["clearance_close"][parent] < -CloseConfig().scrape_depth
         assert columns["generation"][row] == columns["generation"][parent] + 1
         assert columns["resting"][row] == columns["resting"][parent]
         # Five standard deviations of 7.5 mm, in three directions.
         X_GP, X_GC = (unpack_pose(columns["X_OG"][i]) for i in (parent, row))
         assert 0.0 < np.linalg.norm(X_GP[:3, 3] - X_GC[:3, 3]) < 5 * 0.0075 * np.sqrt(3)
 
-    # Every sample of the first generations has all of its children.
+    # Every sample of the first generations has all of its children, and so has each other parent.
     with h5py.File(refined / "trials.hdf5") as file:
         removal, ids = file["successes/removal"][:], file["successes/trial_id"][:]
     sample = ids[np.isin(removal, [Removal.KEPT, Removal.REFINED_TEST])]
-    parents = sample[columns["generation"][sample] < 2]
-    assert len(later) == CHILDREN * len(parents) > 0
+    children = Counter(
+        row_of[*keys[row][:3], int(columns["parent"][row])] for row in later.tolist()
+    )
+    assert {*sample[columns["generation"][sample] < 2].tolist()} <= {*children}
+    assert {*children.values()} == {CHILDREN}
 
 
 def test_refined_trial_replays_bit_for_bit(refined: Path) -> None:
