@@ -19,8 +19,6 @@ if TYPE_CHECKING:
         verify_grasps,
         verify_rows,
     )
-    from drakegrasp.build.pipeline import BuildReport
-    from drakegrasp.build.replay import Replay, replay_trial
     from drakegrasp.config import Config
     from drakegrasp.dataset.checks.findings import Violation
     from drakegrasp.dataset.checks.run import check_dataset
@@ -38,6 +36,8 @@ if TYPE_CHECKING:
         MachineError,
         MeshError,
     )
+    from drakegrasp.generation.pipeline import BuildReport
+    from drakegrasp.generation.replay import Replay, replay_trial
     from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
     from drakegrasp.hand.description import Hand, load_hand
     from drakegrasp.hand.settings import load_config
@@ -52,7 +52,7 @@ __version__ = metadata.version("drakegrasp")
 #: The module of each name.
 _HOMES = {
     "BlankImageError": "errors",
-    "BuildReport": "build.pipeline",
+    "BuildReport": "generation.pipeline",
     "Config": "config",
     "ConfigError": "errors",
     "DataError": "errors",
@@ -68,7 +68,7 @@ _HOMES = {
     "PlacedObject": "api.verifying",
     "PoseTrial": "verification.result",
     "Posture": "simulation.postures.posture",
-    "Replay": "build.replay",
+    "Replay": "generation.replay",
     "Sample": "dataset.reader",
     "SceneDataset": "dataset.scenes.reader",
     "Score": "scoring.run",
@@ -83,7 +83,7 @@ _HOMES = {
     "make_posture": "simulation.postures.posture",
     "pack_grasp": "grasp",
     "place_object": "api.verifying",
-    "replay_trial": "build.replay",
+    "replay_trial": "generation.replay",
     "run_trial": "simulation.postures.trial",
     "score": "api.scoring",
     "transform_grasp": "grasp",

@@ -15,8 +15,8 @@ from helpers.meshes import G3DB, SMALL, write_fixed
 from helpers.objects import CUBE, box_model
 from hypothesis import HealthCheck, settings
 
-from drakegrasp.build.pipeline import build
 from drakegrasp.config import Config
+from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel

@@ -32,7 +32,7 @@ ORDER = (
     "dataset",
     "visualization",
     "commissioning",
-    "build",
+    "generation",
     "inspection",
     "cluster",
     "verification",
@@ -62,7 +62,7 @@ WALLS = {
     ),
     "mujoco": (
         "mjcf",
-        "hand.vendor.compiled",
+        "hand.draft.compiled",
         "protocols.scene",
         "bench",
         "exchange.mujoco_scenes",

@@ -11,14 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drakegrasp.api.workers import announced, connection, end_imported_script
-from drakegrasp.build.pipeline import (
-    BuildReport,
-    build_locked,
-    posture_config,
-    refuse_missing,
-    refuse_unusable,
-)
-from drakegrasp.build.request import BUILTIN, refuse_unknown
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.config import Config, continued
@@ -28,6 +20,14 @@ from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
 from drakegrasp.dataset.paths import FILE_NAME as MANIFEST
 from drakegrasp.errors import DataError, GraspError
 from drakegrasp.exchange.posture_files import read_postures
+from drakegrasp.generation.pipeline import (
+    BuildReport,
+    build_locked,
+    posture_config,
+    refuse_missing,
+    refuse_unusable,
+)
+from drakegrasp.generation.request import BUILTIN, refuse_unknown
 from drakegrasp.hand.carried import carry_hand
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config

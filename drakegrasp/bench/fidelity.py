@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 
-from drakegrasp.build.attempts import TrialSetup, predict_attempts, try_attempt
 from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.errors import ConfigError
+from drakegrasp.generation.attempts import TrialSetup, predict_attempts, try_attempt
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import override_config
 from drakegrasp.objects.model import ObjectModel

@@ -25,13 +25,13 @@ from drakegrasp.bench.fidelity import (
     sum_fidelity,
     variants,
 )
-from drakegrasp.build.attempts import TrialSetup, list_attempts, predict_attempts, try_attempt
-from drakegrasp.build.prepare import prepare
-from drakegrasp.build.work_unit import render_successes
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import installed_versions
 from drakegrasp.dataset.prepared_objects import PreparedObject
 from drakegrasp.errors import DataError
+from drakegrasp.generation.attempts import TrialSetup, list_attempts, predict_attempts, try_attempt
+from drakegrasp.generation.prepare import prepare
+from drakegrasp.generation.work_unit import render_successes
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome

@@ -8,9 +8,9 @@ from typing import Any
 
 import click
 
-from drakegrasp.build.request import BUILTIN
 from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import FILE, NEW_FILE, PATH, chosen_settings, shared
+from drakegrasp.generation.request import BUILTIN
 
 
 @click.command()

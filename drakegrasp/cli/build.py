@@ -25,9 +25,9 @@ from drakegrasp.cli.options import (
 from drakegrasp.errors import counted
 
 if TYPE_CHECKING:
-    from drakegrasp.build.pipeline import BuildReport
-    from drakegrasp.build.request import BuildRequest
-    from drakegrasp.build.scenes.make import Scenes
+    from drakegrasp.generation.pipeline import BuildReport
+    from drakegrasp.generation.request import BuildRequest
+    from drakegrasp.generation.scenes.make import Scenes
 
 
 @click.command(cls=Command)
@@ -131,7 +131,7 @@ def write_scenes(
     show: bool = True,
 ) -> Scenes:
     """Write scenes.hdf5 in processes of this machine."""
-    from drakegrasp.build.scenes.make import make_scenes
+    from drakegrasp.generation.scenes.make import make_scenes
     from drakegrasp.runtime.executor import processes
     from drakegrasp.runtime.progress import progress_bar
 
@@ -155,7 +155,7 @@ def merge(
     Their objects or their seeds may differ, and nothing else but what --set says for all. INTO
     must be new or empty, and appears when it is complete; OUTS stay as they are.
     """
-    from drakegrasp.build.merge import merge as merge_datasets
+    from drakegrasp.generation.merge import merge as merge_datasets
     from drakegrasp.runtime.executor import processes
     from drakegrasp.runtime.progress import progress_bar
 
@@ -240,8 +240,8 @@ def print_stats(out: Path) -> None:
 
 def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -> None:
     """Print how long a requested build is expected to take, and its size."""
-    from drakegrasp.build.estimate import plan_lines, plan_request
-    from drakegrasp.build.stage_times import logged_times, read_times
+    from drakegrasp.generation.estimate import plan_lines, plan_request
+    from drakegrasp.generation.stage_times import logged_times, read_times
 
     logged = logged_times(request.out, request.config)
     measured = logged if times is None else read_times(times)

@@ -82,7 +82,7 @@ def export_objects(directory: Path, **options: Any) -> None:
 
     Equal options write equal bytes on every machine.
     """
-    from drakegrasp.build.request import BUILTIN
+    from drakegrasp.generation.request import BUILTIN
     from drakegrasp.hand.settings import load_config
     from drakegrasp.runtime.progress import progress_bar
     from drakegrasp.shapes.catalog import export_builtin
@@ -133,7 +133,7 @@ def replay(out: Path, trial: int, html: Path | None) -> None:
 
     Exit code 1 if any value differs from the stored one.
     """
-    from drakegrasp.build.replay import record_trial, replay_trial
+    from drakegrasp.generation.replay import record_trial, replay_trial
 
     # Whatever differs is printed: values first, then versions, which may explain them.
     again = replay_trial(out, trial)

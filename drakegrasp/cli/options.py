@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 
 import click
 
-from drakegrasp.build.request import BUILTIN, BuildRequest
 from drakegrasp.cli.help import Option
 from drakegrasp.errors import first_line
+from drakegrasp.generation.request import BUILTIN, BuildRequest
 
 F = TypeVar("F", bound=Callable[..., Any])
 

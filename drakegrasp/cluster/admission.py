@@ -16,10 +16,10 @@ from typing import Any
 
 from distributed import Client, Scheduler, Worker, WorkerPlugin
 
-from drakegrasp.build.prepare import PREPARE_SECONDS
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import REQUIRED_VERSIONS, installed_versions
 from drakegrasp.errors import MachineError, printable
+from drakegrasp.generation.prepare import PREPARE_SECONDS
 from drakegrasp.runtime.journal import wall_limit
 from drakegrasp.vision.probe_image import probe_image
 

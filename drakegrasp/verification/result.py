@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drakegrasp.build.columns import unjudged
 from drakegrasp.config import Config
 from drakegrasp.frames import Array
+from drakegrasp.generation.columns import unjudged
 from drakegrasp.grasp import for_all_fingers
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.simulation.candidates import Pregrasp

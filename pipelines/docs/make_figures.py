@@ -14,9 +14,9 @@ from pathlib import Path
 from doc_figures import frames_figure, hero_figure
 from trial_pictures import frames_panels, render_trial
 
-from drakegrasp.build.prepare import prepare
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.prepared_objects import PreparedObject
+from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.shapes.catalog import export_builtin

@@ -26,12 +26,12 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.build.prepare import prepare
 from drakegrasp.config import FilterConfig
 from drakegrasp.dataset.filters import breaks_hold
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.frames import unpack_pose
+from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import override_config
 from drakegrasp.objects.sources import find_meshes

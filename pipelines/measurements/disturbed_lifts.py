@@ -24,8 +24,6 @@ from typing import Any
 import numpy as np
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.build.attempts import find_attempt
-from drakegrasp.build.columns import judge_sample
 from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.dataset.card.holding import (
     COLUMNS,
@@ -38,6 +36,8 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.frames import make_pose, rotation_about
+from drakegrasp.generation.attempts import find_attempt
+from drakegrasp.generation.columns import judge_sample
 from drakegrasp.outcomes import Removal
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt

@@ -25,12 +25,17 @@ ROOT = Path(__file__).resolve().parents[2]
 EQUIVALENT = Path(__file__).with_name("equivalent_faults.yaml")
 #: The rooms that half of the faults are drawn from, and the others.
 JUDGES = ("simulation", "verification")
-OTHERS = ("hand", "mesh", "objects", "vision", "dataset", "build", "scoring")
+OTHERS = ("hand", "mesh", "objects", "vision", "dataset", "generation", "scoring")
 #: Modules and folders that draw a picture or tell a story: they decide nothing.
 _TELLING = {
     *(f"verification/{name}.py" for name in ("explanation", "figure", "recording", "views")),
     *("dataset/card", "dataset/log.py", "hand/references.py", "scoring/card.py"),
-    *("vision/appearance.py", "vision/probe_image.py", "build/events.py", "build/warnings.py"),
+    *(
+        "vision/appearance.py",
+        "vision/probe_image.py",
+        "generation/events.py",
+        "generation/warnings.py",
+    ),
 }
 #: How many imports may lie between a module and a test, in its room and elsewhere.
 NEAR, NEAR_ELSEWHERE = 2, 1

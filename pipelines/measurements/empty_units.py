@@ -16,10 +16,10 @@ from pathlib import Path
 
 import click
 
-from drakegrasp.build.work_unit import UnitSummary, WorkUnit
 from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry
+from drakegrasp.generation.work_unit import UnitSummary, WorkUnit
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 

@@ -19,11 +19,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from drakegrasp.build.attempts import TrialSetup, list_attempts, predict_attempts
-from drakegrasp.build.prepare import prepare
 from drakegrasp.config import BuiltinConfig, Config
 from drakegrasp.dataset.filters import breaks_hold
 from drakegrasp.errors import MeshError
+from drakegrasp.generation.attempts import TrialSetup, list_attempts, predict_attempts
+from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import MeshSource, find_meshes

@@ -10,9 +10,9 @@ import sys
 import time
 from pathlib import Path
 
-from drakegrasp.build.attempts import TrialSetup, predict_attempts, try_attempt
-from drakegrasp.build.prepare import prepare
 from drakegrasp.config import Config
+from drakegrasp.generation.attempts import TrialSetup, predict_attempts, try_attempt
+from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes

@@ -35,11 +35,11 @@ from drakegrasp.cli.main import main as command
 from drakegrasp.commissioning.model_checks import check_limits
 from drakegrasp.commissioning.run import check_geometry
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.draft.parsing import read_model
+from drakegrasp.hand.draft.source import read_source
+from drakegrasp.hand.draft.writing import write_urdf
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.shapes import link_shapes
-from drakegrasp.hand.vendor.parsing import read_model
-from drakegrasp.hand.vendor.source import read_source
-from drakegrasp.hand.vendor.writing import write_urdf
 from drakegrasp.mesh.loading import load_mesh
 
 #: Numbers and words that take the place of others in a text.

@@ -22,11 +22,11 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.build.attempts import find_attempt
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.generation.attempts import find_attempt
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import override_config
 from drakegrasp.outcomes import Outcome

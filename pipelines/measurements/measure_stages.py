@@ -5,7 +5,7 @@
     drakegrasp build --objects MESH_DIR ... --plan --times times.json
 
 The script builds a small dataset in this process alone, so that no other worker disturbs the
-clock. The defaults of `drakegrasp.build.stage_times` were measured with it.
+clock. The defaults of `drakegrasp.generation.stage_times` were measured with it.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -21,10 +21,6 @@ from typing import Any
 import click
 import h5py
 
-from drakegrasp.build.pipeline import build
-from drakegrasp.build.prepare import prepare_one
-from drakegrasp.build.stage_times import StageTimes
-from drakegrasp.build.work_unit import UnitSummary
 from drakegrasp.cli.options import shared
 from drakegrasp.dataset.assembly.pack import pack_rows
 from drakegrasp.dataset.assembly.survey import survey_object
@@ -32,6 +28,10 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.statistics import count_splits
 from drakegrasp.errors import DataError
+from drakegrasp.generation.pipeline import build
+from drakegrasp.generation.prepare import prepare_one
+from drakegrasp.generation.stage_times import StageTimes
+from drakegrasp.generation.work_unit import UnitSummary
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome

@@ -29,7 +29,7 @@ RADIUS = 0.05
 _CHILD = """
 import json, re, sys, time
 from pathlib import Path
-from drakegrasp.build.prepare import prepare
+from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.memory import forecast_memory
 from drakegrasp.objects.sources import find_mesh

@@ -23,8 +23,8 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.build.replay import Replay, replay_trial
 from drakegrasp.dataset.paths import TRIALS_FILE
+from drakegrasp.generation.replay import Replay, replay_trial
 from drakegrasp.runtime.progress import progress_bar
 
 #: Shares of the trials that were lifted, and that ended while closing.

@@ -37,11 +37,11 @@ from drakegrasp.config import Config
 from drakegrasp.exchange.posture_rows import quaternion_poses
 from drakegrasp.frames import Array, invert_pose, make_pose
 from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.draft.parsing import read_model
+from drakegrasp.hand.draft.source import read_source
+from drakegrasp.hand.draft.writing import write_urdf
 from drakegrasp.hand.file_format import Finger
 from drakegrasp.hand.settings import load_config
-from drakegrasp.hand.vendor.parsing import read_model
-from drakegrasp.hand.vendor.source import read_source
-from drakegrasp.hand.vendor.writing import write_urdf
 from drakegrasp.objects.model import prepare_object
 from drakegrasp.objects.sources import MeshSource, file_frame
 from drakegrasp.outcomes import Outcome

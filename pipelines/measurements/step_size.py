@@ -14,10 +14,10 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from drakegrasp.build.attempts import list_attempts
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
+from drakegrasp.generation.attempts import list_attempts
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import override_config
 from drakegrasp.outcomes import Outcome, Stage

@@ -22,11 +22,11 @@ from typing import Any, TypeVar
 import click
 from distributed import Client
 
-from drakegrasp.build.pipeline import build
-from drakegrasp.build.work_unit import UnitSummary, WorkUnit
 from drakegrasp.cli.options import shared
 from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import DaskExecutor
+from drakegrasp.generation.pipeline import build
+from drakegrasp.generation.work_unit import UnitSummary, WorkUnit
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome

@@ -9,7 +9,7 @@ import pytest
 from helpers.objects import CUBE, box_model
 
 from drakegrasp.bench import fidelity
-from drakegrasp.build.attempts import TrialSetup
+from drakegrasp.generation.attempts import TrialSetup
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.mesh.surfaces import signed_volume

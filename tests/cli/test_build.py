@@ -23,8 +23,6 @@ from helpers.builds import start_build, workers_of
 from helpers.commands import run
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 
-from drakegrasp.build.counts import Counts
-from drakegrasp.build.pipeline import build
 from drakegrasp.config import Config
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import read_manifest
@@ -32,6 +30,8 @@ from drakegrasp.dataset.paths import CARD_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 from drakegrasp.errors import DataError, MachineError
+from drakegrasp.generation.counts import Counts
+from drakegrasp.generation.pipeline import build
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime import file_set
@@ -131,8 +131,8 @@ def test_assemble_that_works_keeps_its_filters(out: Path) -> None:
 #: Assembles copies of a dataset without samples, and dies at the first rename, the second, ...
 DIE = """
 import os, signal, sys
-from drakegrasp.build.counts import Counts
-from drakegrasp.build.pipeline import build
+from drakegrasp.generation.counts import Counts
+from drakegrasp.generation.pipeline import build
 from drakegrasp.cli.main import main
 from drakegrasp.config import Config
 rename, (setting, *copies) = os.replace, sys.argv[1:]
@@ -219,7 +219,7 @@ def test_crashes_that_no_physics_explains_end_the_build_with_an_error(
     def build_here(objects: Path, out: Path, *, config: Config, show: bool, **_: Any) -> Any:
         return build(find_meshes(objects), out, config, run_here, show=show)
 
-    monkeypatch.setattr("drakegrasp.build.work_unit._try_step", _crash)
+    monkeypatch.setattr("drakegrasp.generation.work_unit._try_step", _crash)
     monkeypatch.setattr("drakegrasp.api.building.build_dataset", build_here)
     (tmp_path / "meshes").mkdir()
     trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "meshes" / "1_box.obj")

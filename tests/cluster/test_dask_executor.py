@@ -14,11 +14,11 @@ import pytest
 from dask.utils import parse_timedelta
 from distributed import Client, LocalCluster, SpecCluster, get_worker
 
-from drakegrasp.build.prepare import PREPARE_SECONDS
 from drakegrasp.cluster import executor as tasks
 from drakegrasp.cluster.connect import connect, dask_settings
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.errors import BlankImageError, MachineError
+from drakegrasp.generation.prepare import PREPARE_SECONDS
 from drakegrasp.runtime.journal import wall_limit
 from drakegrasp.vision import rendering
 

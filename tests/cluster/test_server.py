@@ -20,11 +20,11 @@ from server.processes import wait_until
 from server.slurm import PARTITION, queued_jobs, running_slurm
 from server.ssh import running_sshd
 
-from drakegrasp.build.pipeline import build
 from drakegrasp.cluster import launch
 from drakegrasp.cluster.admission import worker_environment
 from drakegrasp.cluster.launch import start_cluster
 from drakegrasp.cluster.request import ClusterRequest
+from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here

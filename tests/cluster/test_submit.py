@@ -25,7 +25,6 @@ from helpers.meshes import write_fixed
 from helpers.scripts import PIPELINES, load_script
 
 import drakegrasp
-from drakegrasp.build.pipeline import build
 from drakegrasp.cluster import connect as connecting
 from drakegrasp.cluster import launch
 from drakegrasp.cluster.admission import admitted_workers, worker_environment
@@ -34,6 +33,7 @@ from drakegrasp.cluster.connect import connect, dask_settings
 from drakegrasp.cluster.launch import _exports, start_cluster
 from drakegrasp.cluster.request import ClusterRequest, walltime_seconds
 from drakegrasp.errors import ConfigError, MachineError
+from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here

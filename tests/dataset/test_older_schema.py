@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from helpers.datasets import edit_manifest
 
-from drakegrasp.build.merge import merge
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import claim_directory, read_manifest
@@ -21,6 +20,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.statistics import count_funnel, count_splits, count_unfinished
 from drakegrasp.errors import DataError
+from drakegrasp.generation.merge import merge
 from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.inspection.rows import read_rows
 

@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 from helpers.datasets import OTM, OTO, TRIALS, edit_file, edit_manifest, make_dataset
 
-from drakegrasp.build.columns import TrialRow
-from drakegrasp.build.replay import replay_trial
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.layout.structure import DATA_TABLES, SCENE_TABLES, TRIAL_TABLES, Tables
@@ -33,6 +31,8 @@ from drakegrasp.dataset.schema import (
 from drakegrasp.dataset.shards import ASSEMBLED_FIELDS
 from drakegrasp.dataset.statistics import count_funnel, count_splits, count_unfinished
 from drakegrasp.errors import DataError
+from drakegrasp.generation.columns import TrialRow
+from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Stage
 from drakegrasp.simulation.contacts import Contacts

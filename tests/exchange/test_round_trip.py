@@ -22,7 +22,6 @@ from helpers.commands import run
 from helpers.datasets import OTO
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.build.pipeline import build, posture_config
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
@@ -30,6 +29,7 @@ from drakegrasp.dataset.trials import Trials
 from drakegrasp.exchange.export import FORMATS, export_dataset
 from drakegrasp.exchange.posture_files import read_postures
 from drakegrasp.frames import unpack_pose
+from drakegrasp.generation.pipeline import build, posture_config
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config

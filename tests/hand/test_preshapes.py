@@ -11,13 +11,13 @@ import pytest
 import yaml
 from helpers.successes import good
 
-from drakegrasp.build.columns import trial_rows
 from drakegrasp.config import CandidateConfig, Config, FilterConfig
 from drakegrasp.dataset.filters import judge_successes
 from drakegrasp.errors import HandError
 from drakegrasp.exchange.closed_grasps import ClosedGrasp
 from drakegrasp.exchange.dexgraspbench import grasp_dictionary
 from drakegrasp.exchange.isaac_grasp import grasp_entry
+from drakegrasp.generation.columns import trial_rows
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand, load_plain_hand
 from drakegrasp.hand.files import hand_file

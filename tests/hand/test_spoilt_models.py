@@ -15,10 +15,10 @@ from helpers.vendors import JAWS, JAWS_MJCF, fixed, link, write_model
 from drakegrasp.cli.main import main
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.draft.parsing import read_model
+from drakegrasp.hand.draft.source import read_source
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.shapes import link_shapes
-from drakegrasp.hand.vendor.parsing import read_model
-from drakegrasp.hand.vendor.source import read_source
 
 MIMIC = '<mimic joint="left_slide"/>'
 JAW = '<geometry><box size="0.02 0.012 0.06"/></geometry>'

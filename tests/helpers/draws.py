@@ -19,9 +19,9 @@ import numpy as np
 import trimesh
 from threadpoolctl import threadpool_info
 
-from drakegrasp.build.prepare import prepare
 from drakegrasp.config import BuiltinConfig, SplitConfig
 from drakegrasp.dataset.assembly.split import split_samples
+from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes

@@ -23,7 +23,6 @@ from helpers.pages import ATTACK, coded, numbered
 from helpers.predictions import write_predictions
 from matplotlib.image import imread
 
-from drakegrasp.build.scenes.make import make_scenes
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.rejections import (
@@ -33,6 +32,7 @@ from drakegrasp.dataset.rejections import (
     read_rejected,
     write_decisions,
 )
+from drakegrasp.generation.scenes.make import make_scenes
 from drakegrasp.inspection.app import Inspection, make_app
 from drakegrasp.inspection.catalog import Catalog, Snapshot
 from drakegrasp.inspection.serve import listen

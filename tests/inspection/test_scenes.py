@@ -16,7 +16,7 @@ from helpers.pages import Tags, state_of
 from PIL import Image
 from starlette.testclient import TestClient
 
-from drakegrasp.build.scenes.make import make_scenes
+from drakegrasp.generation.scenes.make import make_scenes
 from drakegrasp.inspection import static_site
 from drakegrasp.inspection.app import Inspection, make_app
 from drakegrasp.inspection.scenes.pages import FAILS, HOLDS, UNKNOWN

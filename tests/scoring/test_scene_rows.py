@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from helpers.datasets import OTO, make_dataset
 
-from drakegrasp.build.scenes.make import make_scenes
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.scenes.rows import SceneRows, open_rows
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.frames import transform_points
+from drakegrasp.generation.scenes.make import make_scenes
 from drakegrasp.scoring.references import REFERENCES, Scene
 from drakegrasp.scoring.run import own_contacts
 from drakegrasp.verification.placed_grasp import place_on_rows

@@ -19,8 +19,8 @@ import pytest
 from helpers.objects import CUBE, from_above, standing
 from helpers.verdicts import some_forces
 
-from drakegrasp.build.replay import record_trial
 from drakegrasp.config import Config
+from drakegrasp.generation.replay import record_trial
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome

@@ -9,9 +9,9 @@ import numpy as np
 
 from drakegrasp.commissioning.draft.opposition import Grip
 from drakegrasp.frames import Array, invert_pose, transform_points
+from drakegrasp.hand.draft.model import VendorModel
 from drakegrasp.hand.finger_sweep import even_points
 from drakegrasp.hand.shapes import hull_planes
-from drakegrasp.hand.vendor.model import VendorModel
 
 #: Links other than fingertips overlap by less [m]: points miss a part of what Drake sees.
 SUNK = 2e-4

@@ -17,7 +17,7 @@ import numpy as np
 
 from drakegrasp.commissioning.draft.answers import Answers
 from drakegrasp.frames import Array
-from drakegrasp.hand.vendor.model import VendorJoint, VendorModel
+from drakegrasp.hand.draft.model import VendorJoint, VendorModel
 
 #: Cosine from which two axes count as parallel.
 PARALLEL = 0.94

@@ -14,7 +14,7 @@ from drakegrasp.commissioning.draft.answers import Answers
 from drakegrasp.commissioning.draft.closings import Closing, find_closings
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array
-from drakegrasp.hand.vendor.model import VendorJoint, VendorModel
+from drakegrasp.hand.draft.model import VendorJoint, VendorModel
 
 #: Postures on the way from open to closed.
 STEPS = 12

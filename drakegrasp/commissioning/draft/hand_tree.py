@@ -26,9 +26,9 @@ from drakegrasp.commissioning.draft.wording import finger_names, reasons_of
 from drakegrasp.config import Config, apply_override
 from drakegrasp.errors import ConfigError, HandError
 from drakegrasp.frames import Array, invert_pose, transform_points
+from drakegrasp.hand.draft.model import VendorModel
 from drakegrasp.hand.file_format import VERSION
 from drakegrasp.hand.model_text import Mimic
-from drakegrasp.hand.vendor.model import VendorModel
 from drakegrasp.simulation.construction import FINGER_DAMPING
 
 #: Usual closing speeds [rad/s], [m/s].

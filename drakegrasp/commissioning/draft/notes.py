@@ -10,7 +10,7 @@ from drakegrasp.commissioning.draft.answers import Answers
 from drakegrasp.commissioning.draft.closings import find_closings
 from drakegrasp.commissioning.draft.fingers import find_palm, find_tips
 from drakegrasp.commissioning.draft.opposition import Grip
-from drakegrasp.hand.vendor.model import VendorModel
+from drakegrasp.hand.draft.model import VendorModel
 
 #: A smaller share of a joint's range is not worth a note.
 SHARE = 0.01

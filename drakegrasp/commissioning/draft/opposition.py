@@ -15,7 +15,7 @@ from drakegrasp.commissioning.draft.closings import Closing
 from drakegrasp.commissioning.draft.fingers import STEPS, Chain
 from drakegrasp.commissioning.draft.pads import Pad, end_of, find_pad, snapped, surface_points
 from drakegrasp.frames import Array
-from drakegrasp.hand.vendor.model import VendorJoint, VendorModel
+from drakegrasp.hand.draft.model import VendorJoint, VendorModel
 
 #: Width of what is pinched [m], and how far from it costs nothing.
 WIDTH, TOLERANCE = 0.04, 0.01

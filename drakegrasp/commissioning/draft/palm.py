@@ -15,8 +15,8 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 from drakegrasp.commissioning.draft.opposition import Grip
 from drakegrasp.commissioning.motion_checks import PALM_DEPTH, ray_end
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
+from drakegrasp.hand.draft.model import VendorModel
 from drakegrasp.hand.shapes import ray_span
-from drakegrasp.hand.vendor.model import VendorModel
 
 #: Directions that are tried: their steps [deg], and how near an axis of the palm counts as one.
 STEP_DEG, ALIGNED = 15, np.deg2rad(15.0)

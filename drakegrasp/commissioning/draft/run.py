@@ -29,11 +29,11 @@ from drakegrasp.commissioning.trial_grasps import GRASPS, check_grasp
 from drakegrasp.config import Config
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.draft.model import VendorModel
+from drakegrasp.hand.draft.parsing import read_model
+from drakegrasp.hand.draft.source import read_source
+from drakegrasp.hand.draft.writing import write_urdf
 from drakegrasp.hand.settings import load_config
-from drakegrasp.hand.vendor.model import VendorModel
-from drakegrasp.hand.vendor.parsing import read_model
-from drakegrasp.hand.vendor.source import read_source
-from drakegrasp.hand.vendor.writing import write_urdf
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.files import atomic_folder
 

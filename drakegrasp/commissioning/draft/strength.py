@@ -21,7 +21,7 @@ import numpy as np
 from drakegrasp.commissioning.draft.opposition import Grip, Member
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array
-from drakegrasp.hand.vendor.model import VendorModel
+from drakegrasp.hand.draft.model import VendorModel
 
 #: Efforts that a finger's motor can have: turning [N m], sliding [N]. Others are placeholders.
 POSSIBLE = {False: (0.005, 20.0), True: (0.5, 1000.0)}

@@ -7,7 +7,7 @@ from itertools import takewhile
 from drakegrasp.commissioning.draft.answers import Answers
 from drakegrasp.commissioning.draft.opposition import Grip
 from drakegrasp.commissioning.draft.palm import PalmFrame
-from drakegrasp.hand.vendor.model import VendorModel
+from drakegrasp.hand.draft.model import VendorModel
 
 #: Names of fingers, by what the names of their links contain.
 NAMES = ("thumb", "index", "middle", "ring", "pinky", "little")

@@ -10,8 +10,8 @@ import h5py
 import numpy as np
 import pytest
 
-from drakegrasp.build.scenes.make import make_scenes
 from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.generation.scenes.make import make_scenes
 
 pytestmark = pytest.mark.sim
 

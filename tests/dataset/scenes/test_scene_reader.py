@@ -12,10 +12,10 @@ import h5py
 import numpy as np
 import pytest
 
-from drakegrasp.build.scenes.make import make_scenes
 from drakegrasp.dataset.scenes.reader import SceneDataset
 from drakegrasp.errors import DataError
 from drakegrasp.frames import invert_pose, transform_points
+from drakegrasp.generation.scenes.make import make_scenes
 
 pytestmark = pytest.mark.sim
 

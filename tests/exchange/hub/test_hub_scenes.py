@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from drakegrasp.build.scenes.make import make_scenes
 from drakegrasp.dataset.schema import SCENE_GRASP_FIELDS, SPLITS, VIEW_FIELDS, Field
 from drakegrasp.errors import DataError
 from drakegrasp.exchange.export import export_dataset
+from drakegrasp.generation.scenes.make import make_scenes
 
 pytest.importorskip("pyarrow")
 pytestmark = pytest.mark.sim

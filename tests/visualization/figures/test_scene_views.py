@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drakegrasp.build.scenes.make import make_scenes
 from drakegrasp.dataset.scenes.reader import SceneDataset
 from drakegrasp.errors import DataError
+from drakegrasp.generation.scenes.make import make_scenes
 from drakegrasp.visualization.figures.scene_views import scene_views
 
 pytestmark = pytest.mark.sim

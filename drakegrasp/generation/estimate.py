@@ -1,0 +1,192 @@
+"""What a build will take: hours, core-hours and bytes, before it is started.
+
+In: the number of objects, the configuration, the number of workers, and how long each stage
+takes on average. Out: stage by stage, the tasks of the busiest worker times the mean of a task.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.assembly.pack import TASK_ROWS
+from drakegrasp.errors import ConfigError, counted
+from drakegrasp.generation.request import BUILTIN, BuildRequest, refuse_unknown
+from drakegrasp.generation.stage_times import MEASURED, StageTimes
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.runtime.environment import available_cores
+from drakegrasp.shapes.catalog import draw_builtin
+
+#: Time that the scheduler and the client spend on a task, one after the other [s]; measured
+#: with distributed 2026.8 on two cores.
+TASK_SECONDS = 0.003
+#: One simulation of `certify` [s]: twice the mean of 48 successes on ten G3DB meshes.
+CERTIFY_SECONDS = 1.0
+#: Time until a worker has imported Drake and takes its first task [s].
+START_SECONDS = 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What a build is expected to take.
+
+    Attributes:
+        objects: Number of objects.
+        attempts: Number of attempts.
+        units: Number of work units.
+        workers: Number of workers.
+        stages: Wall clock of each stage: start, prepare, simulate, assemble [s].
+        samples: Expected rows of the data files.
+        bytes: Expected size of the directory [B].
+        source: Where the times are from.
+    """
+
+    objects: int
+    attempts: int
+    units: int
+    workers: int
+    stages: dict[str, float]
+    samples: int
+    bytes: float
+    source: str
+
+    @property
+    def seconds(self) -> float:
+        """Wall clock from start to end [s]."""
+        return sum(self.stages.values())
+
+    @property
+    def hours(self) -> float:
+        """Hours from start to end."""
+        return self.seconds / 3600.0
+
+    @property
+    def core_hours(self) -> float:
+        """Hours of all workers together, waiting included: what a cluster is asked for."""
+        return self.workers * self.hours
+
+
+#: More workers, or objects, than any build has.
+MOST_WORKERS = 1_000_000
+
+
+def plan_build(objects: int, config: Config, workers: int, times: StageTimes) -> Plan:
+    """Return what building some objects from nothing is expected to take.
+
+    Every object is taken to have as many candidates as it may have, and none to be cut short by
+    `max_grasps`: this is never less than what will be done.
+
+    Raises:
+        ConfigError: If there is no object or no worker.
+    """
+    for name, count in (("objects", objects), ("workers", workers)):
+        if count < 1:
+            raise ConfigError(f"{name} must be at least 1, got {count}")
+        if count > MOST_WORKERS:
+            raise ConfigError(f"{name} must be at most {MOST_WORKERS:,}, got {count}")
+
+    # How much there is to do.
+    ranges = tuple(config.unit_ranges(config.candidates.max))
+    units = objects * len(ranges)
+    standoffs = len(config.candidates.standoffs)
+    attempts = objects * config.candidates.max * standoffs
+    successes = attempts * times.successes
+    samples = successes * times.samples
+
+    # The mean attempt, and the scenes: all workers that share an object's units build its scene.
+    attempt = times.attempt + times.successes * (times.look + _certify_seconds(config))
+    scenes = objects * min(workers, len(ranges))
+    longest = standoffs * max(map(len, ranges)) * attempt
+
+    # Assembling: a task for each object, then one for some rows each. Meanwhile one process puts
+    # what is packed into the files.
+    survey = _shared(objects, workers, attempts / objects * times.survey)
+    pack = _shared(math.ceil(attempts / TASK_ROWS), workers, TASK_ROWS * times.pack)
+
+    return Plan(
+        objects=objects,
+        attempts=attempts,
+        units=units,
+        workers=workers,
+        stages={
+            "start": START_SECONDS,
+            "prepare": _shared(objects, workers, times.prepare),
+            "simulate": max(_shared(units, workers, attempts / units * attempt), longest)
+            + math.ceil(scenes / workers) * times.scene,
+            "assemble": survey + max(pack, attempts * times.put),
+        },
+        samples=round(samples),
+        bytes=(
+            objects * times.object_bytes
+            + units * times.unit_bytes
+            + attempts * times.attempt_bytes
+            + successes * times.success_bytes
+            + samples * times.sample_bytes
+        ),
+        source=times.source,
+    )
+
+
+def plan_request(
+    request: BuildRequest, workers: int | None = None, times: StageTimes | None = None
+) -> Plan:
+    """Return what a requested build is expected to take.
+
+    Args:
+        request: What is to be built.
+        workers: Number of workers; one per core of this machine if None.
+        times: Of the stages; `MEASURED` if None.
+
+    Raises:
+        MeshError: If there is no mesh, or `only` names no object.
+        ConfigError: If there is no worker.
+    """
+    if request.objects == BUILTIN:
+        names = [each.name for each in draw_builtin(request.config.builtin)]
+    else:
+        meshes = find_meshes(request.objects, units=request.units, manifest=request.manifest)
+        names = [mesh.name for mesh in meshes]
+    refuse_unknown(request.only, names)
+    objects = len(set(request.only or names))
+    count = available_cores() if workers is None else workers
+    return plan_build(objects, request.config, count, times or MEASURED)
+
+
+def plan_lines(plan: Plan) -> list[str]:
+    """Return a plan as the lines that are printed."""
+    stages = ", ".join(f"{name} {_duration(seconds)}" for name, seconds in plan.stages.items())
+    return [
+        f"from the beginning: {counted(plan.objects, 'object')}, "
+        f"{counted(plan.attempts, 'attempt')} in {counted(plan.units, 'work unit')}",
+        f"expected {_duration(plan.seconds)} on {counted(plan.workers, 'worker')} ({stages})",
+        f"expected {plan.core_hours:,.2f} core-hours",
+        f"expected {counted(plan.samples, 'sample')}, {_size(plan.bytes)} on disk",
+        f"times and sizes: {plan.source}",
+    ]
+
+
+def _shared(tasks: int, workers: int, seconds: float) -> float:
+    """Return how long workers take for tasks of equal length [s]; Dask limits their number."""
+    return max(math.ceil(tasks / workers) * seconds, tasks * TASK_SECONDS)
+
+
+def _certify_seconds(config: Config) -> float:
+    """Return how long certifying takes for each success [s]; other lifts are not counted."""
+    rules = config.certify
+    simulations = rules.repeats + rules.friction_steps + 1 if config.certified else 0
+    return CERTIFY_SECONDS * (rules.share or 0.0) * simulations
+
+
+def _duration(seconds: float) -> str:
+    for unit, length in (("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2.0 * length:
+            return f"{seconds / length:,.1f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def _size(size: float) -> str:
+    for unit, length in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if size >= length:
+            return f"{size / length:.1f} {unit}"
+    return f"{size / 1e3:.0f} kB"

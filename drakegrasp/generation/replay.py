@@ -1,0 +1,151 @@
+"""Runs a trial of a dataset again and says which stored values differ."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.manifest import installed_versions, read_manifest
+from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
+from drakegrasp.dataset.shards import trial_columns
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.generation.attempts import TrialSetup, find_attempt, measure_contacts, try_attempt
+from drakegrasp.generation.columns import trial_rows
+from drakegrasp.hand.description import load_hand
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.blas import one_thread
+from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.trial import start_meetings
+from drakegrasp.visualization.recording import record_attempt
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """A trial that was run again.
+
+    Attributes:
+        trial_id: Its row.
+        object_name: Its object.
+        recorded: The outcome in the file.
+        found: The outcome now.
+        differences: Largest absolute difference of each field whose values differ.
+        versions: Packages whose versions differ, as "then -> now".
+        meetings: Of a start collision the links of the hand that meet the object or the table
+            where it starts, by "object" and "table".
+    """
+
+    trial_id: int
+    object_name: str
+    recorded: Outcome
+    found: Outcome
+    differences: dict[str, float]
+    versions: dict[str, str]
+    meetings: dict[str, list[str]]
+
+    @property
+    def same(self) -> bool:
+        """Whether every stored value came out the same, bit for bit."""
+        return not self.differences
+
+
+@one_thread
+def replay_trial(out: str | Path, trial_id: int) -> Replay:
+    """Run one trial of a dataset again, from its prepared object and its candidate.
+
+    The same machine and versions give the same bits. `versions` says which packages have other
+    versions now.
+
+    Raises:
+        DataError: If the dataset or the trial is not there.
+    """
+    stored = _stored_trial(Path(out), trial_id)
+    prepared, config = stored.prepared, stored.config
+
+    # Run the attempt as a work unit would, up to the row that it would store.
+    scene = build_scene(prepared.model, config.physics, load_hand(config.hand_source))
+    setup = TrialSetup(prepared=prepared, config=config, scene=scene)
+    record = try_attempt(setup, stored.attempt)
+    row = trial_rows(setup, [stored.attempt], [record], [measure_contacts(setup, record)])
+    if stored.row["outcome"] == Outcome.SLIPPED and record.outcome is Outcome.PARTLY_HELD:
+        row["outcome"][0] = Outcome.SLIPPED  # as an older version called it
+
+    # What a hand met that could not start.
+    meetings = {}
+    if record.outcome is Outcome.START_COLLISION:
+        meetings = start_meetings(setup.scene_of(stored.attempt), record.X_TO, stored.attempt)
+
+    # Compare bit for bit; other versions may explain a difference.
+    now = installed_versions(config)
+    return Replay(
+        trial_id=trial_id,
+        object_name=stored.row["object_name"],
+        recorded=Outcome(int(stored.row["outcome"])),
+        found=Outcome(int(row["outcome"][0])),
+        differences={
+            field.name: _difference(stored.row[field.name], row[field.name][0])
+            for field in trial_columns()
+            if field.name in row
+            and not np.array_equal(stored.row[field.name], row[field.name][0], equal_nan=True)
+        },
+        versions={
+            key: f"{then} -> {now.get(key)}"
+            for key, then in stored.versions.items()
+            if now.get(key) != then
+        },
+        meetings=meetings,
+    )
+
+
+def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
+    """Run one trial of a dataset again and write an HTML file that plays it back.
+
+    Returns:
+        The outcome now.
+
+    Raises:
+        DataError: If the dataset or the trial is not there.
+        OSError: If the file cannot be written.
+    """
+    stored = _stored_trial(Path(out), trial_id)
+    X_TO = stored.prepared.resting_poses[stored.attempt.resting]
+    model, config = stored.prepared.model, stored.config
+    # A hand that was not lifted for its image is not lifted here, and nothing is rendered.
+    lifted = stored.row["outcome"] != Outcome.NOT_LIFTED
+    attempt = stored.attempt
+    return record_attempt(model, X_TO, attempt, config, Path(path), is_visible=lifted).outcome
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _StoredTrial:
+    """A row of trials.hdf5, and what to run it again with."""
+
+    row: dict[str, Any]
+    prepared: PreparedObject
+    attempt: Attempt
+    config: Config
+    versions: dict[str, str]
+
+
+def _stored_trial(out: Path, trial_id: int) -> _StoredTrial:
+    manifest = read_manifest(out)
+    row = Trials(out).trial(trial_id)
+    name = row["object_name"]
+    config = manifest.config_of(name)
+    prepared = load_prepared(out, name, config)
+    candidate, standoff, child = (int(row[key]) for key in ("candidate", "standoff_index", "child"))
+    return _StoredTrial(
+        row=row,
+        prepared=prepared,
+        attempt=find_attempt(prepared, candidate, standoff, child, config),
+        config=config,
+        versions=manifest.versions,
+    )
+
+
+def _difference(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.max(np.abs(np.asarray(a, dtype=float) - np.asarray(b, dtype=float))))

@@ -1,0 +1,178 @@
+"""The text of a vendor's model.
+
+In: a URDF, SDFormat or MJCF file. Out: its XML, complete by itself but for meshes. A file that asks
+for too much (entities, depth, includes without end) is refused before anything else reads it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from drakegrasp.errors import HandError, one_line
+from drakegrasp.foreign_files import read_content
+from drakegrasp.hand.draft.folders import Folders
+from drakegrasp.hand.files import find_packages
+
+#: Formats by the tag of the root.
+FORMATS = {"robot": "urdf", "sdf": "sdf", "mujoco": "xml"}
+SUFFIXES = (".urdf", ".sdf", ".xml", ".mjcf")
+#: A model's text has at most so many bytes, elements within each other, and files of its own.
+LONGEST, DEEPEST, MOST_INCLUDES = 20_000_000, 200, 50
+#: Bytes that are parsed at a time.
+BITE = 65_536
+#: Numbers of URDF (attributes) and SDFormat (elements), those of MJCF, and what may be infinite.
+_NUMBERS = frozenset(
+    {
+        *("xyz", "rpy", "ixx", "ixy", "ixz", "iyy", "iyz", "izz", "mass", "lower", "upper"),
+        *("effort", "velocity", "multiplier", "offset", "reference", "radius", "length", "size"),
+        *("scale", "rgba", "damping", "friction", "pose"),
+    }
+)
+_MJCF_NUMBERS = frozenset(
+    {
+        *("pos", "quat", "euler", "axisangle", "xyaxes", "zaxis", "axis", "fromto", "size"),
+        *("scale", "mass", "density", "diaginertia", "fullinertia", "range", "ref", "polycoef"),
+        *("coef", "kp", "gear", "ctrlrange", "forcerange", "actuatorfrcrange", "gainprm"),
+        *("biasprm", "damping"),
+    }
+)
+_ENDLESS = ("lower", "upper", "effort", "velocity", "range", "ctrlrange", "forcerange")
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+#: What an element of a model may not lead to: Drake would look for the file itself.
+_ELSEWHERE = {"robot": ("drake:include",), "sdf": ("include",), "mujoco": ("hfield", "plugin")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """A vendor's model, read.
+
+    Attributes:
+        root: Its XML, with what it includes.
+        folders: Of its meshes.
+    """
+
+    root: Element
+    folders: Folders
+
+
+def read_source(path: Path, packages: Mapping[str, Path], given: Sequence[Path] = ()) -> Source:
+    """Return the XML of a model.
+
+    Args:
+        path: A URDF, SDFormat or MJCF file.
+        packages: Folders of package:// URIs, beside those in which the model lies.
+        given: Folders outside of the model's that it may use.
+
+    Raises:
+        HandError: If it cannot be read, in one line that says how to mend it.
+    """
+    # What it is.
+    path = Path(path)
+    if path.suffix.lower() == ".xacro":
+        raise HandError(f"{path}: must be URDF, got xacro: run `xacro {path.name} > hand.urdf`")
+    if path.suffix.lower() not in SUFFIXES:
+        raise HandError(f"{path}: must end in .urdf, .sdf or .xml (MJCF), got {path.suffix!r}")
+    for name, folder in packages.items():
+        if not folder.is_dir():
+            raise HandError(f"package {name} must be a folder, got {str(folder)!r}")
+    root = _parse(path)
+    if root.tag not in FORMATS:
+        raise HandError(
+            f"{path}: must be a model in URDF, SDFormat or MJCF, got XML of <{root.tag}>"
+        )
+
+    # What it is made of.
+    folder = path.resolve().parent
+    known = {**find_packages(folder, path.name, {}), **packages}
+    folders = Folders(model=folder, packages=known, given=tuple(given))
+    if root.tag == "mujoco":
+        _include(root, folders, [0])
+    for element in root.iter():
+        if element.tag in _ELSEWHERE[root.tag] and (element.get("file") or len(element)):
+            raise HandError(
+                f"{path}: must be complete by itself, got <{element.tag}>: put what it names into "
+                "the file"
+            )
+    _refuse_xacro(root, path)
+    _refuse_words(root, root.tag == "mujoco", f"<{root.tag}>")
+    return Source(root=root, folders=folders)
+
+
+def _parse(path: Path) -> Element:
+    """Return the root of an XML file that defines no entities and is not nested too deeply."""
+    # Entities come with a document type.
+    try:
+        text = read_content(path, LONGEST)
+    except OSError as error:
+        raise HandError(f"{path}: must be a readable file, got: {error.strerror}") from None
+    if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
+        raise HandError(f"{path}: must be XML without a document type, got <!DOCTYPE>")
+
+    # It is read bit by bit: what is too deep need not be built.
+    depth, root = 0, None
+    parser: Any = ElementTree.XMLPullParser(("start", "end"))
+    try:
+        for start in range(0, len(text) + 1, BITE):
+            parser.feed(text[start : start + BITE])
+            for event, element in parser.read_events():
+                root = element if root is None else root
+                depth += 1 if event == "start" else -1
+                if depth > DEEPEST:
+                    raise HandError(f"{path}: must be XML of at most {DEEPEST} levels, got more")
+        parser.close()
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise HandError(f"{path}: must be XML, got text that is not ({one_line(error)})") from None
+    assert isinstance(root, Element)
+    return root
+
+
+def _refuse_xacro(root: Element, path: Path) -> None:
+    """Refuse what xacro would have replaced."""
+    for element in root.iter():
+        names = [element.tag, *element.attrib]
+        texts = [element.text or "", *element.attrib.values()]
+        left = [f"<{n.rpartition('}')[2]}>" for n in names if "xacro" in n.rpartition("}")[0]]
+        left += [text.strip() for text in texts if "${" in text or "$(" in text]
+        if left:
+            raise HandError(
+                f"{path}: must be a model in which xacro left nothing to expand, got {left[0]!r}: "
+                "run `xacro` on its source"
+            )
+
+
+def _refuse_words(element: Element, mjcf: bool, owner: str) -> None:
+    """Refuse what is no number where a model has numbers: parsers read its start, or nothing."""
+    owner = f"{element.tag} {element.get('name')!r}" if "name" in element.attrib else owner
+    known = _MJCF_NUMBERS if mjcf else _NUMBERS
+    found = [(key, text) for key, text in element.attrib.items() if key in known]
+    if not mjcf and element.tag == "mass" and "value" in element.attrib:
+        found.append(("mass", element.attrib["value"]))
+    elif not mjcf and element.tag in known and not (len(element) or element.attrib):
+        found.append((element.tag, element.text or ""))
+    for key, text in found:
+        words = text.split() or [""]
+        ends = ("inf", "infinity") if key in _ENDLESS else ()
+        if not all(_NUMBER.fullmatch(w) or w.lower().lstrip("+-") in ends for w in words):
+            raise HandError(f"model: {key} of {owner} must be a number, got {text!r}")
+    for child in element:
+        _refuse_words(child, mjcf, owner)
+
+
+def _include(root: Element, folders: Folders, count: list[int]) -> None:
+    """Put the content of included MJCF files in place of their <include>."""
+    for parent in list(root.iter()):
+        for child in [c for c in parent if c.tag == "include"]:
+            count[0] += 1
+            if count[0] > MOST_INCLUDES:
+                raise HandError("model: must include other files once each, got a loop of them")
+            included = _parse(folders.find(child.get("file", ""), folders.model))
+            _include(included, folders, count)
+            place = list(parent).index(child)
+            parent.remove(child)
+            parent[place:place] = list(included)

@@ -1,0 +1,176 @@
+"""scenes.hdf5: the same bytes whoever makes it, places and cameras, labels, visible contacts."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from drakegrasp.cli.main import main
+from drakegrasp.dataset.card.content import card_content
+from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.paths import CARD_FILES
+from drakegrasp.errors import ConfigError
+from drakegrasp.frames import unpack_pose
+from drakegrasp.generation.scenes.make import make_scenes, split_objects
+from drakegrasp.generation.scenes.visible import visible_contacts
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import processes
+from drakegrasp.vision.viewpoints import fixed_viewpoints
+
+pytestmark = pytest.mark.sim
+
+
+@pytest.fixture(scope="module")
+def scenes(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = Path(shutil.copytree(sound, tmp_path_factory.mktemp("scenes") / "out"))
+    return make_scenes(out).path
+
+
+def test_bytes_do_not_depend_on_the_number_of_workers(scenes: Path, out: Path) -> None:
+    with processes(2) as execute:
+        again = make_scenes(out, execute=execute)
+    assert again.path.read_bytes() == scenes.read_bytes()
+
+
+def test_card_counts_them_as_long_as_they_are_of_the_dataset(scenes: Path, out: Path) -> None:
+    with h5py.File(scenes) as file:
+        splits = file["scenes/split"][:]
+        tested = splits[file["grasps/scene"][:]][file["grasps/tested"][:]]
+    card = json.loads((scenes.parent / CARD_FILES[0]).read_text(encoding="utf-8"))
+    counted = [(row["scenes"], row["tested"]) for row in card["scenes"].values()]
+    assert counted == [((splits == i).sum(), (tested == i).sum()) for i in range(3)]
+    text = (scenes.parent / CARD_FILES[1]).read_text(encoding="utf-8")
+    assert f"| test | {card['scenes']['test']['scenes']} |" in text.partition("## Scenes")[2]
+    # Those of other trials, and damaged ones.
+    shutil.copy(scenes, out)
+    assert card_content(out)["scenes"] == card["scenes"]
+    with h5py.File(out / scenes.name, "r+") as file:
+        file.attrs["shards"] = "others"
+    assert "scenes" not in card_content(out)
+    (out / scenes.name).write_bytes(b"no file")
+    assert "scenes" not in card_content(out)
+
+
+def test_nothing_else_of_the_dataset_changes(sound: Path, scenes: Path) -> None:
+    names = {path.name for path in scenes.parent.iterdir()} - {"build.lock"}
+    assert names == {path.name for path in sound.iterdir()} | {"scenes.hdf5"}
+    for path in sound.iterdir():
+        if path.is_file() and path.name not in CARD_FILES:
+            assert path.read_bytes() == (scenes.parent / path.name).read_bytes()
+
+
+def test_objects_are_turned_and_moved_and_cameras_differ_by_split(scenes: Path) -> None:
+    with h5py.File(scenes) as file:
+        X_TO = unpack_pose(file["scenes/X_TO"][:, 0])
+        split, X_TC = file["scenes/split"][:], unpack_pose(file["views/X_TC"][:])
+        scene, kind = file["views/scene"][:], file["views/kind"][:]
+        names = file["objects/name"].asstr()[file["scenes/object"][:, 0]]
+    assert len(np.unique(X_TO[:, :2, 3])) == 6 and np.abs(X_TO[:, :2, 3]).max() <= 0.1
+    # Each is turned about Tz from where it rested.
+    entries = {entry.name: entry for entry in read_manifest(scenes.parent).objects}
+    for name, X in zip(names, X_TO, strict=True):
+        rested = unpack_pose(np.array(entries[name].resting[0].X_TO))
+        turn = X[:3, :3] @ rested[:3, :3].T
+        assert abs(turn[0, 1]) > 0.01 and abs(turn[2, 2] - 1.0) < 1e-9
+    for number, own in enumerate(split):
+        poses, kinds = X_TC[scene == number], kind[scene == number]
+        if own == 0:
+            assert len(poses) == 16 and not kinds.any()
+            assert len(np.unique(poses[:, :3, 3], axis=0)) == 16
+        else:
+            np.testing.assert_array_equal(poses, fixed_viewpoints())
+            assert kinds.tolist() == [1, 1, 1, 1, 2]
+
+
+def test_only_lifts_to_a_verdict_are_tested(scenes: Path) -> None:
+    with h5py.File(scenes) as file:
+        grasps = {name: file["grasps"][name][:] for name in ("outcome", "tested", "held", "sample")}
+        ids = file["grasps/trial_id"][:]
+    tested = set(grasps["outcome"][grasps["tested"]].tolist())
+    assert tested == {Outcome.SUCCESS, Outcome.SLIPPED, Outcome.DROPPED, Outcome.TABLE_CONTACT}
+    untested = set(grasps["outcome"][~grasps["tested"]].tolist())
+    # A hand that touched the table after closing was not lifted.
+    assert untested == {Outcome.MISSING_FINGERTIP, Outcome.HAND_CONTACT, Outcome.TABLE_CONTACT}
+    assert (grasps["held"] == (grasps["outcome"] == Outcome.SUCCESS)).all()
+    assert grasps["sample"].sum() > 0 and len(np.unique(ids)) == len(ids)
+
+
+def test_other_settings_than_of_scenes_are_refused(out: Path) -> None:
+    with pytest.raises(ConfigError, match="only keys of scenes can change"):
+        make_scenes(out, overrides=["filters.max_slip=1"])
+    made = make_scenes(out, overrides=["scenes.views=2", "scenes.width=64", "scenes.height=48"])
+    assert made.views["train"] == 2 * made.scenes["train"]
+    with h5py.File(made.path) as file:
+        assert file["views/rgb"].shape[1:] == (48, 64, 3)
+
+
+@pytest.mark.parametrize(
+    ("present", "splits"),
+    [
+        ([{0, 1}, {2}, {2}], [0, 2, 2]),
+        # The first has no sample: its class trains.
+        ([set(), {2}, {2}], [0, 2, 2]),
+        # The last is the only one of its class, which does not train.
+        ([{0}, {2}, set()], [0, 2, 2]),
+    ],
+)
+def test_by_class_no_object_is_in_two_splits(
+    sound: Path, present: list[set[int]], splits: list[int]
+) -> None:
+    manifest = read_manifest(sound)
+    split = manifest.config.split.model_copy(update={"by": "class", "valid_fraction": 0.0})
+    manifest = replace(manifest, config=manifest.config.model_copy(update={"split": split}))
+    assert split_objects(manifest, present) == splits
+
+
+def test_what_is_before_a_contact_hides_it_and_so_does_its_normal() -> None:
+    # The camera looks down at a plane 0.5 m away, half of which is hidden by one at 0.4 m.
+    depth = np.full((48, 64), 5000, dtype=np.uint16)
+    depth[:, :32] = 4000
+    K = np.array([[100.0, 0.0, 31.5], [0.0, 100.0, 23.5], [0.0, 0.0, 1.0]])
+    X_TC = np.diag([1.0, -1.0, -1.0, 1.0])
+    X_TC[2, 3] = 0.5
+    up, down = [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]
+    p_TQ = [[0.1, 0, 0], [-0.1, 0, 0], [0.1, 0, 0], [0.1, 0, -0.002], [0.1, 0, -0.004], [1, 0, 0]]
+    nhat = [up, up, down, up, up, up]
+    picture = K, depth, np.ones(depth.shape, dtype=np.uint8)
+    seen = visible_contacts(np.array(p_TQ), np.array(nhat), X_TC, *picture)
+    assert seen.tolist() == [True, False, False, True, False, False]
+    assert not visible_contacts(np.full((1, 3), np.nan), np.array([up]), X_TC, *picture).any()
+
+
+def test_a_contact_that_is_no_place_on_the_object_is_hidden() -> None:
+    """The mask ends at column 40; the contacts are 5 mm, a pixel, apart."""
+    depth, mask = np.full((48, 64), 5000, dtype=np.uint16), np.zeros((48, 64), dtype=np.uint8)
+    mask[:, :41] = 1
+    K = np.array([[100.0, 0.0, 32.0], [0.0, 100.0, 24.0], [0.0, 0.0, 1.0]])
+    X_TC = np.diag([1.0, -1.0, -1.0, 1.0])
+    X_TC[2, 3] = 0.5
+    p_TQ = np.array([[0.005 * (column - 32), 0, 0] for column in (39.5, 41.5, 42.1, 50)])
+    nhat = np.tile([0.0, 0.0, 1.0], (4, 1))
+    seen = visible_contacts(p_TQ, nhat, X_TC, K, depth, mask)
+    assert seen.tolist() == [True, True, False, False]
+    assert not visible_contacts(p_TQ, nhat, X_TC, K, depth, 0 * mask).any()
+
+
+def test_assemble_makes_them_where_the_configuration_says_so(out: Path) -> None:
+    arguments = ["assemble", str(out), "--workers", "1"]
+    assert CliRunner().invoke(main, arguments).exit_code == 0
+    assert not (out / "scenes.hdf5").exists()
+    wanted = ["--set", "scenes.when=assembled", "--set", "scenes.views=2"]
+    assert CliRunner().invoke(main, [*arguments, *wanted]).exit_code == 0
+    assert check_dataset(out) == []
+    with h5py.File(out / "scenes.hdf5") as file:
+        assert len(file["views/scene"]) == 2 + 2 * 5
+    # The next one, which is made of the same manifest, makes them again.
+    (out / "scenes.hdf5").unlink()
+    assert CliRunner().invoke(main, arguments).exit_code == 0
+    assert (out / "scenes.hdf5").exists()

@@ -1,0 +1,227 @@
+"""A dataset of one's own hand is passed on: its hand is in it, and every command reads it there."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from helpers.commands import error_line, run
+from helpers.datasets import edit_manifest
+from helpers.hands import write_tongs
+from helpers.machine import needs_egl
+
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
+from drakegrasp.errors import DataError
+from drakegrasp.generation.pipeline import BuildReport, build
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.folder import hand_digest
+from drakegrasp.hand.settings import load_config
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import run_here
+from drakegrasp.shapes.catalog import builtin_sources
+from drakegrasp.visualization.still_scene import StillScene
+from drakegrasp.visualization.surfaces import link_surfaces
+
+pytestmark = [pytest.mark.sim, needs_egl]
+
+LICENCE = "The Tongs Licence"
+
+
+#: A can of 0.2 kg, at one stand-off; lifts are quick.
+SETTINGS = (
+    *("builtin.per_class=1", "objects.mass=0.2", "camera.size=32", "candidates.max=18"),
+    *("candidates.standoffs=[0.07]", "lift.max_speed=1", "lift.max_acceleration=10"),
+    *("filters.outlier_sigma=0", "filters.require=held"),
+)
+
+
+def go_on(out: Path, hand: Path) -> BuildReport:
+    """Go on with the build, in this process."""
+    config = load_config(overrides=[*SETTINGS, f"hand={hand}"])
+    sources = builtin_sources(out / "builtin", config.builtin, only=["6_can_1"])
+    return build(sources, out, config, run_here, show=False)
+
+
+def write_hand(folder: Path) -> Path:
+    """Write the tutorial's hand with a licence."""
+    folder.mkdir(parents=True)
+    (folder / "LICENSE").write_text(f"{LICENCE}\n\nDo as you like.\n")
+    return write_tongs(folder)
+
+
+@pytest.fixture(scope="module")
+def shapes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What is drawn of the links of the hand."""
+    hand = load_hand(write_hand(tmp_path_factory.mktemp("drawn") / "hand"))
+    return link_surfaces(StillScene(hand))
+
+
+@pytest.fixture(scope="module")
+def passed_on(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset in another folder than where it was built; the hand is gone."""
+    folder = tmp_path_factory.mktemp("passed_on")
+    settings = [*SETTINGS, f"hand={write_hand(folder / 'hands')}"]
+    result = run(
+        *("build", "--objects", "builtin", "--only", "6_can_1", "--out", folder / "built"),
+        *("--workers", "1", "--quiet", *(word for text in settings for word in ("--set", text))),
+    )
+    assert result.exit_code == 0, result.output
+    shutil.rmtree(folder / "hands")
+    return Path(shutil.move(folder / "built", folder / "received"))
+
+
+@pytest.fixture
+def copy(passed_on: Path, tmp_path: Path) -> Path:
+    """The dataset once more, to be changed."""
+    return Path(shutil.copytree(passed_on, tmp_path / "copy"))
+
+
+def success(out: Path) -> int:
+    with h5py.File(out / TRIALS_FILE) as file:
+        return int(np.flatnonzero(file["trials/outcome"][:] == Outcome.SUCCESS)[0])
+
+
+def test_a_trial_is_replayed_to_the_bit(passed_on: Path) -> None:
+    result = run("replay", passed_on, "--trial", success(passed_on))
+    assert (result.exit_code, result.stderr) == (0, "")
+
+
+def test_check_finds_nothing(passed_on: Path) -> None:
+    result = run("check", passed_on)
+    assert result.exit_code == 0, result.output
+
+
+def test_its_grasps_are_verified(passed_on: Path) -> None:
+    result = run("verify", passed_on / DATA_FILES["oto"], "--split", "train", "--quiet")
+    assert result.exit_code == 0, result.stderr
+    verdicts = [json.loads(line) for line in result.stdout.splitlines()]
+    assert verdicts and all(verdict["outcome"] != "invalid" for verdict in verdicts)
+
+
+def test_figures_show_the_hand(passed_on: Path, tmp_path: Path) -> None:
+    result = run("figures", passed_on, "--out", tmp_path / "drawn", "--quiet")
+    assert result.exit_code == 0, result.output
+    assert {"hold.png", "phases.png"} <= {path.name for path in (tmp_path / "drawn").iterdir()}
+
+
+def test_an_export_has_the_links_of_the_hand(passed_on: Path, tmp_path: Path) -> None:
+    result = run("export", passed_on, tmp_path / "scenes", "--to", "glb", "--quiet")
+    assert result.exit_code == 0, result.output
+    scene = trimesh.load_scene(next((tmp_path / "scenes").rglob("*.glb")))
+    assert any("left_tip" in name for name in scene.graph.nodes)
+
+
+def test_the_page_without_a_server_shows_the_hand(
+    passed_on: Path, shapes: dict[str, bytes], tmp_path: Path
+) -> None:
+    result = run("inspect", passed_on, "--static", tmp_path / "site")
+    assert result.exit_code == 0, result.output
+    for number, surface in enumerate(shapes.values()):
+        assert surface.decode() in (tmp_path / "site" / "mesh" / f"link-{number}.js").read_text()
+    pages = [page.read_text() for page in (tmp_path / "site" / "grasp").glob("*.html")]
+    assert pages and not any("the hand cannot be shown" in page for page in pages)
+
+
+def test_it_names_the_hand_its_joints_and_its_licence(passed_on: Path) -> None:
+    joints = load_hand(read_manifest(passed_on).config.hand_source).joint_names
+    card = json.loads((passed_on / "DATACARD.json").read_text())
+    assert (card["hand"], card["hand_digest"]) == ("tongs_hand", hand_digest(hand_path(passed_on)))
+    assert card["hand_licences"] == {"LICENSE": LICENCE}
+    text = (passed_on / "DATACARD.md").read_text()
+    assert LICENCE in text and ", ".join(joints) in text
+    for name, fields in (
+        (TRIALS_FILE, ("trials/closed_q", "trials/lifted_q")),
+        (DATA_FILES["oto"], ("train/grasp_props/q",)),
+    ):
+        with h5py.File(passed_on / name) as file:
+            assert json.loads(file.attrs["joints"]) == list(joints)
+            for field in fields:
+                assert file[field].attrs["joints"] == file.attrs["joints"]
+    # No path of the machine that built it is in it.
+    assert read_manifest(passed_on).config.hand == "hand/tongs_hand.yaml"
+
+
+def hand_path(out: Path) -> Path:
+    return out / "hand" / "tongs_hand.yaml"
+
+
+@pytest.mark.parametrize("hand", ["own", "barrett"])
+def test_a_folder_of_somebody_where_the_hand_goes_stays(tmp_path: Path, hand: str) -> None:
+    own = write_hand(tmp_path / "robot" / "hand")
+    before = {path: path.read_bytes() for path in own.parent.iterdir()}
+    result = run(
+        *("build", "--objects", "builtin", "--only", "6_can_1", "--out", tmp_path / "robot"),
+        *("--set", f"hand={own if hand == 'own' else hand}", "--workers", "1", "--quiet"),
+    )
+    assert result.exit_code != 0
+    assert "must not be there before a build" in error_line(result)
+    assert {path: path.read_bytes() for path in own.parent.iterdir()} == before
+
+
+def test_a_build_goes_on_with_the_same_hand_from_elsewhere(copy: Path, tmp_path: Path) -> None:
+    """Its name does not matter either."""
+    before = (copy / TRIALS_FILE).read_bytes()
+    hand = write_hand(tmp_path / "elsewhere")
+    renamed = hand.rename(hand.with_name("pliers.yaml"))
+    report = go_on(copy, renamed)
+    assert (report.simulated, report.reused, report.assembled) == (0, 1, False)
+    assert (copy / TRIALS_FILE).read_bytes() == before
+
+
+def test_a_build_does_not_go_on_with_a_changed_hand(copy: Path, tmp_path: Path) -> None:
+    hand = write_hand(tmp_path / "elsewhere")
+    known = hand_digest(hand)
+    hand.write_text(hand.read_text().replace("payload: 1.5", "payload: 1.4"))
+    with pytest.raises(
+        DataError, match=f"continued with hand {known}, which made it, got "
+    ) as said:
+        go_on(copy, hand)
+    assert "\n" not in str(said.value)
+    assert hand_digest(hand_path(copy)) == known
+
+
+def test_a_damaged_copy_is_found_refused_and_made_again(copy: Path, tmp_path: Path) -> None:
+    model = copy / "hand" / "tongs.urdf"
+    whole = model.read_text()
+    model.write_text(whole.replace("0.012", "0.013"))
+    found = run("check", copy)
+    assert found.exit_code == 1
+    assert "hand: the hand must be that of manifest.json" in found.output
+    assert "must hold the hand of the dataset" in error_line(run("replay", copy, "--trial", 0))
+    go_on(copy, write_hand(tmp_path / "elsewhere"))
+    assert model.read_text() == whole
+
+
+def test_an_older_dataset_reads_the_hand_at_its_path_until_a_build_goes_on(
+    copy: Path, tmp_path: Path
+) -> None:
+    hand = write_hand(tmp_path / "elsewhere")
+    shutil.rmtree(copy / "hand")
+    edit_manifest(copy, lambda tree: (tree["config"].update(hand=str(hand)), tree.pop("joints")))
+    assert run("replay", copy, "--trial", success(copy)).exit_code == 0
+
+    report = go_on(copy, hand)
+    assert report.simulated == 0
+    shutil.rmtree(hand.parent)
+    assert run("replay", copy, "--trial", success(copy)).exit_code == 0
+    assert run("check", copy).exit_code == 0
+
+
+def test_merging_demands_the_same_hand_and_carries_it(
+    passed_on: Path, copy: Path, tmp_path: Path
+) -> None:
+    result = run("merge", tmp_path / "merged", passed_on, copy)
+    assert result.exit_code == 0, result.output
+    assert hand_digest(hand_path(tmp_path / "merged")) == hand_digest(hand_path(passed_on))
+    assert run("check", tmp_path / "merged").exit_code == 0
+
+    edit_manifest(copy, lambda tree: tree["versions"].update(hand="0" * 16))
+    assert run("assemble", copy).exit_code == 0
+    said = error_line(run("merge", tmp_path / "again", passed_on, copy))
+    assert "must be of hand " in said

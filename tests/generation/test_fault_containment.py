@@ -1,0 +1,362 @@
+"""Whatever dies on the way, the data are those of an undisturbed build."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from helpers.assertions import assert_same_dataset
+from helpers.builds import FAST, finish, start_build, wait_for_shards, workers_of
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.prepared_objects import PreparedObject
+from drakegrasp.dataset.statistics import count_funnel
+from drakegrasp.errors import BlankImageError, DiskFullError, MachineError
+from drakegrasp.generation import attempts
+from drakegrasp.generation.pipeline import build
+from drakegrasp.generation.work_unit import WorkUnit, run_unit
+from drakegrasp.hand.settings import load_config
+from drakegrasp.objects.sources import MeshSource, find_meshes
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import run_here
+from drakegrasp.runtime.journal import Journal, Verdict
+from drakegrasp.runtime.processes import host_label
+from drakegrasp.vision import rendering
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+UNITS = 28
+KILLS = 20
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("boxes")
+    trimesh.creation.box([0.06, 0.05, 0.12]).export(folder / "1_box_a.obj")
+    trimesh.creation.box([0.07, 0.05, 0.14]).export(folder / "2_box_b.obj")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config(overrides=FAST)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(meshes: Path, config: Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset, built in this process. Read only: copy it to harm it."""
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    build(find_meshes(meshes), out, config, run_here, show=False)
+    assert count_funnel(out).outcomes[:, Outcome.SUCCESS].sum() > 0
+    return out
+
+
+def events(out: Path, name: str) -> list[dict[str, Any]]:
+    log = out / "log.jsonl"
+    lines = log.read_text(encoding="utf-8").splitlines() if log.exists() else []
+    return [line for line in map(json.loads, lines) if line["event"] == name]
+
+
+def begin(out: Path, finished: Path, units: int) -> None:
+    """Copy a dataset as a client that died left it: without the last units of each object."""
+    for name in ("objects", "shards"):
+        shutil.copytree(finished / name, out / name)
+    for folder in (out / "shards").iterdir():
+        for shard in sorted(folder.glob("*.h5"))[UNITS // 2 - units :]:
+            shard.unlink()
+
+
+def assert_clean(out: Path, *patterns: str) -> None:
+    """Nothing is left of what was on the way."""
+    for pattern in patterns or (".*.tmp", "*.journal", "build.lock"):
+        assert list(out.rglob(pattern)) == []
+
+
+@pytest.mark.cluster
+def test_random_kills_change_nothing(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
+    """All of four workers are killed while objects are prepared, and twenty times one of them.
+
+    However quick they are: at the latest with the next shard.
+    """
+    out, rng, killed = tmp_path / "out", random.Random(0), 0
+    process = start_build(meshes, out, workers=4)
+    while not list(out.glob("objects/*.journal")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    workers = workers_of(process.pid)
+    for worker in workers:
+        os.kill(worker, signal.SIGKILL)
+    # A journal outlives its process: preparing was interrupted.
+    assert workers and list(out.glob("objects/*.journal"))
+    wait_for_shards(out, 1)
+    while process.poll() is None and killed < KILLS:
+        wait_for_shards(out, 2 + killed, patience=0.8)
+        workers = workers_of(process.pid)
+        if workers:
+            os.kill(rng.choice(workers), signal.SIGKILL)
+            killed += 1
+    said, _ = finish(process)
+    assert killed == KILLS
+    assert f"{UNITS} work units simulated\n" in said
+    assert_same_dataset(undisturbed, out)
+    assert_clean(out)
+    done = [(e["object"], e["start"]) for e in events(out, "unit done")]
+    assert len(done) == len(set(done)) == UNITS
+
+
+@pytest.mark.cluster
+def test_client_that_is_stopped_goes_on(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
+    """One that is killed: test_interruptions.py."""
+    out = tmp_path / "out"
+    begin(out, undisturbed, units=6)
+    for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143)):
+        # Workers that outlive their client write shards, too: only the log tells of this one.
+        before = len(events(out, "unit done"))
+        process = start_build(meshes, out, workers=2)
+        while len(events(out, "unit done")) == before:
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode == code
+        assert errors.splitlines()[-1] == "stopped; the same command goes on from here"
+        assert "Traceback" not in errors
+        assert not (out / "build.lock").exists()
+    said, _ = finish(start_build(meshes, out, workers=2))
+    assert "had been done before" in said
+    assert_same_dataset(undisturbed, out)
+    assert_clean(out)
+    assert len(events(out, "started")) == 3
+    assert len(events(out, "finished")) == 1
+
+
+def test_objects_are_prepared_once_whatever_died(
+    meshes: Path, undisturbed: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The manifest names them when all are; a client that dies before loses none of them."""
+
+    def prepare(source: MeshSource, config: Config) -> PreparedObject:
+        raise AssertionError(f"{source.name} is prepared again")
+
+    out = tmp_path / "out"
+    begin(out, undisturbed, units=0)
+    monkeypatch.setattr("drakegrasp.generation.prepare.prepare", prepare)
+    build(find_meshes(meshes), out, config, run_here, show=False)
+    assert (out / "manifest.json").read_bytes() == (undisturbed / "manifest.json").read_bytes()
+    assert_same_dataset(undisturbed, out)
+
+
+@pytest.mark.cluster
+def test_fault_costs_what_is_guilty_and_nothing_else(
+    meshes: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    """One attempt crashes, one hangs, one hangs with the interpreter's lock, a mesh crashes."""
+    more = Path(shutil.copytree(meshes, tmp_path / "meshes"))
+    trimesh.creation.box([0.05, 0.05, 0.1]).export(more / "3_box_c.obj")
+    faults = "crash:1_box_a:3:1 hang:1_box_a:5:0 freeze:2_box_b:4:2 crash:3_box_c"
+    out = tmp_path / "out"
+    # A hang that does not compute takes many times as long, and is tried twice.
+    limit = ("--set", "attempt_seconds=2")
+    said, errors = finish(start_build(more, out, 2, *limit, fault=faults))
+    assert "refused: 3_box_c: preparing it crashed its process" in said
+    assert errors == ""
+    failing = {
+        (0, 3, 1): Outcome.CRASHED,
+        (0, 5, 0): Outcome.TIMEOUT,
+        (1, 4, 2): Outcome.TIMEOUT,
+    }
+    with h5py.File(undisturbed / "trials.hdf5") as a, h5py.File(out / "trials.hdf5") as b:
+        names = ("object", "candidate", "standoff_index")
+        places = list(zip(*(a["trials"][n][:].tolist() for n in names), strict=True))
+        innocent = np.array([place not in failing for place in places])
+        assert innocent.sum() == len(places) - 3
+        for name in a["trials"]:
+            one, two = a["trials"][name][:], b["trials"][name][:]
+            assert one[innocent].tobytes() == two[innocent].tobytes(), name
+        for place, outcome in failing.items():
+            assert b["trials/outcome"][places.index(place)] == outcome
+            assert np.isnan(b["trials/closed_q"][places.index(place)]).all()
+    assert_clean(out)
+
+
+@pytest.mark.cluster
+def test_suspended_worker_changes_no_label(meshes: Path, tmp_path: Path) -> None:
+    """As SLURM suspends a job: for longer than an attempt may take."""
+    out = tmp_path / "out"
+    few = ("--set", "candidates.max=6")
+    process = start_build(meshes, out, 1, "--set", "attempt_seconds=2", *few)
+    for shards, seconds in ((1, 4.0), (4, 4.0)):
+        wait_for_shards(out, shards)
+        (worker,) = workers_of(process.pid)
+        os.kill(worker, signal.SIGSTOP)
+        time.sleep(seconds)
+        os.kill(worker, signal.SIGCONT)
+    finish(process)
+    with h5py.File(out / "trials.hdf5") as file:
+        outcomes = file["trials/outcome"][:]
+    assert len(outcomes) == 36
+    assert not set(outcomes) & {Outcome.TIMEOUT, Outcome.CRASHED}
+
+
+@pytest.mark.cluster
+def test_mesh_that_takes_too_much_memory_is_refused_and_the_others_go_on(
+    meshes: Path, tmp_path: Path
+) -> None:
+    """The kernel kills its process each time; with more memory the next build has it."""
+    out = tmp_path / "out"
+    few = ("--set", "candidates.max=1")
+    said, errors = finish(start_build(meshes, out, 1, *few, fault="exit:1_box_a"))
+    line = "refused: 1_box_a: preparing it was at work whenever its process vanished"
+    assert line in said
+    assert errors == "" or "nothing will train" in errors
+    assert [entry.name for entry in read_manifest(out).objects] == ["2_box_b"]
+    assert_clean(out)
+    build(find_meshes(meshes), out, load_config(overrides=[*FAST, few[1]]), run_here, show=False)
+    assert [entry.name for entry in read_manifest(out).objects] == ["1_box_a", "2_box_b"]
+    assert not read_manifest(out).refused
+
+
+@pytest.mark.parametrize("step", ["build", "predict", "measure", "write"])
+def test_every_step_of_a_unit_is_in_its_journal(
+    undisturbed: Path, tmp_path: Path, step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that a hang in it meets its limit, and the user is told of which step it was."""
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    header = next(read_manifest(out).headers())
+    header.path(out).unlink()
+    monkeypatch.setattr(
+        Journal, "verdict", lambda self, name: Verdict.HUNG if name == step else None
+    )
+    config = read_manifest(out).config
+    with pytest.raises(MachineError, match=r"1_box_a: .*passed its time limit"):
+        run_unit(WorkUnit(out=out, header=header, config=config, restartable=True))
+
+
+# Faults found on start
+
+
+def _cut(shard: Path) -> None:
+    shard.write_bytes(shard.read_bytes()[:-100])
+
+
+def _flip(shard: Path) -> None:
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    shard.write_bytes(bytes(content))
+
+
+def _exchange(shard: Path) -> None:
+    """Put another object's shard in its place."""
+    other = next(p for p in shard.parent.parent.glob(f"*/{shard.name}") if p != shard)
+    shutil.copyfile(other, shard)
+
+
+def test_what_is_harmed_is_named_and_run_again(
+    meshes: Path, undisturbed: Path, config: Config, tmp_path: Path
+) -> None:
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    shards = sorted(out.glob("shards/*/*.h5"))
+    harms = (_cut, _flip, _exchange, Path.unlink)
+    for harm, shard in zip(harms, shards, strict=False):
+        harm(shard)
+    dead = subprocess.Popen(["true"])
+    dead.wait()
+    stale = out / "shards" / "1_box_a" / f".x.h5.{host_label()}~{dead.pid}~0123456789ab.tmp"
+    alive = stale.with_name(stale.name.replace(f"~{dead.pid}~", f"~{os.getpid()}~"))
+    foreign = stale.with_name(f".y.h5.elsewhere~1~{'0' * 12}.tmp")
+    old = stale.with_name(f".z.h5.elsewhere~1~{'0' * 12}.tmp")
+    for path in (stale, alive, foreign, old):
+        path.write_bytes(b"half")
+    os.utime(old, (0, 0))
+    lock = {"process": {"host": "h", "pid": 5, "began": 1, "boot": ""}, "since": "s", "command": []}
+    (out / "build.lock").write_text(json.dumps(lock))
+    report = build(find_meshes(meshes), out, config, run_here, show=False)
+    assert (report.simulated, report.reused) == (4, UNITS - 4)
+    taken, swept, damaged = report.notices
+    assert taken == "the lock of a dead build was taken over: process 5 on h, since s"
+    assert swept.startswith("2 temporary files (shards/1_box_a/.")
+    names = ", ".join(str(s.relative_to(out)) for s in shards[:3])
+    assert damaged == f"3 shards ({names}): damaged, and simulated again"
+    assert (stale.exists(), alive.exists(), foreign.exists(), old.exists()) == (0, 1, 1, 0)
+    assert len(events(out, "damaged shard")) == 3
+    assert_same_dataset(undisturbed, out)
+
+
+def test_full_disk_stops_and_goes_on(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
+    """A limit on the size of files is what a full disk is to a shard with images."""
+    out = tmp_path / "out"
+    begin(out, undisturbed, units=0)
+    largest = max(out.glob("shards/*/*.h5"), key=lambda path: path.stat().st_size)
+    size = largest.stat().st_size - 1
+    largest.unlink()
+    process = start_build(meshes, out, workers=1, largest_file=size)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert "the disk or the quota is full" in errors.splitlines()[-1]
+    assert "Traceback" not in errors, errors
+    # A unit that was begun meanwhile, and dropped, keeps its journal for its next run.
+    assert_clean(out, ".*.tmp", "build.lock")
+    finish(start_build(meshes, out, workers=1))
+    assert_same_dataset(undisturbed, out)
+
+
+def test_full_disk_of_the_client_is_one_error(
+    meshes: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("drakegrasp.dataset.manifest.write_atomic", full)
+    with pytest.raises(DiskFullError, match=r"the disk or the quota is full .* goes on from here"):
+        build(find_meshes(meshes), tmp_path / "out", config, run_here, show=False)
+    assert not (tmp_path / "out").exists()
+
+
+def test_blank_image_never_becomes_data(
+    meshes: Path, undisturbed: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def blank(*_: object) -> rendering.RenderedView:
+        raise BlankImageError(rendering.BLANK)
+
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    with h5py.File(undisturbed / "trials.hdf5") as file:
+        row = int(np.flatnonzero(file["trials/outcome"][:] == Outcome.SUCCESS)[0])
+        name = ("1_box_a", "2_box_b")[file["trials/object"][row]]
+        start = int(file["trials/candidate"][row])
+    shard = out / "shards" / name / f"{start:07d}-{start + 1:07d}.h5"
+    shard.unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr(attempts, "render", blank)
+        with pytest.raises(BlankImageError, match="must not be blank"):
+            build(find_meshes(meshes), out, config, run_here, show=False)
+    assert not shard.exists()
+    build(find_meshes(meshes), out, config, run_here, show=False)
+    assert_same_dataset(undisturbed, out)
+
+
+@pytest.mark.cluster
+def test_second_build_is_refused_before_it_starts(
+    meshes: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    begin(out, undisturbed, units=2)
+    first = start_build(meshes, out, workers=1)
+    while not (out / "build.lock").exists():
+        time.sleep(0.05)
+    _, errors = start_build(meshes, out, workers=1).communicate(timeout=60)
+    assert f"must be built by one process at a time, got process {first.pid} on" in errors
+    assert len(errors.splitlines()) == 1
+    finish(first)
+    assert_same_dataset(undisturbed, out)

@@ -1,0 +1,125 @@
+"""A step that hangs ends at its limit, whatever it does, and what it was at is refused."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh, read_manifest
+from drakegrasp.errors import MachineError
+from drakegrasp.generation.pipeline import build
+from drakegrasp.generation.prepare import PrepareTask, prepare_one
+from drakegrasp.generation.work_unit import WorkUnit, run_unit
+from drakegrasp.hand.settings import load_config
+from drakegrasp.objects.sources import MeshSource, find_meshes, source_sha256
+from drakegrasp.runtime.executor import run_here
+from drakegrasp.runtime.fault_injection import VARIABLE
+from drakegrasp.runtime.journal import HUNG_DEATHS, PREPARE_DEATHS
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+#: Runs a task some times as workers do, each in a process of its own; prints how each ended. The
+#: limits are some seconds of computing, and ten times as many on the wall.
+CHILD = """
+import os, pickle, sys
+from drakegrasp.generation import prepare, work_unit
+
+prepare.PREPARE_SECONDS = work_unit.STAGE_SECONDS = float(sys.argv[2])
+function, task = pickle.load(sys.stdin.buffer)
+for _ in range(int(sys.argv[1])):
+    child = os.fork()
+    if not child:
+        function(task)
+        os._exit(0)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+
+
+def die(function: object, task: object, fault: str, times: int, seconds: float) -> None:
+    """Let processes die of a fault in a task."""
+    run = subprocess.run(
+        [sys.executable, "-c", CHILD, str(times), str(seconds)],
+        input=pickle.dumps((function, task)),
+        env={**os.environ, VARIABLE: fault},
+        capture_output=True,
+        check=True,
+        timeout=120,
+    )
+    codes = list(map(int, run.stdout.split()))
+    assert len(codes) == times and 0 not in codes, (codes, run.stderr)
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory: pytest.TempPathFactory) -> list[MeshSource]:
+    folder = tmp_path_factory.mktemp("meshes")
+    trimesh.creation.box([0.06, 0.05, 0.12]).export(folder / "1_box_a.obj")
+    trimesh.creation.box([0.07, 0.05, 0.14]).export(folder / "2_box_b.obj")
+    return find_meshes(folder)
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config(overrides=["candidates.max=1", "settle.drop_height=0.01"])
+
+
+def prepare_tasks(sources: list[MeshSource], out: Path, config: Config) -> list[PrepareTask]:
+    return [
+        PrepareTask(
+            source=source,
+            mesh_sha256=source_sha256(source),
+            out=out,
+            config=config,
+            restartable=True,
+        )
+        for source in sources
+    ]
+
+
+@pytest.mark.parametrize("fault", ["freeze", "spin"])
+def test_mesh_whose_preparing_hangs_is_refused_and_the_other_is_not(
+    fault: str, sources: list[MeshSource], config: Config, tmp_path: Path
+) -> None:
+    guilty, innocent = prepare_tasks(sources, tmp_path / "out", config)
+    die(prepare_one, guilty, f"{fault}:1_box_a", HUNG_DEATHS, seconds=0.3)
+    name, entry = prepare_one(guilty)
+    assert isinstance(entry, RefusedMesh)
+    assert (name, entry.reason, entry.again) == (
+        "1_box_a",
+        "preparing it passed its time limit",
+        False,
+    )
+    assert isinstance(prepare_one(innocent)[1], ObjectEntry)
+    assert not list(tmp_path.rglob("*.journal"))
+
+
+def test_distances_that_kill_the_process_cost_the_mesh(
+    sources: list[MeshSource], config: Config, tmp_path: Path
+) -> None:
+    """They are measured while the mesh is prepared, so that they stop no build."""
+    guilty, _ = prepare_tasks(sources, tmp_path / "out", config)
+    die(prepare_one, guilty, "exit:1_box_a:distances", PREPARE_DEATHS, seconds=60.0)
+    entry = prepare_one(guilty)[1]
+    assert isinstance(entry, RefusedMesh) and entry.again
+    assert "was at work whenever its process vanished" in entry.reason
+
+
+def test_screen_that_hangs_ends_and_is_named(
+    sources: list[MeshSource], config: Config, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    build(sources[:1], out, config, run_here, show=False)
+    manifest = read_manifest(out)
+    (header,) = manifest.headers()
+    header.path(out).unlink()
+    unit = WorkUnit(out=out, header=header, config=manifest.config, restartable=True)
+    # Building the scene has the same limit, and takes a second of computing.
+    die(run_unit, unit, "spin:1_box_a:predict", HUNG_DEATHS, seconds=2.0)
+    with pytest.raises(MachineError, match=r"predicting its attempts passed its time limit"):
+        run_unit(unit)

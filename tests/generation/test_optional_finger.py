@@ -1,0 +1,55 @@
+"""A build with fingers that need not touch: a grasp without them is a success, but no sample."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from helpers.hands import write_with_optional_fingers
+from helpers.meshes import SMALL
+
+from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.generation.pipeline import BuildReport, build
+from drakegrasp.generation.replay import replay_trial
+from drakegrasp.hand.settings import load_config
+from drakegrasp.inspection.catalog import Catalog
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.outcomes import Removal
+from drakegrasp.runtime.executor import run_here
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> BuildReport:
+    """A build on a slim pole, past which one of two parallel fingers often closes."""
+    folder = tmp_path_factory.mktemp("optional")
+    (folder / "meshes").mkdir()
+    pole = trimesh.creation.box([0.03, 0.03, 0.14]).subdivide().subdivide()
+    pole.export(folder / "meshes" / "11_box_slim.obj")
+    config = load_config(
+        hand=str(write_with_optional_fingers(folder, 0, 1)),
+        overrides=[*SMALL, "candidates.max=30", "candidates.standoffs=[0.06]", "camera.size=32"],
+    )
+    return build(find_meshes(folder / "meshes"), folder / "out", config, run_here, show=False)
+
+
+def test_a_grasp_without_an_optional_finger_is_a_success_but_no_sample(
+    report: BuildReport,
+) -> None:
+    assert report.assembly is not None and report.assembly.removed[Removal.MISSING_FINGER] == 1
+    assert [str(v) for v in check_dataset(report.out)] == []
+    with h5py.File(report.out / "trials.hdf5") as file:
+        removal = file["successes/removal"][:]
+        row = int(file["successes/trial_id"][:][removal == Removal.MISSING_FINGER][0])
+        touching = file["trials/closed_touching"][row]
+        for name in ("surface_distance", "normal_angle"):
+            np.testing.assert_array_equal(np.isnan(file[f"trials/{name}"][row]), ~touching)
+    assert not touching.all()
+    assert replay_trial(report.out, row).same
+
+    # What is not there makes it no more suspicious.
+    table = Catalog(report.out).current().table
+    for part in ("normal_angle", "surface_distance", "normal_sum"):
+        assert np.isfinite(table.value(part, row))

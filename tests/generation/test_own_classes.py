@@ -1,0 +1,287 @@
+"""The sampler and the filter of the how-to page: built, checked, replayed, and never imported."""
+
+from __future__ import annotations
+
+import html
+import pickle
+import re
+import shlex
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from helpers.commands import error_line, run
+from helpers.datasets import make_dataset
+from helpers.meshes import SMALL, write_fixed
+from helpers.successes import good
+from starlette.testclient import TestClient
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.filters import judge_successes
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
+from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.generation.pipeline import build, refuse_unusable
+from drakegrasp.generation.replay import replay_trial
+from drakegrasp.hand.settings import load_config, override_config
+from drakegrasp.inspection.app import Inspection, make_app
+from drakegrasp.objects.model import ObjectModel, prepare_object
+from drakegrasp.objects.sources import MeshSource, find_meshes
+from drakegrasp.outcomes import Removal
+from drakegrasp.runtime.executor import run_here
+from drakegrasp.simulation.candidates import Candidates, Source, sample_candidates
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "own-sampler.md"
+
+#: What samplers may be otherwise, and what is said of them.
+WRONG_SAMPLERS = {
+    "syntax": ("class Mine(:", r"mine\.py: must be imported, got SyntaxError \(.*line 1\)"),
+    "import": ("\nimport nothing_like_it", r"must be imported, got ModuleNotFoundError in line 2"),
+    "no class": ("Other = 3", r"mine\.py: must have a class Mine, got none"),
+    "no class but a value": ("Mine = 3", r"mine\.py: must have a class Mine, got none"),
+    "constructor": (
+        "class Mine:\n  def __init__(self, model): pass\n  def poses(self): yield",
+        r"mine\.py:Mine: must take \(model, X_TO, stream\), got other arguments",
+    ),
+    "no method": (
+        "class Mine:\n  def __init__(self, model, X_TO, stream): pass",
+        r"mine\.py:Mine: must have a method poses\(self\), got none like it",
+    ),
+}
+#: What a sampler may yield otherwise.
+WRONG_POSES = {
+    "shape": ("yield np.eye(3)", r"Mine: pose 0 must be a pose, 4 x 4 .* of shape \(3, 3\)"),
+    "many": ("yield np.tile(np.eye(4), (2, 1, 1))", r"pose 0 must be one pose, .*, got 2 of them"),
+    "NaN": ("yield np.eye(4); yield np.nan * np.eye(4)", r"pose 1 must be finite"),
+    "no rotation": ("yield 2 * np.eye(4)", r"pose 0 must have 0 0 0 1 as its last row"),
+    "words": ("yield 'up'", r"pose 0 must be a pose, 4 x 4 numbers"),
+    "no poses": ("return None", r"Mine: must run, got TypeError"),
+    "error": (
+        "yield 1 / 0",
+        r"mine\.py:Mine: must run, got ZeroDivisionError in line 4 \(",
+    ),
+}
+#: What a filter may return otherwise.
+WRONG_FILTERS = {
+    "numbers": (
+        "np.ones(len(successes.slip))",
+        r"keep must return \(3,\) of bool, got \(3,\) of fl",
+    ),
+    "shape": (
+        "np.array(True)",
+        r"Mine: keep must return \(3,\) of bool, got \(\) of bool",
+    ),
+    "error": ("successes.magic", r"Mine: must run, got AttributeError in line 4 \(.*magic"),
+}
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder with both files of the page."""
+    monkeypatch.chdir(tmp_path)
+    texts = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S)
+    for name, text in zip(("my_sampler.py", "my_filter.py"), texts, strict=True):
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+    path = tmp_path_factory.mktemp("box") / "box.stl"
+    trimesh.creation.box([0.04, 0.06, 0.08]).export(path)
+    return prepare_object(MeshSource(name="box", class_name="box", path=path))
+
+
+def sampler(text: str) -> Config:
+    """Return the configuration of a sampler with this body of `poses`."""
+    lines = ["import numpy as np", "class Mine:", "  def __init__(self, *arguments): pass"]
+    Path("mine.py").write_text("\n".join([*lines, f"  def poses(self): {text}"]))
+    return load_config(overrides=["candidates.method=mine.py:Mine"])
+
+
+def draw(box: ObjectModel, config: Config, count: int = 20) -> Candidates:
+    X_TO = np.eye(4)
+    X_TO[2, 3] = box.half_extents[2]
+    rules = config.candidates.model_copy(update={"max": count})
+    return sample_candidates(box, X_TO, rules, config.seed)
+
+
+def test_the_sampler_of_the_page_looks_at_the_object(own: Path, box: ObjectModel) -> None:
+    config = load_config(overrides=["candidates.method=my_sampler.py:Ring"])
+    drawn = draw(box, config)
+    assert len(drawn) == 20 and np.isfinite(drawn.distance).all()
+    assert set(drawn.source) == {Source.OWN}
+    np.testing.assert_allclose(drawn.X_OG[:, :3, 2], -drawn.X_OG[:, :3, 3] / 0.107703296, atol=1e-8)
+    fewer = draw(box, config, 5)
+    np.testing.assert_array_equal(fewer.X_OG, drawn.X_OG[:5])
+
+
+def test_it_takes_turns_with_others_and_comes_to_workers(own: Path, box: ObjectModel) -> None:
+    """A worker has the configuration alone: the file may be gone, or on another machine."""
+    turns = ["candidates.method=[my_sampler.py:Ring, normals]", "filters.own=my_filter.py:Wide"]
+    config = load_config(overrides=turns)
+    sent = pickle.dumps(config)
+    (own / "my_sampler.py").unlink()
+    (own / "my_filter.py").unlink()
+    received = pickle.loads(sent)
+    assert received == config and received.filters.code.keys() == set(config.filters.own)
+    assert draw(box, received).source.tolist() == [Source.OWN, Source.NORMALS] * 10
+    refuse_unusable(received)
+    assert override_config(received, ["seed=3"]).code == config.code
+
+
+def test_a_changed_file_is_another_dataset_wherever_it_lies(own: Path) -> None:
+    setting = "candidates.method=my_sampler.py:Ring"
+    config = load_config(overrides=[setting])
+    (own / "folder").mkdir()
+    (own / "my_sampler.py").rename(own / "folder" / "my_sampler.py")
+    moved = load_config(overrides=["candidates.method=folder/my_sampler.py:Ring"])
+    assert moved.simulation_hash() == config.simulation_hash()
+    assert re.fullmatch(r"my_sampler\.py:Ring@[0-9a-f]{16}", str(config.candidates.method))
+    with (own / "folder" / "my_sampler.py").open("a") as file:
+        file.write("# changed\n")
+    changed = load_config(overrides=["candidates.method=folder/my_sampler.py:Ring"])
+    assert changed.simulation_hash() != config.simulation_hash()
+
+
+@pytest.mark.parametrize("name", WRONG_SAMPLERS)
+def test_a_class_that_cannot_be_used_is_refused_in_one_line(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text, message = WRONG_SAMPLERS[name]
+    Path("mine.py").write_text(text)
+    with pytest.raises(ConfigError, match=message) as caught:
+        refuse_unusable(load_config(overrides=["candidates.method=mine.py:Mine"]))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_refused_with_its_key(own: Path) -> None:
+    for key in ("candidates.method", "filters.own"):
+        with pytest.raises(ConfigError, match=rf"^{key}: no\.py: must be a readable UTF-8 file"):
+            load_config(overrides=[f"{key}=no.py:Mine"])
+        for value in ("3", "no.py", "my_sampler.py:", "my_sampler:Ring"):
+            with pytest.raises(ConfigError, match=rf"^{key}: .*must "):
+                load_config(overrides=[f"{key}={value}"])
+
+
+@pytest.mark.parametrize("name", WRONG_POSES)
+def test_what_is_no_pose_is_refused_in_one_line(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, box: ObjectModel
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text, message = WRONG_POSES[name]
+    with pytest.raises(ConfigError, match=message) as caught:
+        draw(box, sampler(text))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("metres", [(0.0, 0.0, 100.0), (0.0, 0.0, 1.05), (80.0, -60.0, 0.0)])
+def test_a_sampler_far_away_is_told_how_far(
+    own: Path, box: ObjectModel, metres: tuple[float, float, float]
+) -> None:
+    pose = "X = np.eye(4); X[:3, 3] = {}; yield X"
+    wrong = r"^mine\.py:Mine: poses must be X_OG in metres, within 1 m .*nearest {:.3g} m from box$"
+    distance = np.linalg.norm(np.maximum(np.abs(metres) - box.half_extents, 0.0))
+    with pytest.raises(ConfigError, match=wrong.format(distance)):
+        draw(box, sampler(pose.format(metres)))
+    # One that faces the object is moved to its stand-offs, and one that is near may miss.
+    facing = f"X = np.diag([1.0, -1, -1, 1]); X[2, 3] = {metres[2] + 0.1}; yield X"
+    assert np.isfinite(draw(box, sampler(facing)).distance).all()
+    near = draw(box, sampler(pose.format((0.0, 0.0, 0.5))))
+    assert len(near) == 1 and np.isnan(near.distance).all()
+
+
+def test_a_set_with_filters_of_its_own_is_merged_and_assembled_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever runs them takes the same option, and so do the lines that other commands print."""
+    monkeypatch.chdir(tmp_path)
+    rule = "class {}:\n  def keep(self, successes): return successes.trial_id.argsort() % 2 == 0\n"
+    for name in ("Even", "Half"):
+        Path(f"{name.lower()}.py").write_text(rule.format(name))
+    own = "filters.own=[even.py:Even, half.py:Half]"
+    outs = [
+        make_dataset(tmp_path / seed, tmp_path / "meshes", overrides=[f"seed={seed}"])
+        for seed in "01"
+    ]
+    for out in outs:
+        assemble(out, overrides=[own])
+    refused = run("merge", "into", *outs)
+    assert refused.exit_code == 2
+    again = r"even\.py:Even@\w+: must be given again, --set filters\.own=FILE\.py:NAME, because"
+    assert re.search(again, error_line(refused))
+    assert not Path("into").exists()
+
+    merged = run("merge", "into", *outs, "--set", own)
+    assert merged.exit_code == 0, merged.output
+    assert check_dataset(Path("into")) == []
+
+    # The line that the page prints, as it is.
+    write_decisions(Path("into/reject.json"), Decisions(rejected={AttemptKey("2_box_b", 0, 0)}))
+    with TestClient(make_app(Inspection(Path("into"))), base_url="http://localhost") as client:
+        (line,) = re.findall(r"<code[^>]*>drakegrasp (assemble .*?)</code>", client.get("/").text)
+    done = run(*shlex.split(html.unescape(line)))
+    assert done.exit_code == 0, done.output
+    kept = read_manifest(Path("into"))
+    assert [key.object for key in kept.rejected] == ["2_box_b"]
+    assert len(kept.config.filters.own) == 2
+
+
+@pytest.mark.parametrize("name", WRONG_FILTERS)
+def test_what_is_no_verdict_is_refused_in_one_line(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    value, message = WRONG_FILTERS[name]
+    lines = ["import numpy as np", "class Mine:", "  def keep(self, successes):"]
+    Path("mine.py").write_text("\n".join([*lines, f"    return {value}"]))
+    config = load_config(overrides=["filters.own=mine.py:Mine"])
+    with pytest.raises(ConfigError, match=message) as caught:
+        judge_successes(good(3), config.filters)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_a_dataset_of_both_is_sound_and_imports_no_code(own: Path) -> None:
+    write_fixed(own / "meshes", "8_wineglass_flute")
+    sources, out = find_meshes(own / "meshes"), own / "out"
+    rules = [*SMALL, "candidates.max=12", "camera.size=32"]
+    half = (
+        "class Half:\n  def keep(self, successes): return successes.trial_id.argsort() % 2 == 0\n"
+    )
+    (own / "half.py").write_text(half)
+    settings = [
+        "candidates.method=my_sampler.py:Ring",
+        "filters.own=[my_filter.py:Wide, half.py:Half]",
+    ]
+    config = load_config(overrides=[*rules, *settings])
+    report = build(sources, out, config, run_here, show=False)
+    removed = report.assembly.removed
+    assert removed[Removal.OWN] == removed[Removal.KEPT] > 0
+    assert [str(v) for v in check_dataset(out)] == []
+    with h5py.File(out / "trials.hdf5") as file:
+        assert set(file["trials/source"][:]) == {Source.OWN}
+
+    # Without the files: everything that reads goes on; what would run them asks for them.
+    for name in ("my_sampler.py", "my_filter.py", "half.py"):
+        (own / name).rename(own / f"{name}.txt")
+    assert not read_manifest(out).config.code
+    assert [str(v) for v in check_dataset(out)] == []
+    assert replay_trial(out, 0).same
+    with pytest.raises(ConfigError, match=r"my_filter\.py:Wide@.* must be given again"):
+        assemble(out, overrides=["filters.max_slip=null"])
+    with pytest.raises(ConfigError, match=r"my_sampler\.py:Ring@.* must be given again"):
+        build(sources, out, read_manifest(out).config, run_here, show=False)
+    assert Removal.OWN not in assemble(out, overrides=["filters.own=null"]).removed
+
+    # With another file it is another dataset.
+    (own / "my_sampler.py").write_text((own / "my_sampler.py.txt").read_text() + "\n")
+    other = load_config(overrides=[*rules, settings[0]])
+    with pytest.raises(DataError, match=r"candidates\.method \(my_sampler\.py:Ring@.* there, "):
+        build(sources, out, other, run_here, show=False)

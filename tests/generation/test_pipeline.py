@@ -1,0 +1,406 @@
+"""The main job, end to end: meshes in, files out; again, elsewhere, and after damage."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from helpers.assertions import assert_same_dataset
+
+from drakegrasp.api.building import build_dataset
+from drakegrasp.config import Config
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.log import read_log
+from drakegrasp.dataset.manifest import read_manifest, write_manifest
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.shards import read_shard, trial_columns, write_shard
+from drakegrasp.dataset.statistics import count_funnel
+from drakegrasp.errors import ConfigError, DataError, MachineError, MeshError
+from drakegrasp.generation.pipeline import BuildReport, build
+from drakegrasp.generation.prepare import prepare_one
+from drakegrasp.generation.replay import replay_trial
+from drakegrasp.generation.work_unit import run_unit
+from drakegrasp.hand.settings import load_config, override_config
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.runtime.executor import Executor, run_here
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+
+def _nothing_runs(function: Callable, items: Iterable) -> Iterator:
+    """Run tasks that only read."""
+    pending = list(items)
+    assert not pending or function not in (run_unit, prepare_one), "nothing may be done again"
+    return (function(item) for item in pending)
+
+
+Again = Callable[..., BuildReport]
+
+
+@pytest.fixture
+def out(small_dataset: Path, tmp_path: Path) -> Path:
+    """A copy of the small dataset."""
+    return Path(shutil.copytree(small_dataset, tmp_path / "copy"))
+
+
+@pytest.fixture
+def meshes(small_meshes: Path, tmp_path: Path) -> Path:
+    """A copy of its meshes."""
+    return Path(shutil.copytree(small_meshes, tmp_path / "meshes"))
+
+
+@pytest.fixture
+def again(small_meshes: Path, small_config: Config) -> Again:
+    """Builds in a directory, of the meshes and by the rules of the small dataset."""
+
+    def build_again(
+        out: Path,
+        execute: Executor = run_here,
+        *,
+        meshes: Path = small_meshes,
+        config: Config = small_config,
+    ) -> BuildReport:
+        return build(find_meshes(meshes), out, config, execute, show=False)
+
+    return build_again
+
+
+def test_every_attempt_has_a_row_and_every_success_a_look(small_dataset: Path) -> None:
+    funnel = count_funnel(small_dataset)
+    assert np.all(funnel.candidates == 40)
+    with h5py.File(small_dataset / "trials.hdf5") as file:
+        keys = ("object", "candidate", "standoff_index")
+        rows = list(zip(*(file[f"trials/{key}"][:].tolist() for key in keys), strict=True))
+        outcomes, ids = file["trials/outcome"][:], file["successes/trial_id"][:]
+        kept = ids[file["successes/removal"][:] == Removal.KEPT]
+    assert rows == list(product(range(3), range(40), range(3)))
+    assert ids.tolist() == np.flatnonzero(outcomes == Outcome.SUCCESS).tolist()
+    with h5py.File(small_dataset / "grasping_otm.hdf5") as file:
+        sampled = np.concatenate([file[split]["trial_id"][:] for split in file])
+    assert sorted(sampled.tolist()) == kept.tolist() != []
+
+
+def test_dataset_keeps_every_invariant(small_dataset: Path) -> None:
+    assert [str(v) for v in check_dataset(small_dataset)] == []
+
+
+@pytest.mark.cluster
+def test_number_of_workers_changes_nothing(
+    small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path
+) -> None:
+    report = build_dataset(
+        small_meshes, tmp_path / "out", config=small_config, workers=2, show=False
+    )
+    assert report.simulated == 12
+    assert_same_dataset(small_dataset, tmp_path / "out")
+
+
+def test_second_build_simulates_nothing(out: Path, again: Again) -> None:
+    before = {p: p.stat().st_mtime_ns for p in out.glob("*.hdf5")}
+    report = again(out, _nothing_runs)
+    assert (report.simulated, report.reused) == (0, 12)
+    assert {p: p.stat().st_mtime_ns for p in out.glob("*.hdf5")} == before
+
+
+def _flip_byte(shard: Path) -> None:
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    shard.write_bytes(bytes(content))
+
+
+def test_changed_filter_needs_no_simulation(out: Path, again: Again) -> None:
+    config = load_config(
+        overrides=["candidates.max=40", "unit_candidates=10", "filters.min_depth_variance=1"]
+    )
+    report = again(out, _nothing_runs, config=config)
+    assert report.assembly.removed.get(Removal.KEPT, 0) == 0
+    assert report.assembly.grasps > 0
+
+
+def test_changed_mesh_is_done_again_and_the_others_are_not(
+    meshes: Path, out: Path, again: Again
+) -> None:
+    trimesh.creation.box([0.06, 0.06, 0.12]).export(meshes / "10_box_tall.obj")
+    report = again(out, meshes=meshes)
+    assert (report.simulated, report.reused) == (4, 8)
+    assert [str(v) for v in check_dataset(out)] == []
+
+
+def test_object_keeps_to_what_is_said_of_it(meshes: Path, out: Path, again: Again) -> None:
+    """A changed entry of objects.yaml prepares and simulates that object again, and no other."""
+    said = "objects: {11_box_slim: {density: 600, friction: 0.9}}\n"
+    (meshes / "objects.yaml").write_text(said)
+    report = again(out, meshes=meshes)
+    assert (report.simulated, report.reused) == (4, 8)
+    assert [str(v) for v in check_dataset(out)] == []
+
+    # The manifest and /objects have it, and the lift is simulated with it.
+    entry = read_manifest(out).objects[1]
+    assert (entry.name, entry.friction) == ("11_box_slim", 0.9)
+    assert entry.mass == pytest.approx(600.0 * 0.065 * 0.05 * 0.14, rel=1e-6)
+    with h5py.File(out / "trials.hdf5") as file:
+        assert file["objects/mass"][1] == entry.mass
+        assert np.isnan(file["objects/friction"][0]) and file["objects/friction"][1] == 0.9
+        lifted = np.flatnonzero(
+            (file["trials/object"][()] == 1) & np.isfinite(file["trials/slip"][()])
+        )
+    assert replay_trial(out, int(lifted[0])).same
+    second = again(out, _nothing_runs, meshes=meshes)
+    assert second.reused == 12
+
+
+def test_changed_class_is_in_the_files_without_a_simulation(
+    meshes: Path, out: Path, again: Again
+) -> None:
+    (meshes / "objects.yaml").write_text("objects: {11_box_slim: {class: carton}}\n")
+    report = again(out, meshes=meshes)
+    assert (report.simulated, report.reused, report.assembled) == (0, 12, True)
+    assert [str(v) for v in check_dataset(out)] == []
+    with h5py.File(out / "trials.hdf5") as file:
+        assert file["objects/class_name"].asstr()[1] == "carton"
+    second = again(out, _nothing_runs, meshes=meshes)
+    assert not second.assembled
+
+    # A group does not even need the object to be prepared.
+    said = "objects: {11_box_slim: {class: carton, group: box}}\n"
+    (meshes / "objects.yaml").write_text(said)
+    second = again(out, _nothing_runs, meshes=meshes)
+    assert second.assembled and read_manifest(out).objects[1].group == "box"
+
+
+def test_shard_that_is_not_the_assembled_one_is_assembled(out: Path, again: Again) -> None:
+    """As after a build that simulated it again, and whose client died before it assembled."""
+    path = sorted(out.glob("shards/*/*.h5"))[0]
+    shard = read_shard(path)
+    (failed,) = np.nonzero(shard.trials["outcome"] != Outcome.SUCCESS)
+    shard.trials["outcome"][failed[0]] = Outcome.CRASHED
+    write_shard(out, shard)
+    report = again(out, _nothing_runs)
+    assert (report.simulated, report.assembled) == (0, True)
+    with h5py.File(out / "trials.hdf5") as file:
+        assert Outcome.CRASHED in file["trials/outcome"][:]
+
+
+def test_build_keeps_what_an_inspection_rejected(meshes: Path, out: Path, again: Again) -> None:
+    """But not of a mesh that has changed since: its grasps are other ones."""
+    assemble(out, rejected=[GraspDataset(out / "grasping_oto.hdf5", split="test")[0].trial_id])
+    (out / "trials.hdf5").unlink()
+    report = again(out, _nothing_runs, meshes=meshes)
+    assert report.assembly.removed[Removal.REJECTED] == 1
+
+    # No mesh is simulated again here: only its entry counts.
+    manifest = read_manifest(out)
+    changed = [replace(entry, mesh_sha256="0" * 64) for entry in manifest.objects]
+    write_manifest(replace(manifest, objects=tuple(changed)), out)
+    again(out, meshes=meshes)
+    assert read_manifest(out).rejected == ()
+
+
+def test_max_grasps_cuts_after_the_last_wanted_one(
+    small_dataset: Path, tmp_path: Path, again: Again
+) -> None:
+    """The rows are those of the full dataset up to each object's first success."""
+    config = load_config(
+        overrides=["candidates.max=40", "unit_candidates=10", "filters.outlier_sigma=0"],
+        max_grasps=1,
+    )
+    again(tmp_path / "out", config=config)
+    few, full = count_funnel(tmp_path / "out"), count_funnel(small_dataset)
+    found = full.outcomes[:, Outcome.SUCCESS] > 0
+    assert np.array_equal(few.outcomes[:, Outcome.SUCCESS], found.astype(int))
+    with h5py.File(tmp_path / "out" / "trials.hdf5") as file:
+        outcome, index = file["trials/outcome"][:], file["trials/object"][:]
+    for i in np.flatnonzero(found):
+        assert outcome[index == i][-1] == Outcome.SUCCESS
+    assert [str(v) for v in check_dataset(tmp_path / "out")] == []
+
+
+def test_damage_beyond_the_last_wanted_grasp_is_nobodys(
+    out: Path, small_config: Config, small_dataset: Path, again: Again
+) -> None:
+    with h5py.File(out / "trials.hdf5") as file:
+        success = file["trials/outcome"][:] == Outcome.SUCCESS
+        early = success & (file["trials/candidate"][:] < small_config.candidates.max // 2)
+        index = int(file["trials/object"][:][early][0])
+        name = file["objects/name"].asstr()[index]
+    _flip_byte(max((out / "shards" / name).glob("*.h5")))
+    config = small_config.model_copy(update={"max_grasps": 1})
+    report = again(out, _nothing_runs, config=config)
+    assert report.notices == ()
+    full = again(out)
+    assert "damaged, and simulated again" in full.notices[0]
+    assert_same_dataset(small_dataset, out)
+
+
+def test_other_configuration_is_refused_and_nothing_changes(out: Path, again: Again) -> None:
+    before = sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*") if p.is_file())
+    with pytest.raises(DataError, match=r"differs in seed \(0 there, 1 here\); choose another"):
+        config = load_config(overrides=["candidates.max=40", "unit_candidates=10"], seed=1)
+        again(out, _nothing_runs, config=config)
+    assert sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*") if p.is_file()) == before
+
+
+def test_refused_meshes_are_listed_and_the_others_go_on(tmp_path: Path) -> None:
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    trimesh.creation.box([0.06, 0.06, 0.09]).export(meshes / "1_box_a.obj")
+    trimesh.creation.box([5.0, 5.0, 5.0]).export(meshes / "2_house_a.obj")
+    (meshes / "3_text_a.obj").write_text("no mesh at all\n")
+    out = tmp_path / "out"
+    config = load_config(overrides=["candidates.max=2"])
+    report = build(find_meshes(meshes), out, config, run_here, show=False)
+    assert report.objects == 1
+    assert [entry.name for entry in report.refused] == ["2_house_a", "3_text_a"]
+    assert "--units" in report.refused[0].reason
+    # Each has its name beside the reason, once.
+    assert not any("2_house_a" in e.reason or "3_text_a" in e.reason for e in report.refused)
+    again = build(find_meshes(meshes), out, config, _nothing_runs, show=False)
+    assert again.refused == report.refused
+
+
+def test_a_build_that_trains_nothing_says_so_before_it_prepares(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    meshes, out = tmp_path / "meshes", tmp_path / "out"
+    meshes.mkdir()
+    trimesh.creation.box([0.06, 0.06, 0.09]).export(meshes / "1_box_a.obj")
+
+    def stop(*_: object) -> Iterator[object]:
+        raise KeyboardInterrupt
+
+    for show in (True, False):
+        with pytest.raises(KeyboardInterrupt):
+            build(find_meshes(meshes), out, load_config("paper"), stop, show=show)
+        said = capsys.readouterr().err
+        assert ("nothing will train: every class has one object" in said) is show
+    notices = [event["text"] for event in read_log(out) if event["event"] == "notice"]
+    assert [text.partition(":")[0] for text in notices] == ["nothing will train"] * 2
+
+
+def test_names_with_spaces_and_other_alphabets_work(tmp_path: Path) -> None:
+    meshes = tmp_path / "Möbel und Töpfe"
+    meshes.mkdir()
+    for name in ("1_чашка большая_a", "2_crème brûlée_b"):
+        trimesh.creation.box([0.06, 0.06, 0.12]).export(meshes / f"{name}.obj")
+    out = tmp_path / "Daten ü"
+    config = load_config(overrides=["candidates.max=6"])
+    build(find_meshes(meshes), out, config, run_here, show=False)
+    assert count_funnel(out).names == ("1_чашка большая_a", "2_crème brûlée_b")
+    assert count_funnel(out).classes == ("чашка большая", "crème brûlée")
+    assert [str(v) for v in check_dataset(out)] == []
+
+
+def test_somebody_elses_directory_is_refused(tmp_path: Path, small_meshes: Path) -> None:
+    (tmp_path / "letter.txt").write_text("dear Ada")
+    with pytest.raises(DataError, match="must be empty or hold a dataset"):
+        build(find_meshes(small_meshes), tmp_path, load_config(), run_here, show=False)
+    assert [p.name for p in tmp_path.iterdir()] == ["letter.txt"]
+
+
+@pytest.mark.parametrize("stage", ["success", "start_collision", "missing_fingertip"])
+def test_replay_gives_the_same_bits(small_dataset: Path, stage: str) -> None:
+    with h5py.File(small_dataset / "trials.hdf5") as file:
+        outcome = file["trials/outcome"][:]
+    (rows,) = np.nonzero(outcome == Outcome[stage.upper()])
+    again = replay_trial(small_dataset, int(rows[-1]))
+    assert again.same, again.differences
+    assert again.found is Outcome[stage.upper()]
+
+
+def test_replay_says_what_differs(out: Path) -> None:
+    """In every column, but for those that say which attempt it is."""
+    names = {f.name for f in trial_columns()} - {"candidate", "standoff_index", "child"}
+    with h5py.File(out / "trials.hdf5", "r+") as file:
+        number = int(np.flatnonzero(file["trials/outcome"][:] == Outcome.SUCCESS)[0])
+        names &= set(file["trials"])
+        for name in names:
+            values = file["trials"][name]
+            row = values[number]
+            # Of what a trial has no value of, a value is the difference.
+            values[number] = ~row if row.dtype.kind == "b" else np.nan_to_num(row) + 1
+    again = replay_trial(out, number)
+    assert not again.same
+    assert set(again.differences) == names
+    assert again.differences["spread"] == again.differences["outcome"] == pytest.approx(1.0)
+    with pytest.raises(DataError, match="trial must be 0 to 359, got 360"):
+        replay_trial(out, 360)
+
+    # Nothing was refined here.
+    with h5py.File(out / "trials.hdf5", "r+") as file:
+        file["trials/child"][number] = 1
+    with pytest.raises(DataError, match="child must be 0 to 0, got 1"):
+        replay_trial(out, number)
+
+
+def test_wrong_use_of_workers_is_refused(tmp_path: Path, small_meshes: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(ConfigError, match="workers must be at least 1, got 0"):
+        build_dataset(small_meshes, out, workers=0)
+    with pytest.raises(ConfigError, match="must not be given with a scheduler"):
+        build_dataset(small_meshes, out, workers=1, scheduler="tcp://127.0.0.1:1")
+    with pytest.raises(MeshError, match="mesh"):
+        build_dataset(tmp_path / "nowhere", out)
+    assert not out.exists()
+
+
+@pytest.mark.cluster
+def test_scheduler_that_is_not_there_is_named(tmp_path: Path, small_meshes: Path) -> None:
+    with pytest.raises(MachineError, match="must be a running Dask scheduler"):
+        build_dataset(small_meshes, tmp_path / "out", scheduler="tcp://127.0.0.1:9", tls=False)
+    with pytest.raises(ConfigError, match=r"begins with tls://, got tcp://127\.0\.0\.1:9: anybody"):
+        build_dataset(small_meshes, tmp_path / "out", scheduler="tcp://127.0.0.1:9")
+    file = tmp_path / "open.json"
+    file.write_text('{"address": "tcp://127.0.0.1:9"}')
+    with pytest.raises(ConfigError, match="begins with tls://, got tcp"):
+        build_dataset(small_meshes, tmp_path / "out", scheduler_file=file)
+    with pytest.raises(MachineError, match=r"none\.json: must be the file of a running Dask"):
+        build_dataset(small_meshes, tmp_path / "out", scheduler_file=tmp_path / "none.json")
+    for number, text in enumerate(("", "x", "{}", "[]", '{"address": 5}')):
+        file = tmp_path / f"{number}.json"
+        file.write_text(text)
+        with pytest.raises(MachineError, match=r"\d\.json: must be the file of a running Dask"):
+            build_dataset(small_meshes, tmp_path / "out", scheduler_file=file)
+
+
+def test_certificates_come_with_the_grasps_and_change_none(
+    small_meshes: Path, small_config: Config, small_dataset: Path, tmp_path: Path
+) -> None:
+    """Of the last object, whose attempts do not depend on the others."""
+    certified = ["certify.repeats=2", "certify.friction_steps=1", "certify.share_others=1"]
+    # Each object is likely to be tested, and no other sample would be drawn.
+    certified += ["certify.share=0", "certify.share_tested=1"]
+    certified += ["split.test_fraction=0.9", "split.valid_fraction=0.09"]
+    config = override_config(small_config, certified)
+    build([find_meshes(small_meshes)[-1]], tmp_path / "out", config, run_here, show=False)
+    with (
+        h5py.File(tmp_path / "out" / "trials.hdf5", "r") as file,
+        h5py.File(small_dataset / "trials.hdf5", "r") as plain,
+    ):
+        friction = file["successes/certified_friction"][:]
+        names = ("repeats", "held", "samples", "half_step", "probability")
+        repeats, held, samples, half, chance = (file[f"trials/p_hold_{n}"][:] for n in names)
+        lifted = np.isfinite(file["trials/time_lift"][:])
+        kept = file["successes/trial_id"][:][file["successes/removal"][:] == Removal.KEPT]
+        last = plain["trials/object"][:] == 2
+        assert file["objects/name"][0] == plain["objects/name"][2]
+        assert np.array_equal(file["trials/outcome"][:], plain["trials/outcome"][:][last])
+        assert not [name for name in plain["trials"] if name.startswith("p_hold")]
+        assert np.array_equal(file["trials/slip"][:], plain["trials/slip"][:][last], equal_nan=True)
+    assert np.array_equal(chance == 1.0, lifted)
+    assert (repeats[lifted] == 2).all()
+    assert np.isin(half[lifted], [0.0, 1.0]).all()
+    assert (samples <= held).all()
+    assert (samples[kept] == 2).any()
+    assert (samples[lifted] == 0).any()
+    mu = config.physics.friction_hand
+    assert set(friction.tolist()) <= {mu / 2.0, mu, np.inf}
+    assert [str(v) for v in check_dataset(tmp_path / "out")] == []

@@ -1,0 +1,330 @@
+"""A build of postures from outside: attempts, samples, replay, resume; and what is refused."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers.assertions import assert_same_arrays
+from helpers.hands import write_with_preshapes
+from helpers.objects import CUBE, STANDOFF, box_model, from_above, standing
+
+from drakegrasp.api.building import build_on
+from drakegrasp.config import Config
+from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.schema import NO_PRESHAPE
+from drakegrasp.dataset.statistics import NO_NAME, counts_as_dict
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import ConfigError, DataError, GraspError
+from drakegrasp.frames import make_pose, unpack_pose
+from drakegrasp.generation.pipeline import build, posture_config
+from drakegrasp.generation.prepare import prepare
+from drakegrasp.generation.replay import replay_trial
+from drakegrasp.generation.scenes.make import make_scenes
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.hand.settings import load_config
+from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import run_here
+from drakegrasp.runtime.files import seal
+from drakegrasp.scoring.verdict import verdict_of
+from drakegrasp.simulation.candidates import Source
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.postures.posture import joint_order
+from drakegrasp.simulation.postures.table import (
+    PostureTable,
+    make_table,
+    unknown_objects,
+)
+from drakegrasp.simulation.trial import run_attempt
+from drakegrasp.verification.placed_postures import place_postures_on_dataset
+from drakegrasp.verification.result_files import write_results
+from drakegrasp.verification.verify import verify_placed
+
+pytestmark = pytest.mark.sim
+
+NAME = "1_box_a"
+HAND = load_hand()
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("meshes")
+    box_model(folder, [CUBE] * 3, NAME)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> PostureTable:
+    """Rows of the cube: held by the hand's motors, held by own ones, inside it, below the table."""
+    model = box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3, NAME)
+    config, attempt = load_config(), from_above(model, STANDOFF)
+    scene = build_scene(model, config.physics, HAND)
+    held = run_attempt(scene, standing(model), attempt, config)
+    start = joint_positions(HAND, 0.0, np.zeros(3))
+    opened = np.array([start[name] for name in joint_order(HAND)])
+
+    coupled, bent = held.closed.q, held.closed.q.copy()
+    for finger in HAND.fingers:
+        bent[joint_order(HAND).index(finger.coupled[0].joint)] += 0.1
+        bent[joint_order(HAND).index(finger.closing_joint)] -= 0.04
+    inside = attempt.X_OG @ make_pose(np.eye(3), [0.0, 0.0, 0.05])
+    below = make_pose(np.eye(3), [0.0, 0.0, -0.2])
+    nothing = np.full(8, np.nan)
+    return make_table(
+        HAND,
+        [NAME] * 4,
+        [attempt.X_OG, attempt.X_OG, inside, below],
+        [coupled, bent, coupled, coupled],
+        q_pregrasp=[opened, bent - 0.3 * (bent - opened), nothing, nothing],
+        log_density=[-2.0, np.nan, np.nan, np.nan],
+        said=["mine", "", "", ""],
+    )
+
+
+def built(meshes: Path, out: Path, table: PostureTable, config: Config | None = None) -> Path:
+    config = posture_config(config or load_config(), table)
+    build(find_meshes(meshes), out, config, run_here, postures=table, show=False)
+    return out
+
+
+@pytest.fixture(scope="module")
+def dataset(meshes: Path, table: PostureTable, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return built(meshes, tmp_path_factory.mktemp("built") / "out", table)
+
+
+def test_each_row_is_an_attempt_with_its_outcome(dataset):
+    trials = Trials(dataset)
+    names = ("outcome", "candidate", "standoff_index", "posture_row", "own_motors", "source")
+    rows = zip(*(trials[name].tolist() for name in names), strict=True)
+    assert list(rows) == [
+        (Outcome.SUCCESS, 0, 0, 0.0, False, Source.POSTURES),
+        (Outcome.SUCCESS, 1, 0, 1.0, True, Source.POSTURES),
+        (Outcome.START_COLLISION, 2, 0, 2.0, False, Source.POSTURES),
+        (Outcome.BELOW_TABLE, 3, 0, 3.0, False, Source.POSTURES),
+    ]
+    np.testing.assert_array_equal(trials["log_density"], [-2.0, np.nan, np.nan, np.nan])
+
+
+def test_dataset_is_sound(dataset):
+    assert check_dataset(dataset) == []
+
+
+@pytest.mark.parametrize("row", range(4))
+def test_trial_of_a_posture_is_replayed_from_the_dataset_alone(dataset, row):
+    again = replay_trial(dataset, row)
+    assert again.same
+    # The fingers of the third begin in the table.
+    assert list(again.meetings) == (["table"] if row == 2 else [])
+
+
+def test_plan_keeps_what_the_file_said(dataset, table):
+    config = posture_config(load_config(), table)
+    kept = load_prepared(dataset, NAME, config).candidates.postures
+    np.testing.assert_array_equal(kept.q_pregrasp, table.q_pregrasp)
+    assert kept.said == ("mine", "", "", "")
+
+
+def test_plan_whose_texts_are_nested_too_deeply_is_refused_in_a_line(dataset, table, tmp_path):
+    shutil.copytree(dataset / "objects", tmp_path / "objects")
+    path = tmp_path / f"objects/{NAME}.plan.h5"
+    with h5py.File(path, "r+") as file:
+        del file["said"]
+        file["said"] = np.frombuffer(b"[" * 100_000, dtype=np.uint8)
+    seal(path)
+    with pytest.raises(DataError, match="must hold postures, got none: values nested too deeply"):
+        load_prepared(tmp_path, NAME, posture_config(load_config(), table))
+
+
+def test_dataset_without_the_columns_reads_as_one_of_samplers(dataset, tmp_path):
+    shutil.copy(dataset / "trials.hdf5", tmp_path)
+    with h5py.File(tmp_path / "trials.hdf5", "r+") as file:
+        del file["trials/own_motors"], file["trials/posture_row"]
+    older = Trials(tmp_path / "trials.hdf5")
+    assert not older["own_motors"].any()
+    assert np.isnan(older["posture_row"]).all()
+
+
+def test_more_rows_complete_the_dataset_of_fewer(meshes, table, dataset, tmp_path):
+    fewer = load_config(overrides=["candidates.max=2"])
+    out = built(meshes, tmp_path / "out", table, fewer)
+    assert len(Trials(out)) == 2
+    assert_same_arrays(built(meshes, out, table) / "trials.hdf5", dataset / "trials.hdf5")
+
+
+def test_dataset_of_other_postures_is_not_continued(meshes, table, dataset, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(dataset, out)
+    other = replace(table, q_grasp=table.q_grasp + 1e-9)
+    with pytest.raises(DataError, match=r"differs in candidates\.postures"):
+        built(meshes, out, other)
+
+
+def test_rows_that_are_no_posture_are_told_and_spoil_no_other(meshes, table, dataset, tmp_path):
+    """The good rows 0 and 3 of the file, with bad ones between and after them."""
+    bad = [0, 0, 0, 0, 0, 0]
+    rows = [0, *bad[:2], 3, *bad[2:], 0]
+    X_FG, q, objects = table.X_FG[rows], table.q_grasp[rows], [NAME] * len(rows)
+    q[1, 2] = np.nan
+    X_FG[2, :3, 3] = 1e6
+    X_FG[4, :3, :3] = 0.0
+    resting, scale = np.zeros(len(rows)), np.full(len(rows), np.nan)
+    resting[5], scale[6], resting[7], objects[8] = 1.0, 0.1, -1.0, "cup"
+    mixed = make_table(
+        *(HAND, objects, X_FG, q),
+        q_pregrasp=table.q_pregrasp[rows],
+        q_squeeze=table.q_squeeze[rows],
+        resting=resting,
+        scale=scale,
+    )
+    mixed = mixed.refuse(unknown_objects(mixed, [NAME]))
+    config = posture_config(load_config(), mixed)
+    report = build(find_meshes(meshes), tmp_path, config, run_here, postures=mixed, show=False)
+    trials, alone = Trials(tmp_path), Trials(dataset)
+    assert trials["posture_row"].tolist() == [0.0, 3.0]
+    for name in ("outcome", "closed_q", "slip"):
+        np.testing.assert_array_equal(trials[name], alone[name][[0, 3]])
+    (told,) = (each for each in report.notices if "postures" in each)
+    assert told.startswith("7 of 9 rows of the postures are not tried: row 1: q_grasp must be fin")
+    for part in (
+        "row 2: the palm's pose must be within 1000 m, got 1e+06 m",
+        "row 4: the palm's pose must hold a rotation",
+        "row 5: resting pose of 1_box_a must be 0, the only one",
+        "row 6: scale must be that of 1_box_a, 1",
+        "row 7: resting must be the index of a resting pose, got -1",
+        "row 8: object must be one of 1_box_a, got 'cup'",
+    ):
+        assert part in told
+    assert check_dataset(tmp_path) == []
+
+
+def test_file_without_any_posture_is_refused(meshes, table, tmp_path):
+    with pytest.raises(GraspError, match=r"4 of 4 rows .* row 0, 1, 2, 3: scale must be that of"):
+        built(meshes, tmp_path / "out", replace(table, scale=np.full(4, 0.1)))
+    with pytest.raises(
+        GraspError, match=r"must be of an object that is built: 4 of 4 rows .*got 'cup'"
+    ):
+        build_on(nullcontext(None), find_meshes(meshes), tmp_path, load_config(),
+                 postures=replace(table, objects=("cup",) * 4))  # fmt: skip
+
+
+#: Closing positions at which the fingers of a posture begin [rad].
+BEGUN = 0.05
+
+
+@pytest.fixture(scope="module")
+def of_preshapes(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """The cube held by two fingers, given back with its preshape, without, and begun."""
+    folder = tmp_path_factory.mktemp("shaped")
+    config = load_config(
+        overrides=[f"hand={write_with_preshapes(folder, all='F1 F2 F3', pair='F1 F3')}"]
+    )
+    hand, model = load_hand(config.hand), box_model(folder, [CUBE] * 3, NAME)
+    attempt, pair = from_above(model, STANDOFF), hand.at(1)
+    held = run_attempt(build_scene(model, config.physics, pair), standing(model), attempt, config)
+    assert held.outcome is Outcome.SUCCESS
+    starts = [joint_positions(pair, 0.0, np.full(2, at)) for at in (0.0, 0.0, BEGUN)]
+    table = make_table(
+        hand,
+        [NAME] * 3,
+        [attempt.X_OG] * 3,
+        [held.closed.q] * 3,
+        q_pregrasp=[[start[name] for name in joint_order(hand)] for start in starts],
+        preshape=["pair", "", "pair"],
+    )
+    return built(meshes, folder / "out", table, config), held.closed.q
+
+
+def test_a_posture_of_a_preshape_is_the_attempt_that_it_was(of_preshapes):
+    """Without one, the third finger closes as well."""
+    out, q = of_preshapes
+    trials = Trials(out)
+    assert trials["preshape"].tolist() == [1, NO_PRESHAPE, 1]
+    assert trials["unused"].tolist() == [0b010, 0, 0b010]
+    assert trials["outcome"].tolist() == [Outcome.SUCCESS] * 3
+    two = [True, False, True]
+    assert trials["closed_touching"].tolist() == [two, [True] * 3, two]
+    np.testing.assert_allclose(trials["closed_q"][0], q, atol=1e-9)
+    assert not trials["own_motors"][0]
+
+
+def test_verdict_on_a_posture_of_a_preshape_has_a_place_for_every_finger(of_preshapes, tmp_path):
+    out, q = of_preshapes
+    config = read_manifest(out).config
+    hand = load_hand(config.hand_source)
+    row = Trials(out)[[0]]
+    table = make_table(
+        *(hand, [NAME] * 2, [unpack_pose(row["X_OG"][0])] * 2, [q] * 2),
+        preshape=["pair", "fist"],
+    )
+    held, none = map(verify_placed, place_postures_on_dataset(table, out))
+    assert held.held
+    assert none.outcome is Outcome.INVALID
+    assert none.reason.startswith("preshape must be one of all, pair for the hand")
+    assert held.closed.touching.tolist() == [True, False, True]
+    assert (held.closed.f_Q_O[1] == 0.0).all()
+    np.testing.assert_allclose(held.closed.p_OQ, row["closed_p_OQ"][0], atol=1e-3)
+    assert np.isnan(held.closing_start).tolist() == [False, True, False]
+    write_results([held, none], tmp_path / "v.h5", config)
+    assert not verdict_of(held).contacts
+
+
+def test_a_dataset_of_postures_of_preshapes_is_sound_and_replayed(of_preshapes):
+    out, _ = of_preshapes
+    assert check_dataset(out) == []
+    assert replay_trial(out, 0).same
+    counts = [(each["preshape"], each["held"]) for each in counts_as_dict(out)["preshapes"]]
+    assert counts == [("all", 0), ("pair", 2), (NO_NAME, 1)]
+
+
+def test_scenes_have_the_hand_from_which_a_posture_of_a_preshape_closed(of_preshapes, tmp_path):
+    out = Path(shutil.copytree(of_preshapes[0], tmp_path / "out"))
+    with h5py.File(make_scenes(out).path) as file:
+        by_trial = np.argsort(file["grasps/trial_id"][:])
+        q_open = file["grasps/q_open"][:][by_trial]
+    pair = load_hand(read_manifest(out).config.hand_source).at(1)
+    order = joint_order(pair)
+    for row, at in ((0, 0.0), (2, BEGUN)):
+        start = joint_positions(pair, 0.0, np.full(2, at))
+        np.testing.assert_allclose(q_open[row], [start[name] for name in order], atol=1e-6)
+
+
+def test_the_hash_of_postures_without_preshapes_is_as_before_there_were_any(table):
+    """Else no build of an older version went on."""
+    plain = make_table(HAND, ["cup"], [np.eye(4)], np.zeros((1, 8)), resting=[0])
+    assert plain.digest() == "553c8cce98b13896"
+    assert replace(plain, preshape=("pair",)).digest() != plain.digest()
+
+
+def test_settings_that_name_other_postures_are_refused(table):
+    config = load_config(overrides=["candidates.postures='0123456789abcdef'"])
+    with pytest.raises(ConfigError, match=r"candidates\.postures must be given with postures"):
+        posture_config(config, None)
+    with pytest.raises(ConfigError, match="must be left out; the postures that are given decide"):
+        posture_config(config, table)
+
+
+def test_ordinary_configuration_does_not_know_of_postures():
+    assert "postures" not in load_config().to_dict()["candidates"]
+
+
+def test_postures_in_the_frame_of_the_mesh_file_are_moved_to_the_object(tmp_path, table):
+    # The file's origin is a corner of the cube, its unit a centimetre.
+    box = box_model(tmp_path, [CUBE] * 3, NAME)
+    vertices = 100.0 * (box.visual_vertices + CUBE / 2.0)
+    (tmp_path / f"{NAME}.obj").write_text(obj_text(vertices, box.visual_faces, normals=False))
+    (source,) = find_meshes(tmp_path, units="cm")
+    there = table.X_FG.copy()
+    there[:, :3, 3] += CUBE / 2.0
+    moved = replace(table, X_FG=there, frame="mesh")
+    prepared = prepare(source, posture_config(load_config(), moved), moved)
+    np.testing.assert_allclose(prepared.candidates.X_OG, table.X_FG, atol=1e-9)

@@ -1,0 +1,70 @@
+"""Preparing one mesh as a task."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh
+from drakegrasp.generation.prepare import PrepareTask, prepare_one
+from drakegrasp.hand.settings import load_config
+from drakegrasp.objects.sources import find_meshes, source_sha256
+
+pytestmark = pytest.mark.sim
+
+
+@pytest.fixture
+def task(tmp_path: Path) -> PrepareTask:
+    """A task for a box, in a new directory."""
+    (tmp_path / "meshes").mkdir()
+    box = trimesh.creation.box([0.05, 0.06, 0.07]).subdivide().subdivide()
+    box.export(tmp_path / "meshes" / "1_box.stl")
+    (source,) = find_meshes(tmp_path / "meshes")
+    return PrepareTask(
+        source=source,
+        mesh_sha256=source_sha256(source),
+        out=tmp_path / "out",
+        config=load_config(overrides=["candidates.max=5"]),
+        restartable=False,
+    )
+
+
+def test_mesh_file_that_changes_during_the_build_is_refused(task: PrepareTask) -> None:
+    """The manifest must not name the digest of one content and hold the other."""
+    _, entry = prepare_one(replace(task, mesh_sha256="0" * 64))
+    assert isinstance(entry, RefusedMesh)
+    assert entry.mesh_sha256 == "0" * 64
+    assert entry.reason == "the mesh file changed during the build"
+    assert not Path(task.out).exists()
+
+
+def test_worker_reads_the_mesh_file_once_and_a_prepared_object_not_at_all(
+    task: PrepareTask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reads, read_bytes = [], Path.read_bytes
+
+    def count(path: Path) -> bytes:
+        reads.append(path)
+        return read_bytes(path)
+
+    monkeypatch.setattr(Path, "read_bytes", count)
+    _, entry = prepare_one(task)
+    assert isinstance(entry, ObjectEntry)
+    assert reads.count(task.source.path) == 1
+    assert prepare_one(task) == ("1_box", entry)
+    assert reads.count(task.source.path) == 1
+
+
+def test_mesh_that_is_no_solid_is_refused_with_its_reason(task: PrepareTask) -> None:
+    """The entry has the file's name already, so the reason begins behind it."""
+    path = task.source.path
+    path.write_bytes(b"solid nothing\nendsolid nothing\n")
+    digest = source_sha256(task.source)
+    name, entry = prepare_one(replace(task, mesh_sha256=digest))
+    assert isinstance(entry, RefusedMesh)
+    assert (name, entry.name, entry.mesh_sha256) == ("1_box", "1_box", digest)
+    assert entry.reason and not entry.reason.startswith(path.name)
+    assert not Path(task.out).exists()
