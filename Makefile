@@ -74,7 +74,7 @@ test-browser: $(DEV)  ## the pages in Chromium, which it installs as root on Deb
 	else \
 	  echo "Chromium is not here, and only root can install it: its tests skip"; \
 	fi
-	$(BIN)/python -m pytest -m browser tests/inspection
+	$(BIN)/python -m pytest -m browser tests/page
 
 # torch is large: only this target installs it, and without it the tests that it runs skip.
 test-torch: $(DEV)  ## the baseline and the loaders for torch, which it installs

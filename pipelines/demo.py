@@ -17,8 +17,8 @@ from drakegrasp.cli.tables import make_console
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.hand.settings import load_config
+from drakegrasp.pictures.contact_sheet import contact_sheet
 from drakegrasp.shapes.catalog import draw_builtin, export_builtin
-from drakegrasp.visualization.contact_sheet import contact_sheet
 
 #: Classes that the hand often grasps, and objects of each: one trains and validates, one is tested.
 CLASSES = ("wineglass", "carton", "boot")

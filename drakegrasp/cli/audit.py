@@ -67,7 +67,7 @@ def audit(
         text = json.dumps([row.to_json() for row in rows], indent=1, ensure_ascii=False)
         write_atomic(json_file, f"{text}\n".encode())
     if sheet is not None:
-        from drakegrasp.visualization.object_sheet import object_sheet
+        from drakegrasp.pictures.object_sheet import object_sheet
 
         with progress_bar("draw", "objects") as progress, atomic_path(sheet) as png:
             object_sheet(rows, png, progress=progress)

@@ -182,7 +182,7 @@ def _draw(hand_file: str | Path, picture: Path) -> None:
     """Draw a hand."""
     from drakegrasp.commissioning.pinch import across_angle
     from drakegrasp.hand.description import load_hand
-    from drakegrasp.visualization.hand_picture import picture_hand
+    from drakegrasp.pictures.hand_picture import picture_hand
 
     loaded = load_hand(hand_file)
     picture_hand(loaded, picture, across=across_angle(loaded))

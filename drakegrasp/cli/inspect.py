@@ -53,8 +53,8 @@ def inspect_(
     from drakegrasp.errors import DataError
 
     try:
-        from drakegrasp.inspection.serve import serve
-        from drakegrasp.inspection.static_site import write_site
+        from drakegrasp.page.serve import serve
+        from drakegrasp.page.static_site import write_site
     except ModuleNotFoundError as error:
         library = (error.name or "").partition(".")[0]
         if library not in ("starlette", "uvicorn", "jinja2"):
@@ -107,8 +107,8 @@ def figures(
     views          views of scenes with a sample of each, if there are scenes
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.foreign_files import refuse_link
+    from drakegrasp.pictures.figures.write import write_figures
     from drakegrasp.runtime.progress import progress_bar
-    from drakegrasp.visualization.figures.write import write_figures
 
     if folder is None:
         folder = out / "figures"

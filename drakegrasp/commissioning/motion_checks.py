@@ -31,7 +31,7 @@ from drakegrasp.hand.kinematics import (
     still_links,
 )
 from drakegrasp.hand.shapes import link_shapes, ray_span
-from drakegrasp.visualization.still_scene import Poses, StillScene
+from drakegrasp.pictures.still_scene import Poses, StillScene
 
 #: The origin of {G} may lie this deep in the hand [m]: in the Barrett Hand it is 1.35 mm deep.
 PALM_DEPTH = 0.005

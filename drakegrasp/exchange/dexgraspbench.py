@@ -40,9 +40,9 @@ from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.mesh.wavefront import hull_text
 from drakegrasp.objects.model import load_object
+from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.protocols.grasp_file import POSTURES
 from drakegrasp.runtime.progress import Report
-from drakegrasp.visualization.still_scene import StillScene
 
 #: By how much pregrasp and squeeze are apart from the grasp [rad], of joints that slide by
 #: `description.SLIDE`.

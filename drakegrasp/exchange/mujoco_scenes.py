@@ -28,8 +28,8 @@ from drakegrasp.mjcf.hand_model import HandModel, make_hand_model
 from drakegrasp.mjcf.links import pair_friction, set_inertia
 from drakegrasp.mjcf.memory import MEMORY
 from drakegrasp.objects.model import ObjectModel, load_object, object_colour
+from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.runtime.progress import Report
-from drakegrasp.visualization.still_scene import StillScene
 
 #: Half extents of the table [m], whose top is at z = 0.
 TABLE = (0.8, 0.8, 0.05)

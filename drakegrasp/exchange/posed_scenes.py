@@ -22,8 +22,8 @@ from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.shapes import hull_triangles, link_shapes
 from drakegrasp.objects.model import ObjectModel, load_object, object_colour
+from drakegrasp.pictures.still_scene import Poses, StillScene
 from drakegrasp.runtime.progress import Report
-from drakegrasp.visualization.still_scene import Poses, StillScene
 
 #: Pose of {T} in the frame U of the file, whose +Y is up.
 X_UT = make_pose(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))

@@ -2,8 +2,8 @@
 
 In: attempts, their records and what was measured of them. Out: arrays by the names of
 `drakegrasp.dataset.schema`. This only lays out values; `drakegrasp.generation.attempts` makes
-them. Of a trial alone, `judge_sample` lays out a row and asks the filters of a dataset; what a filter needs
-and a trial lacks (the images, the other grasps of the object) counts as passed.
+them. Of a trial alone, `judge_sample` lays out a row and asks the filters of a dataset; what a
+filter needs and a trial lacks (the images, the other grasps of the object) counts as passed.
 """
 
 from __future__ import annotations

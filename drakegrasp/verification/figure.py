@@ -17,9 +17,9 @@ from matplotlib.patheffects import withStroke
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
+from drakegrasp.pictures.figures.panels import show_image
+from drakegrasp.pictures.style import INK, LIFTED, PREDICTED, REACHED, add_axes
 from drakegrasp.verification.views import Marks, View, is_seen, largest_force, render_views
-from drakegrasp.visualization.figures.panels import show_image
-from drakegrasp.visualization.style import INK, LIFTED, PREDICTED, REACHED, add_axes
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification

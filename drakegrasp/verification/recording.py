@@ -1,6 +1,6 @@
 """Recordings of verifications: a trial, or an object that no hand was tried on.
 
-In: a `Verification`. Out: an HTML file, see `visualization.recording`.
+In: a `Verification`. Out: an HTML file, see `pictures.recording`.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 
 from pydrake.geometry import Meshcat
 
-from drakegrasp.simulation.construction import build_object_scene
-from drakegrasp.visualization.recording import (
+from drakegrasp.pictures.recording import (
     draw_predicted,
     record_attempt,
     record_html,
     show_object,
 )
+from drakegrasp.simulation.construction import build_object_scene
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification

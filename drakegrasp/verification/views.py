@@ -3,7 +3,7 @@
 In: a verification. Out: the object from two sides with its contacts, then the last state that was
 reached, with the hand. `figure` draws them.
 
-The pictures come from `visualization.still_scene`, so they need OpenGL and a single thread.
+The pictures come from `pictures.still_scene`, so they need OpenGL and a single thread.
 """
 
 from __future__ import annotations
@@ -20,9 +20,7 @@ from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, transform_poi
 from drakegrasp.hand.description import load_hand
 from drakegrasp.mesh.rays import first_hits
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.contacts import Contacts
-from drakegrasp.vision.camera import Picture
-from drakegrasp.visualization.still_scene import (
+from drakegrasp.pictures.still_scene import (
     AZIMUTHS_DEG,
     Lighting,
     Poses,
@@ -30,7 +28,9 @@ from drakegrasp.visualization.still_scene import (
     box_corners,
     camera_pose,
 )
-from drakegrasp.visualization.style import ARROW, HIDDEN, LIFTED, PREDICTED, REACHED
+from drakegrasp.pictures.style import ARROW, HIDDEN, LIFTED, PREDICTED, REACHED
+from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.vision.camera import Picture
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification

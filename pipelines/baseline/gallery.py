@@ -25,10 +25,10 @@ import drakegrasp as dg
 from drakegrasp.dataset.scenes.rows import SceneRows
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.frames import invert_pose
+from drakegrasp.pictures.style import add_axes, hide_ticks, save_figure, shortened
 from drakegrasp.scoring.measures import Judged
 from drakegrasp.scoring.run import VERDICTS
 from drakegrasp.vision.camera import project
-from drakegrasp.visualization.style import add_axes, hide_ticks, save_figure, shortened
 
 #: Pictures side by side, lines of each kind, the width of a picture and between two [inch].
 ACROSS, LINES, WIDE, GAP = 6, 2, 1.5, 0.05

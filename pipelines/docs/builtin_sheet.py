@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 from drakegrasp.config import CameraConfig
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.pictures.style import INK, add_axes, hide_ticks, save_figure
 from drakegrasp.shapes.catalog import BuiltinObject
 from drakegrasp.shapes.classes import CLASSES
 from drakegrasp.vision.rendering import build_renderer, render
-from drakegrasp.visualization.style import INK, add_axes, hide_ticks, save_figure
 
 #: Objects per line of the sheet, and the edge of each picture [inch].
 ACROSS, EDGE = 8, 1.3

@@ -18,9 +18,8 @@ from drakegrasp.dataset.reader import GraspDataset, Sample
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
-from drakegrasp.vision.camera import Picture
-from drakegrasp.visualization.figures.panels import Panel, draw_panel, show_image
-from drakegrasp.visualization.style import (
+from drakegrasp.pictures.figures.panels import Panel, draw_panel, show_image
+from drakegrasp.pictures.style import (
     INK,
     add_axes,
     draw_colour_bar,
@@ -29,6 +28,7 @@ from drakegrasp.visualization.style import (
     read_far,
     save_figure,
 )
+from drakegrasp.vision.camera import Picture
 
 
 def hero_figure(

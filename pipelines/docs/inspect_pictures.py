@@ -16,8 +16,8 @@ from pathlib import Path
 import uvicorn
 from playwright.sync_api import sync_playwright
 
-from drakegrasp.inspection.app import Inspection, make_app
-from drakegrasp.inspection.serve import listen
+from drakegrasp.page.app import Inspection, make_app
+from drakegrasp.page.serve import listen
 
 #: As root Chromium has no sandbox; WebGL is computed by the CPU.
 OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")

@@ -14,10 +14,10 @@ from doc_figures import find_sample
 
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.frames import X_WT, make_pose, transform_points, unpack_pose
+from drakegrasp.pictures.figures.panels import Panel, Triad
+from drakegrasp.pictures.figures.trial_stages import frustum, load_trial
+from drakegrasp.pictures.still_scene import NO_SHADOWS, StillScene, camera_pose
 from drakegrasp.vision.camera import Picture
-from drakegrasp.visualization.figures.panels import Panel, Triad
-from drakegrasp.visualization.figures.trial_stages import frustum, load_trial
-from drakegrasp.visualization.still_scene import NO_SHADOWS, StillScene, camera_pose
 
 #: Edge of the table where the world's origin below it must be seen [m].
 SMALL_TABLE = 0.28

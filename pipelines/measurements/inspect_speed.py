@@ -27,8 +27,8 @@ import numpy as np
 from drakegrasp.dataset.hdf5 import COLUMN_CHUNK, create_field
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SUCCESS_FIELDS, TRIAL_FIELDS
-from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.outcomes import Outcome
+from drakegrasp.page.catalog import Catalog
 
 #: Filters that are asked for, each new to the server.
 FILTERS = ("min_slip=5", "object=50_carton_final&sort=slip", "outcome=any&sort=penetration",

@@ -33,6 +33,7 @@ from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, rotation_angl
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import override_config
 from drakegrasp.outcomes import Outcome
+from drakegrasp.pictures.still_scene import NO_SHADOWS, Poses, StillScene
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation import lift as lifting
 from drakegrasp.simulation.construction import build_scene
@@ -40,7 +41,6 @@ from drakegrasp.simulation.contacts import read_contacts
 from drakegrasp.simulation.randomization.conditions import usual_conditions
 from drakegrasp.simulation.scene import Scene, hand_positions, palm_pose
 from drakegrasp.simulation.trial import run_attempt
-from drakegrasp.visualization.still_scene import NO_SHADOWS, Poses, StillScene
 
 #: Last number of the place of the stream that draws the lifts.
 PLACE = 26

@@ -8,7 +8,7 @@ import pytest
 from helpers.commands import run
 
 from drakegrasp.errors import DataError
-from drakegrasp.visualization.figures import write
+from drakegrasp.pictures.figures import write
 
 
 def test_figures_are_written_beside_the_dataset(

@@ -21,8 +21,8 @@ from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.statistics import count_funnel, count_splits, count_unfinished
 from drakegrasp.errors import DataError
 from drakegrasp.generation.merge import merge
-from drakegrasp.inspection.catalog import Catalog
-from drakegrasp.inspection.rows import read_rows
+from drakegrasp.page.catalog import Catalog
+from drakegrasp.page.rows import read_rows
 
 
 @pytest.fixture

@@ -27,9 +27,9 @@ from drakegrasp.dataset.statistics import (
     preshapes_of,
 )
 from drakegrasp.hand.settings import load_config
-from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.outcomes import Outcome, Removal
-from drakegrasp.visualization.figures.write import NUMBERS_FILE, write_figures
+from drakegrasp.page.catalog import Catalog
+from drakegrasp.pictures.figures.write import NUMBERS_FILE, write_figures
 
 
 def test_words_are_counted_by_object(out: Path) -> None:

@@ -15,7 +15,7 @@ mujoco = pytest.importorskip("mujoco")
 from drakegrasp.exchange.closed_grasps import ClosedGrasp  # noqa: E402
 from drakegrasp.frames import invert_pose  # noqa: E402
 from drakegrasp.hand.description import load_hand  # noqa: E402
-from drakegrasp.visualization.still_scene import Poses, StillScene  # noqa: E402
+from drakegrasp.pictures.still_scene import Poses, StillScene  # noqa: E402
 
 
 def test_each_scene_has_object_and_links_where_they_were(

@@ -16,7 +16,7 @@ from drakegrasp.exchange.posed_scenes import X_UT, link_meshes, posed_scene
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import load_object
-from drakegrasp.visualization.still_scene import Poses, StillScene
+from drakegrasp.pictures.still_scene import Poses, StillScene
 
 
 @pytest.fixture(scope="module")

@@ -35,10 +35,10 @@ from drakegrasp.generation.pipeline import build
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.settings import load_config
-from drakegrasp.inspection.catalog import Catalog
-from drakegrasp.inspection.rows import read_look
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
+from drakegrasp.page.catalog import Catalog
+from drakegrasp.page.rows import read_look
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.files import seal
 

@@ -13,9 +13,9 @@ from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.generation.pipeline import BuildReport, build
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.settings import load_config
-from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Removal
+from drakegrasp.page.catalog import Catalog
 from drakegrasp.runtime.executor import run_here
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]

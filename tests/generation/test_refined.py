@@ -38,13 +38,13 @@ from drakegrasp.generation.pipeline import NEAR_BORDER, build
 from drakegrasp.generation.replay import record_trial, replay_trial
 from drakegrasp.generation.work_unit import WorkUnit, run_unit
 from drakegrasp.hand.settings import load_config, override_config
-from drakegrasp.inspection.catalog import Catalog
-from drakegrasp.inspection.query import Query, select
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.page.catalog import Catalog
+from drakegrasp.page.query import Query, select
+from drakegrasp.pictures.figures.held_grasps import read_approaches, read_held
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.verification.placed_grasp import place_on_rows
-from drakegrasp.visualization.figures.held_grasps import read_approaches, read_held
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 

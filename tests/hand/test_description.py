@@ -31,7 +31,7 @@ from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import link_shapes
-from drakegrasp.visualization.still_scene import Poses, StillScene
+from drakegrasp.pictures.still_scene import Poses, StillScene
 
 #: Mass [kg] and bounding box of the CAD mesh [m] of each kind of link.
 LINKS = {

@@ -24,10 +24,10 @@ from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.simulation.candidates import Attempt, Candidates, Source, make_attempts
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.trial import TrialRecord
-from drakegrasp.visualization.still_scene import StillScene
 
 PINCH = {
     "name": "pinch",

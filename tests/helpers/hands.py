@@ -12,7 +12,7 @@ import yaml
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.files import hand_file
-from drakegrasp.visualization.still_scene import Poses, StillScene
+from drakegrasp.pictures.still_scene import Poses, StillScene
 
 #: A gripper whose two fingers face each other along y, hinged at y = -+0.04, length 0.1.
 PINCER_SDF = """<sdf version="1.9"><model name="pincer">

@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from starlette.testclient import TestClient
 
-from drakegrasp.inspection.catalog import Snapshot
+from drakegrasp.page.catalog import Snapshot
 
 #: A name that must stay text.
 ATTACK = "<script>alert(1)</script>"

@@ -21,13 +21,13 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
+from drakegrasp.pictures.style import save_figure
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.scene import Scene, palm_pose
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.figure import verification_figure
 from drakegrasp.verification.result import Verification
-from drakegrasp.visualization.style import save_figure
 
 pytestmark = pytest.mark.sim
 

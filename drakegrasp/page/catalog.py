@@ -1,0 +1,379 @@
+"""What is in a dataset's directory now, read again when its files change.
+
+A `Snapshot` is one state of the files. It is never changed: a request works on one snapshot to its
+end, whatever a build writes meanwhile.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.config import Config, parse_stored
+from drakegrasp.dataset.layout.trial_files import Stamp, TrialPart, sample_ids, shard_part, stamp
+from drakegrasp.dataset.manifest import Manifest, read_manifest
+from drakegrasp.dataset.paths import (
+    ASSEMBLED_FILES,
+    DATA_FILES,
+    FILE_NAME,
+    TRIALS_FILE,
+    model_path,
+)
+from drakegrasp.dataset.rejections import AttemptKey
+from drakegrasp.dataset.schema import SCHEMA_VERSION
+from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import DataError
+from drakegrasp.hand.carried import carried_hand
+from drakegrasp.outcomes import Outcome
+from drakegrasp.page.table import AttemptTable, first_rows, join, read_table
+from drakegrasp.runtime.json_text import parse_json
+from drakegrasp.runtime.names import is_name
+
+#: While a build runs, its new shards are looked for this often [s].
+LISTING_PERIOD = 5.0
+#: Damaged shards that are named.
+NAMED = 3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Snapshot:
+    """One state of a dataset's files.
+
+    Attributes:
+        out: Directory of the dataset.
+        config: Its configuration.
+        config_hash: Hash of what decides a shard, as its files have it.
+        own_hashes: That of each object with a seed of its own, by its name.
+        names, classes: Of the objects, by their number.
+        meshes: Hashes of the objects' meshes, hexadecimal.
+        trials: The attempts, in their files.
+        table: What is kept of them in memory.
+        sample_ids: Trial ids of the samples by split, in rising order.
+        assembled: Whether the attempts are rows of trials.hdf5; else they are of shards.
+        stamps: Of the assembled files; shards never change.
+        missing: What is not there, in sentences.
+    """
+
+    out: Path
+    config: Config
+    config_hash: str
+    names: tuple[str, ...]
+    classes: tuple[str, ...]
+    meshes: tuple[str, ...]
+    trials: Trials
+    table: AttemptTable
+    sample_ids: dict[str, npt.NDArray[np.int64]]
+    assembled: bool
+    own_hashes: Mapping[str, str] = field(default_factory=dict)
+    stamps: Mapping[Path, Stamp] = field(default_factory=dict)
+    missing: tuple[str, ...]
+
+    @cached_property
+    def codes(self) -> tuple[str, ...]:
+        """A code of each object for addresses: of configuration, mesh and name.
+
+        Its number would be that of another object as soon as there are more of them.
+        """
+        identities = zip(self.meshes, self.names, strict=True)
+        texts = (json.dumps([self.config_hash, *identity]) for identity in identities)
+        return tuple(hashlib.sha256(text.encode()).hexdigest()[:12] for text in texts)
+
+    @cached_property
+    def numbers(self) -> Mapping[str, int]:
+        """Numbers of the objects by their codes."""
+        return {code: number for number, code in enumerate(self.codes)}
+
+    def key(self, i: int) -> AttemptKey:
+        """Return the identity of an attempt by its place in the table."""
+        table = self.table
+        name = self.names[table.object[i]]
+        numbers = (table.candidate[i], table.standoff_index[i], table.child[i])
+        return AttemptKey(name, *(int(number) for number in numbers))
+
+    def label(self, i: int) -> str:
+        """Return the identity of an attempt for addresses: `9f86d081884c-345-2`.
+
+        A refined one has its number in the family behind: `9f86d081884c-345-2-7`.
+        The files of a later state have the same label for it, and for no other attempt.
+        """
+        table = self.table
+        code = self.codes[table.object[i]]
+        refined = f"-{table.child[i]}" if table.child[i] else ""
+        return f"{code}-{table.candidate[i]}-{table.standoff_index[i]}{refined}"
+
+    def find(self, label: str) -> int | None:
+        """Return the place of the attempt of a label, or None if there is none."""
+        code, *numbers = label.split("-")
+        if len(numbers) not in (2, 3) or not all(n.isascii() and n.isdecimal() for n in numbers):
+            return None
+        number = self.numbers.get(code)
+        return None if number is None else self.table.find(number, *map(int, numbers))
+
+    def find_key(self, key: AttemptKey) -> int | None:
+        """Return the place of an attempt by its identity, or None if it is not there."""
+        if key.object not in self.names:
+            return None
+        number = self.names.index(key.object)
+        return self.table.find(number, key.candidate, key.standoff_index, key.child)
+
+    def trial_id(self, i: int) -> int | None:
+        """Return the row of an attempt in trials.hdf5, or None before there is one."""
+        return i if self.assembled else None
+
+    def refuse_replaced(self) -> None:
+        """Refuse what was just read if a file was replaced while it was being read.
+
+        Raises:
+            DataError: If a file was replaced.
+        """
+        for path, before in self.stamps.items():
+            if stamp(path) != before:
+                raise DataError(f"{path}: must stay while it is read, got another; load it again")
+
+
+class Catalog:
+    """The files of a dataset, as they are now.
+
+    Args:
+        out: Directory of the dataset.
+
+    Raises:
+        DataError: If the directory holds neither a trials.hdf5 nor a manifest.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        self._lock = threading.Lock()
+        self._parts: dict[ShardHeader, tuple[TrialPart, AttemptTable]] = {}
+        self._stamps: dict[Path, Stamp] = {}
+        self._listed = -LISTING_PERIOD
+        # The assembled files, if there are any, and the manifest of a build that is not in them.
+        self._assembled: Snapshot | None = None
+        self._manifest: Manifest | None = None
+        self._snapshot: Snapshot | None = None
+        self.current()
+
+    def current(self) -> Snapshot:
+        """Return the state of the files.
+
+        Raises:
+            DataError: If they cannot be read.
+        """
+        with self._lock:
+            stamps = {self.out / n: stamp(self.out / n) for n in (*ASSEMBLED_FILES, FILE_NAME)}
+            changed = self._snapshot is None or stamps != self._stamps
+            if changed:
+                self._read_files(stamps)
+            waited = time.monotonic() - self._listed >= LISTING_PERIOD
+            if self._snapshot is None or changed or (self._manifest is not None and waited):
+                self._snapshot = self._list_shards()
+                self._stamps, self._listed = stamps, time.monotonic()
+            return self._snapshot
+
+    def _read_files(self, stamps: Mapping[Path, Stamp]) -> None:
+        """Read the assembled files, or the manifest of a build that has not ended."""
+        self._assembled = None
+        if stamps[self.out / TRIALS_FILE] is None:
+            self._manifest = read_manifest(self.out)
+            return
+        self._parts.clear()
+        self._assembled, signature = _read_assembled(self.out, stamps)
+        self._manifest = _other_manifest(self.out, signature)
+
+    def _list_shards(self) -> Snapshot:
+        """Return the state of the files with the shards that are there."""
+        before, manifest, assembled = self._snapshot, self._manifest, self._assembled
+        if assembled is None:
+            assert manifest is not None
+            return self._read_shards(manifest)
+        if manifest is None or not (newer := _count_newer(assembled, manifest)):
+            return assembled
+        notice = (
+            f"{TRIALS_FILE} and the data files are of an earlier state: {newer:,} work units are "
+            "newer. They are shown when the build has ended."
+        )
+        if before is not None and before.table is assembled.table and notice in before.missing:
+            return before
+        return replace(assembled, missing=(notice, *assembled.missing))
+
+    def _read_shards(self, manifest: Manifest) -> Snapshot:
+        """Return the state of a build that runs or was stopped."""
+        # Shards never change: only new ones are read. Those of objects that are gone are dropped.
+        entries = manifest.objects
+        numbers = {entry.name: i for i, entry in enumerate(entries)}
+        objects = {
+            key: np.array([getattr(entry, key) for entry in entries], dtype=object)
+            for key in ("name", "class_name")
+        }
+        parts, damaged = {}, []
+        for header in _done_headers(self.out, manifest):
+            try:
+                if (read := self._parts.get(header)) is None:
+                    part = shard_part(self.out, header, numbers[header.object_name])
+                    read = part, read_table(Trials.of_parts(self.out, objects, [part]))
+                parts[header] = read
+            except DataError:
+                damaged.append(header.path(self.out).relative_to(self.out))
+        self._parts = parts
+
+        # The number of an object is its place in this manifest, which may have grown.
+        wanted: dict[str, int | None] = dict.fromkeys(numbers, manifest.config.max_grasps)
+        cut, tables = [], []
+        for header, (part, table) in parts.items():
+            name = header.object_name
+            table.object[:] = numbers[name]
+            rows, wanted[name] = first_rows(table, wanted[name])
+            cut.append(replace(part, count=len(rows), object=numbers[name]))
+            tables.append(rows)
+        trials = Trials.of_parts(self.out, objects, cut)
+
+        missing = [
+            f"{TRIALS_FILE} and the data files are not there yet: {len(parts):,} of "
+            f"{manifest.units:,} work units are done. Filters and split are decided at the end."
+        ]
+        if damaged:
+            named = ", ".join(map(str, damaged[:NAMED]))
+            more = f" and {len(damaged) - NAMED:,} more" if len(damaged) > NAMED else ""
+            missing.append(f"Damaged, and not shown: {named}{more}. The build makes them again.")
+        return Snapshot(
+            out=self.out,
+            config=manifest.config,
+            config_hash=manifest.config.simulation_hash(),
+            names=tuple(entry.name for entry in entries),
+            classes=tuple(entry.class_name for entry in entries),
+            meshes=tuple(entry.mesh_sha256 for entry in entries),
+            trials=trials,
+            table=join(tables) if tables else read_table(trials),
+            sample_ids={},
+            assembled=False,
+            own_hashes=_own_hashes(self.out),
+            missing=tuple(missing),
+        )
+
+
+def find_model(out: Path, name: str) -> Path | None:
+    """Return the file of an object's meshes, or None if it is not there.
+
+    A stranger's dataset may hold names that no file can have; they are shown as they are.
+    """
+    path = model_path(out, name) if is_name(name) else None
+    return path if path is not None and path.is_file() else None
+
+
+def _read_assembled(out: Path, stamps: Mapping[Path, Stamp]) -> tuple[Snapshot, str]:
+    """Return the state of a dataset with a trials.hdf5, and the signature of its manifest then.
+
+    Nothing but that file has to be there.
+    """
+    # Objects and configuration.
+    trials = Trials(out, any_name=True)
+    try:
+        config = parse_stored(parse_json(trials.attributes["config"]))
+    except ValueError as error:
+        path = out / TRIALS_FILE
+        raise DataError(f"{path}: attribute config must be one, got {error}") from None
+    versions = json.loads(str(trials.attributes.get("versions", "{}")))
+    carried = carried_hand(out, config.hand, str(versions.get("hand", "")))
+    config = config.with_hand(config.hand, carried)
+    names, classes, meshes = (
+        tuple(trials.objects[key].tolist()) for key in ("name", "class_name", "mesh_sha256")
+    )
+
+    # What else there is.
+    missing = [
+        f"{name} is not there: images come from the shards, if they are."
+        for name in DATA_FILES.values()
+        if not os.path.lexists(out / name)
+    ]
+    gone = [name for name in names if find_model(out, name) is None]
+    if gone:
+        missing.append(f"{len(gone):,} of {len(names):,} objects have no mesh: no 3D view of them.")
+
+    state = Snapshot(
+        out=out,
+        config=config,
+        config_hash=str(trials.attributes.get("config_hash", "")),
+        names=names,
+        classes=classes,
+        meshes=meshes,
+        trials=trials,
+        table=read_table(trials),
+        sample_ids=sample_ids(out),
+        assembled=True,
+        own_hashes=_own_hashes(out),
+        stamps={path: then for path, then in stamps.items() if path.name in ASSEMBLED_FILES},
+        missing=tuple(missing),
+    )
+    return state, str(trials.attributes.get("signature", ""))
+
+
+def _own_hashes(out: Path) -> dict[str, str]:
+    """Return what `Snapshot.own_hashes` is; nothing if the files are all that there is."""
+    try:
+        manifest = read_manifest(out)
+    except DataError:
+        return {}
+    return {
+        entry.name: entry.config_in(manifest.config).simulation_hash()
+        for entry in manifest.objects
+        if entry.seed is not None
+    }
+
+
+def _other_manifest(out: Path, signature: str) -> Manifest | None:
+    """Return the manifest if a build went on since the files were assembled, else None."""
+    try:
+        manifest = read_manifest(out)
+    except DataError:
+        return None  # the files are all that there is
+    # No build goes on with an older schema.
+    same = manifest.schema_version < SCHEMA_VERSION or manifest.signature() == signature
+    return None if same else manifest
+
+
+def _count_newer(state: Snapshot, manifest: Manifest) -> int:
+    """Return how many work units are done that are not in the assembled files."""
+    # Each object's last palm pose in the files, and whether it has all grasps that it wants.
+    table, count = state.table, len(state.names)
+    last = np.full(count, -1, dtype=np.int32)
+    np.maximum.at(last, table.object, table.candidate)
+    grasps = np.bincount(table.object[table.outcome == Outcome.SUCCESS], minlength=count)
+    wanted = manifest.config.max_grasps
+    full = np.zeros(count, dtype=bool) if wanted is None else grasps >= wanted
+
+    numbers = {key: i for i, key in enumerate(zip(state.names, state.meshes, strict=True))}
+    newer = 0
+    for header in _done_headers(state.out, manifest):
+        number = numbers.get((header.object_name, header.mesh_sha256))
+        newer += number is None or (header.start > last[number] and not full[number])
+    return newer
+
+
+def _done_headers(out: Path, manifest: Manifest) -> Iterator[ShardHeader]:
+    """Yield the work units whose shards are there, in the order of the dataset's rows."""
+    # One listing per object: a look at each file of a large build takes seconds.
+    folder, names = None, frozenset[str]()
+    for header in manifest.headers():
+        path = header.path(out)
+        if path.parent != folder:
+            folder, names = path.parent, _names_in(path.parent)
+        if path.name in names:
+            yield header
+
+
+def _names_in(folder: Path) -> frozenset[str]:
+    try:
+        return frozenset(os.listdir(folder))
+    except OSError:
+        return frozenset()

@@ -1,0 +1,228 @@
+"""The two samplers of palm poses compared: which approaches they try, and what they find.
+
+In: a dataset, and perhaps another of the same objects by the other sampler. Out: palm poses of one
+object by both, and numbers. Without the other dataset the other sampler draws palm poses of that
+one object, which nobody has tried.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drakegrasp.config import POSTPROCESSING_KEYS, Config
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
+from drakegrasp.dataset.statistics import Funnel, count_funnel
+from drakegrasp.errors import DataError
+from drakegrasp.frames import Array
+from drakegrasp.outcomes import Outcome
+from drakegrasp.pictures.figures.approach_sphere import (
+    NEAR_DEG,
+    approach_directions,
+    coverage,
+)
+from drakegrasp.simulation.candidates import Candidates, sample_candidates
+
+#: Names of the samplers in the configuration, in the order of the paper's figure, and in words.
+METHODS = {"normals": "along surface normals", "rotations": "global and local rotations"}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SamplerComparison:
+    """Both samplers on one object, and their numbers.
+
+    Attributes:
+        shown: The object that is drawn.
+        candidates: Its palm poses by method, METHODS.
+        standoff: The largest stand-off, from which its palm rays are drawn [m].
+        numbers: As they are written to JSON: of the object, and of all that both have.
+    """
+
+    shown: PreparedObject
+    candidates: dict[str, Candidates]
+    standoff: float
+    numbers: dict[str, Any]
+
+
+def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
+    """Return palm poses and numbers of both samplers.
+
+    Args:
+        out: Directory of a dataset.
+        other: That of one of the same objects by the other sampler, otherwise of the same
+            configuration.
+
+    Raises:
+        DataError: If a file is missing, or the other dataset is of another configuration or has
+            none of the objects.
+    """
+    # The datasets by method.
+    manifest = read_manifest(out)
+    config = manifest.config
+    method, most = config.candidates.method, config.objects.resting_poses
+    if isinstance(method, tuple) or method not in METHODS or most > 1:
+        named = " and ".join(method) if isinstance(method, tuple) else method
+        raise DataError(
+            f"{out}: must be of candidates.method {' or '.join(METHODS)} and "
+            f"objects.resting_poses 1, got {named} and {most}"
+        )
+    datasets: dict[str, Path] = {method: out}
+    if other is not None:
+        datasets[_other_method(config)] = other
+        _refuse_other_configuration(other, config)
+
+    # The objects that all have, and the one with the most successes.
+    funnels = {method: count_funnel(path) for method, path in datasets.items()}
+    names = _common_objects(datasets, funnels)
+    own = funnels[method]
+    wins = {name: int(own.outcomes[own.names.index(name), Outcome.SUCCESS]) for name in names}
+    name = max(names, key=lambda name: wins[name])
+    own_config = manifest.config_of(name)
+    shown = load_prepared(out, name, own_config)
+
+    # Palm poses of that object, and numbers.
+    candidates: dict[str, Candidates] = {}
+    of_shown: dict[str, dict[str, Any]] = {}
+    of_all: dict[str, dict[str, Any]] = {}
+    for method in METHODS:
+        if method in datasets:
+            path, funnel = datasets[method], funnels[method]
+            settings = read_manifest(path).config_of
+            covers = {each: _cover(load_prepared(path, each, settings(each))) for each in names}
+            candidates[method] = load_prepared(path, name, settings(name)).candidates
+            of_shown[method] = _numbers({name: covers[name]}, funnel)
+            of_all[method] = _numbers(covers, funnel)
+        else:
+            drawn = replace(shown, candidates=_draw(shown, own_config, method))
+            candidates[method] = drawn.candidates
+            of_shown[method] = _numbers({name: _cover(drawn)}, None)
+    return SamplerComparison(
+        shown=shown,
+        candidates=candidates,
+        standoff=max(config.candidates.standoffs),
+        numbers={
+            "what": "palm_rays: palm rays that meet the object; coverage: share of the directions "
+            f"of the half sphere over the table that lie within {NEAR_DEG:g} deg of one of them, "
+            "mean over objects; attempts: those that the simulator decided",
+            "object": name,
+            "of_object": of_shown,
+            "objects": len(names),
+            "of_objects": of_all,
+        },
+    )
+
+
+def palm_rays(candidates: Candidates, standoff: float, count: int) -> Array:
+    """Return the first approach rays of palm poses, from a stand-off to the surface.
+
+    Args:
+        candidates: Of the object, in drawing order, which is random.
+        standoff: Of the palm from the surface [m].
+        count: Most rays to return.
+
+    Returns:
+        (n, 2, 3) in {O}: the palm's origin and the point on the surface [m].
+    """
+    hits = np.flatnonzero(np.isfinite(candidates.distance))[:count]
+    z_O = candidates.X_OG[hits, :3, 2]
+    p_OS = candidates.X_OG[hits, :3, 3] + candidates.distance[hits, None] * z_O
+    return np.stack([p_OS - standoff * z_O, p_OS], axis=1)
+
+
+def _draw(prepared: PreparedObject, config: Config, method: str) -> Candidates:
+    """Return as many palm poses of the other method as a dataset of it would try."""
+    changed = config.candidates.model_copy(update={"method": method})
+    return sample_candidates(prepared.model, prepared.X_TO, changed, config.seed)
+
+
+def _cover(prepared: PreparedObject) -> tuple[int, int, float]:
+    """Return how many palm poses there are, how many palm rays hit, and what these cover."""
+    candidates = prepared.candidates
+    hits = np.isfinite(candidates.distance)
+    covered = coverage(approach_directions(prepared.X_TO, candidates.X_OG[hits]))
+    return len(hits), int(hits.sum()), covered
+
+
+def _numbers(covers: dict[str, tuple[int, int, float]], funnel: Funnel | None) -> dict[str, Any]:
+    """Return the numbers of a sampler on objects; None for what was not simulated.
+
+    Args:
+        covers: By object, see `_cover`.
+        funnel: Of the dataset; None if the palm poses were only drawn.
+    """
+    attempts = successes = rate = None
+    if funnel is not None:
+        # Where the simulator failed nothing is known of the palm pose.
+        rows = [funnel.names.index(name) for name in covers]
+        decided = [outcome for outcome in Outcome if not outcome.inconclusive]
+        attempts = int(funnel.outcomes[np.ix_(rows, decided)].sum())
+        successes = int(funnel.outcomes[rows, Outcome.SUCCESS].sum())
+        rate = round(1000.0 * successes / attempts, 3) if attempts else None
+    return {
+        "palm_poses": sum(poses for poses, _, _ in covers.values()),
+        "palm_rays": sum(hits for _, hits, _ in covers.values()),
+        "coverage": round(float(np.mean([share for _, _, share in covers.values()])), 4),
+        "attempts": attempts,
+        "successes": successes,
+        "successes_per_1000_attempts": rate,
+    }
+
+
+def _other_method(config: Config) -> str:
+    return next(method for method in METHODS if method != config.candidates.method)
+
+
+def _refuse_other_configuration(other: Path, config: Config) -> None:
+    """Refuse a dataset that differs by more than the method of its palm poses.
+
+    Raises:
+        DataError: If it does.
+    """
+    # What changes no attempt may differ.
+    wanted = config.candidates.model_copy(update={"method": _other_method(config)})
+    mine = _settings(config.model_copy(update={"candidates": wanted}))
+    theirs = _settings(read_manifest(other).config)
+    keys = sorted(mine.keys() | theirs.keys())
+    differing = [key for key in keys if mine.get(key) != theirs.get(key)]
+    if differing:
+        raise DataError(
+            f"{other}: must be of candidates.method={_other_method(config)} and else of the same "
+            f"configuration, got another {', '.join(differing)}"
+        )
+
+
+def _settings(config: Config) -> dict[str, Any]:
+    """Return what decides about attempts, by key: `hand`, `lift.hold_time`."""
+    settings: dict[str, Any] = {}
+    for name, value in config.to_dict().items():
+        if name not in (*POSTPROCESSING_KEYS, "unit_candidates"):
+            parts = value if isinstance(value, dict) else {"": value}
+            settings |= {f"{name}.{key}".rstrip("."): part for key, part in parts.items()}
+    return settings
+
+
+def _common_objects(datasets: dict[str, Path], funnels: dict[str, Funnel]) -> list[str]:
+    """Return the names of the objects that all datasets have, of the same mesh, in order.
+
+    A manifest has more objects than the files while a build goes on that adds some.
+
+    Raises:
+        DataError: If there is none.
+    """
+    first, *others = (
+        {
+            entry.name: entry.mesh_sha256
+            for entry in read_manifest(path).objects
+            if entry.name in funnels[method].names
+        }
+        for method, path in datasets.items()
+    )
+    names = [name for name, mesh in first.items() if all(o.get(name) == mesh for o in others)]
+    if not names:
+        paths = " and ".join(str(path) for path in datasets.values())
+        raise DataError(f"{paths}: must have objects of the same meshes, got none")
+    return names

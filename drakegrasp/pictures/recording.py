@@ -1,0 +1,226 @@
+"""Recordings: an attempt as a single HTML file that any browser plays.
+
+In: a function that runs a simulation. Out: its result, the same to the last bit as without a
+recording because the same code runs, and an HTML file that needs neither other files nor the
+network. An attempt that ends before it is simulated is shown at its start.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+from collections.abc import Callable
+from html import escape
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from pydrake.geometry import Cylinder, Meshcat, MeshcatCone, MeshcatParams, Rgba, Sphere
+from pydrake.math import RigidTransform, RotationMatrix
+
+from drakegrasp.config import Config
+from drakegrasp.frames import X_WT, Array
+from drakegrasp.hand.description import load_hand
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.pictures.style import PREDICTED
+from drakegrasp.runtime.environment import allow_network
+from drakegrasp.runtime.files import write_atomic
+from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
+from drakegrasp.simulation.scene import ObjectScene, Scene, reset_attempt, reset_object
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
+
+Result = TypeVar("Result")
+
+#: Meshcat's path of the object; everything below it moves with the object.
+OBJECT_PATH = "visualizer/object/object"
+#: Radius of a contact's dot, length and radius of the arrow along its normal [m].
+DOT, ARROW, SHAFT = 0.004, 0.03, 0.0012
+#: A text over the picture, in the lower left corner.
+CAPTION = (
+    '<p style="position:fixed;left:1em;bottom:4em;z-index:9;max-width:34em;margin:0;'
+    "padding:.6em .8em;font:14px/1.4 sans-serif;color:#222;background:#fffc;"
+    'border-radius:4px;pointer-events:none">{}</p>'
+)
+#: Length and radius of an arrow's head [m].
+HEAD, HEAD_RADIUS = 0.009, 0.0035
+#: Direction of the camera: azimuth from the palm's side, about the vertical, and elevation [rad].
+AZIMUTH, ELEVATION = np.deg2rad(50.0), np.deg2rad(20.0)
+#: Distance of the camera in radii of a ball around the whole lift; what the hand adds to that
+#: radius [m].
+DISTANCE, HAND_RADIUS = 1.15, 0.1
+
+
+def record_attempt(
+    model: ObjectModel,
+    X_TO: npt.ArrayLike,
+    attempt: Pregrasp,
+    config: Config,
+    path: Path,
+    *,
+    p_OQ: Array | None = None,
+    nhat_Q_O: Array | None = None,
+    is_visible: bool = True,
+    caption: str = "",
+) -> TrialRecord:
+    """Return the result of `trial.run_attempt`, and write a recording of it.
+
+    Args:
+        model: The object.
+        X_TO: (4, 4), its resting pose in the table-top frame.
+        attempt: What to try.
+        config: Hand, physics, lift and limits.
+        path: The HTML file.
+        p_OQ: (k, 3), predicted contacts to draw on the object, in {O} [m].
+        nhat_Q_O: (k, 3), their outward unit normals in {O}.
+        is_visible: Whether the images of the grasp would make a sample.
+        caption: Text in a corner.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+
+    def run(meshcat: Meshcat) -> TrialRecord:
+        hand = load_hand(config.hand_source).at(attempt.preshape)
+        scene = build_scene(model, config.physics, hand, meshcat=meshcat)
+        # An attempt that fails before it is simulated is shown at its start.
+        q = None if attempt.path is None else attempt.path.start
+        pose = attempt.X_OG, attempt.spread, attempt.closing
+        show_start(meshcat, scene, X_TO, config, *pose, q=q)
+        record = run_attempt(scene, X_TO, attempt, config, is_visible=lambda: is_visible)
+        draw_predicted(meshcat, p_OQ, nhat_Q_O)
+        return record
+
+    return record_html(run, path, caption)
+
+
+def show_start(
+    meshcat: Meshcat,
+    scene: Scene,
+    X_TO: npt.ArrayLike,
+    config: Config,
+    X_OG: Array,
+    spread: float,
+    closing: Array | None,
+    q: Array | None = None,
+) -> None:
+    """Show object and hand at the start, and aim the camera.
+
+    Args:
+        meshcat: Where to show them.
+        scene: Of the object and the hand.
+        X_TO: (4, 4), resting pose of the object in the table-top frame.
+        config: With the target of the lift.
+        X_OG: (4, 4), pose of the palm.
+        spread: Angle of the spread joints [rad].
+        closing: (k,), closing positions [rad or m]; the open hand if None.
+        q: (j,), positions of all joints, instead of both.
+    """
+    X_WO = X_WT @ np.asarray(X_TO, dtype=float)
+    reset_attempt(scene, X_WO, X_WO @ X_OG, spread=spread, closing=closing, q=q)
+    _aim_camera(meshcat, scene, X_WO, config, side_W=X_WO[:3, :3] @ X_OG[:3, 3])
+
+
+def show_object(meshcat: Meshcat, scene: ObjectScene, X_TO: npt.ArrayLike, config: Config) -> None:
+    """Show the object alone at the start, and aim the camera; see `show_start`."""
+    X_WO = X_WT @ np.asarray(X_TO, dtype=float)
+    reset_object(scene, X_WO)
+    scene.simulator.Initialize()
+    _aim_camera(meshcat, scene, X_WO, config, side_W=np.array([1.0, 0.0, 0.0]))
+
+
+def _aim_camera(
+    meshcat: Meshcat, scene: ObjectScene, X_WO: Array, config: Config, *, side_W: Array
+) -> None:
+    """Look from beside the palm, whose direction is side_W, far enough to see the whole lift."""
+    way = X_WT[:3, 3] + config.lift.p_TG - X_WO[:3, 3]
+    radius = np.linalg.norm(way) / 2.0 + np.linalg.norm(scene.model.half_extents) + HAND_RADIUS
+    azimuth = np.arctan2(side_W[1], side_W[0]) + AZIMUTH
+    towards = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(ELEVATION)])
+    middle = X_WO[:3, 3] + way / 2.0
+    meshcat.SetCameraPose(middle + DISTANCE * radius * towards, middle)
+
+
+def record_html(run: Callable[[Meshcat], Result], path: Path, caption: str = "") -> Result:
+    """Return the result of `run`, and write what it published; nothing is written if it raises.
+
+    Args:
+        run: Runs a simulation that publishes to the Meshcat it is given.
+        path: The HTML file.
+        caption: Text in a corner.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    meshcat = _make_meshcat()
+    try:
+        for part in ("/Grid", "/Axes"):
+            meshcat.SetProperty(part, "visible", False)
+        meshcat.StartRecording(frames_per_second=MESHCAT_RATE)
+        result = run(meshcat)
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
+        text = meshcat.StaticHtml()
+        if caption:
+            text = text.replace("<body>", f"<body>{CAPTION.format(escape(caption))}", 1)
+        write_atomic(path, text.encode())
+    finally:
+        # The diagram of `run` is in a reference cycle; Meshcat's port closes when it is collected.
+        del meshcat
+        gc.collect()
+    return result
+
+
+def _make_meshcat() -> Meshcat:
+    """Return a Meshcat that only this machine can reach.
+
+    A Meshcat always starts a server, and only it can write the HTML. Under
+    `DRAKE_ALLOW_NETWORK=none`, which our workers set, its constructor raises; it is allowed here,
+    and nothing leaves the machine. Drake's announcement of the address is suppressed, because
+    nobody needs to open it.
+    """
+    logger = logging.getLogger("drake")
+    level = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        with allow_network("meshcat"):
+            # Port 0 means any free port, so that several recordings can be made at once.
+            return Meshcat(MeshcatParams(host="localhost", port=0, show_stats_plot=False))
+    finally:
+        logger.setLevel(level)
+
+
+def draw_predicted(meshcat: Meshcat, p_OQ: Array | None, nhat_Q_O: Array | None) -> None:
+    """Draw a dot per contact on the object, with an arrow along its normal.
+
+    Args:
+        meshcat: Where to draw.
+        p_OQ: (k, 3), contacts in {O} [m]; nothing is drawn if None.
+        nhat_Q_O: (k, 3), their outward unit normals in {O}.
+    """
+    if p_OQ is None or nhat_Q_O is None:
+        return
+    colour = rgba(PREDICTED)
+    # A posture asks for no contacts.
+    there = np.isfinite(p_OQ).all(axis=1)
+    for i, (p, n) in enumerate(zip(p_OQ[there], nhat_Q_O[there], strict=True)):
+        path = f"{OBJECT_PATH}/predicted/{i + 1}"
+        meshcat.SetTransform(path, pose_along(p, n))
+        meshcat.SetObject(f"{path}/dot", Sphere(DOT), colour)
+        meshcat.SetObject(f"{path}/shaft", Cylinder(SHAFT, ARROW - HEAD), colour)
+        meshcat.SetTransform(f"{path}/shaft", RigidTransform([0.0, 0.0, (ARROW - HEAD) / 2.0]))
+        # A Meshcat cone opens along its +z from its apex, which is the arrow's tip here.
+        meshcat.SetObject(f"{path}/head", MeshcatCone(HEAD, HEAD_RADIUS, HEAD_RADIUS), colour)
+        tip = RigidTransform(RotationMatrix.MakeXRotation(np.pi), [0.0, 0.0, ARROW])
+        meshcat.SetTransform(f"{path}/head", tip)
+
+
+def pose_along(p_OQ: Array, v_O: Array) -> RigidTransform:
+    """Return the pose in {O} of a frame at a point p_OQ (3,) whose z axis is along v_O (3,)."""
+    return RigidTransform(RotationMatrix.MakeFromOneVector(v_O, 2), p_OQ)
+
+
+def rgba(colour: str) -> Rgba:
+    """Return a colour "#rrggbb" as Drake's type."""
+    return Rgba(*(int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5)))

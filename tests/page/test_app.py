@@ -1,0 +1,496 @@
+"""The pages, what they contain, and what is refused."""
+
+from __future__ import annotations
+
+import gc
+import html
+import json
+import os
+import re
+import shutil
+import weakref
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers.datasets import (
+    CERTIFIED,
+    OTM,
+    SLIP,
+    SLIPPED,
+    TRIALS,
+    change,
+    end_lift,
+    make_dataset,
+    set_at,
+)
+from helpers.pages import ATTACK, Tags, coded, get, numbered, state_of, surface_of
+from matplotlib.image import imread
+from starlette.testclient import TestClient
+
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.manifest import read_manifest, write_manifest
+from drakegrasp.dataset.rejections import AttemptKey, read_decisions, read_rejected
+from drakegrasp.dataset.schema import CAMERAS
+from drakegrasp.errors import DataError
+from drakegrasp.frames import unpack_pose
+from drakegrasp.outcomes import Removal
+from drakegrasp.page import plots
+from drakegrasp.page.app import HEADERS, TOKEN_HEADER, Inspection, make_app
+from drakegrasp.page.query import PAGE
+
+PAGES = ("/", "/?outcome=any&page=2", "/grasp/0-0-0", "/grasp/0-0-1", "/plots")
+
+
+def token(client: TestClient) -> str:
+    found = re.search(r'name="token" content="([^"]+)"', client.get("/").text)
+    assert found is not None
+    return found[1]
+
+
+def decide(client: TestClient, label: str, decision: str) -> int:
+    content = {"label": coded(state_of(client), label), "decision": decision}
+    answer = client.post("/decide", json=content, headers={TOKEN_HEADER: token(client)})
+    return answer.status_code
+
+
+def test_gallery_shows_what_is_selected_page_by_page(client: TestClient) -> None:
+    everything = Tags(client.get("/").text)
+    labels = [a["data-label"] for tag, a in everything.tags if tag == "li"]
+    assert len(labels) == 9
+    assert "9 of 36 attempts" in " ".join(everything.text.split())
+    first = Tags(client.get("/?outcome=any&sort=row&order=up").text)
+    second = Tags(client.get("/?outcome=any&sort=row&order=up&page=2").text)
+    both = [a["data-label"] for p in (first, second) for tag, a in p.tags if tag == "li"]
+    assert len(both) == len(set(both)) == 36
+    assert len([tag for tag, _ in first.tags if tag == "li"]) == PAGE
+    # A page beyond the last is the last.
+    assert "page 2 of 2" in client.get("/?outcome=any&page=99").text
+    assert "No attempt fits" in client.get("/?object=nothing").text
+
+
+def test_contacts_are_drawn_in_all_three_images(client: TestClient) -> None:
+    card = client.get("/?object=1_box_a&sort=row&order=up").text.partition("</li>")[0]
+    assert card.count("<circle") == 9
+    assert coded(state_of(client), "/strip/0-0-0-oto.png") in card
+    strip = imread(BytesIO(get(client, "/strip/0-0-0-oto.png").content))
+    assert strip.shape[:2] == (32, 96)
+    for address in ("0-0-1-oto", "0-0-0-out", "9-9-9-oto", "x-oto"):
+        assert get(client, f"/strip/{address}.png").status_code == 404
+
+
+def test_page_says_which_images_cannot_be_read(client: TestClient, out: Path) -> None:
+    os.truncate(out / OTM, 3000)
+    page = get(client, "/grasp/0-0-0").text
+    assert "The images of camera otm cannot be read from grasping_otm.hdf5." in page
+    assert page.count("<image") == 1
+    assert assemble(out, rejected=[0]).removed[Removal.REJECTED] == 1
+    shutil.rmtree(out / "shards")
+    page = get(client, "/grasp/0-0-0").text
+    assert page.count("cannot be read from shards of 1_box_a.") == 2
+
+
+def test_next_and_previous_go_through_the_selection(client: TestClient) -> None:
+    query = "object=2_box_b&sort=row&order=up"
+    page = get(client, f"/grasp/1-1-0?{query}").text
+    assert "2 of 3" in page
+    links = {a.get("id"): a.get("href") for tag, a in Tags(page).tags if tag == "a"}
+    for name, label in (("previous", "1-0-0"), ("next", "1-3-2")):
+        assert numbered(state_of(client), str(links[name])) == f"/grasp/{label}?{query}"
+    assert links["gallery"] == f"/?{query}"
+    assert "not in the selection" in get(client, f"/grasp/0-0-0?{query}").text
+
+
+def test_page_of_a_grasp_has_numbers_and_a_scene(client: TestClient) -> None:
+    page = get(client, "/grasp/0-0-0").text
+    for text in ("2.0 mm", "12.5", "camera otm", "--trial 0", "stable"):
+        assert text in page
+    found = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page, re.S)
+    assert found is not None
+    content = json.loads(found[1])
+    scene = content["scene"]
+    assert set(scene["states"]) == {"start", "closed", "lifted"}
+    closed = scene["states"]["closed"]
+    assert len(closed["contacts"]) == 3
+    assert len(closed["links"]) == scene["links"] == len(content["meshes"]["links"]) == 9
+    # The first contact is on the side of the box, which is yawed by 30 degrees: half of 6 cm from
+    # its centre, which is 2.5 cm above the table. Lifted it is 2 mm farther along z of {O}; the
+    # scene shows the object where it rested.
+    x, y = np.cos(np.pi / 6.0), np.sin(np.pi / 6.0)
+    assert closed["contacts"][0]["p"] == pytest.approx([0.03 * x, 0.03 * y, 0.025])
+    assert closed["contacts"][0]["f"] == pytest.approx([-10.0 * x, -10.0 * y, 0.0], abs=1e-9)
+    lifted = [0.03 * x + SLIP * y, 0.03 * y - SLIP * x, 0.025]
+    assert scene["states"]["lifted"]["contacts"][0]["p"] == pytest.approx(lifted)
+
+
+def test_failed_attempt_is_shown_as_far_as_it_got(client: TestClient) -> None:
+    page = get(client, "/grasp/0-2-1").text
+    assert "ray miss" in page
+    assert 'data-state="start"' in page
+    assert 'data-state="closed"' not in page
+    assert "data-decide" not in page
+    assert "Only successes have images" in page
+
+
+def test_lift_that_was_ended_is_said_to_have_no_verdict(client: TestClient, out: Path) -> None:
+    end_lift(out, SLIPPED, 0.02)
+    gallery = get(client, "/?outcome=moved").text
+    assert gallery.count("lift ended, not judged") == 1
+    assert "moved: no images" in gallery
+    assert "lift ended, not judged" not in get(client, "/?outcome=dropped").text
+
+
+def test_meshes_are_there(client: TestClient) -> None:
+    for address in ("link-0", "link-8"):
+        assert len(surface_of(client.get(f"/mesh/{address}.json").text).faces)
+    box = surface_of(client.get(f"/mesh/object-{state_of(client).codes[0]}.json").text)
+    assert box.extents.tolist() == pytest.approx([0.06, 0.05, 0.10])
+    for address in ("object-0", "link-99", "link-x", "other-0"):
+        assert client.get(f"/mesh/{address}.json").status_code == 404
+
+
+def test_plots_are_there(client: TestClient) -> None:
+    page = client.get("/plots").text
+    sources = [a["src"] for tag, a in Tags(page).tags if tag == "img"]
+    assert len(sources) == 4
+    for source in sources:
+        answer = client.get(str(source))
+        assert answer.content.startswith(b"<?xml")
+        assert answer.headers["content-type"] == "image/svg+xml"
+    assert client.get("/plot/other.svg").status_code == 404
+
+
+# Decisions
+
+
+def test_decisions_are_on_disk_at_once_and_undone_in_turn(client: TestClient, out: Path) -> None:
+    path = out / "reject.json"
+    assert not path.exists()
+    assert decide(client, "0-0-0", "rejected") == 200
+    assert decide(client, "1-1-0", "rejected") == 200
+    assert decide(client, "1-1-0", "kept") == 200
+    a, b = AttemptKey("1_box_a", 0, 0), AttemptKey("2_box_b", 1, 0)
+    assert (read_decisions(path).rejected, read_decisions(path).kept) == ({a}, {b})
+    assert "card rejected" in client.get("/").text
+    assert 'data-decision="kept"' in get(client, "/grasp/1-1-0").text
+
+    headers = {TOKEN_HEADER: token(client)}
+    for label, decision in (("1-1-0", "rejected"), ("1-1-0", ""), ("0-0-0", "")):
+        result = client.post("/undo", headers=headers).json()
+        assert (numbered(state_of(client), result["label"]), result["decision"]) == (
+            label,
+            decision,
+        )
+    assert client.post("/undo", headers=headers).json() == {"name": None}
+    assert not read_decisions(path).rejected
+
+
+def test_assembly_drops_exactly_the_rejected(client: TestClient, out: Path) -> None:
+    for label in ("0-0-0", "2-3-2"):
+        decide(client, label, "rejected")
+    decide(client, "1-1-0", "kept")
+    assembly = assemble(out, rejected=read_rejected(out / "reject.json"))
+    assert assembly.removed == {Removal.KEPT: 7, Removal.REJECTED: 2}
+    page = " ".join(Tags(client.get("/?removal=rejected").text).text.split())
+    assert "2 of 36 attempts" in page
+
+
+def test_an_edited_file_is_not_overwritten(client: TestClient, out: Path) -> None:
+    decide(client, "0-0-0", "rejected")
+    (out / "reject.json").write_text('{"version": 1, "rejected": [], "kept": []}')
+    decide(client, "1-1-0", "rejected")
+    assert read_decisions(out / "reject.json").rejected == {AttemptKey("2_box_b", 1, 0)}
+    (out / "reject.json").write_text("mine")
+    content = {"label": coded(state_of(client), "0-0-0"), "decision": "kept"}
+    assert decide_raw(client, content, token_of(client)) == 400
+    assert (out / "reject.json").read_text() == "mine"
+
+
+def token_of(client: TestClient) -> str:
+    """The token when no page can be shown."""
+    inspection: Inspection = client.app.state.inspection  # type: ignore[attr-defined]
+    return inspection.token
+
+
+def decide_raw(client: TestClient, content: object, with_token: str | None) -> int:
+    headers = {} if with_token is None else {TOKEN_HEADER: with_token}
+    return client.post("/decide", json=content, headers=headers).status_code
+
+
+@pytest.mark.parametrize(
+    ("content", "status"),
+    [
+        ({"label": "0-0-1", "decision": "rejected"}, 404),
+        ({"label": "9-9-9", "decision": "rejected"}, 404),
+        ({"label": None}, 404),
+        ({"label": "0-0-0", "decision": "perhaps"}, 400),
+        ({"label": "0-0-0"}, 400),
+        ([1], 400),
+        ({"label": "0-0-0", "decision": "rejected", "more": "x" * 5000}, 413),
+    ],
+)
+def test_what_cannot_be_decided_is_refused(
+    client: TestClient, out: Path, content: object, status: int
+) -> None:
+    text = coded(state_of(client), json.dumps(content))
+    assert decide_raw(client, json.loads(text), token(client)) == status
+    assert not (out / "reject.json").exists()
+
+
+# What keeps others out
+
+
+def test_changes_need_the_token_of_the_page(client: TestClient, out: Path) -> None:
+    content = {"label": coded(state_of(client), "0-0-0"), "decision": "rejected"}
+    for wrong in (None, "", "x", "ü"):
+        headers = {} if wrong is None else {TOKEN_HEADER: wrong.encode()}
+        assert client.post("/decide", json=content, headers=headers).status_code == 403
+        assert client.post("/undo", headers=headers).status_code == 403
+        assert client.post("/record", json=content, headers=headers).status_code == 403
+    for path in ("/decide", "/undo", "/record"):
+        assert client.get(path).status_code == 405
+    assert not (out / "reject.json").exists()
+
+
+def test_a_foreign_host_gets_nothing(client: TestClient) -> None:
+    """A name of another site that resolves to this machine (DNS rebinding)."""
+    for host in ("evil.example", "evil.example:8321", "127.0.0.1.evil.example", "", "10.0.0.1"):
+        answer = client.get("/", headers={"host": host})
+        assert answer.status_code == 400, host
+        assert "token" not in answer.text
+    for host in ("localhost:8321", "127.0.0.1", "127.0.0.1:99"):
+        assert client.get("/", headers={"host": host}).status_code == 200
+
+
+@pytest.mark.parametrize("path", [*PAGES, "/static/inspect.js", "/strip/0-0-0-oto.png", "/nothing"])
+def test_every_answer_has_the_strictest_policy(client: TestClient, path: str) -> None:
+    answer = get(client, path)
+    for name, value in HEADERS.items():
+        assert answer.headers[name] == value
+    policy = answer.headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+
+
+@pytest.mark.parametrize("path", PAGES)
+def test_pages_ask_nothing_of_other_hosts_and_run_no_script_of_their_own(
+    client: TestClient, path: str
+) -> None:
+    for tag, attributes in Tags(get(client, path).text).tags:
+        for name in ("src", "href", "action"):
+            address = attributes.get(name) or "/"
+            assert address.startswith(("/", "?")) and not address.startswith("//"), (tag, address)
+        assert not [name for name in attributes if name.startswith("on") or name == "style"], tag
+        if tag == "script":
+            assert attributes.get("src") or attributes.get("type") == "application/json"
+        assert tag != "style"
+
+
+@pytest.mark.parametrize("path", ["/", "/grasp/0-0-0", f"/?object={ATTACK}", "/plots"])
+def test_names_stay_text(hostile: Path, path: str) -> None:
+    with TestClient(make_app(Inspection(hostile)), base_url="http://localhost") as client:
+        page = get(client, path).text
+        assert "<script>alert" not in page
+        if path != "/plots":
+            assert ATTACK in Tags(page).text
+        assert client.get("/plot/objects.svg").text.count("<script>alert") == 0
+
+
+@pytest.mark.parametrize(
+    ("path", "status"),
+    [
+        ("/?sort=<b>x</b>", 400),
+        ("/grasp/9-9-9", 404),
+        ("/grasp/<b>x</b>", 404),
+        ("/static/../app.py", 404),
+        ("/static/%2e%2e/app.py", 404),
+        ("/recording/0-0-0.html", 404),
+    ],
+)
+def test_errors_are_pages_without_foreign_tags(client: TestClient, path: str, status: int) -> None:
+    answer = get(client, path)
+    assert answer.status_code == status
+    assert "<b>x</b>" not in answer.text
+
+
+def test_page_works_while_the_files_are_replaced(client: TestClient, out: Path) -> None:
+    before = client.get("/?sort=row&order=up").text
+    assemble(out, rejected=[0])
+    after = client.get("/?sort=row&order=up").text
+    assert "no sample: rejected" in after
+    assert "no sample: rejected" not in before
+
+
+def test_an_open_page_rejects_the_grasp_that_it_shows(client: TestClient, out: Path) -> None:
+    """Though another object came before its own meanwhile."""
+    whole = read_manifest(out)
+    write_manifest(replace(whole, objects=whole.objects[1:]), out)
+    assemble(out)
+    label = coded(state_of(client), "0-0-0")
+    assert "2_box_b" in client.get(f"/grasp/{label}").text
+    write_manifest(whole, out)
+    assemble(out)
+    content = {"label": label, "decision": "rejected"}
+    assert decide_raw(client, content, token(client)) == 200
+    assert read_decisions(out / "reject.json").rejected == {AttemptKey("2_box_b", 0, 0)}
+    # A mesh of the page is that of its object, too.
+    code = label.partition("-")[0]
+    mesh = surface_of(client.get(f"/mesh/object-{code}.json").text)
+    assert mesh.extents.tolist() == pytest.approx([0.08, 0.04, 0.06])
+
+
+def test_a_page_names_the_file_of_meshes_that_is_not_there(client: TestClient, out: Path) -> None:
+    label = coded(state_of(client), "0-0-0")
+    page = client.get(f"/grasp/{label}").text
+    assert "There is no file" not in page
+    path = sorted((out / "objects").glob("*.npz"))[0]
+    path.unlink()
+    page = client.get(f"/grasp/{label}").text
+    assert f"There is no file objects/{path.name}" in page
+
+
+def test_answers_say_what_is_decided_in_all(client: TestClient, out: Path) -> None:
+    headers = {TOKEN_HEADER: token(client)}
+
+    def counts(label: str) -> object:
+        content = {"label": coded(state_of(client), label), "decision": "rejected"}
+        return client.post("/decide", json=content, headers=headers).json()["counts"]
+
+    assert counts("0-0-0") == {"rejected": 1, "kept": 0, "samples": 1}
+    assert counts("1-1-0") == {"rejected": 2, "kept": 0, "samples": 2}
+    # After assembling they are samples no more.
+    assemble(out, rejected=read_rejected(out / "reject.json"))
+    assert counts("2-0-0") == {"rejected": 3, "kept": 0, "samples": 1}
+    undone = client.post("/undo", headers=headers).json()
+    assert undone["name"] == "3_brick, palm pose 0, stand-off 0"
+    assert undone["counts"] == {"rejected": 2, "kept": 0, "samples": 0}
+    assert undone["done"] is True
+
+
+def test_undo_of_a_page_is_its_own(client: TestClient, out: Path) -> None:
+    headers = {TOKEN_HEADER: token(client)}
+    for label, page in (("0-0-0", "a"), ("1-1-0", "b")):
+        content = {"label": coded(state_of(client), label), "decision": "rejected", "page": page}
+        client.post("/decide", json=content, headers=headers)
+    undone = client.post("/undo", json={"page": "a"}, headers=headers).json()
+    assert numbered(state_of(client), undone["label"]) == "0-0-0"
+    assert read_decisions(out / "reject.json").rejected == {AttemptKey("2_box_b", 1, 0)}
+
+
+@pytest.mark.parametrize("path", ["/", "/grasp/0-0-0"])
+def test_pages_say_how_to_take_rejected_grasps_out(boxes: Path, tmp_path: Path, path: str) -> None:
+    """The command can be pasted into a shell, whatever the directory is called."""
+    out = Path(shutil.copytree(boxes, tmp_path / "my data;x"))
+    with TestClient(make_app(Inspection(out)), base_url="http://localhost") as client:
+        hidden = [a for _, a in Tags(get(client, path).text).tags if a.get("id") == "nextstep"]
+        assert "hidden" in hidden[0]
+        decide(client, "0-0-0", "rejected")
+        page = get(client, path).text
+        shown = [a for _, a in Tags(page).tags if a.get("id") == "nextstep"]
+        assert "hidden" not in shown[0]
+        command = f"drakegrasp assemble '{out}' --reject '{out / 'reject.json'}'"
+        text = " ".join(Tags(page).text.split())
+        assert (
+            f"1 rejected, 1 of them samples now. To take them out of the files: {command}" in text
+        )
+        assert f"drakegrasp replay '{out}' --trial 0" in Tags(get(client, "/grasp/0-0-0").text).text
+
+
+def test_samples_can_be_chosen_in_one_step(client: TestClient, out: Path) -> None:
+    assemble(out, rejected=[0])
+    page = client.get("/").text
+    links = {a.get("href") for tag, a in Tags(page).tags if tag == "a"}
+    assert "/?split=samples" in links
+    options = re.findall(r'<select name="split">(.*?)</select>', page, re.S)[0]
+    assert re.findall(r'value="(\w*)"', options)[:2] == ["", "samples"]
+    # What filters keep is called samples, and nothing but a decision is called kept.
+    removals = re.findall(r'<select name="removal">(.*?)</select>', page, re.S)[0]
+    assert re.findall(r'value="(\w*)"', removals) == ["", "rejected"]
+    assert "8 of 36 attempts" in " ".join(Tags(client.get("/?split=samples").text).text.split())
+
+
+def test_page_of_a_grasp_has_friction_certificate_and_text_to_copy(
+    client: TestClient, out: Path
+) -> None:
+    assert "repeats with noise" not in get(client, "/grasp/0-0-0").text
+    for name, value in (("certified_share", 0.75), ("certified_friction", 0.4)):
+        change(out, TRIALS, f"successes/{name}", 0, lambda _, value=value: value)
+    page = get(client, "/grasp/0-0-0").text
+    with h5py.File(out / TRIALS) as file:
+        friction = float(file["trials/friction_hand"][0])
+        q = file["trials/closed_q"][0].tolist()
+        X_OG = unpack_pose(file["trials/X_OG"][0])
+    for name, value in (
+        ("friction of the object with the hand", f"{friction:.3f}"),
+        ("repeats with noise that hold", "75 %"),
+        ("least friction with the hand that holds", "0.4"),
+    ):
+        assert f"<th>{name}</th><td>{value}</td>" in page
+    content = json.loads(re.findall(r"<pre>(.*?)</pre>", html.unescape(page), re.S)[0])
+    assert content["closed_q"] == q
+    assert content["X_OG"] == X_OG.tolist()
+    # An attempt that never closed has a start only, and dashes.
+    page = get(client, "/grasp/0-2-1").text
+    content = json.loads(re.findall(r"<pre>(.*?)</pre>", html.unescape(page), re.S)[0])
+    assert set(content) == {"object", "X_TO", "X_OG"}
+    assert "<th>other links after closing</th><td>–</td>" in page
+
+
+def test_p_hold_is_shown_and_filtered_by(tmp_path: Path) -> None:
+    out = make_dataset(tmp_path / "certified", tmp_path, overrides=CERTIFIED)
+    change(out, TRIALS, "trials/p_hold_samples", 0, lambda _: 1)
+    client = TestClient(make_app(Inspection(out)), base_url="http://127.0.0.1:8321")
+    page = get(client, "/grasp/0-0-0").text
+    assert "<th>disturbed repeats that would be samples</th><td>1 of 4 (5 to 70 %)</td>" in page
+    assert "<th>would be a sample at half the time step</th><td>yes</td>" in page
+    for least, shown in ((0.2, 9), (0.5, 8)):
+        text = " ".join(Tags(get(client, f"/?min_p_hold={least}").text).text.split())
+        assert f"{shown} of 36 attempts" in text
+
+
+def test_a_contact_without_a_normal_is_a_reason(client: TestClient, out: Path) -> None:
+    change(out, TRIALS, "trials/normal_angle", 0, set_at(0, to=np.nan))
+    card = client.get("/").text.partition("</li>")[0]
+    assert "normal angle: none" in card
+    parts = get(client, "/grasp/0-0-0").text
+    assert re.search(r"<th>normal angle</th><td>none</td>", parts)
+
+
+def test_contacts_that_the_object_hides_are_hollow(client: TestClient, out: Path) -> None:
+    """As on contact sheets: a depth image with nothing near hides no contact."""
+    before = get(client, "/grasp/0-0-0").text.count('class="hidden"')
+    assert before > 0
+    # Without depth nothing is before a contact.
+    for camera in CAMERAS:
+        with h5py.File(out / f"grasping_{camera}.hdf5", "r+") as file:
+            for split in file.values():
+                images = split["images"][:]
+                images[:, 3] = 9.0
+                split["images"][:] = images
+    assert get(client, "/grasp/0-0-0").text.count('class="hidden"') == 0
+
+
+def test_plots_are_drawn_once_for_each_state_and_then_forgotten(
+    client: TestClient, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+    monkeypatch.setattr(plots, "svg_bytes", lambda figure: drawn.append(figure) or b"<svg/>")
+    for _ in range(2):
+        assert client.get("/plot/outcomes.svg").status_code == 200
+    assert len(drawn) == 1
+    state = weakref.ref(state_of(client))
+    assemble(out, rejected=[0])
+    client.get("/")
+    gc.collect()
+    assert state() is None
+    assert client.get("/plot/outcomes.svg").status_code == 200
+    assert len(drawn) == 2
+
+
+def test_broken_rejections_are_refused_at_the_start(out: Path) -> None:
+    (out / "reject.json").write_text("3")
+    with pytest.raises(DataError, match="must be a list of rejections"):
+        Inspection(out)

@@ -1,0 +1,584 @@
+"""The pages in a real browser: Chromium of the system, driven by Playwright.
+
+They skip where there is no Chromium; `make test-browser` installs it on Debian. Screenshots are
+written to the folder that DRAKEGRASP_SCREENSHOTS names, if it is set.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+import uvicorn
+from helpers.pages import ATTACK, coded, numbered
+from helpers.predictions import write_predictions
+from matplotlib.image import imread
+
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.manifest import read_manifest, write_manifest
+from drakegrasp.dataset.rejections import (
+    AttemptKey,
+    Decisions,
+    read_decisions,
+    read_rejected,
+    write_decisions,
+)
+from drakegrasp.generation.scenes.make import make_scenes
+from drakegrasp.outcomes import Removal
+from drakegrasp.page.app import Inspection, make_app
+from drakegrasp.page.catalog import Catalog, Snapshot
+from drakegrasp.page.serve import listen
+from drakegrasp.page.static_site import write_site
+
+playwright = pytest.importorskip("playwright.sync_api")
+Browser, Page = playwright.Browser, playwright.Page
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+#: As root Chromium has no sandbox; WebGL is computed by the CPU.
+OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+#: Longest wait for anything on a page [ms]; shared machines stall.
+PATIENCE = 60_000.0
+SIZES = {"wide": (1280, 900), "narrow": (390, 844)}
+#: A page that is left before it has loaded gives up its requests, and one whose server has ended
+#: with its test may still ask for its icon.
+HARMLESS = ("GPU stall", "ABORTED", "CONNECTION_REFUSED")
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: make test-browser"),
+]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with playwright.sync_playwright() as driver:
+        chromium = driver.chromium.launch(executable_path=CHROMIUM, args=list(OPTIONS))
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def page(browser: Browser) -> Iterator[Page]:
+    """A page that fails the test if a script does, or if a request leaves its host."""
+    context = browser.new_context(viewport={"width": 1280, "height": 900})
+    context.set_default_timeout(PATIENCE)
+    faults: list[str] = []
+    page = context.new_page()
+    page.on("pageerror", lambda error: faults.append(f"script: {error}"))
+    page.on("console", lambda m: faults.append(m.text) if m.type in ("error", "warning") else None)
+    page.on("requestfailed", lambda r: faults.append(f"failed, {r.failure}: {r.url}"))
+    page.on("dialog", lambda dialog: faults.append(f"dialog: {dialog.message}"))
+    page.on("request", lambda r: None if _is_ours(r.url) else faults.append(f"leaves: {r.url}"))
+    yield page
+    context.close()
+    assert not [fault for fault in faults if not any(text in fault for text in HARMLESS)]
+
+
+def _is_ours(url: str) -> bool:
+    return url.startswith(("http://127.0.0.1:", "file:///", "blob:"))
+
+
+@pytest.fixture
+def state(boxes: Path) -> Snapshot:
+    """Of the dataset that is shown: objects have codes in addresses."""
+    return Catalog(boxes).current()
+
+
+@pytest.fixture
+def address(out: Path) -> Iterator[str]:
+    yield from serve(out)
+
+
+def serve(out: Path, results: Path | None = None) -> Iterator[str]:
+    """Serve a dataset from a thread, with results of predictions; yield its address."""
+    listener = listen(0)
+    config = uvicorn.Config(make_app(Inspection(out, results)), log_level="error")
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+    thread.start()
+    yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+    server.should_exit = True
+    thread.join(timeout=30.0)
+    listener.close()
+
+
+def wait_for_view(page: Page) -> None:
+    page.wait_for_selector("#view3d[data-ready]")
+
+
+def colours_of(page: Page) -> int:
+    """Return how many colours the 3D view shows, counted on a coarse scale."""
+    png = page.locator("#view3d").screenshot()
+    pixels = (imread(BytesIO(png))[..., :3] * 15.0).astype(int).reshape(-1, 3)
+    return len(np.unique(pixels, axis=0))
+
+
+def keep_screenshot(page: Page, name: str) -> None:
+    folder = os.environ.get("DRAKEGRASP_SCREENSHOTS")
+    if folder:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        page.screenshot(path=str(Path(folder) / f"{name}.png"), full_page="narrow" in name)
+
+
+def labels(page: Page, state: Snapshot) -> list[str]:
+    found = page.locator("#cards li").evaluate_all("cards => cards.map(c => c.dataset.label)")
+    return [numbered(state, label) for label in found]
+
+
+def wait_for_decision(out: Path, key: AttemptKey, decision: str) -> None:
+    """Wait until the file on disk says what was decided."""
+    end = time.monotonic() + PATIENCE / 1e3
+    while read_decisions(out / "reject.json").of(key) != decision:
+        assert time.monotonic() < end, f"{key} must be {decision!r} on disk"
+        time.sleep(0.05)
+
+
+def wait_until(page: Page, is_so: Callable[[], bool]) -> None:
+    """Wait until something is so; the policy of the pages forbids Playwright's own way."""
+    end = time.monotonic() + PATIENCE / 1e3
+    while not is_so():
+        assert time.monotonic() < end
+        page.wait_for_timeout(20)
+
+
+def wait_for_labels(page: Page, state: Snapshot, wanted: list[str]) -> None:
+    """Wait until the gallery shows these attempts, in this order."""
+    wait_until(page, lambda: labels(page, state) == wanted)
+
+
+def wait_for_cards(page: Page, count: int) -> None:
+    wait_until(page, lambda: page.locator("#cards li").count() == count)
+
+
+IN_ORDER = ["1-0-0", "1-1-0", "1-3-2"]
+
+
+def test_filters_act_when_chosen(page: Page, address: str, state: Snapshot) -> None:
+    page.goto(address)
+    assert len(labels(page, state)) == 9
+    page.evaluate("window.same = true")
+    page.select_option("select[name=object]", "2_box_b")
+    page.select_option("select[name=sort]", "row")
+    page.focus("select[name=order]")
+    page.keyboard.press("ArrowDown")
+    wait_for_labels(page, state, IN_ORDER)
+    # The page was not loaded again, the keyboard stays where it was, and the number is told.
+    assert page.evaluate("window.same") and page.evaluate("document.activeElement.name") == "order"
+    page.wait_for_selector("#told:has-text('3 of 36 attempts')", state="attached")
+    # The address has what was chosen, without empty fields.
+    assert "object=2_box_b" in page.url and "min_slip" not in page.url
+
+    # What is typed acts without a button; back is as before.
+    page.fill("input[name=min_slip]", "3")
+    page.wait_for_selector(".empty")
+    page.fill("input[name=min_slip]", "3x")
+    page.wait_for_selector("#message:has-text('least slip must be a number, got 3x')")
+    page.go_back()
+    wait_for_labels(page, state, IN_ORDER)
+    assert page.input_value("input[name=min_slip]") == ""
+    page.click("text=Reset")
+    wait_for_cards(page, 9)
+    assert page.input_value("select[name=object]") == ""
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_pages_fit_and_their_pictures_load(
+    page: Page, address: str, state: Snapshot, size: str
+) -> None:
+    width, height = SIZES[size]
+    page.set_viewport_size({"width": width, "height": height})
+    for name, path in (
+        ("gallery", "/"),
+        ("failures", "/?outcome=any&sort=row&order=up"),
+        ("grasp", coded(state, "/grasp/0-0-0")),
+        ("plots", "/plots"),
+    ):
+        page.goto(address + path)
+        if name == "grasp":
+            wait_for_view(page)
+        page.wait_for_load_state("networkidle")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, name
+        keep_screenshot(page, f"{name}_{size}")
+
+
+def test_3d_view_draws_each_state(page: Page, address: str, state: Snapshot) -> None:
+    page.goto(coded(state, f"{address}/grasp/0-0-0"))
+    wait_for_view(page)
+    assert page.get_attribute("#view3d", "data-ready") == "yes"
+    # A blank canvas has one colour; hand, object, table and contacts in light have many.
+    assert colours_of(page) > 30
+    shots = set()
+    for state in ("start", "closed", "lifted"):
+        page.click(f"[data-state={state}]")
+        shots.add(page.locator("#view3d").screenshot())
+    assert len(shots) == 3
+    page.uncheck("[data-layer=hand]")
+    assert page.locator("#view3d").screenshot() not in shots
+
+
+def test_keys_move_the_3d_view(page: Page, address: str, state: Snapshot) -> None:
+    page.goto(coded(state, f"{address}/grasp/0-0-0"))
+    wait_for_view(page)
+    first = page.locator("#view3d").screenshot()
+    shots = {first}
+    for key in ("Shift+ArrowLeft", "Shift+ArrowUp", "+", "h", "f", "3"):
+        page.keyboard.press(key)
+        shots.add(page.locator("#view3d").screenshot())
+    assert len(shots) == 7
+    assert not page.is_checked("[data-layer=hand]")
+    for key in ("h", "f", "2", "0"):
+        page.keyboard.press(key)
+    assert page.locator("#view3d").screenshot() == first
+    # The list of keys; while it is open they do nothing.
+    page.keyboard.press("?")
+    assert "turn the 3D view" in page.inner_text("dialog#keys")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("h")
+    page.keyboard.press("Escape")
+    assert not page.is_visible("dialog#keys") and page.is_checked("[data-layer=hand]")
+    page.keyboard.press("ArrowRight")
+    page.wait_for_url(coded(state, "**/grasp/*"))
+
+
+def test_keyboard_moves_rejects_keeps_and_undoes(
+    page: Page, address: str, state: Snapshot, out: Path
+) -> None:
+    keys = [AttemptKey("1_box_a", *numbers) for numbers in ((0, 0), (1, 0), (3, 2))]
+    page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
+    page.keyboard.press("r")  # rejects, and goes on to the next
+    page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
+    wait_for_decision(out, keys[0], "rejected")
+    page.keyboard.press("k")
+    page.wait_for_url(coded(state, "**/grasp/0-3-2?sort=row&order=up"))
+    wait_for_decision(out, keys[1], "kept")
+    page.keyboard.press("ArrowLeft")
+    page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
+    assert page.inner_text("#decision") == "kept"
+    page.keyboard.press("p")
+    page.wait_for_url(coded(state, "**/grasp/0-0-0?sort=row&order=up"))
+    assert page.inner_text("#decision") == "rejected"
+    page.keyboard.press("ArrowRight")
+    page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
+
+    # Undo shows what was undone.
+    page.keyboard.press("u")
+    wait_for_decision(out, keys[1], "")
+    # The page takes one request at a time: a key before the answer would be lost.
+    page.wait_for_selector("#decision", state="hidden")
+    page.keyboard.press("u")
+    page.wait_for_url(coded(state, "**/grasp/0-0-0?sort=row&order=up"))
+    wait_for_decision(out, keys[0], "")
+    page.keyboard.press("g")
+    page.wait_for_selector("#cards")
+
+
+def test_keys_work_after_a_click_on_a_checkbox(
+    page: Page, address: str, state: Snapshot, out: Path
+) -> None:
+    page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
+    wait_for_view(page)
+    page.click("[data-layer=forces]")
+    page.keyboard.press("r")
+    page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
+    assert read_decisions(out / "reject.json").rejected == {AttemptKey("1_box_a", 0, 0)}
+
+
+def test_keys_work_with_caps_lock(page: Page, address: str, state: Snapshot, out: Path) -> None:
+    page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
+    page.keyboard.press("K")
+    page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
+    assert read_decisions(out / "reject.json").kept == {AttemptKey("1_box_a", 0, 0)}
+
+
+def test_keys_work_while_a_recording_is_made(
+    page: Page, address: str, state: Snapshot, out: Path
+) -> None:
+    page.route("**/record", lambda route: None)  # an answer that never comes
+    page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
+    page.click("[data-record]")
+    page.wait_for_selector("[data-record]:disabled")
+    page.keyboard.press("k")
+    wait_for_decision(out, AttemptKey("1_box_a", 0, 0), "kept")
+    page.unroute("**/record")
+
+
+def _fulfil(body: str, route: playwright.Route) -> None:
+    route.fulfill(body=body)
+
+
+def test_a_recording_says_how_it_compares(page: Page, address: str, state: Snapshot) -> None:
+    answers = [
+        '{"url": "/", "same": true, "text": "trial 0 of <b>: was success, is success"}',
+        '{"url": "/", "same": false, "text": "slip differs: by up to 0.001"}',
+    ]
+    for answer, words in zip(answers, ("Equal to what is stored.", "Differs from"), strict=True):
+        page.route("**/record", partial(_fulfil, answer))
+        page.goto(coded(state, f"{address}/grasp/0-0-0"))
+        page.click("[data-record]")
+        page.wait_for_selector("#verdict:not([hidden])")
+        assert words in page.inner_text("#verdict")
+        keep_screenshot(page, "verdict_wide")
+        page.unroute("**/record")
+
+
+def test_the_gallery_counts_undoes_and_says_what_to_do_next(
+    page: Page, address: str, state: Snapshot, out: Path
+) -> None:
+    page.goto(address)
+    assert not page.is_visible("#nextstep")
+    page.click(coded(state, "[data-label='1-1-0'] [data-decide=rejected]"))
+    page.wait_for_selector("#nextstep:not([hidden])")
+    assert "1 rejected, 1 of them samples now" in page.inner_text("#nextstep")
+    assert "drakegrasp assemble" in page.inner_text("#nextstep")
+    keep_screenshot(page, "next_wide")
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    keep_screenshot(page, "next_narrow")
+    page.click("[data-undo]")
+    page.wait_for_selector("#nextstep", state="hidden")
+    assert page.inner_text("#message") == "Undone: 2_box_b, palm pose 1, stand-off 0"
+    wait_for_decision(out, AttemptKey("2_box_b", 1, 0), "")
+    page.click("[data-undo]")
+    page.wait_for_selector("#message:has-text('Nothing to undo.')")
+
+
+def test_each_tab_undoes_its_own_decisions(
+    page: Page, address: str, state: Snapshot, out: Path
+) -> None:
+    other = page.context.new_page()
+    for tab, label in ((page, "0-0-0"), (other, "1-1-0")):
+        tab.goto(address)
+        tab.click(coded(state, f"[data-label='{label}'] [data-decide=rejected]"))
+        tab.wait_for_selector(coded(state, f"[data-label='{label}'].rejected"))
+    page.keyboard.press("u")
+    wait_for_decision(out, AttemptKey("1_box_a", 0, 0), "")
+    assert read_decisions(out / "reject.json").rejected == {AttemptKey("2_box_b", 1, 0)}
+
+
+def test_files_of_an_earlier_state_are_told(page: Page, out: Path) -> None:
+    whole = read_manifest(out)
+    write_manifest(replace(whole, objects=whole.objects[1:]), out)
+    assemble(out)
+    write_manifest(whole, out)
+    for address in serve(out):
+        for size, (width, height) in SIZES.items():
+            page.set_viewport_size({"width": width, "height": height})
+            page.goto(address)
+            assert "2 work units are newer" in page.inner_text(".notice")
+            keep_screenshot(page, f"newer_{size}")
+
+
+def test_buttons_reject_and_assembly_drops_exactly_these(
+    page: Page, address: str, state: Snapshot, out: Path
+) -> None:
+    page.goto(address)
+    page.click(coded(state, "[data-label='1-1-0'] [data-decide=rejected]"))
+    page.wait_for_selector(coded(state, "[data-label='1-1-0'].rejected"))
+    assert read_decisions(out / "reject.json").of(AttemptKey("2_box_b", 1, 0)) == "rejected"
+    page.click(coded(state, "[data-label='2-0-0'] [data-decide=rejected]"))
+    page.wait_for_selector(coded(state, "[data-label='2-0-0'].rejected"))
+    # The same button again withdraws the decision.
+    page.click(coded(state, "[data-label='1-1-0'] [data-decide=rejected]"))
+    wait_for_decision(out, AttemptKey("2_box_b", 1, 0), "")
+    assembly = assemble(out, rejected=read_rejected(out / "reject.json"))
+    assert assembly.removed == {Removal.KEPT: 8, Removal.REJECTED: 1}
+
+
+def test_a_server_that_has_ended_is_named(browser: Browser, out: Path, state: Snapshot) -> None:
+    page = browser.new_page()
+    served = serve(out)
+    page.goto(next(served))
+    next(served, None)
+    page.click(coded(state, "[data-label='0-0-0'] [data-decide=rejected]"))
+    page.wait_for_selector("#message:not([hidden])", timeout=PATIENCE)
+    assert "does not answer" in page.inner_text("#message")
+    page.close()
+
+
+def test_a_name_that_is_a_script_stays_text(page: Page, hostile: Path) -> None:
+    state = Catalog(hostile).current()
+    for address in serve(hostile):
+        page.goto(address)
+        assert page.locator("#cards h2", has_text=ATTACK).count() == 3
+        page.goto(coded(state, f"{address}/grasp/0-0-0"))
+        wait_for_view(page)
+        assert ATTACK in page.inner_text("h1")
+        assert page.locator("h1 script").count() == 0
+        page.goto(f"{address}/plots")
+        page.wait_for_load_state("networkidle")
+
+
+def test_files_open_without_a_server(
+    page: Page, boxes: Path, tmp_path: Path, state: Snapshot
+) -> None:
+    write_site(boxes, tmp_path / "site")
+    page.goto((tmp_path / "site" / "index.html").as_uri())
+    page.wait_for_selector("#pages button")
+    assert len(labels(page, state)) == 9
+    page.select_option("select[name=object]", "2_box_b")
+    page.select_option("select[name=sort]", "row")
+    page.select_option("select[name=order]", "up")
+    wait_for_labels(page, state, IN_ORDER)
+    assert page.inner_text("#count") == "3"
+    # The address keeps it.
+    page.reload()
+    wait_for_labels(page, state, IN_ORDER)
+    assert page.input_value("select[name=object]") == "2_box_b"
+    page.fill("input[name=max_slip]", "1")
+    wait_for_labels(page, state, [])
+    page.click("text=Reset")
+    wait_for_cards(page, 9)
+    page.locator(coded(state, "[data-label='0-0-0'] a")).click()
+    wait_for_view(page)
+    assert page.get_attribute("#view3d", "data-ready") == "yes"
+    assert colours_of(page) > 30
+    page.keyboard.press("ArrowRight")
+    page.wait_for_url(coded(state, "**/grasp/0-1-0.html"))
+    page.goto((tmp_path / "site" / "plots.html").as_uri())
+    page.wait_for_load_state("networkidle")
+
+
+#: The smallest contrast of a text to what is behind it, with that text. Disabled things and text in
+#: pictures are not counted.
+CONTRAST = """() => {
+  const numbers = (text) => text.match(/[0-9.]+/g).map(Number);
+  const linear = (x) => x <= 0.03928 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4;
+  const light = ([r, g, b]) =>
+    0.2126 * linear(r / 255) + 0.7152 * linear(g / 255) + 0.0722 * linear(b / 255);
+  const behind = (element) => {
+    for (let e = element; e; e = e.parentElement) {
+      const colour = numbers(getComputedStyle(e).backgroundColor);
+      if (colour.length === 3 || colour[3] === 1) return colour;
+    }
+    return [255, 255, 255];
+  };
+  let worst = [99, ""];
+  const judge = (element, text, part) => {
+    const colour = numbers(getComputedStyle(element, part).color);
+    const [a, b] = [light(colour), light(behind(element))].sort((x, y) => y - x);
+    if ((a + 0.05) / (b + 0.05) < worst[0]) worst = [(a + 0.05) / (b + 0.05), text];
+  };
+  for (const element of document.querySelectorAll("body *")) {
+    if (!element.checkVisibility() || element.closest("svg") || element.disabled) continue;
+    const texts = [...element.childNodes].filter((node) => node.nodeType === 3);
+    const own = texts.map((node) => node.textContent.trim()).join("");
+    if (own || element.tagName === "SELECT") judge(element, own || element.name);
+    if (element.placeholder) judge(element, element.placeholder, "::placeholder");
+  }
+  return worst;
+}"""
+
+
+def test_text_stands_out_in_both_themes(
+    page: Page, out: Path, tmp_path: Path, state: Snapshot
+) -> None:
+    results = write_predictions(out, tmp_path / "run.h5")
+    decisions = Decisions(
+        rejected=frozenset([AttemptKey("1_box_a", 0, 0)]),
+        kept=frozenset([AttemptKey("2_box_b", 1, 0)]),
+    )
+    write_decisions(out / "reject.json", decisions)
+    for address in serve(out, results):
+        for path in ("/", "/grasp/0-0-0", "/predictions", "/prediction/0", "/plots"):
+            page.goto(address + coded(state, path))
+            page.keyboard.press("?")
+            for theme in ("light", "dark"):
+                page.select_option("#theme", theme, force=True)
+                contrast, text = page.evaluate(CONTRAST)
+                assert contrast >= 4.5, f"{theme} {path}: {text!r} has {contrast:.2f}"
+
+
+def test_the_theme_that_is_chosen_is_remembered(page: Page, address: str, state: Snapshot) -> None:
+    def background() -> str:
+        return str(page.evaluate("getComputedStyle(document.body).backgroundColor"))
+
+    page.goto(coded(state, f"{address}/grasp/0-0-0"))
+    wait_for_view(page)
+    light, view = background(), page.locator("#view3d").screenshot()
+    page.emulate_media(color_scheme="dark")
+    wait_until(page, lambda: background() != light)
+    dark = background()
+    # The 3D view follows.
+    assert page.locator("#view3d").screenshot() != view
+    page.select_option("#theme", "light")
+    assert background() == light
+    page.goto(address)
+    assert background() == light
+    page.select_option("#theme", "")
+    assert background() == dark
+
+
+def test_predictions_filter_and_open(page: Page, out: Path, tmp_path: Path) -> None:
+    results = write_predictions(out, tmp_path / "run.h5")
+    for address in serve(out, results):
+        for width, height in SIZES.values():
+            page.set_viewport_size({"width": width, "height": height})
+            page.goto(f"{address}/predictions")
+            page.wait_for_load_state("networkidle")
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+        page.set_viewport_size({"width": 1280, "height": 900})
+        page.select_option("select[name=verdict]", "fails")
+        wait_for_cards(page, 2)
+        page.click("#cards li:nth-child(2) a")
+        wait_for_view(page)
+        assert "2 of 2" in page.inner_text(".position")
+        shots = {page.locator("#view3d").screenshot()}
+        for key in ("a", "c", "t"):
+            page.keyboard.press(key)
+            shots.add(page.locator("#view3d").screenshot())
+        assert len(shots) == 4
+        page.keyboard.press("g")
+        page.wait_for_url("**/predictions?verdict=fails")
+
+
+@pytest.mark.sim
+def test_scenes_filter_and_open(page: Page, out: Path, tmp_path: Path) -> None:
+    make_scenes(out, overrides=["scenes.views=3"])
+    for address in serve(out):
+        for name, (width, height) in SIZES.items():
+            page.set_viewport_size({"width": width, "height": height})
+            page.goto(address)
+            page.click("text=Scenes")
+            page.wait_for_load_state("networkidle")
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            keep_screenshot(page, f"scenes_{name}")
+            page.click("#cards li:nth-child(2) a")
+            wait_for_view(page)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            assert "2 of 3" in page.inner_text(".position")
+            keep_screenshot(page, f"scene_{name}")
+        assert page.get_attribute("#view3d", "data-ready") == "yes"
+        # Palms, hands and the hand of another grasp are all drawn.
+        shots = {page.locator("#view3d").screenshot()}
+        for key in ("m", "2", "h", "m"):
+            page.keyboard.press(key)
+            shots.add(page.locator("#view3d").screenshot())
+        assert len(shots) == 5
+        for theme in ("light", "dark"):
+            page.select_option("#theme", theme)
+            contrast, text = page.evaluate(CONTRAST)
+            assert contrast >= 4.5, f"{theme}: {text!r} has {contrast:.2f}"
+        page.set_viewport_size({"width": 1280, "height": 900})
+        page.keyboard.press("g")
+        page.wait_for_url("**/scenes")
+        page.wait_for_load_state("networkidle")
+        page.select_option("select[name=split]", "test")
+        wait_for_cards(page, 2)
+
+    # As files, too.
+    write_site(out, tmp_path / "site")
+    page.goto((tmp_path / "site" / "scenes.html").as_uri())
+    page.select_option("select[name=split]", "train")
+    wait_for_cards(page, 1)
+    page.click("#cards a")
+    wait_for_view(page)
+    assert page.get_attribute("#view3d", "data-ready") == "yes"

@@ -1,0 +1,293 @@
+"""The attempts in memory: of assembled files, of a build that runs, of files that are missing."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers.datasets import OTM, OTO, SLIP, TRIALS, change, make_dataset, set_at
+from helpers.pages import coded, numbered
+
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.layout.trial_files import NONE
+from drakegrasp.dataset.manifest import Manifest, read_manifest, write_manifest
+from drakegrasp.dataset.rejections import Decisions
+from drakegrasp.errors import DataError
+from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.page import catalog as catalog_module
+from drakegrasp.page.catalog import Catalog
+from drakegrasp.page.query import parse_query, select
+from drakegrasp.page.rows import read_look, read_rows
+from drakegrasp.page.table import FEATURES
+
+
+def build_again(out: Path) -> None:
+    """Take away what is assembled: a build that has done all units but not ended."""
+    for name in (TRIALS, OTO, OTM):
+        (out / name).unlink()
+
+
+def test_table_is_what_the_files_say(boxes: Path) -> None:
+    snapshot = Catalog(boxes).current()
+    table = snapshot.table
+    with h5py.File(boxes / TRIALS) as file, h5py.File(boxes / OTO) as data:
+        for name in ("outcome", "object", "candidate", "standoff_index", "precision", "stable"):
+            np.testing.assert_array_equal(getattr(table, name), file["trials"][name][:])
+        hits = file["successes/trial_id"][:]
+        np.testing.assert_array_equal(table.removal[hits], file["successes/removal"][:])
+        for number, split in enumerate(("train", "valid", "test")):
+            ids = np.flatnonzero(table.split == number)
+            np.testing.assert_array_equal(ids, data[split]["trial_id"][:])
+    assert (table.removal != NONE).sum() == (table.split != NONE).sum() == 9
+    assert set(table.features) == set(FEATURES)
+    np.testing.assert_allclose(table.feature("slip")[table.precision], SLIP)
+    assert table.value("force", 0) == 12.5
+    # The second attempt misses a finger, the third is below the table.
+    assert np.isnan(table.feature("slip")[[1, 2]]).all()
+    assert np.isnan(table.value("force", 2))
+    assert table.value("force", 1) == 10.0
+    assert np.isfinite(table.feature("force")[table.closed]).all()
+
+
+def test_attempts_are_found_by_their_label(boxes: Path) -> None:
+    snapshot = Catalog(boxes).current()
+    assert numbered(snapshot, snapshot.label(3)) == "0-1-0"
+    assert snapshot.find(coded(snapshot, "0-1-0")) == 3
+    assert str(snapshot.key(3)) == "1_box_a, palm pose 1, stand-off 0"
+    code = snapshot.codes[0]
+    for label in ("0-1-0", f"{code}-1", f"{code}-1-x", f"{code}-1--1", "", f"{code}-٣-0"):
+        assert snapshot.find(label) is None
+
+
+@pytest.mark.parametrize("assembled", [True, False], ids=["assembled", "building"])
+def test_rows_and_images_are_those_of_the_attempt(out: Path, assembled: bool) -> None:
+    with h5py.File(out / TRIALS) as trials, h5py.File(out / OTM) as data:
+        X_OG = trials["trials/X_OG"][15]
+        split = next(s for s in data if 15 in data[s]["trial_id"][:])
+        place = data[split]["trial_id"][:].tolist().index(15)
+        image, mask = data[split]["images"][place], data[split]["masks"][place]
+    if not assembled:
+        build_again(out)
+    snapshot = Catalog(out).current()
+    assert snapshot.assembled is assembled
+    i = snapshot.find(coded(snapshot, "1-1-0"))
+    assert i is not None
+    (row,) = read_rows(snapshot, [i], ("X_OG",))
+    np.testing.assert_array_equal(row["X_OG"], X_OG)
+    look = read_look(snapshot, i, "otm")
+    assert look is not None
+    np.testing.assert_array_equal(look.image, image)
+    np.testing.assert_array_equal(look.mask, mask)
+    assert read_look(snapshot, i + 1, "otm") is None
+
+
+def test_success_that_is_no_sample_has_the_images_of_its_shard(out: Path) -> None:
+    expected = read_look(Catalog(out).current(), 0, "oto")
+    assert assemble(out, rejected=[0]).removed[Removal.REJECTED] == 1
+    snapshot = Catalog(out).current()
+    assert snapshot.table.split[0] == NONE
+    look = read_look(snapshot, 0, "oto")
+    assert look is not None
+    assert expected is not None
+    np.testing.assert_array_equal(look.image, expected.image)
+
+
+def test_data_files_alone_are_enough_for_images(out: Path) -> None:
+    for folder in ("shards", "objects"):
+        shutil.rmtree(out / folder)
+    (out / "manifest.json").unlink()
+    (out / OTM).unlink()
+    snapshot = Catalog(out).current()
+    assert read_look(snapshot, 0, "oto") is not None
+    assert read_look(snapshot, 0, "otm") is None
+    assert [line.split()[0] for line in snapshot.missing] == [OTM, "3"]
+
+
+def test_a_build_that_runs_shows_what_is_done(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    build_again(out)
+    hidden = out / "shards" / "3_brick"
+    hidden.rename(out / "later")
+    catalog = Catalog(out)
+    first = catalog.current()
+    assert len(first.table) == 24
+    assert "4 of 6 work units are done" in first.missing[0]
+    assert first.trial_id(0) is None
+
+    # A new shard shows after a while, and the assembled files at once.
+    (out / "later").rename(hidden)
+    assert catalog.current() is first
+    monkeypatch.setattr(catalog_module, "LISTING_PERIOD", 0.0)
+    assert len(catalog.current().table) == 36
+    assert (catalog.current().table.outcome == Outcome.SUCCESS).sum() == 9
+    assemble(out)
+    assert catalog.current().assembled
+    assert catalog.current() is catalog.current()
+
+
+def test_a_build_that_has_done_nothing_yet_has_no_attempts(out: Path) -> None:
+    build_again(out)
+    shutil.rmtree(out / "shards")
+    table = Catalog(out).current().table
+    assert len(table) == 0
+    assert table.candidate.dtype == np.int32
+
+
+def without_first(out: Path) -> Manifest:
+    """Make the dataset one of the last two objects; return the manifest of all three."""
+    whole = read_manifest(out)
+    write_manifest(replace(whole, objects=whole.objects[1:]), out)
+    return whole
+
+
+@pytest.mark.parametrize("assembled", [True, False], ids=["assembled", "building"])
+def test_a_label_stays_that_of_its_attempt_when_objects_are_added(
+    out: Path, assembled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another object comes first by its name, so the numbers of all others change."""
+    monkeypatch.setattr(catalog_module, "LISTING_PERIOD", 0.0)
+    build_again(out)
+    whole = without_first(out)
+    if assembled:
+        assemble(out)
+    catalog = Catalog(out)
+    before = catalog.current()
+    labels = {before.label(i): before.key(i) for i in range(len(before.table))}
+    write_manifest(whole, out)
+    if assembled:
+        assemble(out)
+    after = catalog.current()
+    assert len(after.table) == len(labels) + 12
+    for label, key in labels.items():
+        place = after.find(label)
+        assert place is not None
+        assert after.key(place) == key
+
+
+def test_a_label_of_another_mesh_or_configuration_is_another(boxes: Path) -> None:
+    snapshot = Catalog(boxes).current()
+    label = snapshot.label(0)
+    for other in (
+        replace(snapshot, meshes=("0" * 64, *snapshot.meshes[1:])),
+        replace(snapshot, config_hash="0" * 16),
+    ):
+        assert other.find(label) is None
+
+
+def test_attempts_stay_with_their_objects_when_the_manifest_grows(
+    out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(catalog_module, "LISTING_PERIOD", 0.0)
+    build_again(out)
+    whole = without_first(out)
+    catalog = Catalog(out)
+    assert [catalog.current().key(i).object for i in (0, 12)] == ["2_box_b", "3_brick"]
+    write_manifest(whole, out)
+    grown = catalog.current()
+    assert [grown.key(i).object for i in (0, 12, 24)] == ["1_box_a", "2_box_b", "3_brick"]
+    np.testing.assert_array_equal(grown.table.object, Catalog(out).current().table.object)
+
+    # And when it shrinks: what is gone is not kept.
+    write_manifest(replace(whole, objects=whole.objects[1:]), out)
+    assert len(catalog.current().table) == 24
+
+
+def test_a_file_that_was_replaced_is_not_read_as_the_one_before(out: Path) -> None:
+    """By row the files would give the numbers and images of other attempts."""
+    whole = without_first(out)
+    assemble(out)
+    catalog = Catalog(out)
+    before = catalog.current()
+    assert read_look(before, 0, "oto") is not None
+    write_manifest(whole, out)
+    assemble(out)
+    with pytest.raises(DataError, match="must stay while it is read"):
+        read_rows(before, [0], ("slip",))
+    with pytest.raises(DataError, match="must stay while it is read"):
+        read_look(before, 0, "oto")
+    assert len(read_rows(catalog.current(), [0], ("slip",))) == 1
+
+
+def test_a_shard_of_another_mesh_is_not_read_as_the_one_before(out: Path) -> None:
+    build_again(out)
+    before = Catalog(out).current()
+    for i in range(0, len(before.table), 6):
+        part, _ = before.trials.part_of(i)
+        with h5py.File(part.path, "r+") as file:
+            file.attrs["mesh_sha256"] = "0" * 64
+    with pytest.raises(DataError, match="must be a shard of"):
+        read_rows(before, [0], ("slip",))
+    assert read_look(before, 0, "oto") is None
+
+
+def test_a_damaged_shard_is_named_and_the_others_are_shown(out: Path) -> None:
+    build_again(out)
+    path = next((out / "shards" / "2_box_b").iterdir())
+    path.write_bytes(path.read_bytes()[:1000])
+    snapshot = Catalog(out).current()
+    assert len(snapshot.table) == 30
+    assert snapshot.missing[1].startswith("Damaged, and not shown: shards/2_box_b/")
+    assert "5 of 6 work units are done" in snapshot.missing[0]
+
+
+def test_files_of_an_earlier_state_are_told(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A build went on with another object: the files are still those of before."""
+    monkeypatch.setattr(catalog_module, "LISTING_PERIOD", 0.0)
+    whole = without_first(out)
+    assemble(out)
+    catalog = Catalog(out)
+    assert catalog.current().missing == ()
+    hidden = out / "shards" / "1_box_a"
+    hidden.rename(out / "later")
+    write_manifest(whole, out)
+    assert catalog.current().missing == ()  # no unit is newer yet
+    (out / "later").rename(hidden)
+    first = catalog.current()
+    assert "2 work units are newer" in first.missing[0]
+    assert len(first.table) == 24
+    assert catalog.current() is first
+    assemble(out)
+    assert catalog.current().missing == ()
+    assert len(catalog.current().table) == 36
+
+
+@pytest.mark.parametrize("wanted", [1, 2])
+def test_attempts_beyond_the_wanted_grasps_are_not_shown(tmp_path: Path, wanted: int) -> None:
+    """Assembly takes none of them, so they cannot be rejected either."""
+    out = make_dataset(tmp_path / "out", tmp_path, overrides=[f"max_grasps={wanted}"])
+    assembled = Catalog(out).current().table
+    build_again(out)
+    building = Catalog(out).current().table
+    assert (building.outcome == Outcome.SUCCESS).sum() == 3 * wanted
+    for name in ("object", "candidate", "standoff_index", "outcome", "closed"):
+        np.testing.assert_array_equal(getattr(building, name), getattr(assembled, name))
+    for name in FEATURES:
+        np.testing.assert_array_equal(building.features[name], assembled.features[name])
+
+
+def test_a_contact_without_a_normal_has_the_largest_angle(out: Path) -> None:
+    change(out, TRIALS, "trials/normal_angle", 0, set_at(0, to=np.nan))
+    snapshot = Catalog(out).current()
+    assert snapshot.table.value("normal_angle", 0) == np.inf
+    places = select(snapshot, parse_query({"min_normal_angle": "10"}), Decisions())
+    assert places.tolist() == [0]
+    assert select(snapshot, parse_query({"sort": "normal_angle"}), Decisions())[0] == 0
+
+
+def test_another_schema_is_one_message(out: Path) -> None:
+    with h5py.File(out / TRIALS, "r+") as file:
+        file.attrs["schema_version"] = 2
+    with pytest.raises(DataError) as caught:
+        Catalog(out)
+    assert str(caught.value).count(TRIALS) == 1
+
+
+def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="must be the directory of a dataset"):
+        Catalog(tmp_path)
+    (tmp_path / TRIALS).write_bytes(b"nothing")
+    with pytest.raises(DataError, match="must be the trials of a dataset, got none"):
+        Catalog(tmp_path)

@@ -1,0 +1,213 @@
+"""Predictions beside their rows: which are shown, in which order, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from helpers.datasets import TRIALS
+from helpers.pages import Tags
+from helpers.predictions import write_predictions
+from starlette.testclient import TestClient
+
+from drakegrasp.cli.verify.request import VerifyRequest, requested_rows
+from drakegrasp.dataset.layout.predicted_rows import read_predicted_rows
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.errors import DataError
+from drakegrasp.page.app import Inspection, make_app
+from drakegrasp.page.static_site import write_site
+
+
+@pytest.fixture
+def results(out: Path, tmp_path: Path) -> Path:
+    return write_predictions(out, tmp_path / "run.h5")
+
+
+@pytest.fixture
+def client(out: Path, results: Path) -> Iterator[TestClient]:
+    app = make_app(Inspection(out, results))
+    with TestClient(app, base_url="http://127.0.0.1:8321") as client:
+        yield client
+
+
+def shown(client: TestClient, query: str = "") -> list[str]:
+    """Return the numbers of the predictions of a gallery, in its order."""
+    tags = Tags(client.get(f"/predictions?{query}").text).tags
+    return [str(attributes["data-label"]) for tag, attributes in tags if tag == "li"
+            and "data-label" in attributes]  # fmt: skip
+
+
+def test_the_worst_come_first(client: TestClient) -> None:
+    """Never closed, failed, then those that hold, by how far the contacts are off."""
+    assert shown(client) == ["2", "3", "1", "0"]
+    assert shown(client, "order=up") == ["0", "1", "3", "2"]
+    assert shown(client, "sort=error") == ["1", "3", "0", "2"]
+
+
+@pytest.mark.parametrize(
+    ("query", "numbers"),
+    [
+        ("verdict=fails", ["2", "3"]),
+        ("verdict=precision", ["0"]),
+        ("outcome=dropped", ["3"]),
+        ("object=nothing", []),
+        ("class=box&min_error=5", ["3", "1"]),
+        ("max_error=5", ["0"]),
+        ("min_true_error=3.9&verdict=held", ["1", "0"]),
+    ],
+)
+def test_filters_choose(client: TestClient, query: str, numbers: list[str]) -> None:
+    assert shown(client, query) == numbers
+
+
+def test_asked_reached_and_true_contacts_are_marked(client: TestClient) -> None:
+    cards = client.get("/predictions?sort=row&order=up").text.split("</li>")
+    card = next(c for c in cards if 'data-label="0"' in c)
+    kinds = {kind: card.count(f'class="{kind}"') for kind in ("asked", "reached", "true")}
+    # Three fingers, in colour and depth.
+    assert kinds == {"asked": 6, "reached": 6, "true": 6}
+    assert "4.0 mm" in card and "it &lt;success&gt;" in card
+    never_closed = next(c for c in cards if 'data-label="2"' in c)
+    assert 'class="reached"' not in never_closed
+    assert never_closed.count('class="asked"') == 6
+
+
+def test_page_of_a_prediction_has_both_hands_and_all_contacts(client: TestClient) -> None:
+    page = client.get("/prediction/3?sort=error").text
+    assert "2 of 4" in page and "row 1 of train" in page and "dropped" in page
+    scene = _scene(page)
+    assert set(scene["states"]) == {"closed", "dataset's grasp"}
+    contacts = scene["states"]["closed"]["contacts"]
+    points = {kind: [c["p"] for c in contacts if c["kind"] == kind] for kind in ("asked", "true")}
+    # The first was asked 7 mm from the true one along z of {O}, which lies in the table's plane.
+    apart = np.subtract(points["asked"], points["true"])
+    z_T = np.array([0.5, -np.sqrt(0.75), 0.0])
+    np.testing.assert_allclose(apart, [0.007 * z_T, [0, 0, 0], [0, 0, 0]], atol=1e-9)
+    assert set(_scene(client.get("/prediction/2").text)["states"]) == {"dataset's grasp"}
+    for label in ("4", "x", "-1"):
+        assert client.get(f"/prediction/{label}").status_code == 404
+
+
+def _scene(page: str) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page, re.S)
+    assert found is not None
+    return dict(json.loads(found[1])["scene"])
+
+
+def test_without_results_there_are_no_predictions(out: Path) -> None:
+    client = TestClient(make_app(Inspection(out)), base_url="http://127.0.0.1")
+    assert client.get("/predictions").status_code == 404
+    assert "/predictions" not in client.get("/").text
+
+
+def _without_rows(file: h5py.File) -> None:
+    del file["rows"]
+
+
+def _of_others(file: h5py.File) -> None:
+    file["rows"].attrs["shards"] = "other"
+
+
+def _beyond(file: h5py.File) -> None:
+    file["rows/trial_id"][1] = 99
+
+
+def _another_object(file: h5py.File) -> None:
+    file["grasps/object"][1] = "3_brick"
+
+
+def _flat(file: h5py.File) -> None:
+    values = file["grasps/closed_p_OQ"][:, 0]
+    del file["grasps/closed_p_OQ"]
+    file["grasps/closed_p_OQ"] = values
+
+
+def _no_verdicts(file: h5py.File) -> None:
+    del file["grasps/outcome"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (_without_rows, "must say which rows of a dataset it is for, got none"),
+        (_of_others, "as it is now, got another"),
+        (_beyond, "must be for rows of"),
+        (_another_object, "must be for rows of"),
+        (_flat, "grasps/closed_p_OQ must be"),
+        (_no_verdicts, "must be a result file of drakegrasp verify, got another"),
+    ],
+)
+def test_results_of_something_else_are_refused(
+    out: Path, results: Path, spoil: Callable[[h5py.File], None], message: str
+) -> None:
+    with h5py.File(results, "r+") as file:
+        spoil(file)
+    with pytest.raises(DataError, match=message):
+        Inspection(out, results)
+
+
+def test_a_field_that_a_file_lacks_is_a_dash(out: Path, results: Path) -> None:
+    with h5py.File(results, "r+") as file:
+        for name in set(file["grasps"]) - {"object", "outcome", "p_OQ", "nhat_Q_O"}:
+            del file[f"grasps/{name}"]
+    client = TestClient(make_app(Inspection(out, results)), base_url="http://127.0.0.1")
+    assert shown(client, "verdict=held") == ["0", "1"]
+    assert "4.0 mm" in client.get("/prediction/0").text  # from the true contact
+    assert client.get("/prediction/0").text.count("<td>–</td>") > 10
+
+
+def test_results_are_read_again_when_they_change(
+    client: TestClient, out: Path, results: Path
+) -> None:
+    assert shown(client, "outcome=dropped") == ["3"]
+    results.unlink()
+    write_predictions(out, results)
+    with h5py.File(results, "r+") as file:
+        file["grasps/outcome"][3] = file["grasps/outcome"][0]
+    assert shown(client, "outcome=dropped") == []
+    # A dataset that has other rows by now is another one.
+    with h5py.File(out / TRIALS, "r+") as file:
+        file.attrs["shards"] = "other"
+    assert client.get("/predictions").status_code == 400
+
+
+def test_files_hold_the_predictions_too(out: Path, results: Path, tmp_path: Path) -> None:
+    write_site(out, tmp_path / "site", results=results)
+    tags = Tags((tmp_path / "site" / "predictions.html").read_text(encoding="utf-8")).tags
+    cards = [a for tag, a in tags if tag == "li" and "data-label" in a]
+    assert [card["data-label"] for card in cards] == ["2", "3", "1", "0"]
+    assert [card["data-verdict"].split()[0] for card in cards] == ["fails", "fails", "held", "held"]
+    assert cards[2]["data-error"] == "12"
+    page = (tmp_path / "site" / "prediction" / "3.html").read_text(encoding="utf-8")
+    assert "2 of 4" in page
+    for _, attributes in Tags(page).tags:
+        address = attributes.get("src") or attributes.get("href") or ""
+        assert not address or (tmp_path / "site" / "prediction" / address).is_file(), address
+
+
+def test_results_say_which_rows_were_asked_for(out: Path, tmp_path: Path) -> None:
+    """As `verify` finds them: those in the file of predictions, else all of the split."""
+    data = GraspDataset(out / "grasping_oto.hdf5", split="train")
+    rows = np.array([1, 0, 1])
+    with h5py.File(tmp_path / "p.h5", "w") as file:
+        file["grasps"], file["rows"] = data.column("grasps")[rows], rows
+    for path, split, wanted in (
+        (tmp_path / "p.h5", "train", rows),
+        (data.path, "train", np.arange(len(data))),
+    ):
+        request = VerifyRequest(grasps=path, dataset=data.path, split=split)
+        asked = requested_rows(request, len(wanted))
+        assert asked is not None
+        with h5py.File(tmp_path / "r.h5", "w") as file:
+            asked.write(file)
+            read = read_predicted_rows(file)
+        assert read is not None
+        assert (read.split, read.camera, read.row.tolist()) == ("train", "oto", wanted.tolist())
+        assert read.trial_id.tolist() == data.column("trial_id")[wanted].tolist()
+    assert requested_rows(VerifyRequest(grasps=tmp_path / "p.h5", mesh=Path("a.obj")), 3) is None

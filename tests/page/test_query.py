@@ -1,0 +1,146 @@
+"""Filters and order: each filter chooses by its own column, in the units that are shown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import parse_qsl
+
+import numpy as np
+import pytest
+from helpers.pages import numbered
+
+from drakegrasp.dataset.layout.trial_files import NONE
+from drakegrasp.dataset.rejections import AttemptKey, Decisions
+from drakegrasp.errors import DataError
+from drakegrasp.page.catalog import Catalog, Snapshot
+from drakegrasp.page.query import QUANTITIES, Query, parse_query, select
+from drakegrasp.page.table import FEATURES
+
+NOTHING = Decisions()
+
+
+@pytest.fixture
+def snapshot(boxes: Path) -> Snapshot:
+    return Catalog(boxes).current()
+
+
+def chosen(snapshot: Snapshot, text: str, decisions: Decisions = NOTHING) -> list[str]:
+    query = parse_query(dict(parse_qsl(text)))
+    return [numbered(snapshot, snapshot.label(i)) for i in select(snapshot, query, decisions)]
+
+
+def test_successes_are_shown_unless_others_are_asked_for(snapshot: Snapshot) -> None:
+    assert len(chosen(snapshot, "")) == 9
+    assert len(chosen(snapshot, "outcome=any")) == 36
+    assert chosen(snapshot, "outcome=slipped&sort=row&order=up") == ["0-1-1", "1-1-1", "2-1-1"]
+
+
+@pytest.mark.parametrize(
+    ("text", "labels"),
+    [
+        ("object=2_box_b", ["1-0-0", "1-1-0", "1-3-2"]),
+        ("class=brick", ["2-0-0", "2-1-0", "2-3-2"]),
+        ("class=brick&object=2_box_b", []),
+        ("object=nothing", []),
+        ("split=none", []),
+        ("removal=other_links", []),
+        ("min_slip=3", []),
+    ],
+)
+def test_each_filter_chooses_its_own(snapshot: Snapshot, text: str, labels: list[str]) -> None:
+    assert chosen(snapshot, f"{text}&sort=row&order=up") == labels
+
+
+def test_words_choose_by_how_an_attempt_holds(snapshot: Snapshot) -> None:
+    table = snapshot.table
+    precision, stable = table.precision.copy(), table.stable.copy()
+    precision[12] = stable[12] = stable[15] = False
+    changed = replace(snapshot, table=replace(table, precision=precision, stable=stable))
+    counts = {
+        hold: len(chosen(changed, f"hold={hold}")) for hold in ("held", "precision", "stable")
+    }
+    assert counts == {"held": 9, "precision": 8, "stable": 7}
+
+
+def test_splits_are_a_partition_of_the_samples(snapshot: Snapshot) -> None:
+    parts = [chosen(snapshot, f"split={split}") for split in ("train", "valid", "test")]
+    assert sorted(label for part in parts for label in part) == sorted(chosen(snapshot, ""))
+    assert all(parts)
+
+
+def test_any_sample_is_one_choice(snapshot: Snapshot) -> None:
+    split = snapshot.table.split.copy()
+    split[[0, 3]] = NONE
+    changed = replace(snapshot, table=replace(snapshot.table, split=split))
+    assert len(chosen(changed, "split=samples&outcome=any")) == 7
+    assert set(chosen(changed, "split=none")) == {"0-0-0", "0-1-0"}
+
+
+def test_ranges_are_in_the_units_that_are_shown(snapshot: Snapshot) -> None:
+    """All slip by 2 mm; a slipped attempt of two fingers pushes with 12.5 N, too."""
+    assert len(chosen(snapshot, "min_slip=1.9&max_slip=2.1")) == 9
+    assert chosen(snapshot, "max_slip=1.9") == []
+    assert len(chosen(snapshot, "min_force=12.4&max_force=12.6")) == 9
+    assert chosen(snapshot, "min_force=12.6&outcome=any") == []
+    # What never closed has no penetration, so it is in no range.
+    assert len(chosen(snapshot, "max_penetration=100&outcome=any")) < 36
+
+
+def test_order_is_by_the_quantity_and_those_without_come_last(snapshot: Snapshot) -> None:
+    table = snapshot.table
+    score = table.features["suspicion"].copy()
+    score[np.searchsorted(table.closed, [0, 3, 11])] = [5.0, np.nan, 7.0]
+    changed = replace(
+        snapshot, table=replace(table, features={**table.features, "suspicion": score})
+    )
+    down, up = chosen(changed, ""), chosen(changed, "order=up")
+    assert down[:2] == ["0-3-2", "0-0-0"]
+    assert up[-3:] == ["0-0-0", "0-3-2", "0-1-0"]
+    assert down[-1] == up[-1] == "0-1-0"
+    rows = chosen(snapshot, "sort=row&order=up")
+    assert rows[:3] == ["0-0-0", "0-1-0", "0-3-2"]  # "smallest first"
+    assert chosen(snapshot, "sort=row") == rows[::-1]
+
+
+def test_decisions_choose_what_is_left(snapshot: Snapshot) -> None:
+    a, b = AttemptKey("1_box_a", 0, 0), AttemptKey("3_brick", 1, 0)
+    gone = AttemptKey("no object", 0, 0)
+    decisions = Decisions(rejected=frozenset([a, gone]), kept=frozenset([b]))
+    assert chosen(snapshot, "decision=rejected", decisions) == ["0-0-0"]
+    assert chosen(snapshot, "decision=kept", decisions) == ["2-1-0"]
+    # Failures are never decided, so they are not open either.
+    for text in ("decision=open", "decision=open&outcome=any"):
+        assert len(chosen(snapshot, text, decisions)) == 7
+
+
+def test_address_of_a_query_gives_the_query_again() -> None:
+    text = "outcome=any&object=a%26b%3Dc&min_slip=1.5&sort=slip&order=up&page=3&hold=stable"
+    query = parse_query(dict(parse_qsl(text)))
+    assert parse_query(dict(parse_qsl(query.params()))) == query
+    assert query.object_name == "a&b=c"
+    assert Query().params() == ""
+    assert parse_query({}) == Query()
+    assert query.identity == replace(query, page=1).params()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("outcome=good", "outcome must be one of any, success, .* got 'good'"),
+        ("sort=x", "sort must be one of"),
+        ("min_slip=much", "min_slip must be a number, got 'much'"),
+        ("max_slip=nan", "max_slip must be a number"),
+        ("page=-1", "page must be a number"),
+    ],
+)
+def test_what_cannot_be_asked_for_is_refused(text: str, words: str) -> None:
+    with pytest.raises(DataError, match=words):
+        parse_query(dict(parse_qsl(text)))
+
+
+def test_every_feature_has_a_title_and_a_unit() -> None:
+    assert set(QUANTITIES) == set(FEATURES)
+    assert QUANTITIES["slip"].text(0.0123) == "12.3 mm"
+    assert QUANTITIES["turn"].text(np.pi / 2.0) == "90.0°"
+    assert QUANTITIES["force"].text(np.nan) == "–"

@@ -1,0 +1,136 @@
+"""Serving: one line for what cannot be served, the loopback address and nothing else."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+from click.testing import CliRunner
+
+from drakegrasp.cli.main import main
+from drakegrasp.page import serve as serving
+from drakegrasp.page.app import ASSETS
+from drakegrasp.page.serve import LOOPBACK, listen
+
+#: The program, with Ctrl-C as at a terminal: a test that runs in the background inherits a shell's
+#: choice to ignore it.
+CODE = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "from drakegrasp.cli.main import run; run()"
+)
+
+
+def test_only_the_loopback_address_is_listened_on() -> None:
+    with listen(0) as listener:
+        assert listener.getsockname()[0] == LOOPBACK == "127.0.0.1"
+
+
+async def slow_app(scope: Any, receive: Any, send: Any) -> None:
+    """Answer a request a moment after its end."""
+    if scope["type"] == "http":
+        while (await receive()).get("more_body"):
+            pass
+        await asyncio.sleep(0.8)
+        headers = [(b"content-length", b"2")]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        await send({"type": "http.response.body", "body": b"ok"})
+
+
+def test_request_that_does_not_end_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serving, "REQUEST_SECONDS", 0.4)
+    config = serving.server_config(slow_app)
+    config.lifespan = "off"
+    server, listener = uvicorn.Server(config), listen(0)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    head, host = b"POST / HTTP/1.1\r\n", b"Host: x\r\nContent-Length: 4\r\n\r\n"
+    try:
+        for begun in (b"", head, head + host + b"abc"):
+            with socket.create_connection(listener.getsockname(), timeout=60) as client:
+                client.sendall(begun)
+                assert client.recv(100) == b""
+
+        # A complete one is answered, however long that takes; what follows it must end, too.
+        with socket.create_connection(listener.getsockname(), timeout=60) as client:
+            client.sendall(head + host + b"abcd" + head)
+            received = b"".join(iter(lambda: client.recv(1000), b""))
+            assert received.startswith(b"HTTP/1.1 200") and received.endswith(b"ok")
+    finally:
+        server.should_exit = True
+        thread.join(60)
+        listener.close()
+
+
+def test_a_taken_port_is_one_line(boxes: Path) -> None:
+    with socket.socket() as other:
+        other.bind((LOOPBACK, 0))
+        other.listen()
+        port = str(other.getsockname()[1])
+        result = CliRunner().invoke(main, ["inspect", str(boxes), "--port", port, "--no-browser"])
+    assert result.exit_code == 1
+    assert result.stderr.startswith(f"error: --port must be free on this machine, got {port}")
+
+
+def test_a_directory_without_a_dataset_is_one_line(tmp_path: Path) -> None:
+    for option in ([], ["--static", str(tmp_path / "site")]):
+        result = CliRunner().invoke(main, ["inspect", str(tmp_path / "none"), *option])
+        assert result.exit_code == 1
+        assert result.stderr.startswith("error: ")
+        assert "must be the directory of a dataset" in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("library", ["starlette", "uvicorn", "jinja2"])
+def test_missing_extra_is_one_line(
+    library: str, boxes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in list(sys.modules):
+        if name.startswith("drakegrasp.page"):
+            monkeypatch.delitem(sys.modules, name)
+        if name.partition(".")[0] == library:
+            monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.setattr("socket.socket.listen", None)  # else a mistake would serve for ever
+    result = CliRunner().invoke(main, ["inspect", str(boxes), "--no-browser"])
+    assert result.exit_code == 1
+    assert f"inspect needs {library}" in result.stderr
+    assert "pip install 'drakegrasp[inspect]'" in result.stderr
+
+
+def test_command_serves_until_it_is_stopped(boxes: Path) -> None:
+    command = [sys.executable, "-c", CODE, "inspect", str(boxes), "--port", "0", "--no-browser"]
+    server = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
+    )
+    assert server.stdout is not None
+    try:
+        address = server.stdout.readline().strip()
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", address)
+        with urllib.request.urlopen(address, timeout=60.0) as answer:
+            assert b"1_box_a" in answer.read()
+    finally:
+        server.send_signal(signal.SIGINT)
+        _, errors = server.communicate(timeout=60.0)
+    assert server.returncode == 130
+    assert errors.strip() == "stopped"
+
+
+def test_vendored_files_are_those_of_their_readme() -> None:
+    folder = ASSETS / "vendor"
+    rows = re.findall(r"\| `(\S+)` \|.*\| ([0-9a-f]{64}) \|", (folder / "README.md").read_text())
+    assert {name for name, _ in rows} == {path.name for path in folder.glob("*.js")}
+    for name, digest in rows:
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest
+    assert (folder / "LICENSE").read_text(encoding="utf-8").startswith("The MIT License")

@@ -1,0 +1,123 @@
+"""The pages as files: every file that a page names is there, and none is a server's."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from helpers.pages import ATTACK, Tags, coded, surface_of
+
+from drakegrasp.cli.main import main
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
+from drakegrasp.errors import DataError
+from drakegrasp.page import static_site
+from drakegrasp.page.catalog import Catalog
+from drakegrasp.page.static_site import Site, write_site
+
+
+@pytest.fixture(scope="module")
+def site(boxes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site") / "pages"
+    assert write_site(boxes, folder) == Site(grasps=9, successes=9)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def first(boxes: Path) -> str:
+    """The label of the first attempt."""
+    return coded(Catalog(boxes).current(), "0-0-0")
+
+
+def test_every_address_is_a_file_of_the_folder(site: Path) -> None:
+    pages = sorted(site.rglob("*.html"))
+    assert len(pages) == 11
+    for page in pages:
+        for _, attributes in Tags(page.read_text(encoding="utf-8")).tags:
+            for name in ("src", "href"):
+                address = attributes.get(name)
+                if address:
+                    assert not address.startswith(("/", "http")), address
+                    assert (page.parent / address).is_file(), f"{page.name}: {address}"
+
+
+def test_meshes_of_a_page_are_scripts_that_hold_their_data(site: Path, first: str) -> None:
+    page = (site / "grasp" / f"{first}.html").read_text(encoding="utf-8")
+    addresses = re.findall(r'"(\.\./mesh/[^"]+)"', page)
+    assert len(addresses) == 10
+    for address in addresses:
+        script = (site / "grasp" / address).read_text(encoding="utf-8")
+        name, text = re.findall(r'drakegraspMeshes\["(.+)"\] = (.+);', script)[0]
+        assert name == Path(address).stem
+        assert len(surface_of(text).faces)
+
+
+def test_cards_carry_what_filters_need(site: Path, first: str) -> None:
+    tags = Tags((site / "index.html").read_text(encoding="utf-8")).tags
+    cards = [a for tag, a in tags if tag == "li"]
+    assert len(cards) == 9
+    card = next(a for a in cards if a["data-label"] == first)
+    assert card["data-object"] == "1_box_a"
+    assert card["data-slip"] == "2"
+    # In an order that is not a set's, which differs from run to run.
+    assert card["data-hold"] == "held precision stable"
+
+
+def test_files_cannot_decide_but_show_decisions(out: Path, tmp_path: Path) -> None:
+    key = AttemptKey("1_box_a", 0, 0)
+    write_decisions(out / "reject.json", Decisions(rejected=frozenset([key])))
+    write_site(out, tmp_path / "site")
+    index = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
+    assert index.count("card rejected") == 1
+    for page in (tmp_path / "site").rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        assert not re.search("<button data-(decide|undo|record)", text)
+
+
+def test_what_is_left_out_is_told(
+    boxes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(static_site, "MAX_GRASPS", 4)
+    result = CliRunner().invoke(main, ["inspect", str(boxes), "--static", str(tmp_path / "site")])
+    assert result.exit_code == 0, result.stderr
+    assert "4 grasps in " in result.stdout
+    assert "the most suspicious of 9" in result.stdout
+    index = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
+    assert "Only the 4 most suspicious of 9 successes are here." in index
+    assert index.count("<li ") == 4
+    # Failures are not there, so none can be asked for.
+    assert 'name="outcome"' not in index
+
+
+@pytest.mark.parametrize("how", [KeyboardInterrupt, DataError])
+def test_a_run_that_ends_early_leaves_nothing(
+    out: Path, tmp_path: Path, how: type[BaseException]
+) -> None:
+    """After Ctrl-C, and where the dataset was assembled anew: the next run can begin."""
+
+    def end(done: int, total: int) -> None:
+        if how is KeyboardInterrupt:
+            raise KeyboardInterrupt
+        if done == 1:
+            assemble(out, rejected=[0])
+
+    with pytest.raises(how):
+        write_site(out, tmp_path / "site", progress=end)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
+    assert write_site(out, tmp_path / "site").grasps == 9
+
+
+def test_names_stay_text(hostile: Path, tmp_path: Path) -> None:
+    write_site(hostile, tmp_path / "site")
+    for page in (tmp_path / "site").rglob("*.html"):
+        assert "<script>alert" not in page.read_text(encoding="utf-8")
+    assert ATTACK in Tags((tmp_path / "site" / "index.html").read_text(encoding="utf-8")).text
+
+
+def test_a_folder_with_files_is_refused_and_left_alone(boxes: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(DataError, match="--static must be a new or empty directory"):
+        write_site(boxes, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]

@@ -1,0 +1,120 @@
+"""All figures of a dataset: the same bytes every time, and one line for what is missing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from xml.etree import ElementTree
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from helpers import datasets
+from helpers.datasets import OTO, TRIALS, edit_file, make_dataset
+from helpers.machine import needs_egl
+
+from drakegrasp.errors import DataError, MachineError
+from drakegrasp.pictures.figures import write
+from drakegrasp.pictures.figures.write import NUMBERS_FILE, write_figures
+
+ALL = {
+    *("palm_poses", "phases", "classes_1", "outcomes", "hold", "objects"),
+    *("distributions", "approaches"),
+}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.fixture
+def no_render(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the only figure that needs a renderer."""
+
+    def refuse(data: object, trial_id: int | None) -> None:
+        raise DataError("not in this test")
+
+    monkeypatch.setattr(write, "_phases", refuse)
+
+
+@pytest.mark.sim
+@needs_egl
+def test_the_same_dataset_gives_the_same_bytes(
+    sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = write_figures(sound, tmp_path / "a")
+    assert written.left_out == {}
+    assert set(written.names) == ALL
+    files = contents(tmp_path / "a")
+    assert set(files) == {f"{n}{s}" for n in ALL for s in (".png", ".svg")} | {NUMBERS_FILE}
+    for name, content in files.items():
+        if name.endswith(".svg"):
+            ElementTree.fromstring(content)
+            assert b"<dc:date>" not in content
+    numbers = json.loads(files[NUMBERS_FILE])
+    assert numbers["outcomes"]["success"] == 9
+    assert numbers["hold"]["held"] == numbers["hold"]["stable"] == 9
+    assert numbers["phases"]["trial_id"] == 0
+
+    # The style of somebody's papers changes nothing.
+    with mpl.rc_context({"font.size": 25, "axes.grid": True, "savefig.dpi": 30}):
+        write_figures(sound, tmp_path / "b")
+    again = contents(tmp_path / "b")
+    assert {name for name in files if files[name] != again[name]} == set()
+
+
+@pytest.mark.usefixtures("no_render")
+def test_what_the_dataset_lacks_is_left_out(sound: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(sound, tmp_path / "out"))
+    (out / OTO).unlink()
+    (out / "objects" / "1_box_a.plan.h5").unlink()
+    edit_file(out / TRIALS, lambda f: f["trials/outcome"].write_direct(np.full(36, 9, "u1")))
+    folder = tmp_path / "figures"
+    folder.mkdir()
+    for name in ("approaches.png", "classes_1.png", "classes_12.svg", "mine.png"):
+        (folder / name).touch()
+    written = write_figures(out, folder)
+    assert set(written.names) == {"outcomes", "hold", "objects"}
+    assert written.left_out["approaches"] == "no attempt succeeded"
+    assert written.left_out["distributions"] == "no attempt succeeded"
+    assert "1_box_a.plan.h5" in written.left_out["palm_poses"]
+    assert OTO in written.left_out["classes"]
+    # A picture of what was there before is removed, and nothing else.
+    assert {p.name for p in folder.glob("*.png")} == {
+        *(f"{name}.png" for name in written.names),
+        "mine.png",
+    }
+    assert not list(folder.glob("classes_*.svg"))
+    assert json.loads((folder / NUMBERS_FILE).read_text())["hold"]["held"] == 0
+
+
+def test_names_are_drawn_as_they_are_also_without_opengl(
+    sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of one object, whose name would be a formula, a tag, and letters that the font lacks."""
+
+    def fail(*_: object) -> None:
+        raise MachineError("no EGL")
+
+    monkeypatch.setattr(write, "phases_figure", fail)
+    name = "1_$^$ <script>&\"' 碗 x" + 30 * "y"
+    monkeypatch.setattr(datasets, "BOXES", {name: ((0.06, 0.05, 0.10), "a $^$ class")})
+    out = make_dataset(tmp_path / "out", tmp_path)
+    written = write_figures(out, tmp_path / "figures")
+    assert set(written.names) == ALL - {"phases"}
+    assert written.left_out == {"phases": "no EGL"}
+    for svg in (tmp_path / "figures").glob("*.svg"):
+        assert b"<script" not in svg.read_bytes()
+    assert name in json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())["objects"]
+    with pytest.raises(MachineError, match="no EGL"):
+        write_figures(sound, tmp_path / "asked", trial_id=0)
+
+
+def test_what_was_asked_for_must_be_drawn(sound: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"candidates\.method=normals"):
+        write_figures(sound, tmp_path, compare=sound)
+    with pytest.raises(DataError, match="trial must be 0 to 35, got 36"):
+        write_figures(sound, tmp_path, trial_id=36)
+    with pytest.raises(DataError, match="must have been lifted, got below_table"):
+        write_figures(sound, tmp_path, trial_id=2)

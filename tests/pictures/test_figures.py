@@ -1,0 +1,258 @@
+"""Figures: contacts are drawn where they project, and what is shown is what was asked for."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import h5py
+import numpy as np
+import pytest
+from doc_figures import find_sample, frames_figure, hero_figure
+from helpers.datasets import MISSING
+from helpers.machine import needs_egl
+from helpers.scripts import PIPELINES
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+from drakegrasp.config import CameraConfig
+from drakegrasp.dataset.hdf5 import create_field
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS, sizes
+from drakegrasp.errors import DataError
+from drakegrasp.frames import Array, make_pose, pack_pose
+from drakegrasp.grasp import pack_grasp
+from drakegrasp.pictures.contact_sheet import contact_sheet, draw_sheet, spread_over_objects
+from drakegrasp.pictures.style import draw_contacts
+from drakegrasp.vision.camera import intrinsics, project
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+CAMERA = CameraConfig()
+K = intrinsics(CAMERA)
+LETTERS = sizes(fingers=3, joints=8, image=CAMERA.size)
+#: Contacts in {C}: two in front of the surface at 0.25 m, one behind it.
+P_CQ = np.array([[-0.03, -0.02, 0.24], [0.04, 0.01, 0.25], [0.0, 0.03, 0.28]])
+NHAT_Q_C = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+#: X_TC: straight down from 0.5 m over the table.
+X_TC = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.5])
+
+
+def write_data_file(path: Path, names: list[str], split: str = "train") -> None:
+    """Write a data file whose samples are all of a square block, 0.25 m before the camera."""
+    image = np.full((4, CAMERA.size, CAMERA.size), 0.5, dtype=np.float32)
+    mask = np.zeros((CAMERA.size, CAMERA.size), dtype=np.uint8)
+    mask[40:90, 40:90] = 1
+    image[3] = np.where(mask, 0.25, CAMERA.far)
+    values = {
+        "images": image,
+        "masks": mask,
+        "grasps": pack_grasp(P_CQ, NHAT_Q_C),
+        "object_props/frame_cam2img_otm": pack_pose(make_pose(np.eye(3), [0.0, 0.0, 0.25])),
+        "object_props/frame_work2cam_oto": pack_pose(X_TC),
+        "object_props/frame_work2cam_otm": pack_pose(X_TC),
+    }
+    with h5py.File(path, "w") as file:
+        file.attrs.update(schema_version=SCHEMA_VERSION, K=K, near=CAMERA.near, far=CAMERA.far)
+        file.attrs.update(seed=0, config="{}", versions="{}", camera="oto")
+        file.attrs.update(signature="of a test", shards="of a test", config_hash="of a test")
+        for name in SPLITS:
+            group, rows = file.create_group(name), len(names) if name == split else 0
+            for field in DATA_FIELDS:
+                dataset = create_field(group, field, field.row_shape(LETTERS))
+                dataset.resize(rows, axis=0)
+                if rows and field.dtype == "str":
+                    dataset[:] = names
+                elif rows and field.name == "trial_id":
+                    dataset[:] = 10 + np.arange(rows)
+                elif rows:
+                    dataset[:] = values.get(field.name, 0.0)
+
+
+def test_contact_sheet_draws_all_samples_of_all_splits(tmp_path: Path) -> None:
+    path, png = tmp_path / "grasping_oto.hdf5", tmp_path / "sheet.png"
+    write_data_file(path, ["1_mug_small", "1_mug_small", "2_box"], split="test")
+    assert contact_sheet(path, png) == 3
+    height, width = imread(png).shape[:2]
+    assert width > 1000
+    assert 150 < height < width / 3
+
+
+def test_contact_sheet_has_no_more_lines_than_asked_for(tmp_path: Path) -> None:
+    path, png = tmp_path / "grasping_oto.hdf5", tmp_path / "sheet.png"
+    write_data_file(path, ["1_mug"] * 9)
+    assert contact_sheet(path, png, rows=2) == 6
+    first = png.read_bytes()
+    assert contact_sheet(path, png, rows=2, split="train") == 6
+    assert png.read_bytes() == first
+
+
+def test_contact_sheet_refuses_a_file_without_samples(tmp_path: Path) -> None:
+    path, png = tmp_path / "grasping_oto.hdf5", tmp_path / "sheet.png"
+    write_data_file(path, [])
+    with pytest.raises(DataError, match="at least one sample"):
+        contact_sheet(path, png)
+    write_data_file(path, ["1_mug"], split="train")
+    with pytest.raises(DataError, match="at least one sample"):
+        contact_sheet(path, png, split="valid")
+    assert not png.exists()
+
+
+def test_dots_are_where_the_contacts_project(tmp_path: Path) -> None:
+    path = tmp_path / "grasping_oto.hdf5"
+    write_data_file(path, ["1_mug"])
+    data = GraspDataset(path)
+    figure = draw_sheet([data[0]], data.K, far=CAMERA.far)
+    expected = project(K, P_CQ)
+    for axes in figure.axes[:3]:
+        dots = {line.get_gid(): line for line in axes.lines if line.get_gid()}
+        assert sorted(dots) == ["contact 0", "contact 1", "contact 2"]
+        for i, uv in enumerate(expected):
+            np.testing.assert_allclose(dots[f"contact {i}"].get_xydata()[0], uv, atol=1e-4)
+        hollow = [dots[f"contact {i}"].get_markerfacecolor() == "white" for i in range(3)]
+        assert hollow == [False, False, True]
+        assert axes.get_xlim() == (-0.5, 127.5)
+        assert axes.get_ylim() == (127.5, -0.5)
+
+
+def test_samples_are_spread_over_objects() -> None:
+    names = ["10_can"] * 4 + ["2_mug"] * 3 + ["1_box"]
+    assert spread_over_objects(names, 3) == [7, 4, 0]
+    assert spread_over_objects(names, 5) == [7, 4, 5, 0, 1]
+    assert sorted(spread_over_objects(names, 99)) == list(range(8))
+    assert spread_over_objects([f"{i}_x" for i in range(9)], 3) == [0, 4, 8]
+
+
+def test_sample_of_an_unknown_trial_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "grasping_oto.hdf5"
+    write_data_file(path, ["1_mug", "2_box"])
+    assert find_sample(path, 11)[0].props["object_name"] == "2_box"
+    with pytest.raises(DataError, match="trial 12"):
+        find_sample(path, 12)
+
+
+def test_examples_of_the_docs_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (DOCS / "reference" / "frames-and-units.md").read_text(encoding="utf-8")
+    (tmp_path / "OUT").mkdir()
+    write_data_file(tmp_path / "OUT" / "grasping_oto.hdf5", ["1_mug"])
+    monkeypatch.chdir(tmp_path)
+    space: dict[str, Array] = {}
+    for block in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL):
+        exec(block, space)
+    np.testing.assert_allclose(space["uv"], project(K, P_CQ), atol=1e-4)
+    assert "Q3: pixel (64, 78), 30 mm behind" in capsys.readouterr().out
+    np.testing.assert_allclose(space["p_TQ"][0], [-0.03, 0.02, 0.26], atol=1e-6)
+    np.testing.assert_allclose(space["p_DQ"], P_CQ, atol=1e-6)
+    np.testing.assert_allclose(space["p_LQ"], P_CQ * [1.0, -1.0, -1.0], atol=1e-6)
+    np.testing.assert_allclose(space["X_TL"][:3, 2], [0.0, 0.0, 1.0], atol=1e-6)
+    assert f"f = {K[0, 0]:.2f} px, c = {K[0, 2]:.1f} px" in text
+
+
+@pytest.mark.sim
+@needs_egl
+def test_snapshots_show_the_hand_and_the_object(sound: Path, tmp_path: Path) -> None:
+    from trial_pictures import render_trial
+
+    pictures = render_trial(sound, 0, size=(160, 120))
+    assert [p.image.shape for p in pictures] == [(120, 160, 3)] * 3
+    for picture in pictures:
+        assert picture.image.std() > 5.0
+    # The open and the closed hand are seen from one point, the lifted one from another.
+    np.testing.assert_array_equal(pictures[0].X_WC, pictures[1].X_WC)
+    assert np.abs(pictures[0].image.astype(int) - pictures[1].image).max() > 50
+    assert pictures[2].X_WC[2, 3] > pictures[1].X_WC[2, 3]
+    files = [sound / f"grasping_{camera}.hdf5" for camera in ("oto", "otm")]
+    hero_figure(*files, 0, pictures, tmp_path / "hero.png")
+    assert imread(tmp_path / "hero.png").shape[1] > 1000
+
+
+@pytest.mark.sim
+@needs_egl
+def test_figure_of_the_frames_has_them_all(sound: Path, tmp_path: Path) -> None:
+    from trial_pictures import frames_panels
+
+    panels = frames_panels(sound, 0)
+    names = [name for p in panels for name in (*(t.label for t in p.triads), *p.points, *p.arrows)]
+    letters = ["W", "T", "O", "Ocm", "G", "F1", "F2", "F3", "Q1", "Q2", "Q3", "C", "I"]
+    assert set(names) == set(letters)
+    # Every frame's origin is in its picture.
+    for panel in panels:
+        height, width = panel.picture.image.shape[:2]
+        for triad in panel.triads:
+            uv = panel.picture.pixels(triad.X_WA[None, :3, 3])[0]
+            assert np.all((uv >= 0.0) & (uv <= [width, height])), triad.label
+    frames_figure(panels, tmp_path / "frames.png")
+    assert imread(tmp_path / "frames.png").shape[1] > 1000
+
+
+@pytest.mark.sim
+@needs_egl
+def test_chosen_view_sees_every_fingertip(sound: Path) -> None:
+    from drakegrasp.frames import X_WT
+    from drakegrasp.hand.description import load_hand
+    from drakegrasp.pictures.figures.trial_stages import load_trial
+    from drakegrasp.simulation.construction import build_scene
+    from drakegrasp.simulation.scene import hand_joint_names
+
+    trial = load_trial(sound, 0)
+    scene = build_scene(trial.model, trial.config.physics, load_hand(trial.config.hand))
+    # What trials.hdf5 holds is in the order of the simulated scene.
+    assert list(trial.scene.joints) == list(hand_joint_names(scene))
+    assert trial.place.q.tolist().count(0.1) == 2
+    body = trial.scene.outline(trial.close)
+    X_WC = trial.scene.choose_view(body)
+    *tips, box = trial.scene.seen(X_WC, (128, 128))
+    assert [tip.sum() > 30 for tip in tips] == [True] * 3
+    # What is shown is in the picture, and the object where its frame projects to.
+    picture = trial.scene.picture(X_WC, (128, 128))
+    uv = picture.pixels(body)
+    assert np.all((uv >= 0.0) & (uv <= 127.0))
+    rows, columns = np.nonzero(box)
+    top = trial.close.X_WO[:3, 3] + [0.0, 0.0, trial.model.half_extents[2]]
+    assert abs(picture.pixels(top[None])[0, 1] - rows.min()) < 6.0
+    assert abs(picture.pixels(X_WT[None, :3, 3])[0, 0] - columns.mean()) < 6.0
+
+
+@pytest.mark.sim
+def test_only_lifted_trials_can_be_shown(sound: Path) -> None:
+    from drakegrasp.pictures.figures.trial_stages import load_trial
+
+    with pytest.raises(DataError, match="missing_fingertip"):
+        load_trial(sound, MISSING)
+    with pytest.raises(DataError, match="0 to 35"):
+        load_trial(sound, 36)
+
+
+def test_figures_import_no_drake() -> None:
+    import subprocess
+
+    code = (
+        "import sys, doc_figures, drakegrasp.pictures.contact_sheet; "
+        "print({'pydrake', 'dask', 'trimesh'} & set(sys.modules))"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=PIPELINES / "docs",
+    )
+    assert found.stdout.strip() == "set()"
+
+
+def test_a_finger_that_a_grasp_leaves_out_is_not_drawn() -> None:
+    """Its contact is NaN."""
+    points = np.array([[0.0, 0.0, 0.3], [np.nan] * 3, [0.01, 0.0, 0.3]])
+    sample = SimpleNamespace(
+        image=np.ones((4, 16, 16), np.float32),
+        mask=np.ones((16, 16), np.uint8),
+        grasp=pack_grasp(points, np.where(np.isnan(points), np.nan, [0.0, 1.0, 0.0])),
+        fingers=np.array([True, False, True]),
+    )
+    axes = Figure().add_subplot()
+    draw_contacts(axes, sample, np.diag([20.0, 20.0, 1.0]))
+    assert {line.get_gid() for line in axes.lines} - {None} >= {"contact 0", "contact 2"}
+    assert "contact 1" not in {line.get_gid() for line in axes.lines}

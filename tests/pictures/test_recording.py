@@ -1,0 +1,173 @@
+"""Recordings: the file holds what happened, and recording it changes nothing."""
+
+from __future__ import annotations
+
+import base64
+import os
+import pickle
+import re
+import socket
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from urllib.parse import urlsplit
+
+import h5py
+import msgpack
+import numpy as np
+import pytest
+from helpers.objects import CUBE, from_above, standing
+from helpers.verdicts import some_forces
+
+from drakegrasp.config import Config
+from drakegrasp.generation.replay import record_trial
+from drakegrasp.hand.description import load_hand
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.outcomes import Outcome
+from drakegrasp.pictures import recording
+from drakegrasp.pictures.recording import record_attempt
+from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
+from drakegrasp.simulation.trial import run_attempt
+from drakegrasp.verification.recording import record_verification
+
+pytestmark = pytest.mark.sim
+
+#: Two contacts on opposite faces of the cube, a third beside the first, and their normals.
+P_OQ = CUBE / 2.0 * np.array([[0.3, 1.0, 0.0], [0.0, -1.0, 0.0], [-0.3, 1.0, 0.0]])
+NHAT_Q_O = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
+#: What Meshcat calls the object, the palm, and the command that sends a recording.
+OBJECT, HAND, ANIMATION = b"visualizer/object/object", b"palm_plate", b"set_animation"
+#: No file is larger [bytes]; three.js alone is some two million.
+LARGEST = 5_000_000
+
+
+@pytest.fixture(scope="module")
+def attempt(cube: ObjectModel) -> Attempt:
+    """One that holds the cube."""
+    return from_above(cube, 0.06)
+
+
+def commands_of(path: Path) -> list[bytes]:
+    """Return what the page tells Meshcat, decoded."""
+    text = path.read_text(encoding="utf-8")
+    assert len(text) < LARGEST
+    assert not re.search(r"<(script|link)[^>]+(src|href)=", text), "the page loads something"
+    return [base64.b64decode(b) for b in re.findall(r"octet-binary;base64,([\w+/=]+)", text)]
+
+
+def keys_of(path: Path) -> bytes:
+    """Return the one command that holds the recording."""
+    (animation,) = (c for c in commands_of(path) if ANIMATION in c)
+    return animation
+
+
+def not_simulated(cube: ObjectModel, config: Config, *, forces: object = None) -> SimpleNamespace:
+    """Return a verification that ended without a trial."""
+    placed = SimpleNamespace(model=cube, X_TO_simulated=standing(cube))
+    return SimpleNamespace(
+        placed=placed, p_OQ=P_OQ, nhat_Q_O=NHAT_Q_O, pregrasp=None, forces=forces, config=config,
+        explain=lambda: "It was not simulated.",
+    )  # fmt: skip
+
+
+def test_recording_a_trial_changes_no_bit_of_it(
+    cube: ObjectModel, attempt: Attempt, config: Config, tmp_path: Path
+) -> None:
+    hand = load_hand(config.hand)
+    plain = run_attempt(build_scene(cube, config.physics, hand), standing(cube), attempt, config)
+    path = tmp_path / "new" / "trial.html"
+    recorded = record_attempt(
+        cube, standing(cube), attempt, config, path, p_OQ=P_OQ, nhat_Q_O=NHAT_Q_O
+    )
+    assert plain.outcome is recorded.outcome is Outcome.SUCCESS
+    assert pickle.dumps(recorded) == pickle.dumps(plain)
+    everything = b"".join(commands_of(path))
+    assert all(part in everything for part in (OBJECT, HAND, b"predicted/3/shaft"))
+    # Object and fingers move; contacts go with the object.
+    keys = keys_of(path)
+    # Two diagrams take turns in a lift, and no picture is missing.
+    clips = {
+        part["path"]: part["clip"]
+        for part in msgpack.unpackb(keys, strict_map_key=False)["animations"]
+    }
+    times = [key["time"] for key in clips["/drake/visualizer/object/object"]["tracks"][0]["keys"]]
+    end = plain.closed.duration + plain.lift.duration
+    assert times == list(range(len(times)))
+    assert len(times) / MESHCAT_RATE == pytest.approx(end, abs=2.0 / MESHCAT_RATE)
+    assert OBJECT in keys
+    assert b"finger" in keys
+    assert b"predicted" not in keys
+    assert not list(path.parent.glob("*tmp*"))
+
+
+def test_attempt_that_is_not_simulated_is_shown_all_the_same(
+    cube: ObjectModel, attempt: Attempt, config: Config, tmp_path: Path
+) -> None:
+    path = tmp_path / "miss.html"
+    missed = replace(attempt, ray_hits=False)
+    assert record_attempt(cube, standing(cube), missed, config, path).outcome is Outcome.RAY_MISS
+    everything = b"".join(commands_of(path))
+    assert OBJECT in everything
+    assert HAND in everything
+    assert b"predicted" not in everything
+
+
+@pytest.mark.parametrize("judged", [False, True])
+def test_verification_without_a_trial_shows_the_object_and_contacts_that_forces_judged(
+    cube: ObjectModel, config: Config, tmp_path: Path, judged: bool
+) -> None:
+    verified = not_simulated(cube, config, forces=some_forces() if judged else None)
+    record_verification(verified, tmp_path / "still.html")
+    everything = b"".join(commands_of(tmp_path / "still.html"))
+    assert OBJECT in everything and HAND not in everything
+    assert (b"predicted/1" in everything) == judged
+
+
+def test_only_this_machine_is_served_and_only_meanwhile(
+    cube: ObjectModel,
+    attempt: Attempt,
+    config: Config,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "none")
+    urls = []
+    make = recording._make_meshcat
+
+    def spy() -> object:
+        meshcat = make()
+        urls.append(urlsplit(meshcat.web_url()))
+        return meshcat
+
+    monkeypatch.setattr(recording, "_make_meshcat", spy)
+    missed = replace(attempt, ray_hits=False)
+    record_attempt(cube, standing(cube), missed, config, tmp_path / "a.html")
+    record_verification(not_simulated(cube, config), tmp_path / "b.html")
+    assert os.environ["DRAKE_ALLOW_NETWORK"] == "none"
+    assert [url.hostname for url in urls] == ["localhost"] * 2
+    for url in urls:
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.1", url.port), timeout=5.0).close()
+    assert "listening" not in "".join(capfd.readouterr())
+
+
+def test_file_that_cannot_be_written_leaves_nothing_behind(
+    cube: ObjectModel, attempt: Attempt, config: Config, tmp_path: Path
+) -> None:
+    (tmp_path / "folder").mkdir()
+    missed = replace(attempt, ray_hits=False)
+    with pytest.raises(OSError, match="folder"):
+        record_attempt(cube, standing(cube), missed, config, tmp_path / "folder")
+    assert [p.name for p in tmp_path.iterdir()] == ["folder"]
+
+
+@pytest.mark.slow
+def test_trial_of_a_dataset_is_recorded(small_dataset: Path, tmp_path: Path) -> None:
+    with h5py.File(small_dataset / "trials.hdf5") as file:
+        outcomes = file["trials/outcome"][:]
+    row = int(np.flatnonzero(outcomes == Outcome.MISSING_FINGERTIP)[0])
+    path = tmp_path / "trial.html"
+    assert record_trial(small_dataset, row, path) is Outcome.MISSING_FINGERTIP
+    assert b"finger" in keys_of(path)
