@@ -32,7 +32,7 @@ def morph(
     (.obj, metres, +z up) stand on the table as the mesh does, and an objects.yaml beside them
     keeps their class. The same seed gives the same files.
     """
-    from drakegrasp.objects.morph_set import morph_meshes
+    from drakegrasp.objects.morph import morph_meshes
     from drakegrasp.runtime.progress import progress_bar
 
     with progress_bar("morph", "morphs") as progress:

@@ -24,7 +24,7 @@ from drakegrasp.dataset.statistics import (
 )
 from drakegrasp.errors import counted, printable
 from drakegrasp.objects.audit import AuditRow
-from drakegrasp.objects.memory import needed_limit
+from drakegrasp.objects.model import needed_limit
 from drakegrasp.outcomes import Outcome, Removal
 
 if TYPE_CHECKING:

@@ -24,8 +24,7 @@ from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
-from drakegrasp.objects.contact_fit import ContactFit, fit_contacts
-from drakegrasp.objects.model import ObjectModel
+from drakegrasp.objects.model import ContactFit, ObjectModel, fit_contacts
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.simulation.candidates import Attempt, children, family_member, make_attempts

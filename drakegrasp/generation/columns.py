@@ -30,8 +30,7 @@ from drakegrasp.dataset.shards import trial_columns
 from drakegrasp.frames import pack_pose
 from drakegrasp.generation.attempts import TrialSetup, View
 from drakegrasp.grasp import unused_fingers
-from drakegrasp.objects.contact_fit import ContactFit, fit_contacts
-from drakegrasp.objects.model import ObjectModel
+from drakegrasp.objects.model import ContactFit, ObjectModel, fit_contacts
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.randomization.conditions import Conditions, usual_conditions

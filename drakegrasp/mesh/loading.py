@@ -11,13 +11,12 @@ import trimesh
 from drakegrasp.errors import MeshError, one_line
 from drakegrasp.foreign_files import read_content
 from drakegrasp.frames import Array
-from drakegrasp.mesh.declared.glb import declared_glb
-from drakegrasp.mesh.declared.obj import declared_obj
-from drakegrasp.mesh.declared.ply import declared_ply
-from drakegrasp.mesh.declared.polygons import Declared
-from drakegrasp.mesh.declared.stl import declared_stl
+from drakegrasp.mesh.declared import Declared, declared_stl
+from drakegrasp.mesh.glb import declared_glb
+from drakegrasp.mesh.ply import declared_ply
 from drakegrasp.mesh.repair import weld
 from drakegrasp.mesh.surfaces import Faces, compact, stack
+from drakegrasp.mesh.wavefront import declared_obj
 
 #: Mesh files that can be read, and by what; other files are ignored.
 _DECLARED = {

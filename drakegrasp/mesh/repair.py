@@ -21,13 +21,13 @@ from drakegrasp.arithmetic import norm
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import (
+    close_rims,
     edge_ids,
     face_components,
     find_components,
     pair_half_edges,
     part_touching_edges,
 )
-from drakegrasp.mesh.hole_filling import close_rims
 from drakegrasp.mesh.surfaces import (
     Faces,
     Solid,

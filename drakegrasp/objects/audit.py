@@ -13,8 +13,7 @@ import trimesh
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import face_components, pair_half_edges
-from drakegrasp.mesh.rays import first_hits
-from drakegrasp.mesh.self_intersection import crossing_faces
+from drakegrasp.mesh.crossings import crossing_faces, first_hits
 from drakegrasp.mesh.surfaces import (
     Faces,
     diagonal,
@@ -24,9 +23,7 @@ from drakegrasp.mesh.surfaces import (
     signed_volume,
     unit_normals,
 )
-from drakegrasp.objects.contact_fit import AHEAD
-from drakegrasp.objects.memory import forecast_memory
-from drakegrasp.objects.model import ObjectModel, prepare_object
+from drakegrasp.objects.model import AHEAD, ObjectModel, forecast_memory, prepare_object
 from drakegrasp.objects.sources import (
     UNITS,
     MeshSource,

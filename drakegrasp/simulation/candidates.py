@@ -31,7 +31,7 @@ from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
 from drakegrasp.config import CandidateConfig, RefineConfig
 from drakegrasp.errors import ConfigError
 from drakegrasp.frames import make_pose, rotation_about
-from drakegrasp.mesh.rays import first_hits
+from drakegrasp.mesh.crossings import first_hits
 from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key

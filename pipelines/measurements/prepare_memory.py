@@ -31,7 +31,7 @@ import json, re, sys, time
 from pathlib import Path
 from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.settings import load_config
-from drakegrasp.objects.memory import forecast_memory
+from drakegrasp.objects.model import forecast_memory
 from drakegrasp.objects.sources import find_mesh
 
 def peak():

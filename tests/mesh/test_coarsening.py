@@ -9,9 +9,9 @@ import pytest
 import trimesh
 from helpers.meshes import assert_sound, prepare, write
 
-from drakegrasp.mesh import coarsening
-from drakegrasp.mesh.coarsening import coarsen
+from drakegrasp.mesh import decimation
 from drakegrasp.mesh.components import face_components, pair_half_edges
+from drakegrasp.mesh.decimation import coarsen
 from drakegrasp.mesh.surfaces import is_solid_surface, signed_volume
 
 RADIUS = 0.05
@@ -19,8 +19,8 @@ RADIUS = 0.05
 
 @pytest.fixture(autouse=True)
 def few_faces(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(coarsening, "MOST_FACES", 3_000)
-    monkeypatch.setattr(coarsening, "MOST_DECIMATED", 6_000)
+    monkeypatch.setattr(decimation, "MOST_FACES", 3_000)
+    monkeypatch.setattr(decimation, "MOST_DECIMATED", 6_000)
 
 
 def ball(subdivisions: int, radius: float = RADIUS) -> trimesh.Trimesh:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from drakegrasp.mesh.rays import PAIRS, first_hits
+from drakegrasp.mesh.crossings import PAIRS, first_hits
 
 HALF = np.array([0.03, 0.04, 0.05])
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from drakegrasp.mesh.resting_hull import resting_hull
+from drakegrasp.mesh.resting import resting_hull
 from drakegrasp.mesh.surfaces import face_areas, is_solid_surface, signed_volume
 
 

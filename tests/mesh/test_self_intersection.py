@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from helpers.meshes import box
 
-from drakegrasp.mesh.self_intersection import crossing_faces
+from drakegrasp.mesh.crossings import crossing_faces
 
 
 def joined(*meshes: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:

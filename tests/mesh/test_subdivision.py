@@ -9,7 +9,7 @@ from helpers.meshes import solid_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drakegrasp.mesh.subdivision import subdivide
+from drakegrasp.mesh.resting import subdivide
 from drakegrasp.mesh.surfaces import (
     Solid,
     face_areas,

@@ -12,8 +12,7 @@ from helpers.meshes import G3DB, box, flipped, needs_g3db, open_box, write
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import opening
 from drakegrasp.objects.audit import audit, guess_units
-from drakegrasp.objects.memory import forecast_memory, needed_limit
-from drakegrasp.objects.model import prepare_object
+from drakegrasp.objects.model import forecast_memory, needed_limit, prepare_object
 from drakegrasp.objects.sources import find_meshes
 
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from drakegrasp.objects.contact_fit import fit_contacts
-from drakegrasp.objects.model import ObjectModel, prepare_object
+from drakegrasp.objects.model import ObjectModel, fit_contacts, prepare_object
 from drakegrasp.objects.sources import MeshSource
 
 

@@ -10,11 +10,17 @@ import trimesh
 from helpers.meshes import box, write
 
 from drakegrasp.errors import MeshError
-from drakegrasp.mesh.self_intersection import crossing_faces
+from drakegrasp.mesh.crossings import crossing_faces
 from drakegrasp.objects import morph as morph_module
 from drakegrasp.objects.model import prepare_object
-from drakegrasp.objects.morph import Morph, draw_morph, load_original, morph_object, morph_points
-from drakegrasp.objects.morph_set import morph_meshes
+from drakegrasp.objects.morph import (
+    Morph,
+    draw_morph,
+    load_original,
+    morph_meshes,
+    morph_object,
+    morph_points,
+)
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.seeding import Stream
 
@@ -171,7 +177,7 @@ def test_nothing_appears_unless_all_of_it_does(
     def fail(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("drakegrasp.objects.morph_set.yaml.safe_dump", fail)
+    monkeypatch.setattr("drakegrasp.objects.morph.yaml.safe_dump", fail)
     with pytest.raises(KeyboardInterrupt):
         morph_meshes(tmp_path / "meshes", tmp_path / "out", per_mesh=1)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["full", "meshes"]

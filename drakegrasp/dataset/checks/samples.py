@@ -25,8 +25,7 @@ from drakegrasp.dataset.filters import breaks_hold
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
 from drakegrasp.frames import P_WT, X_WT, Array, invert_pose
 from drakegrasp.grasp import unused_fingers
-from drakegrasp.objects.contact_fit import fit_contacts
-from drakegrasp.objects.model import ObjectModel
+from drakegrasp.objects.model import ObjectModel, fit_contacts
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.verdict import is_precision, is_stable
 from drakegrasp.vision.camera import LOOKS_VERTICALLY

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from drakegrasp.frames import Array
-from drakegrasp.mesh.declared.ply import strip_faces
-from drakegrasp.mesh.declared.polygons import Declared
+from drakegrasp.mesh.declared import Declared
+from drakegrasp.mesh.ply import strip_faces
 from drakegrasp.mesh.surfaces import Faces
 from drakegrasp.runtime.json_text import parse_json
 

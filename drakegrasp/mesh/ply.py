@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from drakegrasp.mesh.declared.numbers import read_floats
-from drakegrasp.mesh.declared.polygons import Declared, triangulate
+from drakegrasp.mesh.declared import Declared, read_floats, triangulate
 from drakegrasp.mesh.surfaces import Faces
 
 #: Names of the types of numbers.

@@ -1,7 +1,7 @@
-"""Self-intersection: a surface of triangles comes in, the faces that pass through others go out.
+"""Crossings: where rays first meet a surface of triangles, and which of its faces cross others.
 
-Winding numbers tell how much volume a surface encloses twice; here each pair of faces counts, be
-the volume ever so small.
+The same bits on every machine: nothing but sums, products and roots. Embree is no alternative: it
+works in single precision, with kernels that depend on the CPU.
 """
 
 from __future__ import annotations
@@ -13,12 +13,76 @@ from drakegrasp.arithmetic import dot, norm
 from drakegrasp.frames import Array
 from drakegrasp.mesh.surfaces import Faces, diagonal, pair_blocks, unit_normals
 
+# Rays
+
+#: A ray that misses a triangle by this share of it still meets it, so that no ray passes between
+#: two triangles.
+EDGE = 1e-9
+#: By how much the sphere around a triangle is widened [m], far above rounding.
+MARGIN = 1e-6
+#: Pairs of a ray and a triangle that are tested together; they fit into a CPU's cache.
+PAIRS = 65_536
+
+
+def first_hits(triangles: Array, p: Array, z: Array) -> Array:
+    """Return the distance (n,) [m] at which each ray first meets a triangle; inf where none does.
+
+    Möller and Trumbore's test (1997); a ray through an edge or a corner meets it.
+
+    Args:
+        triangles: Corners (m, 3, 3) [m].
+        p: Where the rays begin, (n, 3) [m].
+        z: Their unit directions, (n, 3).
+    """
+    # A sphere around each triangle.
+    a, b, c = np.moveaxis(np.asarray(triangles, dtype=float), 1, 0)
+    centre = (a + b + c) / 3.0
+    radius = np.sqrt(np.max([dot(q - centre, q - centre) for q in (a, b, c)], axis=0, initial=0.0))
+
+    # Test only triangles whose sphere the ray passes.
+    distance = np.full(len(p), np.inf)
+    step = max(1, PAIRS // max(1, len(a)))
+    for start in range(0, len(p), step):
+        block = slice(start, start + step)
+        ray, triangle = np.nonzero(_pass_spheres(p[block], z[block], centre, radius + MARGIN))
+        ray += start
+        hits = _triangle_hits(p[ray], z[ray], a[triangle], b[triangle], c[triangle])
+        np.minimum.at(distance, ray, hits)
+    return distance
+
+
+def _pass_spheres(p: Array, z: Array, centre: Array, radius: Array) -> npt.NDArray[np.bool_]:
+    """Return (n, m) whether each ray passes each sphere of centre (m, 3) and radius (m,)."""
+    along, squared = np.zeros((len(p), len(centre))), np.zeros((len(p), len(centre)))
+    for axis in range(3):
+        apart = centre[:, axis] - p[:, None, axis]
+        along += apart * z[:, None, axis]
+        squared += apart * apart
+    # The difference of two squares loses digits; MARGIN in the radius is far above that error.
+    return (squared - along * along <= radius * radius) & (along >= -radius)
+
+
+def _triangle_hits(p: Array, z: Array, a: Array, b: Array, c: Array) -> Array:
+    """Return the distance (n,) at which each ray meets its triangle; inf where it does not."""
+    ab, ac, ap = b - a, c - a, p - a
+    across, up = np.cross(z, ac), np.cross(ap, ab)
+    volume = dot(ab, across)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v, t = dot(ap, across) / volume, dot(z, up) / volume, dot(ac, up) / volume
+        meets = (u >= -EDGE) & (v >= -EDGE) & (u + v <= 1.0 + EDGE) & (t >= 0.0)
+    # A triangle that is seen edge-on is skipped: the ray meets its neighbours.
+    flat = np.abs(volume) <= EDGE * norm(ab) * norm(ac)
+    return np.where(meets & ~flat, t, np.inf)
+
+
+# Faces that cross
+
 #: An edge passes through a face if its ends are farther than this on both sides, and it farther
 #: than this from the face's edges, as a fraction of the diagonal. Surfaces that only touch do
 #: not, though their vertices are rounded.
 DEPTH = 2e-6
 #: Pairs of faces that are looked at together.
-PAIRS = 1_000_000
+FACE_PAIRS = 1_000_000
 
 Mask = npt.NDArray[np.bool_]
 
@@ -44,7 +108,7 @@ def crossing_faces(vertices: Array, faces: Faces) -> Faces:
     # Test the pairs of many runs at a time.
     crosses = np.zeros(len(faces), dtype=bool)
     depth = DEPTH * diagonal(vertices)
-    for i, j in pair_blocks(counts, PAIRS):
+    for i, j in pair_blocks(counts, FACE_PAIRS):
         first, second = order[i], order[i + 1 + j]
         overlap = ((low[first] <= high[second]) & (low[second] <= high[first])).all(axis=1)
         first, second = first[overlap], second[overlap]

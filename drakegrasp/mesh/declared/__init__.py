@@ -1,1 +1,0 @@
-"""What a mesh file declares: each format read line by line, and nothing passed over in silence."""
