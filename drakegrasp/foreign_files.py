@@ -1,17 +1,30 @@
-"""Reading files of unknown origin: nothing is waited for, has no end, or fills the memory.
+"""Files and names of unknown origin: nothing is waited for, has no end, or fills the memory.
 
 In: a path, and the most bytes that such a file may have. Out: its bytes, or an `OSError` that says
 what is there instead, as for any file that cannot be read. A link is followed: a dataset from a hub
 consists of links into its cache.
+
+Of JSON every mistake is a `ValueError`, and nothing is read in two ways: Python's own reader takes
+NaN, keeps the last of two equal keys, and gives up in other ways at bytes that are no text, at
+values that are nested too deeply and at numbers of thousands of digits.
 """
 
 from __future__ import annotations
 
+import json
 import stat
 from pathlib import Path
+from typing import Any, NoReturn
 
 from drakegrasp.errors import DataError
 
+#: Longest name of an object [bytes]: file systems allow 255, and we append to it.
+MAX_NAME = 200
+#: What a name must be, for error messages.
+NAME_RULE = (
+    "printable, not empty, without slashes, not begin with a dot, and have at most "
+    f"{MAX_NAME} bytes"
+)
 #: Most bytes of a text (JSON, YAML, CSV), and of arrays or a mesh that are read at once.
 LARGEST_TEXT, LARGEST_CONTENT = 2**28, 2**30
 #: Most bytes of a file that is hashed whole: a shard is built in memory.
@@ -81,3 +94,50 @@ def _refusal(what: str) -> OSError:
     error = OSError(what)
     error.strerror = what
     return error
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        OSError: If it cannot be read.
+        ValueError: As for `parse_json`.
+    """
+    return parse_json(read_content(path, LARGEST_TEXT))
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return the content of a JSON text.
+
+    Raises:
+        ValueError: If it is no JSON in UTF-8, is nested too deeply, has a key twice or a number
+            that is none, with the reason.
+    """
+    try:
+        text = text if isinstance(text, str) else text.decode("utf-8")
+        return json.loads(text, object_pairs_hook=_mapping, parse_constant=_no_number)
+    except RecursionError:
+        raise ValueError("values nested too deeply") from None
+    except ValueError as error:
+        if "integer string conversion" in str(error):
+            raise ValueError("a number of too many digits") from None
+        raise
+
+
+def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice!r} twice")
+    return found
+
+
+def _no_number(text: str) -> NoReturn:
+    raise ValueError(f"the number {text}")
+
+
+def is_name(text: str) -> bool:
+    """Return whether a text may be the name of an object or a class."""
+    bad = any(c in "/\\" or not c.isprintable() for c in text) or text.startswith(".")
+    return bool(text.strip()) and not bad and len(text.encode()) <= MAX_NAME

@@ -26,7 +26,7 @@ from drakegrasp.errors import DataError
 from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome, Removal
-from drakegrasp.runtime.blas import one_thread
+from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.candidates import Pregrasp

@@ -36,9 +36,8 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.allocator import allocator
-from drakegrasp.runtime.blas import one_thread
+from drakegrasp.runtime.environment import one_thread, timed
 from drakegrasp.runtime.progress import Report, silent
-from drakegrasp.runtime.timing import timed
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import build_scene

@@ -189,7 +189,7 @@ def _read_report(path: Path) -> dict[str, Any]:
     Raises:
         click.UsageError: If the file is none.
     """
-    from drakegrasp.runtime.json_text import read_json
+    from drakegrasp.foreign_files import read_json
 
     try:
         report: dict[str, Any] = read_json(path)

@@ -17,7 +17,7 @@ from drakegrasp.errors import HandError
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.shapes import link_shapes
-from drakegrasp.runtime.blas import one_thread
+from drakegrasp.runtime.environment import one_thread
 
 
 @one_thread

@@ -54,8 +54,7 @@ from drakegrasp.dataset.schema import (
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Removal
 from drakegrasp.runtime.executor import Executor, in_order, run_here
-from drakegrasp.runtime.file_set import replaced_together
-from drakegrasp.runtime.files import disk_full_named, new_hdf5, sweep_temporary
+from drakegrasp.runtime.files import disk_full_named, new_hdf5, replaced_together, sweep_temporary
 from drakegrasp.runtime.progress import Report, silent
 
 

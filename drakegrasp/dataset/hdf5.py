@@ -16,9 +16,8 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.schema import Field
 from drakegrasp.errors import DataError, first_line, printable
-from drakegrasp.foreign_files import refuse_irregular
-from drakegrasp.runtime.file_set import refuse_half_replaced
-from drakegrasp.runtime.names import NAME_RULE, is_name
+from drakegrasp.foreign_files import NAME_RULE, is_name, refuse_irregular
+from drakegrasp.runtime.files import refuse_half_replaced
 
 try:
     import deflate

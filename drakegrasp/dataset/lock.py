@@ -28,9 +28,15 @@ from io import FileIO
 from pathlib import Path
 
 from drakegrasp.errors import DataError
-from drakegrasp.runtime.file_set import LIST_NAME, complete_replacement
-from drakegrasp.runtime.files import open_own, stale_temporary, sweep_temporary
-from drakegrasp.runtime.processes import Process, lock_file, this_process
+from drakegrasp.runtime.environment import Process, this_process
+from drakegrasp.runtime.files import (
+    LIST_NAME,
+    complete_replacement,
+    lock_file,
+    open_own,
+    stale_temporary,
+    sweep_temporary,
+)
 
 FILE_NAME = "build.lock"
 #: Folders that a build makes in the directory.

@@ -13,9 +13,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from drakegrasp.foreign_files import refuse_irregular
+from drakegrasp.foreign_files import parse_json, refuse_irregular
 from drakegrasp.runtime.files import open_own
-from drakegrasp.runtime.json_text import parse_json
 
 FILE_NAME = "log.jsonl"
 

@@ -54,8 +54,7 @@ from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.folder import hand_digest, is_hand
 from drakegrasp.hand.settings import override_config
-from drakegrasp.runtime.file_set import refuse_half_replaced
-from drakegrasp.runtime.files import probe_folder, write_atomic
+from drakegrasp.runtime.files import probe_folder, refuse_half_replaced, write_atomic
 
 #: Packages whose versions may change a result.
 VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "h5py")

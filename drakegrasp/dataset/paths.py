@@ -9,9 +9,8 @@ from drakegrasp.dataset.layout.opening import opened
 from drakegrasp.dataset.layout.plans import refuse_other_plan
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
-from drakegrasp.foreign_files import read_content
+from drakegrasp.foreign_files import NAME_RULE, is_name, read_content
 from drakegrasp.runtime.files import refuse_broken_seal
-from drakegrasp.runtime.names import NAME_RULE, is_name
 
 #: The file of all attempts, the two of samples by camera, that of scenes, and the manifest.
 TRIALS_FILE = "trials.hdf5"

@@ -29,10 +29,10 @@ from drakegrasp.dataset.paths import (
     refuse_changed_model,
 )
 from drakegrasp.errors import DataError, one_line
+from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel, load_object, save_object
 from drakegrasp.runtime.files import atomic_hdf5
-from drakegrasp.runtime.json_text import parse_json
 from drakegrasp.simulation.candidates import Candidates, GivenPostures
 
 

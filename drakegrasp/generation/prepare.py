@@ -18,11 +18,16 @@ from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared, s
 from drakegrasp.errors import DrakegraspError, MachineError, MeshError
 from drakegrasp.objects.model import prepare_object
 from drakegrasp.objects.sources import MeshSource, file_frame
-from drakegrasp.runtime.blas import one_thread
-from drakegrasp.runtime.environment import release_memory
-from drakegrasp.runtime.fault_injection import inject_fault
+from drakegrasp.runtime.environment import one_thread, release_memory
 from drakegrasp.runtime.files import disk_full_named
-from drakegrasp.runtime.journal import GIVE_UP_DEATHS, PREPARE, Journal, Verdict, open_journal
+from drakegrasp.runtime.journal import (
+    GIVE_UP_DEATHS,
+    PREPARE,
+    Journal,
+    Verdict,
+    inject_fault,
+    open_journal,
+)
 from drakegrasp.simulation.candidates import sample_candidates
 from drakegrasp.simulation.postures.table import PostureTable, given_candidates
 from drakegrasp.simulation.settle import find_resting_poses

@@ -15,8 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from drakegrasp.config import Config, NonNegative, NonNegativeCount
 from drakegrasp.dataset.log import FILE_NAME, read_log
 from drakegrasp.errors import DataError, counted, one_line
+from drakegrasp.foreign_files import read_json
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime.json_text import read_json
 
 
 @dataclass(frozen=True, kw_only=True)

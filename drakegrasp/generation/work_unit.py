@@ -40,9 +40,7 @@ from drakegrasp.generation.columns import empty_looks, fill_look, judge_sample, 
 from drakegrasp.generation.target import has_target
 from drakegrasp.hand.description import Hand
 from drakegrasp.outcomes import Outcome, Removal
-from drakegrasp.runtime.blas import one_thread
-from drakegrasp.runtime.environment import trim_memory
-from drakegrasp.runtime.fault_injection import inject_fault
+from drakegrasp.runtime.environment import one_thread, timed, trim_memory
 from drakegrasp.runtime.files import disk_full_named
 from drakegrasp.runtime.journal import (
     ATTEMPT,
@@ -50,9 +48,9 @@ from drakegrasp.runtime.journal import (
     NO_JOURNAL,
     Journal,
     Verdict,
+    inject_fault,
     open_journal,
 )
-from drakegrasp.runtime.timing import timed
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.robustness import Certificate, certify, is_drawn
 from drakegrasp.simulation.scene_cache import cached_scene

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from xml.sax.saxutils import escape, unescape
 
-from drakegrasp.runtime.json_text import parse_json
+from drakegrasp.foreign_files import parse_json
 
 #: Suffixes of models, which a model may include.
 MODELS = (".sdf", ".urdf", ".xml")

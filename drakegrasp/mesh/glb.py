@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import Array
 from drakegrasp.mesh.declared import Declared
 from drakegrasp.mesh.ply import strip_faces
 from drakegrasp.mesh.surfaces import Faces
-from drakegrasp.runtime.json_text import parse_json
 
 #: Most nodes of a scene: trimesh takes a millisecond for each.
 MOST_NODES = 10_000

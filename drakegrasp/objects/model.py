@@ -24,7 +24,7 @@ import trimesh
 from drakegrasp.arithmetic import dot
 from drakegrasp.config import ObjectConfig, PhysicsConfig
 from drakegrasp.errors import MeshError, one_line
-from drakegrasp.foreign_files import read_content
+from drakegrasp.foreign_files import is_name, read_content
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import count_parts
 from drakegrasp.mesh.decimation import MOST_FACES, coarsen, decimate
@@ -41,7 +41,6 @@ from drakegrasp.objects.sources import (
     upright_vertices,
 )
 from drakegrasp.runtime.files import write_atomic
-from drakegrasp.runtime.names import is_name
 from drakegrasp.seeding import object_key
 
 #: Smaller objects are sheets or specks, which hydroelastic contact does not resolve.

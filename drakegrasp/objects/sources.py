@@ -38,11 +38,10 @@ import yaml
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Licence, Positive, describe_mistake
 from drakegrasp.errors import MeshError, one_line
-from drakegrasp.foreign_files import read_text
+from drakegrasp.foreign_files import NAME_RULE, is_name, read_text
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.mesh.loading import MANY_FACES, SUFFIXES, clean_triangles, parse_mesh, read_bytes
 from drakegrasp.runtime.environment import release_memory
-from drakegrasp.runtime.names import NAME_RULE, is_name
 from drakegrasp.yaml_text import parse_yaml
 
 #: Metres per unit of length of a file.

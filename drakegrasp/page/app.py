@@ -30,6 +30,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from drakegrasp.errors import DataError, DrakegraspError, printable
+from drakegrasp.foreign_files import parse_json
 from drakegrasp.outcomes import Outcome
 from drakegrasp.page.catalog import Catalog, Snapshot
 from drakegrasp.page.decisions import DecisionFile
@@ -48,7 +49,6 @@ from drakegrasp.page.scenes.file import SceneFile, Scenes
 from drakegrasp.page.scenes.pages import scene_page, scenes_page
 from drakegrasp.page.scenes.query import parse_scene_query, select_scenes
 from drakegrasp.pictures.thumbnails import strip_png
-from drakegrasp.runtime.json_text import parse_json
 
 ASSETS = Path(__file__).parent / "static"
 #: Names of this machine that a browser may have asked for.

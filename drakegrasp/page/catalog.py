@@ -34,11 +34,10 @@ from drakegrasp.dataset.schema import SCHEMA_VERSION
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
+from drakegrasp.foreign_files import is_name, parse_json
 from drakegrasp.hand.carried import carried_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.page.table import AttemptTable, first_rows, join, read_table
-from drakegrasp.runtime.json_text import parse_json
-from drakegrasp.runtime.names import is_name
 
 #: While a build runs, its new shards are looked for this often [s].
 LISTING_PERIOD = 5.0

@@ -20,8 +20,7 @@ from drakegrasp.dataset.rejections import (
     write_decisions,
 )
 from drakegrasp.errors import DataError
-from drakegrasp.runtime.files import open_own
-from drakegrasp.runtime.processes import lock_file
+from drakegrasp.runtime.files import lock_file, open_own
 
 #: Who writes `reject.json` holds this file; it goes when the decision is written.
 LOCK_NAME = f".{FILE_NAME}.lock"

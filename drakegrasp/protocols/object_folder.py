@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drakegrasp.errors import DataError, one_line
-from drakegrasp.runtime.json_text import read_json
+from drakegrasp.foreign_files import read_json
 
 #: Where the parts and the volume are.
 PARTS, INFO = "urdf/meshes", "info/simplified.json"

@@ -1,10 +1,15 @@
-"""This process: its cores, its memory, and Drake's ban on the network.
+"""This process: who it is, its cores, memory, time, and Drake's ban on the network.
 
 Diagrams and meshes are megabytes of C++ and NumPy memory. Python's garbage collector does not see
 the C++ part, and the allocator keeps freed memory for later use, separately for each thread.
 
 Workers run with `DRAKE_ALLOW_NETWORK=none`. Drake (1.51 to 1.58) then refuses to make some
 objects even if they would not use the network; `allow_network` eases the ban for these.
+
+A process is identified by its machine, the start of the machine, its number and its start: the
+kernel reuses numbers. psutil is no substitute: it computes the start of a process from the wall
+clock, which may be set, so a living process could look like another one. Linux's clock ticks since
+the machine's start never change.
 """
 
 from __future__ import annotations
@@ -12,15 +17,26 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import re
 import resource
+import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache, wraps
 from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
 
 from drakegrasp.errors import MachineError
 from drakegrasp.runtime.allocator import has_jemalloc, kept_variables
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
+#: Where Linux keeps a number that is new at every start of the machine.
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 #: Least time between two returns of free memory [s]; one takes about 20 ms.
 TRIM_SECONDS = 5.0
 #: What jemalloc is told: forget what this thread keeps, and return the free pages of every arena
@@ -32,6 +48,74 @@ RENDER_MEMORY = 1.5e9
 
 _trimmed = -TRIM_SECONDS
 _VARIABLE = "DRAKE_ALLOW_NETWORK"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Process:
+    """A process of some machine.
+
+    Attributes:
+        host: Name of the machine.
+        pid: Number of the process there.
+        began: Clock ticks from the machine's start to the process's; -1 if unknown.
+        boot: What tells one start of the machine from the next; empty if unknown.
+    """
+
+    host: str
+    pid: int
+    began: int
+    boot: str
+
+    def runs(self) -> bool | None:
+        """Return whether the process still runs, or None where this machine cannot know."""
+        if self.host != socket.gethostname():
+            return None
+        if self.boot != _boot() or not is_running(self.pid):
+            return False
+        return self.began == _began(self.pid)
+
+
+def this_process() -> Process:
+    """Return the process that calls."""
+    pid = os.getpid()
+    return Process(host=socket.gethostname(), pid=pid, began=_began(pid), boot=_boot())
+
+
+def is_running(pid: int) -> bool:
+    """Return whether this machine runs a process of a number; a zombie is dead."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return _stat(pid)[:1] != ["Z"]
+
+
+def host_label() -> str:
+    """Return this machine's name as it may stand in a file's name: short, without dots."""
+    return re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[:20] or "-"
+
+
+def _boot() -> str:
+    try:
+        return _BOOT_ID.read_text().strip()
+    except OSError:
+        return ""
+
+
+def _began(pid: int) -> int:
+    fields = _stat(pid)
+    return int(fields[19]) if len(fields) > 19 else -1
+
+
+def _stat(pid: int) -> list[str]:
+    """Return what Linux says of a process, from its state on; empty where it says nothing."""
+    try:
+        # The name before it stands in parentheses and may hold blanks.
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return []
 
 
 def available_cores() -> int:
@@ -98,3 +182,45 @@ def allow_network(kind: str) -> Iterator[None]:
     with kept_variables(_VARIABLE):
         os.environ[_VARIABLE] = kind
         yield
+
+
+def one_thread(function: Callable[P, R]) -> Callable[P, R]:
+    """Return a function whose linear algebra runs in one thread of the process.
+
+    OpenBLAS divides large products among its threads and adds up in another order for each number
+    of them, so the last bits differ. With one thread, workers and callers' own processes compute
+    the same bits on any number of cores.
+    """
+
+    @wraps(function)
+    def limited(*args: P.args, **kwargs: P.kwargs) -> R:
+        with _libraries().limit(limits=1, user_api="blas"):
+            return function(*args, **kwargs)
+
+    return limited
+
+
+@cache
+def _libraries() -> Any:
+    import scipy.linalg  # noqa: F401  # loads SciPy's own BLAS, so that threadpoolctl finds it
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
+@contextmanager
+def timed(
+    seconds: dict[str, float], stage: str, clock: Callable[[], float] = time.perf_counter
+) -> Iterator[None]:
+    """Add the duration of the block to a stage's total, also when the block raises.
+
+    Args:
+        seconds: Total by stage [s]; updated in place.
+        stage: Name of the stage.
+        clock: Returns the time [s]: wall clock by default, `time.process_time` for CPU time.
+    """
+    start = clock()
+    try:
+        yield
+    finally:
+        seconds[stage] = seconds.get(stage, 0.0) + clock() - start

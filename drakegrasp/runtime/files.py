@@ -3,29 +3,37 @@
 A file is written under a temporary name in its own folder, closed, synced and renamed. A reader
 never sees half a file, and a crash leaves only a temporary file. A seal shows any changed bit: it
 is the SHA-256 of all other bytes, in the user block that HDF5 leaves free at a file's start.
+
+Files of a folder that are replaced together are all the old ones, or all the new ones. When all new
+ones are complete and synced under temporary names, a list of them appears, `replacement.json`: from
+then on the new files count. Each gets its name, and the list goes. A process that dies before there
+is a list leaves the old files. One that dies later leaves the list, and `complete_replacement` does
+the rest; until then nobody may read in the folder.
 """
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
+import json
 import os
 import re
 import secrets
 import shutil
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedRandom, BufferedReader, BytesIO, FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 import h5py
 
 from drakegrasp.errors import DataError, DiskFullError
-from drakegrasp.foreign_files import LARGEST_SEALED, refuse_irregular
-from drakegrasp.runtime.processes import host_label, is_running
+from drakegrasp.foreign_files import LARGEST_SEALED, read_json, refuse_irregular
+from drakegrasp.runtime.environment import host_label, is_running
 
 if TYPE_CHECKING:
     from typing_extensions import Buffer
@@ -43,6 +51,10 @@ _TEMPORARY = re.compile(r"\.(?P<host>[A-Za-z0-9-]+)~(?P<pid>\d+)~[0-9a-f]{12}\.t
 STALE_SECONDS = 3600.0
 #: Error numbers of no room: on the disk, in the quota, or by a limit on a file's size.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+#: The list of files that are being replaced.
+LIST_NAME = "replacement.json"
+#: How long a reader waits for a process that is just replacing files [s]; it takes milliseconds.
+PATIENCE = 2.0
 
 
 @contextmanager
@@ -368,3 +380,125 @@ def sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def lock_file(file: IO[bytes]) -> bool | None:
+    """Take the kernel's lock on an open file, which it frees when this process closes it or dies.
+
+    Args:
+        file: Open for writing; NFS locks no other.
+
+    Returns:
+        Whether it is ours now; None where the file system knows no locks.
+    """
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
+@contextmanager
+def replaced_together(folder: Path) -> Iterator[Callable[[str], Path]]:
+    """Yield a function that gives the path under which to write a file; it takes its name.
+
+    The files appear in the folder when the block ends well. One process at a time may do this.
+
+    Args:
+        folder: Of the files.
+
+    Raises:
+        OSError: If the disk is full or the folder cannot be written; the old files stay.
+    """
+    temporary: dict[str, Path] = {}
+
+    def begin(name: str) -> Path:
+        temporary[name] = temporary_name(folder / name)
+        return temporary[name]
+
+    try:
+        yield begin
+
+        # On the disk before the list is, or a power cut could leave a list of empty files.
+        for path in temporary.values():
+            sync(path)
+        listed = {name: path.name for name, path in temporary.items()}
+        write_atomic(folder / LIST_NAME, json.dumps(listed, indent=1).encode() + b"\n")
+    except BaseException:
+        # The list first: a list of files that are gone must not stay.
+        for path in (folder / LIST_NAME, *temporary.values()):
+            path.unlink(missing_ok=True)
+        raise
+    complete_replacement(folder)
+
+
+def complete_replacement(folder: Path) -> bool:
+    """Give the files in a folder's list their names; return whether there was a list.
+
+    Raises:
+        DataError: If the list is of something else.
+        OSError: If the folder cannot be written.
+    """
+    path = folder / LIST_NAME
+    try:
+        listed = _read_list(path)
+    except FileNotFoundError:
+        return False
+
+    # What is no longer there has its name already.
+    for name, temporary in listed.items():
+        new = folder / temporary
+        try:
+            if not stat.S_ISREG(new.lstat().st_mode):
+                raise _no_list(path, f"{temporary!r}, which is no file")
+        except FileNotFoundError:
+            continue
+        new.replace(folder / name)
+
+    sync(folder)
+    path.unlink(missing_ok=True)
+    sync(folder)
+    return True
+
+
+def refuse_half_replaced(folder: Path) -> None:
+    """Refuse to read in a folder some of whose files are old and some new.
+
+    Raises:
+        DataError: If the list stays for `PATIENCE`: the process that wrote it is dead.
+    """
+    end = time.monotonic() + PATIENCE
+    while (folder / LIST_NAME).exists():
+        if time.monotonic() > end:
+            raise DataError(
+                f"{folder}: must hold files of one state, got some that were being replaced when a "
+                f"process died; `drakegrasp stats {folder}` completes this"
+            )
+        time.sleep(0.05)
+
+
+def _read_list(path: Path) -> dict[str, str]:
+    """Return the names in the folder by which names they shall get.
+
+    Raises:
+        FileNotFoundError: If there is no list.
+        DataError: If it names anything but files of its folder that were written for it.
+    """
+    try:
+        content = read_json(path)
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError) as error:
+        raise _no_list(path, f"a broken one ({error})") from None
+    if not isinstance(content, dict):
+        raise _no_list(path, "something else")
+    for name, temporary in content.items():
+        if "/" in name or not isinstance(temporary, str) or not is_temporary_of(temporary, name):
+            raise _no_list(path, f"{temporary!r} for {name!r}")
+    return content
+
+
+def _no_list(path: Path, got: str) -> DataError:
+    return DataError(f"{path}: must be a list of files that are being replaced, got {got}")

@@ -24,10 +24,16 @@ chance.
 
 The file is text: a line of JSON with the unit's identity and the deaths before, the record, and
 what faulthandler wrote.
+
+Tests cause deaths by the environment variable DRAKEGRASP_TEST_FAULT, which nobody else sets:
+`KIND:OBJECT:CANDIDATE:STANDOFF` for an attempt, `KIND:OBJECT` for preparing an object,
+`KIND:OBJECT:distances` for its distance field, `KIND:OBJECT:predict` for the screen; several
+separated by blanks.
 """
 
 from __future__ import annotations
 
+import ctypes
 import faulthandler
 import json
 import os
@@ -41,9 +47,9 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
+from drakegrasp.errors import BlankImageError
 from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
-from drakegrasp.runtime.files import temporary_name
-from drakegrasp.runtime.processes import lock_file
+from drakegrasp.runtime.files import lock_file, temporary_name
 
 #: Crashes in a row in one step after which it is not tried again: one may be the machine's fault.
 NATIVE_DEATHS = 2
@@ -67,6 +73,8 @@ _CRASH_MARK, _TIME_MARKS = b"Fatal Python error", (b"Timeout (", b"hread 0x")
 ATTEMPT, PREPARE = "try", "prepare"
 #: What the record says before the first step.
 _START = "start"
+#: Names the deaths that a test wants.
+VARIABLE = "DRAKEGRASP_TEST_FAULT"
 
 
 class Verdict(Enum):
@@ -297,3 +305,52 @@ def _crashes_marked(file: FileIO) -> Iterator[None]:
         if before and sys.__stderr__ is not None:
             with suppress(OSError, ValueError):  # stderr may be no real file
                 faulthandler.enable(file=sys.__stderr__)
+
+
+def inject_fault(*place: str | int) -> None:
+    """Cause the fault that the environment asks for at a place, if any.
+
+    Args:
+        place: An object's name; for an attempt also its candidate and its standoff, for other
+            steps what they do.
+
+    Raises:
+        MemoryError: For the kind `memory`.
+        BlankImageError: For the kind `blank`.
+    """
+    faults = os.environ.get(VARIABLE)
+    if faults is None:
+        return
+    label = ":".join(map(str, place))
+    for fault in faults.split():
+        kind, _, target = fault.partition(":")
+        if target == label:
+            _cause(kind)
+
+
+def _cause(kind: str) -> None:
+    # The process ends.
+    if kind == "crash":
+        ctypes.string_at(0)  # a segmentation fault
+    elif kind == "abort":
+        os.abort()
+    elif kind == "exit":
+        os._exit(3)
+
+    # It never returns.
+    elif kind == "hang":
+        while True:  # in C, without the interpreter's lock, like a simulation
+            ctypes.CDLL(None).pause()
+    elif kind == "freeze":
+        ctypes.PyDLL(None).pause()  # in C, with the interpreter's lock
+    elif kind == "spin":
+        while True:  # computes; the others only wait
+            pass
+
+    # An error of Python.
+    elif kind == "memory":
+        raise MemoryError
+    elif kind == "blank":
+        raise BlankImageError("a blank image, by fault injection")
+    else:
+        raise ValueError(f"{VARIABLE}: must name a known kind of fault, got {kind!r}")

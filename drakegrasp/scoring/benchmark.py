@@ -22,10 +22,10 @@ from drakegrasp.dataset.manifest import differences, read_manifest
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, MeshError
+from drakegrasp.foreign_files import read_json
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MANIFEST_NAME
 from drakegrasp.runtime.files import write_atomic
-from drakegrasp.runtime.json_text import read_json
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.shapes.catalog import LICENCE, BuiltinObject, draw_builtin, wavefront

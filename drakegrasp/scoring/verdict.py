@@ -16,10 +16,10 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import Array
 from drakegrasp.outcomes import Outcome
 from drakegrasp.protocols.protocol import PostureVerdict
-from drakegrasp.runtime.json_text import parse_json
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.verify import PlacedGrasp
 

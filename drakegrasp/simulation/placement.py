@@ -24,7 +24,7 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.mesh.loading import clean_triangles
 from drakegrasp.objects.model import ObjectModel, make_object, prepare_object
 from drakegrasp.objects.sources import UNITS, find_mesh
-from drakegrasp.runtime.blas import one_thread
+from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.settle import settle
 
 #: Largest distance of the object's lowest point from the table at a given pose [m].

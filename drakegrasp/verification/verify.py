@@ -23,8 +23,7 @@ from drakegrasp.grasp import for_all_fingers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime.blas import one_thread
-from drakegrasp.runtime.timing import timed
+from drakegrasp.runtime.environment import one_thread, timed
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject

@@ -36,7 +36,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import override_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime.blas import one_thread
+from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Pregrasp

@@ -28,7 +28,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime.blas import one_thread
+from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.shapes.catalog import builtin_sources
 from drakegrasp.simulation.construction import build_scene

@@ -34,7 +34,7 @@ from drakegrasp.generation.counts import Counts
 from drakegrasp.generation.pipeline import build
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime import file_set
+from drakegrasp.runtime import files as file_set
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.progress import silent
 from drakegrasp.simulation.trial import TrialRecord

@@ -22,7 +22,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
 from drakegrasp.hand.carried import carry_hand
 from drakegrasp.page.pages import TEMPLATES
-from drakegrasp.runtime.processes import host_label
+from drakegrasp.runtime.environment import host_label
 
 #: What a terminal would obey: a title of its window, as bytes of 7 and of 8 bits.
 STEERING = "\x1b]0;x\x07\x9b31m"

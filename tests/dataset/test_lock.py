@@ -18,7 +18,7 @@ import pytest
 from drakegrasp.dataset import lock
 from drakegrasp.dataset.lock import FILE_NAME, build_lock
 from drakegrasp.errors import DataError
-from drakegrasp.runtime.processes import this_process
+from drakegrasp.runtime.environment import this_process
 
 HOLD = """
 import sys

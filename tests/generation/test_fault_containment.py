@@ -30,9 +30,9 @@ from drakegrasp.generation.work_unit import WorkUnit, run_unit
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.environment import host_label
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.journal import Journal, Verdict
-from drakegrasp.runtime.processes import host_label
 from drakegrasp.vision import rendering
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]

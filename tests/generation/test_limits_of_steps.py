@@ -20,8 +20,7 @@ from drakegrasp.generation.work_unit import WorkUnit, run_unit
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes, source_sha256
 from drakegrasp.runtime.executor import run_here
-from drakegrasp.runtime.fault_injection import VARIABLE
-from drakegrasp.runtime.journal import HUNG_DEATHS, PREPARE_DEATHS
+from drakegrasp.runtime.journal import HUNG_DEATHS, PREPARE_DEATHS, VARIABLE
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 

@@ -10,7 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from drakegrasp.runtime.fault_injection import VARIABLE
+from drakegrasp.runtime.journal import VARIABLE
 
 #: Units of half a second, so that none goes with another and a build can be stopped in time; of ten
 #: attempts one succeeds.

@@ -15,16 +15,17 @@ from drakegrasp.dataset.hdf5 import write_field
 from drakegrasp.dataset.schema import Field
 from drakegrasp.dataset.shards import write_shard
 from drakegrasp.runtime import files
-from drakegrasp.runtime.file_set import LIST_NAME, replaced_together
+from drakegrasp.runtime.environment import host_label
 from drakegrasp.runtime.files import (
+    LIST_NAME,
     atomic_folder,
     atomic_hdf5,
     atomic_path,
     probe_folder,
+    replaced_together,
     sweep_temporary,
     write_atomic,
 )
-from drakegrasp.runtime.processes import host_label
 
 
 def everything_in(folder: Path) -> list[Path]:

@@ -30,7 +30,7 @@ UNIT = {"name": "mug", "start": 0, "stop": 10}
 RUN = """
 import sys, time
 from pathlib import Path
-from drakegrasp.runtime.fault_injection import _cause
+from drakegrasp.runtime.journal import _cause
 from drakegrasp.runtime.journal import open_journal
 
 faults = dict(reversed(argument.split(":")) for argument in sys.argv[2:])

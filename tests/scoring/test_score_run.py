@@ -17,7 +17,7 @@ from helpers.scores import FakeVerify
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
-from drakegrasp.runtime.json_text import read_json
+from drakegrasp.foreign_files import read_json
 from drakegrasp.scoring.card import card_text
 from drakegrasp.scoring.ranked import ranked_sets
 from drakegrasp.scoring.run import VERDICTS, Request, own_contacts, score

@@ -34,7 +34,7 @@ from drakegrasp.hand.draft.parsing import read_model
 from drakegrasp.hand.draft.source import read_source
 from drakegrasp.hand.draft.writing import write_urdf
 from drakegrasp.hand.settings import load_config
-from drakegrasp.runtime.blas import one_thread
+from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.files import atomic_folder
 
 #: Grips that are tried, palm frames with each, and shares of the closing at which links are seen.

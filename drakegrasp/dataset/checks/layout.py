@@ -20,7 +20,7 @@ from drakegrasp.dataset.layout.attributes import OF_CAMERA, OF_SCENES, ORIGIN, a
 from drakegrasp.dataset.layout.structure import DATA_TABLES, SCENE_TABLES, TRIAL_TABLES, differences
 from drakegrasp.dataset.schema import CAMERAS, CONVENTIONS, OTHER_SCHEMA, SCHEMA_VERSION
 from drakegrasp.errors import first_line
-from drakegrasp.runtime.json_text import parse_json
+from drakegrasp.foreign_files import parse_json
 
 #: Key of scenes.hdf5 among the files that are checked.
 SCENES = "scenes"

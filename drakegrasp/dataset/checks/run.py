@@ -29,9 +29,9 @@ from drakegrasp.dataset.manifest import read_manifest, refuse_older
 from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, SCENES_FILE, TRIALS_FILE
 from drakegrasp.dataset.schema import CAMERAS, refuse_other_schema
 from drakegrasp.errors import DataError, first_line
+from drakegrasp.foreign_files import read_json
 from drakegrasp.runtime.executor import Executor, in_order, run_here
-from drakegrasp.runtime.file_set import refuse_half_replaced
-from drakegrasp.runtime.json_text import read_json
+from drakegrasp.runtime.files import refuse_half_replaced
 from drakegrasp.runtime.progress import Report, silent
 
 __all__ = ["Violation", "check_dataset"]

@@ -15,7 +15,7 @@ import numpy as np
 from drakegrasp.dataset.layout.structure import Difference
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import printable
-from drakegrasp.runtime.json_text import parse_json
+from drakegrasp.foreign_files import parse_json
 
 
 def _is_text(value: Any) -> bool:

@@ -12,9 +12,7 @@ from pydantic import AfterValidator, BaseModel, ValidationError
 
 from drakegrasp.config import describe_mistake
 from drakegrasp.errors import DataError, one_line, printable
-from drakegrasp.foreign_files import LARGEST_TEXT, read_content
-from drakegrasp.runtime.json_text import parse_json
-from drakegrasp.runtime.names import NAME_RULE, is_name
+from drakegrasp.foreign_files import LARGEST_TEXT, NAME_RULE, is_name, parse_json, read_content
 
 M = TypeVar("M", bound=BaseModel)
 

@@ -25,9 +25,9 @@ from drakegrasp.dataset.layout.structure import SCENE_TABLES
 from drakegrasp.dataset.layout.trial_files import stamp
 from drakegrasp.dataset.schema import DEPTH_UNIT, SPLITS, Field
 from drakegrasp.errors import DataError
+from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import invert_pose, unpack_pose
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime.json_text import parse_json
 from drakegrasp.seeding import Stream
 from drakegrasp.vision.depth_sensor import DepthSensor, spoil_depth
 

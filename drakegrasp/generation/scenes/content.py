@@ -35,7 +35,7 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.mesh.surfaces import even_points, on_faces, unit_normals
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime.blas import one_thread
+from drakegrasp.runtime.environment import one_thread
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.candidates import Source
 from drakegrasp.simulation.randomization.conditions import Conditions, usual_materials

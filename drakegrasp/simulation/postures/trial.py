@@ -8,7 +8,7 @@ from __future__ import annotations
 from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.errors import GraspError
 from drakegrasp.hand.description import load_hand
-from drakegrasp.runtime.blas import one_thread
+from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.placement import PlacedObject, config_for, refuse_other_objects
 from drakegrasp.simulation.postures.posture import Posture, make_posture, start_of
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
