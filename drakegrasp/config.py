@@ -32,6 +32,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from drakegrasp import registry
 from drakegrasp.errors import ConfigError, one_line
 from drakegrasp.foreign_files import read_text
 from drakegrasp.yaml_text import parse_yaml
@@ -191,17 +192,17 @@ class _ExtensibleSection(_Section):
         return section
 
 
-#: Names of the package's samplers of palm poses.
-SAMPLER_NAMES = ("rotations", "normals")
-
-
 def _samplers(value: Any) -> str | tuple[str, ...]:
     """Return the name of a sampler, or the names of those that take turns."""
     names = value if isinstance(value, list | tuple) else [value]
-    if not names or any(name not in SAMPLER_NAMES and not is_own_class(name) for name in names):
-        known = ", ".join(SAMPLER_NAMES)
+    if not names or not all(map(_is_sampler, names)):
+        known = ", ".join(registry.names("samplers"))
         raise ValueError(f"must be one of {known}, FILE.py:NAME, or a list of them, got {value!r}")
     return tuple(names) if names is value else str(value)
+
+
+def _is_sampler(name: object) -> bool:
+    return is_own_class(name) or (isinstance(name, str) and registry.is_known("samplers", name))
 
 
 def _own_filters(value: Any) -> tuple[str, ...]:

@@ -3,21 +3,33 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import fill
 
 import click
 
+from drakegrasp import registry
 from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import PATH, dataset_argument, shared
+from drakegrasp.cli.help import Command
+from drakegrasp.cli.options import PATH, Named, dataset_argument, shared
 from drakegrasp.errors import counted
 
-#: The formats as the help lists them; loading them would take longer than printing the help.
-FORMATS = ("hf", "original", "dexgraspbench", "isaac_grasp", "glb", "mjcf")
+
+class _Export(Command):
+    """The command, whose help lists the exporters."""
+
+    def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the text, and a paragraph of the formats; called by click."""
+        super().format_help_text(ctx, formatter)
+        formatter.write_paragraph()
+        for name in registry.names("exporters"):
+            row = f"  {name:<15}{registry.summary('exporters', name)}"
+            formatter.write(f"{fill(row, 79, subsequent_indent=' ' * 17)}\n")
 
 
-@click.command()
+@click.command(cls=_Export)
 @dataset_argument()
 @click.argument("directory", type=PATH, required=False)
-@click.option("--to", "form", type=click.Choice(FORMATS), required=True, help="The format.")
+@click.option("--to", "form", type=Named("exporters"), required=True, help="The format.")
 @click.option(
     "--licence",
     "--license",
@@ -42,18 +54,7 @@ def export(
     """Write the samples of a dataset in another format.
 
     DIRECTORY must be new or empty.  [default: OUT/export_FORMAT]
-
-    \b
-    hf             Parquet, a dataset card and Croissant metadata, as the Hugging
-                   Face Hub has them; needs pip install 'drakegrasp[hub]'
-    original       HDF5 as of the paper's released code: depth first, 27 numbers
-                   a grasp, axes of its cameras
-    dexgraspbench  hand, objects and grasps as that benchmark's code evaluates
-                   them; needs pip install 'drakegrasp[peer]'
-    isaac_grasp    a YAML file per object: poses of the palm link, joints by name
-    glb            a 3D scene per grasp: the object in the closed hand
-    mjcf           the same for MuJoCo, with the table; needs drakegrasp[peer]
-    """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
+    """
     from drakegrasp.exchange.export import export_dataset
     from drakegrasp.exchange.publication import Publication, not_said, read_publication
     from drakegrasp.foreign_files import refuse_link
@@ -70,7 +71,7 @@ def export(
         directory = out / f"export_{form}"
         refuse_link(directory)
     with progress_bar("export", "sample", show=not quiet) as progress:
-        count = export_dataset(out, directory, form, publication=publication, progress=progress)  # type: ignore[arg-type]
+        count = export_dataset(out, directory, form, publication=publication, progress=progress)
     say(f"{counted(count, 'sample')} in {directory}")
     if form == "hf" and (missing := not_said(publication)):
         say(f"before it is published, --about should say: {', '.join(missing)}")

@@ -22,7 +22,8 @@ class Command(click.Command):
         """Write the options; called by click."""
         sections: dict[str, list[tuple[str, str]]] = {"Options": []}
         for parameter in self.get_params(ctx):
-            if (record := parameter.get_help_record(ctx)) is not None:
+            record = parameter.get_help_record(ctx)
+            if record is not None and not isinstance(parameter, click.Argument):
                 heading = getattr(parameter, "heading", "Options")
                 sections.setdefault(heading, []).append(record)
         for heading, records in sections.items():

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import click
 
+from drakegrasp import registry
 from drakegrasp.cli.help import Option
 from drakegrasp.errors import first_line
 from drakegrasp.generation.request import BUILTIN, BuildRequest
@@ -34,6 +35,18 @@ class PathType(click.Path):
         except (OSError, ValueError) as error:
             self.fail(f"must be a path, got one that no file has ({first_line(error)})", param, ctx)
         return super().convert(value, param, ctx)
+
+
+class Named(click.Choice[str]):
+    """A name of the registry; it is asked when the option is used, or its help is printed."""
+
+    def __init__(self, kind: registry.Kind) -> None:
+        self.kind, self.case_sensitive = kind, True
+
+    @property
+    def choices(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The names."""
+        return registry.names(self.kind)
 
 
 #: Types of options: any path, a file to write, a file that is there.

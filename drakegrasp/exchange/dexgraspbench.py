@@ -42,7 +42,14 @@ from drakegrasp.mesh.wavefront import hull_text
 from drakegrasp.objects.model import load_object
 from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.protocols.grasp_file import POSTURES
+from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.progress import Report
+
+#: What `drakegrasp export --help` says of the format.
+HELP = (
+    "hand, objects and grasps as that benchmark's code evaluates them; needs pip install "
+    "'drakegrasp[peer]'"
+)
 
 #: By how much pregrasp and squeeze are apart from the grasp [rad], of joints that slide by
 #: `description.SLIDE`.
@@ -54,6 +61,7 @@ OBJECTS = ASSETS / "objects"
 
 def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
     """Write the files and return the number of samples; see `export.export_dataset`."""
+    require_mujoco("mujoco", "coacd")
     from drakegrasp.mjcf.convex_parts import convex_parts
 
     # The hand, by a name that the benchmark does not have.

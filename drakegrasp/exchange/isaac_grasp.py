@@ -31,6 +31,9 @@ from drakegrasp.runtime.progress import Report
 from drakegrasp.simulation.postures.posture import joint_order
 from drakegrasp.simulation.postures.table import CONDITIONS
 
+#: What `drakegrasp export --help` says of the format.
+HELP = "a YAML file per object: poses of the palm link, joints by name"
+
 
 def write_isaac_grasp(out: Path, folder: Path, progress: Report) -> int:
     """Write the samples of a dataset and return their number; see `export.export_dataset`."""

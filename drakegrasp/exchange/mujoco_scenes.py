@@ -31,6 +31,9 @@ from drakegrasp.objects.model import ObjectModel, load_object, object_colour
 from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.runtime.progress import Report
 
+#: What `drakegrasp export --help` says of the format.
+HELP = "the same for MuJoCo, with the table; needs drakegrasp[peer]"
+
 #: Half extents of the table [m], whose top is at z = 0.
 TABLE = (0.8, 0.8, 0.05)
 #: Folder of all meshes, and the one of the hand's in it.

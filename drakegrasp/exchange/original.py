@@ -28,6 +28,9 @@ from drakegrasp.frames import Array, invert_pose, make_pose, pack_pose, unpack_p
 from drakegrasp.runtime.files import atomic_hdf5
 from drakegrasp.runtime.progress import Report
 
+#: What `drakegrasp export --help` says of the format.
+HELP = "HDF5 as of the paper's released code: depth first, 27 numbers a grasp, axes of its cameras"
+
 #: Pose of V-REP's camera axes V in ours: a turn by 180 degrees about the line of sight.
 X_CV = make_pose(np.diag([-1.0, -1.0, 1.0]), [0.0, 0.0, 0.0])
 #: Rows that are read at once: images of 64 samples take 17 MB.

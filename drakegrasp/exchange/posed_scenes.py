@@ -25,6 +25,9 @@ from drakegrasp.objects.model import ObjectModel, load_object, object_colour
 from drakegrasp.pictures.still_scene import Poses, StillScene
 from drakegrasp.runtime.progress import Report
 
+#: What `drakegrasp export --help` says of the format.
+HELP = "a 3D scene per grasp: the object in the closed hand"
+
 #: Pose of {T} in the frame U of the file, whose +Y is up.
 X_UT = make_pose(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 #: Colours of fingertips and of other links, RGBA.

@@ -1,4 +1,4 @@
-"""The protocols by name, and those of a user's own.
+"""The protocols by name, and those of a user's own. pyproject.toml lists them.
 
 In: a name, or `file.py:Name`. Out: a protocol. Each class says what a paper would say of it.
 """
@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from drakegrasp import registry
 from drakegrasp.errors import ConfigError, listed
 from drakegrasp.frames import Array
 from drakegrasp.protocols.protocol import MujocoProtocol, Simulator
@@ -120,15 +121,13 @@ class DexonomyHardAsRun(DexonomyHard):
 
 
 Protocol = Lift | MujocoProtocol
-_CLASSES = (Lift, DexGraspBench, DexGraspBenchTabletop, DexonomyHard, DexonomyHardAsRun)
-PROTOCOLS: dict[str, Protocol] = {made.name: made for made in (each() for each in _CLASSES)}  # type: ignore[attr-defined]
 
 
 def find_protocol(name: str, code: Mapping[str, str] | None = None) -> tuple[Protocol, str]:
     """Return a protocol, and the name that a result keeps of it.
 
     Args:
-        name: One of `PROTOCOLS`, or `FILE.py:NAME` of a user's own, a subclass of `MujocoProtocol`
+        name: Of the registry, or `FILE.py:NAME` of a user's own; a subclass of `MujocoProtocol`
             that is made without arguments.
         code: Text of the file by stored names, for a worker that has no such file.
 
@@ -138,10 +137,10 @@ def find_protocol(name: str, code: Mapping[str, str] | None = None) -> tuple[Pro
     Raises:
         ConfigError: If there is none of that name, or the user's own cannot be imported or made.
     """
-    if name in PROTOCOLS:
-        return PROTOCOLS[name], name
+    if ":" not in name and registry.is_known("protocols", name):
+        return registry.find("protocols", name)(), name
     if ":" not in name:
-        known = listed(tuple(PROTOCOLS))
+        known = listed(registry.names("protocols"))
         raise ConfigError(f"protocol must be one of {known}, or FILE.py:NAME, got {name!r}")
 
     # A user's own comes from a file that is given now, never from a dataset.

@@ -2,7 +2,7 @@
 
 In: the object's box and mesh, and its resting poses. Out: up to `candidates.max` palm poses X_OG
 and, for each, its resting pose and the distance along its palm ray to the object. Each sampler of
-`SAMPLERS` gives a sequence of poses at a resting pose; resting poses and samplers take turns. The
+the registry gives a sequence of poses at a resting pose; resting poses and samplers take turns. The
 first n poses are the same for every `candidates.max` of at least n, so a dataset can grow. The
 paper's method (`rotations`) multiplies a first palm pose with global and local rotations; `normals`
 is the baseline of its Figure 2; a class of the user's own may be another sampler. `children` draws
@@ -27,8 +27,9 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
+from drakegrasp import registry
 from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
-from drakegrasp.config import CandidateConfig, RefineConfig
+from drakegrasp.config import CandidateConfig, RefineConfig, is_own_class
 from drakegrasp.errors import ConfigError
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.mesh.crossings import first_hits
@@ -268,13 +269,6 @@ class Normals:
         return int(self._numbers[count - 1]) + 1 if count else 0, count, count
 
 
-#: The package's samplers by the names that a configuration has for them.
-SAMPLERS: Mapping[str, Callable[[ObjectModel, Array, CandidateConfig, Stream], Sampler]] = {
-    "rotations": Rotations,
-    "normals": Normals,
-}
-
-
 def sample_candidates(
     model: ObjectModel, X_TO: npt.ArrayLike, config: CandidateConfig, seed: int
 ) -> Candidates:
@@ -307,7 +301,7 @@ def sample_candidates(
     counts = [sampler.counts(used[place]) for place, sampler in samplers.items()]
     combinations, valid, distinct = (sum(numbers) for numbers in zip(*counts, strict=True))
     distance = palm_ray_distance(model.collision, poses)
-    for method in set(config.methods) - SAMPLERS.keys():
+    for method in {each for each in config.methods if _source(each) is Source.OWN}:
         of_method = [of == method for (_, of), _ in turns]
         _refuse_far(method, model, poses[of_method], distance[of_method])
     return Candidates(
@@ -341,12 +335,16 @@ def _refuse_far(method: str, model: ObjectModel, poses: Array, distance: Array) 
 
 def _sampler(method: str) -> Callable[[ObjectModel, Array, CandidateConfig, Stream], Sampler]:
     """Return the sampler of a name: one of the package, or of the user's own."""
-    return SAMPLERS[method] if method in SAMPLERS else partial(OwnPoses, method)
+    if is_own_class(method):
+        return partial(OwnPoses, method)
+    found: Callable[[ObjectModel, Array, CandidateConfig, Stream], Sampler]
+    found = registry.find("samplers", method)
+    return found
 
 
 def _source(method: str) -> Source:
     """Return what is stored of a sampler."""
-    return Source[method.upper()] if method in SAMPLERS else Source.OWN
+    return {"rotations": Source.ROTATIONS, "normals": Source.NORMALS}.get(method, Source.OWN)
 
 
 def _sampler_stream(name: str, seed: int, resting: int, method: str) -> Stream:
@@ -355,7 +353,7 @@ def _sampler_stream(name: str, seed: int, resting: int, method: str) -> Stream:
     if (resting, method) == (0, "rotations"):
         return Stream(seed, object_key(name))
     place = (resting, _source(method), _SAMPLER)
-    if method in SAMPLERS:
+    if _source(method) is not Source.OWN:
         return Stream(seed, object_key(name), *place)
     # Two samplers of the user's own do not share their numbers, and a new digest changes none.
     return Stream(seed, object_key(name), *place, object_key(method.partition("@")[0]))

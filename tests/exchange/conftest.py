@@ -11,7 +11,7 @@ import pytest
 from helpers.datasets import make_dataset
 
 from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
-from drakegrasp.exchange.export import Format, export_dataset
+from drakegrasp.exchange.export import export_dataset
 from drakegrasp.exchange.publication import Publication
 
 #: What the publishers of the exported dataset say.
@@ -39,11 +39,11 @@ def grasps(dataset: Path) -> list[ClosedGrasp]:
 
 
 @pytest.fixture(scope="session")
-def exported(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[Format], Path]:
+def exported(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """Returns the folder of a format. Read only."""
 
     @cache
-    def export(form: Format) -> Path:
+    def export(form: str) -> Path:
         to = tmp_path_factory.mktemp(form) / "to"
         export_dataset(dataset, to, form, publication=PUBLICATION)
         return to

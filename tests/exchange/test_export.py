@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 from helpers.commands import run
 
-from drakegrasp.cli import export as command
+from drakegrasp import registry
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
 from drakegrasp.exchange import dexgraspbench
 from drakegrasp.exchange.closed_grasps import ClosedGrasp
-from drakegrasp.exchange.export import FORMATS, Format, export_dataset
+from drakegrasp.exchange.export import export_dataset
 
 
 def test_closed_grasps_are_the_samples_of_all_splits(
@@ -29,9 +29,8 @@ def test_closed_grasps_are_the_samples_of_all_splits(
 
 
 def test_help_names_every_format() -> None:
-    assert command.FORMATS == FORMATS
     text = run("export", "--help").output
-    assert all(f"\n  {form} " in text for form in FORMATS)
+    assert all(f"\n  {form} " in text for form in registry.names("exporters"))
 
 
 def test_command_says_how_many(dataset: Path, grasps: list[ClosedGrasp], tmp_path: Path) -> None:
@@ -55,8 +54,8 @@ def test_missing_dataset_is_refused_before_anything_is_written(tmp_path: Path) -
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("form", FORMATS)
-def test_dataset_without_samples_is_refused(dataset: Path, tmp_path: Path, form: Format) -> None:
+@pytest.mark.parametrize("form", registry.names("exporters"))
+def test_dataset_without_samples_is_refused(dataset: Path, tmp_path: Path, form: str) -> None:
     out = Path(shutil.copytree(dataset, tmp_path / "out"))
     assemble(out, overrides=["filters.max_slip=1e-9"])
     with pytest.raises(DataError, match="must have samples to export, got none"):

@@ -22,11 +22,12 @@ from helpers.commands import run
 from helpers.datasets import OTO
 from scipy.spatial.transform import Rotation
 
+from drakegrasp import registry
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.trials import Trials
-from drakegrasp.exchange.export import FORMATS, export_dataset
+from drakegrasp.exchange.export import export_dataset
 from drakegrasp.exchange.posture_files import read_postures
 from drakegrasp.frames import unpack_pose
 from drakegrasp.generation.pipeline import build, posture_config
@@ -142,12 +143,12 @@ def write_own(path: Path, samples: Trials) -> Path:
     return path
 
 
-BACK = (*(form for form in FORMATS if form not in ONLY_OUT), *OWN)
+BACK = (*(form for form in registry.names("exporters") if form not in ONLY_OUT), *OWN)
 
 
 def test_every_format_is_told(meshes: Path) -> None:
-    assert set(BACK) == (set(FORMATS) | set(OWN)) - ONLY_OUT
-    assert set(FORMATS) >= ONLY_OUT
+    assert set(BACK) == (set(registry.names("exporters")) | set(OWN)) - ONLY_OUT
+    assert set(registry.names("exporters")) >= ONLY_OUT
 
 
 def verified(written: Path, *where: str | Path | int) -> list[dict[str, Any]]:

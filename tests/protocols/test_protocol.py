@@ -11,13 +11,14 @@ import pytest
 import trimesh
 from helpers.jaws import EDGE, HAND, HERE, box_folder, jaws
 
+from drakegrasp import registry
 from drakegrasp.errors import ConfigError
 from drakegrasp.exchange.dexgraspbench import write_object
 from drakegrasp.protocols.catalog import (
-    PROTOCOLS,
     DexGraspBench,
     DexGraspBenchTabletop,
     DexonomyHard,
+    find_protocol,
 )
 from drakegrasp.protocols.object_folder import ObjectFolder, read_object_folder
 from drakegrasp.protocols.protocol import PostureVerdict, displacement
@@ -164,8 +165,8 @@ def test_lift_raises_the_box_from_the_table(judge: Judge) -> None:
 
 def test_dexonomy_pushes_with_the_weight_and_half_the_friction(judge: Judge) -> None:
     """0.98 N: 2 x 1.2 N x 0.3 are not enough, what the solver does against slip aside."""
-    assert judge(protocol=PROTOCOLS["dexonomy-hard"]).reason == "moved"
-    assert judge(protocol=PROTOCOLS["dexonomy-hard-as-run"]).reason == "moved"
+    assert judge(protocol=find_protocol("dexonomy-hard")[0]).reason == "moved"
+    assert judge(protocol=find_protocol("dexonomy-hard-as-run")[0]).reason == "moved"
     assert judge(protocol=DexonomyHard(friction=(0.6, 0.02), impratio=10.0)).success
 
 
@@ -184,9 +185,9 @@ def test_angle_of_a_whole_turn_is_no_return() -> None:
     assert displacement(np.array(HERE), -turned)[1] == pytest.approx(2 * np.pi - 0.2)
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", registry.names("protocols"))
 def test_protocols_have_a_name_a_source_and_words_for_a_paper(name: str) -> None:
-    protocol = PROTOCOLS[name]
+    protocol, _ = find_protocol(name)
     assert protocol.name == name
     assert protocol.source
     assert type(protocol).__doc__ and len(type(protocol).__doc__) > 80

@@ -33,6 +33,12 @@ from drakegrasp.exchange.hub.table import Columns, HubTable, png_cell
 from drakegrasp.exchange.publication import Publication
 from drakegrasp.runtime.progress import Report
 
+#: What `drakegrasp export --help` says of the format.
+HELP = (
+    "Parquet, a dataset card and Croissant metadata, as the Hugging Face Hub has them; needs "
+    "pip install 'drakegrasp[hub]'"
+)
+
 #: Columns that are images, made of the fields `images` and `masks`, and what they hold.
 IMAGES = {
     "image": "colour, 8-bit PNG",
