@@ -69,7 +69,7 @@ WALLS = {
     ),
     "coacd": ("mjcf.convex_parts",),
     "pyarrow": ("exchange", "verification.prediction"),
-    "torch": ("dataset.loaders.torch_samples",),
+    "torch": ("dataset.torch_samples",),
 }
 #: Modules that name a type of a library for the type checker alone: what callers give or get.
 NAMES_TYPES = {

@@ -32,7 +32,6 @@ from drakegrasp.dataset.assembly.survey import Survey, survey_object, survey_tas
 from drakegrasp.dataset.card.content import content_of
 from drakegrasp.dataset.card.text import card_files
 from drakegrasp.dataset.hdf5 import AnyArray, create_field, write_field
-from drakegrasp.dataset.layout.opening import open_samples, open_trials, read_codes
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -41,6 +40,7 @@ from drakegrasp.dataset.manifest import (
     refuse_older,
     with_postprocessing,
 )
+from drakegrasp.dataset.opening import open_samples, open_trials, read_codes
 from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.rejections import AttemptKey, find_keys
 from drakegrasp.dataset.schema import (

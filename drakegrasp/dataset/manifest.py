@@ -37,7 +37,7 @@ from drakegrasp.config import (
 from drakegrasp.dataset import lock, log
 from drakegrasp.dataset.assembly.split import Rule, split_rule
 from drakegrasp.dataset.assembly.weights import number_poses
-from drakegrasp.dataset.layout.json_files import Name, read_mapping, validated
+from drakegrasp.dataset.json_files import Name, read_mapping, validated
 from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.rejections import AttemptKey, key_to_json
 from drakegrasp.dataset.schema import (

@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from drakegrasp.dataset.layout.opening import opened
-from drakegrasp.dataset.layout.plans import refuse_other_plan
+from drakegrasp.dataset.opening import opened, refuse_other_plan
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import NAME_RULE, is_name, read_content

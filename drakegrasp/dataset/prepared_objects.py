@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import h5py
@@ -17,9 +18,8 @@ import numpy.typing as npt
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray
-from drakegrasp.dataset.layout.opening import opened
-from drakegrasp.dataset.layout.plans import ARRAYS, POSTURE_ARRAYS
 from drakegrasp.dataset.manifest import ObjectEntry, RestingEntry, read_manifest, refuse_older
+from drakegrasp.dataset.opening import PLAN_TABLES, POSTURE_FIELDS, POSTURE_TEXTS, opened
 from drakegrasp.dataset.paths import (
     FILE_NAME,
     model_file_sha256,
@@ -108,21 +108,21 @@ def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
         for name in ("combinations", "valid", "distinct"):
             file.attrs[name] = getattr(candidates, name)
         arrays = {**vars(candidates), **vars(prepared), "X_TO": prepared.resting_poses}
-        for name, (dtype, _) in ARRAYS.items():
-            file.create_dataset(name, data=arrays[name], dtype=dtype)
+        for field in chain(*PLAN_TABLES):
+            file.create_dataset(field.name, data=arrays[field.name], dtype=field.dtype)
         if candidates.postures is not None:
             _save_postures(candidates.postures, file)
 
 
 def _save_postures(postures: GivenPostures, file: h5py.File) -> None:
     """Write the arrays of postures; texts are JSON."""
-    for name, (dtype, _) in POSTURE_ARRAYS.items():
-        data = getattr(postures, name)
-        if name == "preshape" and not any(data):
+    for field in (*POSTURE_FIELDS, *POSTURE_TEXTS):
+        data = getattr(postures, field.name)
+        if field.optional and not any(data):
             continue
         if isinstance(data, tuple):
             data = np.frombuffer(json.dumps(data).encode(), dtype=np.uint8)
-        file.create_dataset(name, data=data, dtype=dtype)
+        file.create_dataset(field.name, data=data, dtype=field.dtype)
 
 
 def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
@@ -140,8 +140,9 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
         refuse_changed_model(out, name, recorded_model(out, name))
         with opened(path, "the plan of an object") as file:
             attributes = dict(file.attrs)
-            arrays = {key: file[key][:] for key in ARRAYS}
-            given = {key: file[key][:] for key in POSTURE_ARRAYS if key in file}
+            arrays = {field.name: file[field.name][:] for field in chain(*PLAN_TABLES)}
+            names = [field.name for field in (*POSTURE_FIELDS, *POSTURE_TEXTS)]
+            given = {name: file[name][:] for name in names if name in file}
     except DataError:
         if (out / FILE_NAME).exists():
             refuse_older(read_manifest(out), out)

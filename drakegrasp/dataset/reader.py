@@ -23,13 +23,13 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.hdf5 import ImageRows, open_hdf5, says_damage
-from drakegrasp.dataset.layout.opening import open_samples
+from drakegrasp.dataset.opening import open_samples
 from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS
 from drakegrasp.errors import DataError, MachineError, first_line
 from drakegrasp.grasp import unpack_grasp, unused_fingers
 
 if TYPE_CHECKING:
-    from drakegrasp.dataset.loaders.torch_samples import TorchSamples
+    from drakegrasp.dataset.torch_samples import TorchSamples
 
 #: The fields of a sample, by name.
 FIELDS = {field.name: field for field in DATA_FIELDS}
@@ -260,7 +260,7 @@ class GraspDataset:
         _refuse_other_fields(fields)
         if find_spec("torch") is None:
             raise MachineError("to_torch needs torch, got none: pip install 'drakegrasp[torch]'")
-        from drakegrasp.dataset.loaders.torch_samples import TorchSamples
+        from drakegrasp.dataset.torch_samples import TorchSamples
 
         return TorchSamples(self, fields)
 

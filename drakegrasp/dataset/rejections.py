@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, with_config
 
-from drakegrasp.dataset.layout.json_files import Name, read_mapping, validated
+from drakegrasp.dataset.json_files import Name, read_mapping, validated
 from drakegrasp.errors import DataError, printable
 from drakegrasp.foreign_files import read_text
 from drakegrasp.runtime.files import write_atomic

@@ -15,14 +15,16 @@ import h5py
 import numpy as np
 
 from drakegrasp.dataset.hdf5 import AnyArray, read_column, write_fixed
-from drakegrasp.dataset.layout.attributes import COUNT, TEXT
-from drakegrasp.dataset.layout.opening import (
+from drakegrasp.dataset.opening import (
+    COUNT,
+    TEXT,
+    Tables,
+    differences,
     opened,
     refuse_first,
     refuse_other_attributes,
     refuse_other_codes,
 )
-from drakegrasp.dataset.layout.structure import Tables, differences
 from drakegrasp.dataset.paths import shards_folder
 from drakegrasp.dataset.schema import LOOK_FIELDS, SCHEMA_VERSION, TRIAL_FIELDS, Field
 from drakegrasp.errors import DataError

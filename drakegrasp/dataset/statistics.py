@@ -21,11 +21,11 @@ from drakegrasp.dataset.assembly.survey import shards_sha256
 from drakegrasp.dataset.assembly.weights import effective_number
 from drakegrasp.dataset.card.holding import holding_of
 from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_names
-from drakegrasp.dataset.layout.opening import open_samples, open_trials
-from drakegrasp.dataset.layout.trial_files import NONE, shard_part
 from drakegrasp.dataset.manifest import read_manifest, refuse_older
+from drakegrasp.dataset.opening import open_samples, open_trials
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import NO_PRESHAPE, SCHEMA_VERSION, SPLITS
+from drakegrasp.dataset.trial_files import NONE, shard_part
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError, HandError, counted
 from drakegrasp.hand.file_format import read_hand_file

@@ -18,7 +18,8 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.hdf5 import AnyArray
-from drakegrasp.dataset.layout.trial_files import (
+from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.dataset.trial_files import (
     DERIVED,
     FIELDS,
     NONE,
@@ -26,7 +27,6 @@ from drakegrasp.dataset.layout.trial_files import (
     TrialPart,
     whole_file,
 )
-from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.frames import X_WT, Array, invert_pose, unpack_pose
 from drakegrasp.outcomes import Outcome, Removal

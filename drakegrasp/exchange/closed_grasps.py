@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from drakegrasp.dataset.layout.opening import refuse_other_codes
-from drakegrasp.dataset.layout.trial_files import sample_ids
+from drakegrasp.dataset.opening import refuse_other_codes
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.schema import NO_PRESHAPE
+from drakegrasp.dataset.trial_files import sample_ids
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand

@@ -20,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config, parse_stored
-from drakegrasp.dataset.layout.trial_files import Stamp, TrialPart, sample_ids, shard_part, stamp
 from drakegrasp.dataset.manifest import Manifest, read_manifest
 from drakegrasp.dataset.paths import (
     ASSEMBLED_FILES,
@@ -32,6 +31,7 @@ from drakegrasp.dataset.paths import (
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.schema import SCHEMA_VERSION
 from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.dataset.trial_files import Stamp, TrialPart, sample_ids, shard_part, stamp
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import is_name, parse_json

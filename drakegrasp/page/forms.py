@@ -7,8 +7,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.schema import Shown
+from drakegrasp.dataset.trial_files import NONE
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.page.catalog import Snapshot
 from drakegrasp.page.query import (

@@ -15,10 +15,10 @@ import numpy.typing as npt
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from drakegrasp.dataset.filters import own_setting
-from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.rejections import FILE_NAME, Decisions
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.suspicion import PARTS
+from drakegrasp.dataset.trial_files import NONE
 from drakegrasp.errors import counted, printable
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.page.catalog import Snapshot

@@ -8,8 +8,8 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.statistics import count_splits
+from drakegrasp.dataset.trial_files import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.page.catalog import Snapshot

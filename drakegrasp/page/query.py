@@ -13,10 +13,10 @@ from urllib.parse import urlencode
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.rejections import Decisions
 from drakegrasp.dataset.schema import SPLITS, Shown
 from drakegrasp.dataset.suspicion import PARTS
+from drakegrasp.dataset.trial_files import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.page.catalog import Snapshot

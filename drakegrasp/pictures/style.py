@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
-from drakegrasp.dataset.layout.opening import open_samples
+from drakegrasp.dataset.opening import open_samples
 from drakegrasp.dataset.reader import Sample
 from drakegrasp.frames import Array
 from drakegrasp.grasp import unpack_grasp

@@ -15,8 +15,8 @@ from helpers.datasets import OTM, OTO, TRIALS, edit_file, edit_manifest, make_da
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
-from drakegrasp.dataset.layout.structure import DATA_TABLES, SCENE_TABLES, TRIAL_TABLES, Tables
 from drakegrasp.dataset.manifest import claim_directory
+from drakegrasp.dataset.opening import DATA_TABLES, SCENE_TABLES, TRIAL_TABLES, Tables
 from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import (

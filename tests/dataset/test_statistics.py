@@ -14,7 +14,6 @@ from helpers.hands import write_with_preshapes
 from drakegrasp.cli.tables import funnel_table, hold_table
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.card.content import card_content
-from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
 from drakegrasp.dataset.statistics import (
@@ -26,6 +25,7 @@ from drakegrasp.dataset.statistics import (
     counts_as_dict,
     preshapes_of,
 )
+from drakegrasp.dataset.trial_files import NONE
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.page.catalog import Catalog

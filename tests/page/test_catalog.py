@@ -13,9 +13,9 @@ from helpers.datasets import OTM, OTO, SLIP, TRIALS, change, make_dataset, set_a
 from helpers.pages import coded, numbered
 
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.manifest import Manifest, read_manifest, write_manifest
 from drakegrasp.dataset.rejections import Decisions
+from drakegrasp.dataset.trial_files import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.page import catalog as catalog_module

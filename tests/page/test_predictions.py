@@ -17,7 +17,7 @@ from helpers.predictions import write_predictions
 from starlette.testclient import TestClient
 
 from drakegrasp.cli.verify.request import VerifyRequest, requested_rows
-from drakegrasp.dataset.layout.predicted_rows import read_predicted_rows
+from drakegrasp.dataset.predicted_rows import read_predicted_rows
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
 from drakegrasp.page.app import Inspection, make_app

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from helpers.pages import numbered
 
-from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.rejections import AttemptKey, Decisions
+from drakegrasp.dataset.trial_files import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.page.catalog import Catalog, Snapshot
 from drakegrasp.page.query import QUANTITIES, Query, parse_query, select

@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from drakegrasp.cli.errors import say
 from drakegrasp.config import Config
-from drakegrasp.dataset.layout.predicted_rows import PredictedRows
 from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.predicted_rows import PredictedRows
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, GraspError, listed
 from drakegrasp.exchange.posture_files import has_rows, holds_postures, read_postures

@@ -18,8 +18,8 @@ from drakegrasp.arithmetic import norm
 from drakegrasp.config import CarriedHand, Config
 from drakegrasp.dataset.card.holding import holding_lines, holding_of
 from drakegrasp.dataset.hdf5 import read_names
-from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
+from drakegrasp.dataset.opening import open_samples
 from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE, TRIALS_FILE
 from drakegrasp.dataset.scenes.reader import SceneDataset, count_scenes
 from drakegrasp.dataset.scenes.rows import refuse_other_state

@@ -16,8 +16,16 @@ from drakegrasp.config import Config, parse_stored
 from drakegrasp.dataset.assembly.decisions import lens_attributes
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
 from drakegrasp.dataset.checks.rows import CheckedFile, identity
-from drakegrasp.dataset.layout.attributes import OF_CAMERA, OF_SCENES, ORIGIN, attribute_mistakes
-from drakegrasp.dataset.layout.structure import DATA_TABLES, SCENE_TABLES, TRIAL_TABLES, differences
+from drakegrasp.dataset.opening import (
+    DATA_TABLES,
+    OF_CAMERA,
+    OF_SCENES,
+    ORIGIN,
+    SCENE_TABLES,
+    TRIAL_TABLES,
+    attribute_mistakes,
+    differences,
+)
 from drakegrasp.dataset.schema import CAMERAS, CONVENTIONS, OTHER_SCHEMA, SCHEMA_VERSION
 from drakegrasp.errors import first_line
 from drakegrasp.foreign_files import parse_json

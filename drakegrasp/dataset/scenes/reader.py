@@ -20,10 +20,9 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array
 from drakegrasp.dataset.hdf5 import AnyArray, ImageRows, read_texts
-from drakegrasp.dataset.layout.opening import open_scenes, opened, refuse_other_codes
-from drakegrasp.dataset.layout.structure import SCENE_TABLES
-from drakegrasp.dataset.layout.trial_files import stamp
+from drakegrasp.dataset.opening import SCENE_TABLES, open_scenes, opened, refuse_other_codes
 from drakegrasp.dataset.schema import DEPTH_UNIT, SPLITS, Field
+from drakegrasp.dataset.trial_files import stamp
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import invert_pose, unpack_pose

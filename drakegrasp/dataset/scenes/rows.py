@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.layout.opening import opened, refuse_other_codes
+from drakegrasp.dataset.opening import opened, refuse_other_codes
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.scenes.reader import SceneDataset
 from drakegrasp.dataset.trials import Trials

@@ -22,7 +22,7 @@ import yaml
 
 from drakegrasp.dataset.card.content import card_content
 from drakegrasp.dataset.card.text import card_text
-from drakegrasp.dataset.layout.opening import open_samples
+from drakegrasp.dataset.opening import open_samples
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, DEPTH_UNIT, SPLITS, Field

@@ -18,10 +18,9 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.assembly.split import may_train, rank_in_split
 from drakegrasp.dataset.card.text import write_card
 from drakegrasp.dataset.hdf5 import create_field, write_field
-from drakegrasp.dataset.layout.opening import open_samples
-from drakegrasp.dataset.layout.structure import SCENE_TABLES
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manifest, refuse_older
+from drakegrasp.dataset.opening import SCENE_TABLES, open_samples
 from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.scenes.reader import count_scenes
 from drakegrasp.dataset.schema import SPLITS, VIEW_FIELDS

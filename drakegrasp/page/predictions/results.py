@@ -19,11 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import norm
-from drakegrasp.dataset.layout.opening import opened, read_codes, refuse_first
-from drakegrasp.dataset.layout.predicted_rows import PredictedRows, read_predicted_rows
-from drakegrasp.dataset.layout.structure import Difference
-from drakegrasp.dataset.layout.trial_files import Stamp, stamp
+from drakegrasp.dataset.opening import Difference, opened, read_codes, refuse_first
+from drakegrasp.dataset.predicted_rows import PredictedRows, read_predicted_rows
 from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, Shown, refuse_other_schema
+from drakegrasp.dataset.trial_files import Stamp, stamp
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome
 from drakegrasp.page.catalog import Snapshot

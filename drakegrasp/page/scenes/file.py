@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.layout.opening import refuse_other_codes
-from drakegrasp.dataset.layout.trial_files import Stamp, stamp
+from drakegrasp.dataset.opening import refuse_other_codes
 from drakegrasp.dataset.paths import SCENES_FILE
 from drakegrasp.dataset.scenes.reader import SceneDataset
 from drakegrasp.dataset.scenes.rows import refuse_other_state
 from drakegrasp.dataset.schema import VIEW_KINDS
+from drakegrasp.dataset.trial_files import Stamp, stamp
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome
 from drakegrasp.page.catalog import Snapshot

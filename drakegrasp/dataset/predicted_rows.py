@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.hdf5 import write_field
-from drakegrasp.dataset.layout.opening import open_samples
+from drakegrasp.dataset.opening import open_samples
 from drakegrasp.dataset.schema import PREDICTED_ROW_FIELDS
 
 #: Group of a file of results, beside that of the verdicts.

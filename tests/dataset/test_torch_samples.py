@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drakegrasp.dataset.loaders.torch_samples import TorchSamples
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.reader import FIELDS, GraspDataset
+from drakegrasp.dataset.torch_samples import TorchSamples
 
 torch = pytest.importorskip("torch")
 

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.hdf5 import AnyArray, read_names, read_texts
-from drakegrasp.dataset.layout.opening import (
+from drakegrasp.dataset.opening import (
     open_samples,
     open_trials,
     opened,

@@ -1,1 +1,0 @@
-"""Loaders: the samples of a dataset for a library of machine learning."""

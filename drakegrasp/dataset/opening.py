@@ -1,0 +1,505 @@
+"""Opens HDF5 files of a dataset to read them: one that differs from the schema is refused.
+
+In: a path, or an open file and the fields of its groups. Out: an open file in which every group,
+dataset and attribute of the schema is there, of its type and shape; or every `Difference`. Only
+headers are read; `read_codes` refuses numbers of things that do not exist. Commands refuse the
+first difference, `drakegrasp check` lists all of them. Needs no more than NumPy and h5py.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.dataset.hdf5 import open_hdf5, says_damage
+from drakegrasp.dataset.schema import (
+    CAMERAS,
+    DATA_FIELDS,
+    OBJECT_FIELDS,
+    SCENE_FIELDS,
+    SCENE_GRASP_FIELDS,
+    SCENE_OBJECT_FIELDS,
+    SCHEMA_VERSION,
+    SPLITS,
+    SUCCESS_FIELDS,
+    TRIAL_FIELDS,
+    VIEW_FIELDS,
+    VISIBLE_FIELDS,
+    Field,
+    is_readable,
+    refuse_other_schema,
+)
+from drakegrasp.errors import DataError, first_line, printable
+from drakegrasp.foreign_files import parse_json
+
+#: Fields of each group of a file, by the group's name.
+Tables = Mapping[str, tuple[Field, ...]]
+DATA_TABLES: Tables = {split: DATA_FIELDS for split in SPLITS}
+TRIAL_TABLES: Tables = {
+    "objects": OBJECT_FIELDS,
+    "trials": TRIAL_FIELDS,
+    "successes": SUCCESS_FIELDS,
+}
+SCENE_TABLES: Tables = {
+    "objects": SCENE_OBJECT_FIELDS,
+    "scenes": SCENE_FIELDS,
+    "views": VIEW_FIELDS,
+    "grasps": SCENE_GRASP_FIELDS,
+    "visible": VISIBLE_FIELDS,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference:
+    """How a file differs from the schema.
+
+    Attributes:
+        path: Path of the group or the dataset; empty for the whole file.
+        what: What must be there, in words.
+        got: What is there instead.
+        text_only: Whether it is in the words beside the values: the rows can be read.
+    """
+
+    path: str = ""
+    what: str
+    got: str
+    text_only: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.path + ': ' if self.path else ''}{self.what}, got {self.got}"
+
+
+# Files
+
+
+@contextmanager
+def opened(path: Path, what: str, *, again: bool = False) -> Iterator[h5py.File]:
+    """Open an HDF5 file while the block runs; HDF5 errors in the block become a DataError.
+
+    Args:
+        path: Of the file.
+        what: What it must be, in words.
+        again: See `open_hdf5`.
+
+    Raises:
+        DataError: If it is missing or damaged.
+    """
+    if path.is_dir():
+        raise DataError(f"{path}: must be {what}, got a folder; name the file in it")
+    try:
+        with open_hdf5(path, again=again) as file:
+            yield file
+    except DataError:
+        raise
+    except Exception as error:
+        if not says_damage(error):
+            raise
+        raise DataError(f"{path}: must be {what}, got none ({first_line(error)})") from None
+
+
+@contextmanager
+def _opened_whole(
+    path: Path, what: str, rules: Mapping[str, Rule], tables: Tables
+) -> Iterator[h5py.File]:
+    """Open a file that must not differ from the schema, see `opened`."""
+    with opened(path, what) as file:
+        refuse_other_attributes(path, file, rules)
+        refuse_first(path, differences(file, tables))
+        yield file
+
+
+def open_samples(path: Path) -> AbstractContextManager[h5py.File]:
+    """Open grasping_oto.hdf5 or grasping_otm.hdf5 while the block runs.
+
+    Raises:
+        DataError: If it is missing, damaged, or differs from the schema.
+    """
+    return _opened_whole(path, "a data file of drakegrasp", OF_CAMERA, DATA_TABLES)
+
+
+def open_trials(path: Path) -> AbstractContextManager[h5py.File]:
+    """Open trials.hdf5 while the block runs; errors as for `open_samples`."""
+    return _opened_whole(path, "the trials of a dataset", ORIGIN, TRIAL_TABLES)
+
+
+def open_scenes(path: Path) -> AbstractContextManager[h5py.File]:
+    """Open scenes.hdf5 while the block runs; errors as for `open_samples`."""
+    return _opened_whole(path, "the scenes of a dataset", OF_SCENES, SCENE_TABLES)
+
+
+def refuse_first(path: Path, mistakes: Iterable[object]) -> None:
+    """Refuse a file with any mistake; the first is told.
+
+    Raises:
+        DataError: If there is one.
+    """
+    if (first := next(iter(mistakes), None)) is not None:
+        raise DataError(f"{path}: {printable(str(first))}")
+
+
+def read_codes(
+    dataset: h5py.Dataset, codes: int | Sequence[int], rows: slice = slice(None)
+) -> npt.NDArray[Any]:
+    """Return a column (n,) of numbers that stand for something.
+
+    Args:
+        dataset: The column.
+        codes: How many things there are, counted from 0, or the numbers of those that there are.
+        rows: Those that are read.
+
+    Raises:
+        DataError: If a number stands for nothing.
+    """
+    values: npt.NDArray[Any] = dataset[rows]
+    path = Path(dataset.file.filename)
+    refuse_other_codes(path, dataset.name, values, codes, rows.start or 0)
+    return values
+
+
+def refuse_other_codes(
+    path: Path,
+    name: str,
+    values: npt.NDArray[Any],
+    codes: int | Sequence[int],
+    first: int = 0,
+) -> None:
+    """Refuse numbers that stand for nothing, see `read_codes`; `first` is the row of the first.
+
+    Raises:
+        DataError: If there is one.
+    """
+    if isinstance(codes, int):
+        bad, must = (values < 0) | (values >= codes), f"0 to {codes - 1}"
+    else:
+        bad, must = ~np.isin(values, codes), f"{min(codes)} to {max(codes)}"
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise DataError(f"{path}: {name} must be {must}, got {values[row]} in row {first + row}")
+
+
+# Attributes
+
+#: A rule: what the value must be, in words, and whether it is.
+Rule = tuple[str, Callable[[Any], bool]]
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and bool(value.strip()) and value.isprintable()
+
+
+def _is_json(
+    kind: type[dict[str, Any] | list[Any]], each: Callable[[Any], bool] = lambda value: True
+) -> Callable[[Any], bool]:
+    """Return the rule that a value is JSON text of a mapping or a list of such values."""
+
+    def obeys(value: Any) -> bool:
+        try:
+            tree = parse_json(value) if isinstance(value, str) else None
+        except ValueError:
+            return False
+        if not isinstance(tree, kind):
+            return False
+        return all(map(each, tree.values() if isinstance(tree, dict) else tree))
+
+    return obeys
+
+
+def _is_truth(value: Any) -> bool:
+    return isinstance(value, bool)
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= 0)
+
+
+def _is_positive(value: Any) -> bool:
+    return isinstance(value, float | np.floating) and bool(0.0 < value < np.inf)
+
+
+def _is_matrix(value: Any) -> bool:
+    is_array = isinstance(value, np.ndarray) and value.shape == (3, 3) and value.dtype.kind == "f"
+    return is_array and bool(np.isfinite(value).all())
+
+
+TEXT: Rule = ("a text", _is_text)
+COUNT: Rule = ("a whole number that is not negative", _is_whole)
+#: Attributes of all three files.
+ORIGIN: Mapping[str, Rule] = {
+    **dict.fromkeys(("config", "versions"), ("a mapping in JSON", _is_json(dict))),
+    **dict.fromkeys(("config_hash", "signature", "shards"), TEXT),
+    "seed": COUNT,
+    "fingers": ("whether a grasp needs each finger, in JSON", _is_json(dict, _is_truth)),
+    "joints": ("names of the hand's joints, in JSON", _is_json(list, _is_text)),
+    "K": ("a matrix of 3 x 3 finite numbers", _is_matrix),
+    **dict.fromkeys(("near", "far"), ("a positive number", _is_positive)),
+}
+#: Those that files of before they were written may lack.
+_YOUNG = ("fingers", "joints", "split_by")
+#: And of the data files.
+OF_CAMERA: Mapping[str, Rule] = {
+    **ORIGIN,
+    "camera": (f"one of {', '.join(CAMERAS)}", lambda v: isinstance(v, str) and v in CAMERAS),
+    "split_by": ("class or object", lambda v: isinstance(v, str) and v in ("class", "object")),
+}
+#: Of scenes.hdf5, whose views have their own camera matrices.
+OF_SCENES: Mapping[str, Rule] = {key: rule for key, rule in ORIGIN.items() if key != "K"}
+
+
+def attribute_mistakes(file: h5py.File, rules: Mapping[str, Rule]) -> dict[str, Difference]:
+    """Return by their names the attributes that are missing or break their rules.
+
+    Args:
+        file: The file.
+        rules: By the attributes' names.
+    """
+    mistakes = {}
+    for key, (must, obeys) in rules.items():
+        value = file.attrs.get(key)
+        if key not in file.attrs and key not in _YOUNG:
+            mistakes[key] = Difference(what=f"attribute {key} must be {must}", got="none")
+        elif key in file.attrs and not obeys(value):
+            got = printable(" ".join(repr(value).split())[:60])
+            mistakes[key] = Difference(what=f"attribute {key} must be {must}", got=got)
+    return mistakes
+
+
+def refuse_other_attributes(path: Path, file: h5py.File, rules: Mapping[str, Rule]) -> None:
+    """Refuse a file of another version of the schema, or with an attribute that breaks its rule.
+
+    Args:
+        path: Of the file, for the message.
+        file: The file.
+        rules: By the attributes' names.
+
+    Raises:
+        DataError: If there is one; the first is told.
+    """
+    # The version first: another schema may have other attributes, and a stranger's file has none.
+    if "schema_version" not in file.attrs:
+        raise DataError(f"{path}: must be a data file of drakegrasp, got another HDF5 file")
+    refuse_other_schema(path, file.attrs["schema_version"])
+    refuse_first(path, attribute_mistakes(file, rules).values())
+
+
+# Groups and datasets
+
+
+def differences(
+    file: h5py.File, tables: Tables, *, image: int | None = None, thorough: bool = False
+) -> Iterator[Difference]:
+    """Yield how the groups and datasets of a file differ from the schema.
+
+    Args:
+        file: The file.
+        tables: Fields of each group; of the whole file under "/".
+        image: Size of the images [px]; what most datasets say if None.
+        thorough: Whether to report harmless differences as well: additional fields, and other
+            attributes of fields.
+    """
+    # Older files have fewer fields.
+    version = file.attrs.get("schema_version")
+    version = version if is_readable(version) and not thorough else SCHEMA_VERSION
+    tables = {
+        name: tuple(f for f in fields if f.since <= version) for name, fields in tables.items()
+    }
+
+    # The headers of all datasets, each looked at once.
+    headers = {name: _datasets(file, name, fields) for name, fields in tables.items()}
+    lengths = _lengths(tables, headers)
+    if image is not None:
+        lengths["S"] = image
+
+    if thorough:
+        yield from _extras(file, tables)
+    for name, fields in tables.items():
+        datasets, place = headers[name], f"/{name}".rstrip("/")
+        if datasets is None:
+            yield Difference(path=place, what="the group must be there", got="none")
+            continue
+
+        # Each field by itself; the number of rows is that of most datasets.
+        meanings = {f.meaning: f.name for f in fields}
+        rows = _most_frequent([dataset.shape[0] for dataset in datasets.values() if dataset.shape])
+        for f in fields:
+            dataset = datasets.get(f.name)
+            if dataset is not None:
+                yield from _of_field(f"{place}/{f.name}", dataset, f, rows, lengths)
+                attributes = dict(h5py.Dataset(dataset).attrs)
+                yield from _of_words(f"{place}/{f.name}", attributes, f, meanings, thorough)
+            elif not f.optional or f.name in file[name]:
+                path = f"{place}/{f.name}"
+                yield Difference(path=path, what="the dataset must be there", got="none")
+
+
+def _datasets(
+    file: h5py.File, name: str, fields: Iterable[Field]
+) -> dict[str, h5py.h5d.DatasetID] | None:
+    """Return the datasets of a group that are fields; None if there is no such group."""
+    group = file.get(name)
+    if not isinstance(group, h5py.Group):
+        return None
+    datasets = {}
+    for f in fields:
+        try:
+            item = h5py.h5o.open(group.id, f.name.encode())
+        except KeyError:
+            continue
+        if isinstance(item, h5py.h5d.DatasetID):
+            datasets[f.name] = item
+    return datasets
+
+
+def _extras(file: h5py.File, tables: Tables) -> Iterator[Difference]:
+    """Yield the groups and datasets that are no fields."""
+    for extra in sorted(set(file) - set(tables)):
+        yield Difference(what="groups must be those of the schema", got=f"/{extra} too")
+    for name, fields in tables.items():
+        group, paths = file.get(name), list[str]()
+        if isinstance(group, h5py.Group):
+            group.visititems(
+                lambda path, node, paths=paths: (
+                    paths.append(path) if isinstance(node, h5py.Dataset) else None
+                )
+            )
+        for key in sorted(set(paths) - {f.name for f in fields}):
+            what = "datasets must be those of the schema"
+            yield Difference(path=f"/{name}", what=what, got=f"{key} too")
+
+
+def _lengths(
+    tables: Tables, headers: Mapping[str, dict[str, h5py.h5d.DatasetID] | None]
+) -> dict[str, int]:
+    """Return the lengths of the letters in the shapes that most datasets of a file agree on."""
+    votes: dict[str, list[int]] = {}
+    for name, fields in tables.items():
+        datasets = headers[name] or {}
+        for f in fields:
+            shape = datasets[f.name].shape if f.name in datasets else None
+            if shape and len(shape) == 1 + len(f.axes):
+                for axis, length in zip(f.axes, shape[1:], strict=True):
+                    letter, each = ("k", 6) if axis == "6k" else (str(axis), 1)
+                    votes.setdefault(letter, []).append(length // each)
+    known = {letter: _most_frequent(lengths) for letter, lengths in votes.items()}
+    known["6k"] = 6 * known.get("k", 0)
+    return {letter: length for letter, length in known.items() if length}
+
+
+def _most_frequent(numbers: Sequence[int]) -> int:
+    return Counter(numbers).most_common(1)[0][0] if numbers else 0
+
+
+def _of_field(
+    path: str,
+    dataset: h5py.h5d.DatasetID,
+    field: Field,
+    rows: int,
+    lengths: Mapping[str, int],
+) -> Iterator[Difference]:
+    """Yield how the type and shape of a dataset differ from its field.
+
+    Args:
+        path: Path of the dataset.
+        dataset: The dataset.
+        field: The field.
+        rows: Number of rows that it must have.
+        lengths: Of the letters in the shapes, where they are known.
+    """
+    dtype, stored = dataset.dtype, dataset.shape
+    text = h5py.check_string_dtype(dtype) is not None
+    if text != (field.dtype == "str") or not (text or dtype == np.dtype(field.dtype)):
+        yield Difference(path=path, what=f"type must be {field.dtype}", got=str(dtype))
+    try:
+        shape = (rows, *field.row_shape(lengths))
+    except KeyError:
+        # No sound dataset tells the length of a letter; one without a space has no shape.
+        shape = (rows, *(stored or ())[1:])
+    if stored != shape:
+        yield Difference(path=path, what=f"shape must be {shape}", got=str(stored))
+
+
+def _of_words(
+    path: str, attrs: Mapping[str, Any], field: Field, meanings: Mapping[str, str], thorough: bool
+) -> Iterator[Difference]:
+    """Yield how the attributes of a dataset differ from its field.
+
+    Args:
+        path: Path of the dataset.
+        attrs: Its attributes.
+        field: The field.
+        meanings: Names of the fields of the group by their meanings.
+        thorough: Whether unit and frame must be the field's, and a meaning be there.
+    """
+    # Wording may improve without a new version of the schema: only what is another's is told, as
+    # two fields were swapped then.
+    said = attrs.get("meaning")
+    if isinstance(said, str) and said != field.meaning and said in meanings:
+        yield Difference(path=path, what=f"must be {field.name}", got=meanings[said])
+    if not thorough:
+        return
+    for key, value in (("unit", field.unit), ("frame", field.frame)):
+        if not (isinstance(attrs.get(key), str) and attrs[key] == value):
+            what, got = f"attribute {key} must be {value!r}", repr(attrs.get(key))
+            yield Difference(path=path, what=what, got=got, text_only=True)
+    if not str(attrs.get("meaning", "")):
+        what = "attribute meaning must be there"
+        yield Difference(path=path, what=what, got="none", text_only=True)
+
+
+# Plans
+
+
+def _array(name: str, shape: str, dtype: str, optional: bool = False) -> Field:
+    return Field(name, shape, dtype, "-", "-", "", optional=optional)
+
+
+#: The arrays of a plan of an object, `objects/NAME.plan.h5`, in tables of as many rows: of resting
+#: poses, and of palm poses.
+PLAN_TABLES: Sequence[tuple[Field, ...]] = (
+    (
+        _array("X_TO", "4 4", "float64"),
+        _array("probability", "", "float64"),
+        _array("table_force", "", "float64"),
+        _array("stopped", "", "bool"),
+    ),
+    (
+        _array("X_OG", "4 4", "float64"),
+        _array("distance", "", "float64"),
+        _array("resting", "", "int64"),
+        _array("source", "", "int64"),
+        _array("log_density", "", "float64"),
+    ),
+)
+#: Those of a plan of postures from outside, in addition to the palm poses.
+POSTURE_FIELDS = (
+    *(_array(name, "j", "float64") for name in ("q_grasp", "q_pregrasp", "q_squeeze")),
+    _array("row", "", "int64"),
+)
+#: Lists of texts as JSON; `preshape` is left out where all are empty.
+POSTURE_TEXTS = (_array("said", "", "uint8"), _array("preshape", "", "uint8", optional=True))
+_PLAN_ATTRIBUTES = {
+    **dict.fromkeys(("model_sha256", "config_hash", "mesh_sha256"), TEXT),
+    **dict.fromkeys(("combinations", "valid", "distinct", "max"), COUNT),
+}
+
+
+def refuse_other_plan(path: Path, file: h5py.File) -> None:
+    """Refuse a file that is no plan of an object.
+
+    Raises:
+        DataError: If it is none; the first difference is told.
+    """
+    refuse_first(path, attribute_mistakes(file, _PLAN_ATTRIBUTES).values())
+    resting, palms = PLAN_TABLES
+    tables = [resting, palms]
+    if "q_grasp" in file:
+        tables = [resting, (*palms, *POSTURE_FIELDS), *((text,) for text in POSTURE_TEXTS)]
+    for table in tables:
+        refuse_first(path, differences(file, {"/": table}))
