@@ -43,8 +43,7 @@ if TYPE_CHECKING:
     from drakegrasp.hand.settings import load_config
     from drakegrasp.outcomes import Outcome
     from drakegrasp.scoring.run import Score
-    from drakegrasp.simulation.postures.posture import Posture, make_posture
-    from drakegrasp.simulation.postures.trial import run_trial
+    from drakegrasp.simulation.posture import Posture, make_posture, run_trial
     from drakegrasp.verification.result import PoseTrial, Verification
 
 __version__ = metadata.version("drakegrasp")
@@ -67,7 +66,7 @@ _HOMES = {
     "Outcome": "outcomes",
     "PlacedObject": "api.verifying",
     "PoseTrial": "verification.result",
-    "Posture": "simulation.postures.posture",
+    "Posture": "simulation.posture",
     "Replay": "generation.replay",
     "Sample": "dataset.reader",
     "SceneDataset": "dataset.scenes.reader",
@@ -80,11 +79,11 @@ _HOMES = {
     "load_config": "hand.settings",
     "load_hand": "hand.description",
     "make_benchmark": "api.building",
-    "make_posture": "simulation.postures.posture",
+    "make_posture": "simulation.posture",
     "pack_grasp": "grasp",
     "place_object": "api.verifying",
     "replay_trial": "generation.replay",
-    "run_trial": "simulation.postures.trial",
+    "run_trial": "simulation.posture",
     "score": "api.scoring",
     "transform_grasp": "grasp",
     "unpack_grasp": "grasp",

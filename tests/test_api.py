@@ -32,12 +32,11 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.progress import silent
-from drakegrasp.verification.batch import verify_batch
 from drakegrasp.verification.hints import find_hints
-from drakegrasp.verification.placed_grasp import place_on_object, place_on_rows
+from drakegrasp.verification.placing import place_on_object, place_on_rows
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.result_files import write_results
-from drakegrasp.verification.verify import PlacedGrasp
+from drakegrasp.verification.verify import PlacedGrasp, verify_batch
 
 pytestmark = pytest.mark.sim
 

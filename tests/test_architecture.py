@@ -65,7 +65,7 @@ WALLS = {
         "hand.draft.compiled",
         "protocols.scene",
         "bench",
-        "exchange.mujoco_scenes",
+        "exchange.mjcf",
     ),
     "coacd": ("mjcf.convex_parts",),
     "pyarrow": ("exchange", "verification.prediction"),

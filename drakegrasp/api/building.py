@@ -36,7 +36,7 @@ from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.scoring.benchmark import NAME, PRESET, write_objects
 from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.postures.table import PostureTable, unknown_objects
+from drakegrasp.simulation.posture_table import PostureTable, unknown_objects
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -16,8 +16,8 @@ from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.exchange.protocol_grasps import fitted_postures, write_grasps
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
-from drakegrasp.protocols.catalog import Lift, find_protocol
 from drakegrasp.protocols.postures import describe, prepare_trials, verify_postures, versions
+from drakegrasp.protocols.protocol import Lift, find_protocol
 from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.executor import processes
 from drakegrasp.runtime.progress import progress_bar
@@ -26,9 +26,13 @@ from drakegrasp.scoring.references import REFERENCES
 from drakegrasp.scoring.run import Request, Score
 from drakegrasp.scoring.run import score as score_request
 from drakegrasp.scoring.verdict import Verdict, protocol_verdict, verdict_of
-from drakegrasp.simulation.postures.table import PostureTable
-from drakegrasp.verification.placed_grasp import dataset_config, overridden_keys, place_on_rows
-from drakegrasp.verification.placed_postures import place_postures_on_rows
+from drakegrasp.simulation.posture_table import PostureTable
+from drakegrasp.verification.placing import (
+    dataset_config,
+    overridden_keys,
+    place_on_rows,
+    place_postures_on_rows,
+)
 from drakegrasp.verification.verify import PlacedGrasp
 
 #: Folder of the convex parts of objects, for protocols of MuJoCo.

@@ -29,14 +29,13 @@ from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.simulation.placement import Placed, config_for
 from drakegrasp.simulation.placement import PlacedObject as ObjectOnTable
 from drakegrasp.simulation.placement import place_object as put_on_table
-from drakegrasp.verification.batch import ResultCallback, ignore_result, verify_batch
-from drakegrasp.verification.placed_grasp import (
+from drakegrasp.verification.placing import (
     place_on_object,
     place_on_rows,
 )
 from drakegrasp.verification.prediction import HDF5_SUFFIXES
 from drakegrasp.verification.result import Verification
-from drakegrasp.verification.verify import PlacedGrasp
+from drakegrasp.verification.verify import PlacedGrasp, ResultCallback, ignore_result, verify_batch
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -55,8 +55,8 @@ def export(
 
     DIRECTORY must be new or empty.  [default: OUT/export_FORMAT]
     """
+    from drakegrasp.exchange.croissant import Publication, not_said, read_publication
     from drakegrasp.exchange.export import export_dataset
-    from drakegrasp.exchange.publication import Publication, not_said, read_publication
     from drakegrasp.foreign_files import refuse_link
     from drakegrasp.runtime.progress import progress_bar
 

@@ -34,14 +34,14 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import model_path
-from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
+from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
 from drakegrasp.frames import Array, invert_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.mesh.wavefront import hull_text
 from drakegrasp.objects.model import load_object
 from drakegrasp.pictures.still_scene import StillScene
-from drakegrasp.protocols.grasp_file import POSTURES
+from drakegrasp.protocols.files import POSTURES
 from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.progress import Report
 

@@ -25,8 +25,8 @@ from drakegrasp.errors import DataError, GraspError, one_line
 from drakegrasp.exchange.posture_rows import Rows, quaternion_poses
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import Hand
-from drakegrasp.protocols.grasp_file import read_grasp_file
-from drakegrasp.simulation.postures.table import CONDITIONS
+from drakegrasp.protocols.files import read_grasp_file
+from drakegrasp.simulation.posture_table import CONDITIONS
 from drakegrasp.yaml_text import parse_yaml
 
 #: What an isaac_grasp file of ours says of its origin.

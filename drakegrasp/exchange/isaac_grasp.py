@@ -18,8 +18,8 @@ import yaml
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import model_path
-from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
 from drakegrasp.exchange.dexgraspbench import pose_vector
+from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
 from drakegrasp.exchange.foreign_postures import CREATED_WITH
 from drakegrasp.frames import invert_pose
 from drakegrasp.grasp import unused_fingers
@@ -28,8 +28,8 @@ from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import load_object
 from drakegrasp.runtime.progress import Report
-from drakegrasp.simulation.postures.posture import joint_order
-from drakegrasp.simulation.postures.table import CONDITIONS
+from drakegrasp.simulation.posture import joint_order
+from drakegrasp.simulation.posture_table import CONDITIONS
 
 #: What `drakegrasp export --help` says of the format.
 HELP = "a YAML file per object: poses of the palm link, joints by name"

@@ -27,8 +27,8 @@ from drakegrasp.exchange.posture_rows import Rows, quaternion_poses, table_of
 from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
-from drakegrasp.protocols.grasp_file import is_grasp_file
-from drakegrasp.simulation.postures.table import CONDITIONS, PostureTable, join_tables
+from drakegrasp.protocols.files import is_grasp_file
+from drakegrasp.simulation.posture_table import CONDITIONS, PostureTable, join_tables
 
 #: Suffixes of the layouts.
 ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml", ".yml")

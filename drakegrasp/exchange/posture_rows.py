@@ -18,8 +18,8 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.errors import GraspError, listed, one_line
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand
-from drakegrasp.simulation.postures.posture import joint_order, preshape_index
-from drakegrasp.simulation.postures.table import PostureTable, known_preshapes, make_table
+from drakegrasp.simulation.posture import joint_order, preshape_index
+from drakegrasp.simulation.posture_table import PostureTable, known_preshapes, make_table
 
 #: How far the length of a quaternion may be from one.
 UNIT_TOLERANCE = 1e-3

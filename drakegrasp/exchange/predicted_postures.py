@@ -19,8 +19,8 @@ from drakegrasp.exchange.posture_files import files_in, named, read_rows
 from drakegrasp.exchange.posture_rows import Rows, table_of
 from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.simulation.postures.table import PostureTable, join_tables
-from drakegrasp.verification.placed_grasp import choose_rows, dataset_config
+from drakegrasp.simulation.posture_table import PostureTable, join_tables
+from drakegrasp.verification.placing import choose_rows, dataset_config
 
 
 def read_predicted_postures(

@@ -15,15 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
-from drakegrasp.exchange.closed_grasps import ClosedGrasp
 from drakegrasp.exchange.dexgraspbench import OBJECTS, BenchFiles, write_object
+from drakegrasp.exchange.export import ClosedGrasp
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.postures.posture import Posture, joint_order
+from drakegrasp.simulation.posture import Posture, joint_order
 from drakegrasp.verification.verify import PlacedGrasp, first_fit
 
 

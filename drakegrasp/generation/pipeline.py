@@ -52,7 +52,7 @@ from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.postures.table import PostureTable, misfits
+from drakegrasp.simulation.posture_table import PostureTable, misfits
 from drakegrasp.simulation.sampling.own import own_sampler
 
 #: By how much a rank may be off the border of a split that depends on which objects have samples.

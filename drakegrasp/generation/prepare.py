@@ -29,7 +29,7 @@ from drakegrasp.runtime.journal import (
     open_journal,
 )
 from drakegrasp.simulation.candidates import sample_candidates
-from drakegrasp.simulation.postures.table import PostureTable, given_candidates
+from drakegrasp.simulation.posture_table import PostureTable, given_candidates
 from drakegrasp.simulation.settle import find_resting_poses
 
 #: Computing time after which preparing a mesh hangs [s].

@@ -19,10 +19,8 @@ import numpy as np
 
 from drakegrasp import __version__
 from drakegrasp.errors import ConfigError, DataError, MeshError
-from drakegrasp.protocols.catalog import Protocol, find_protocol
-from drakegrasp.protocols.grasp_file import inner_path, one_motion, read_grasp_file
-from drakegrasp.protocols.object_folder import read_object_folder
-from drakegrasp.protocols.protocol import MujocoProtocol, PostureVerdict
+from drakegrasp.protocols.files import inner_path, one_motion, read_grasp_file, read_object_folder
+from drakegrasp.protocols.protocol import MujocoProtocol, PostureVerdict, Protocol, find_protocol
 from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.user_code import read_class, run_own

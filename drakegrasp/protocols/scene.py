@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from drakegrasp.errors import HandError, MeshError, one_line
 from drakegrasp.frames import Array
 from drakegrasp.mjcf.memory import MEMORY
-from drakegrasp.protocols.object_folder import ObjectFolder
+from drakegrasp.protocols.files import ObjectFolder
 from drakegrasp.protocols.protocol import MujocoProtocol
 
 #: Before the names of what comes from the hand's MJCF.

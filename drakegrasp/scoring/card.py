@@ -13,12 +13,15 @@ from typing import Any
 
 from drakegrasp.errors import NAMED
 from drakegrasp.frames import Array
-from drakegrasp.scoring.bootstrap import LEVEL, RESAMPLES, Estimate, Resampling, resample
 from drakegrasp.scoring.measures import (
     COVER,
     CURVE_MM,
+    LEVEL,
+    RESAMPLES,
+    Estimate,
     Grouping,
     Judged,
+    Resampling,
     by_class,
     by_object,
     calibration,
@@ -28,6 +31,7 @@ from drakegrasp.scoring.measures import (
     diversity,
     estimates,
     penetration,
+    resample,
 )
 from drakegrasp.scoring.references import REFERENCES
 

@@ -20,7 +20,7 @@ from drakegrasp.errors import GraspError
 from drakegrasp.exchange.posture_files import digest_of, holds_postures
 from drakegrasp.exchange.predicted_postures import read_predicted_postures
 from drakegrasp.frames import Array, as_numbers
-from drakegrasp.simulation.postures.table import PostureTable
+from drakegrasp.simulation.posture_table import PostureTable
 from drakegrasp.verification.prediction import ROWS, read_predictions
 
 Rows = npt.NDArray[np.int64]

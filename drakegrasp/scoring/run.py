@@ -29,7 +29,7 @@ from drakegrasp.scoring.ranked import Ranked, rank
 from drakegrasp.scoring.references import REFERENCES, Scene
 from drakegrasp.scoring.verdict import Verdict, VerdictFile, verdict_key
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.simulation.postures.table import PostureTable
+from drakegrasp.simulation.posture_table import PostureTable
 
 #: Tries grasps (n, 6k), or n postures, on rows (n,) and calls back with the place of each and its
 #: verdict.

@@ -1,28 +1,309 @@
-"""The figure of a verified grasp: predicted and reached contacts on the object.
+"""Pictures of a verified grasp: a figure of its contacts on the object, and a recording.
 
-In: a verification. Out: a matplotlib figure of its views (`views`), with the verdict and a legend.
+In: a verification. Out: a matplotlib figure with the object from two sides, then the last state
+that was reached, with the hand, with the verdict and a legend; or an HTML file that plays the
+trial. The pictures come from `visualization.still_scene`, so they need OpenGL and a single thread.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
+from pydrake.geometry import LightParameter, Meshcat
 
-from drakegrasp.frames import Array, transform_points
+from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, transform_points
+from drakegrasp.hand.description import load_hand
+from drakegrasp.mesh.crossings import first_hits
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.figures.panels import show_image
-from drakegrasp.pictures.style import INK, LIFTED, PREDICTED, REACHED, add_axes
-from drakegrasp.verification.views import Marks, View, is_seen, largest_force, render_views
+from drakegrasp.pictures.recording import (
+    draw_predicted,
+    record_attempt,
+    record_html,
+    show_object,
+)
+from drakegrasp.pictures.still_scene import (
+    AZIMUTHS_DEG,
+    Lighting,
+    Poses,
+    StillScene,
+    box_corners,
+    camera_pose,
+)
+from drakegrasp.pictures.style import ARROW, HIDDEN, INK, LIFTED, PREDICTED, REACHED, add_axes
+from drakegrasp.simulation.construction import build_object_scene
+from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.vision.camera import Picture
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
+
+#: Lights beside the camera and above the table, without shadows: contacts are on all sides of an
+#: object, and none should be in the dark.
+LIGHTING = Lighting(
+    name="contacts",
+    lights=(
+        LightParameter(type="point", frame="camera", position=[-0.25, -0.15, 0.0], intensity=0.85),
+        LightParameter(type="point", frame="camera", position=[0.4, 0.0, 0.0], intensity=0.4),
+        LightParameter(type="point", frame="world", position=[0.0, 0.0, 4.0], intensity=0.4),
+    ),
+)
+#: Pose of the hand in pictures of the object alone: out of view.
+AWAY = make_pose(np.eye(3), [0.0, 0.0, -100.0])
+#: Elevation of the camera in pictures of the object alone [rad].
+ELEVATION = np.deg2rad(24.0)
+#: A contact faces the camera if the cosine between its normal and the line of sight is above this.
+FACING = 0.1
+#: Edge of a picture [px].
+PIXELS = 560
+#: Length of the arrow of the largest force [m].
+LARGEST_FORCE = 0.05
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Marks:
+    """Contacts of one kind to draw: a dot and an arrow each.
+
+    Attributes:
+        kind: Name of the kind in the ids of the figure's elements.
+        colour: Of dots and arrows.
+        size: Diameter of the dots; the arrows scale with it [points].
+        p_OQ: (n, 3), points in {O} [m].
+        nhat_Q_O: (n, 3), outward unit normals in {O}.
+        tail_O, tip_O: (n, 3), ends of the arrows in {O} [m].
+        names: Text at the tip of each arrow.
+    """
+
+    kind: str
+    colour: str
+    size: float
+    p_OQ: Array
+    nhat_Q_O: Array
+    tail_O: Array
+    tip_O: Array
+    names: Sequence[str]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """A picture, and the contacts to draw over it.
+
+    Attributes:
+        title: Text above the picture.
+        picture: The picture.
+        X_WO: (4, 4), pose of the object.
+        marks: The contacts.
+    """
+
+    title: str
+    picture: Picture
+    X_WO: Array
+    marks: Sequence[Marks]
+
+
+def render_views(verified: Verification) -> list[View]:
+    """Return the views of a verified grasp.
+
+    Args:
+        verified: The verdict.
+
+    Raises:
+        MachineError: If a picture is blank, which means that OpenGL failed.
+    """
+    # The contacts: predicted ones, those after closing, and where these are after the lift.
+    model = verified.placed.model
+    scene = StillScene(load_hand(verified.config.hand_source), model)
+    X_WO = X_WT @ verified.placed.X_TO_simulated
+    marks = [
+        _predicted(verified),
+        *_reached(verified.closed, _force_scale(verified)),
+        *_moved(verified.closed, verified.lifted),
+    ]
+
+    # The object from two sides, then the last state that was reached.
+    first, second = _two_sides(model, X_WO, marks)
+    return [
+        _object_view(scene, "contacts", X_WO, marks, _camera(model, X_WO, marks, first)),
+        _object_view(scene, "from another side", X_WO, marks, _camera(model, X_WO, marks, second)),
+        *_last_view(scene, verified, marks),
+    ]
+
+
+def _last_view(scene: StillScene, verified: Verification, marks: Sequence[Marks]) -> list[View]:
+    """Return the view of the last state that was reached; no view if no hand was tried."""
+    X_WO = X_WT @ verified.placed.X_TO_simulated
+    trial, fit = verified.trial, verified.fit
+
+    # After the lift.
+    if trial is not None and trial.lift is not None:
+        X_WO = X_WT @ trial.lift.X_TO
+        reached = _reached(verified.lifted, _force_scale(verified), kind="lifted", colour=LIFTED)
+        title, X_OG, q = "end of the lift, with forces", trial.lift.X_OG, trial.lift.q
+        return [_hand_view(scene, title, X_WO, X_OG, q, reached)]
+
+    # Before it: the closed hand, or the palm pose that comes closest.
+    if trial is not None and trial.closed is not None:
+        return [_hand_view(scene, "after closing", X_WO, trial.X_OG, trial.closed.q, marks)]
+    if fit is not None:
+        q, title = scene.positions(fit.spread, fit.closing), "the hand where it comes closest"
+        return [_hand_view(scene, title, X_WO, fit.X_OG, q, marks)]
+    return []
+
+
+def _object_view(
+    scene: StillScene, title: str, X_WO: Array, marks: Sequence[Marks], X_WC: Array
+) -> View:
+    """Return a view of the object alone."""
+    scene.pose(Poses(X_WG=AWAY, q=scene.positions(0.0), X_WO=X_WO))
+    picture = scene.picture(X_WC, (PIXELS, PIXELS), LIGHTING)
+    return View(title=title, picture=picture, X_WO=X_WO, marks=marks)
+
+
+def _hand_view(
+    scene: StillScene, title: str, X_WO: Array, X_OG: Array, q: Array, marks: Sequence[Marks]
+) -> View:
+    """Return a view of hand and object, from where most of both is visible."""
+    around = scene.outline(Poses(X_WG=X_WO @ X_OG, q=q, X_WO=X_WO))
+    picture = scene.picture(scene.choose_view(around), (PIXELS, PIXELS), LIGHTING)
+    return View(title=title, picture=picture, X_WO=X_WO, marks=marks)
+
+
+def _predicted(verified: Verification) -> Marks:
+    """Return the predicted contacts, with arrows along their normals."""
+    # A row that is no grasp has none.
+    there = np.isfinite(verified.p_OQ).all(axis=1)
+    p, n = verified.p_OQ[there], verified.nhat_Q_O[there]
+    return Marks(
+        kind="predicted",
+        colour=PREDICTED,
+        size=9.0,
+        p_OQ=p,
+        nhat_Q_O=n,
+        tail_O=p,
+        tip_O=p + ARROW * n,
+        names=[str(i + 1) for i in range(len(p))],
+    )
+
+
+def _reached(
+    contacts: Contacts | None, scale: float, *, kind: str = "reached", colour: str = REACHED
+) -> list[Marks]:
+    """Return the contacts of touching fingertips, if any, with their forces as arrows.
+
+    The arrow of a force ends at its contact; its length per force is `scale` [m/N].
+    """
+    if contacts is None:
+        return []
+    return _arriving(
+        contacts, contacts.touching, contacts.p_OQ - scale * contacts.f_Q_O, kind, colour, size=5.0
+    )
+
+
+def _moved(closed: Contacts | None, lifted: Contacts | None) -> list[Marks]:
+    """Return the contacts after the lift, with arrows from where they were after closing.
+
+    They are on the object as it lay: an arrow is how far a fingertip slid over its surface.
+    """
+    if closed is None or lifted is None:
+        return []
+    both = closed.touching & lifted.touching
+    return _arriving(lifted, both, closed.p_OQ, "lifted", LIFTED, size=4.0)
+
+
+def _arriving(
+    contacts: Contacts,
+    chosen: npt.NDArray[np.bool_],
+    tail_O: Array,
+    kind: str,
+    colour: str,
+    *,
+    size: float,
+) -> list[Marks]:
+    """Return chosen contacts (k,), if there is one, at the tips of arrows from tail_O (k, 3)."""
+    if not chosen.any():
+        return []
+    p = contacts.p_OQ[chosen]
+    return [
+        Marks(
+            kind=kind,
+            colour=colour,
+            size=size,
+            p_OQ=p,
+            nhat_Q_O=contacts.nhat_Q_O[chosen],
+            tail_O=tail_O[chosen],
+            tip_O=p,
+            names=[""] * len(p),
+        )
+    ]
+
+
+def largest_force(verified: Verification) -> float:
+    """Return the largest force on a fingertip that is drawn [N]; inf if there is none."""
+    ends = (verified.closed, verified.lifted)
+    forces = [float(np.linalg.norm(c.f_Q_O, axis=1).max()) for c in ends if c is not None]
+    return max(forces, default=0.0) or np.inf
+
+
+def _force_scale(verified: Verification) -> float:
+    """Return the length of an arrow per force [m/N]."""
+    return LARGEST_FORCE / largest_force(verified)
+
+
+def _two_sides(model: ObjectModel, X_WO: Array, marks: Sequence[Marks]) -> tuple[float, float]:
+    """Return two azimuths [rad] that together show as many predicted contacts as possible.
+
+    The first shows the most; the second shows the most of those that the first does not.
+    """
+    # Which contacts each camera sees, and which of them face it.
+    azimuths = np.deg2rad(AZIMUTHS_DEG)
+    cameras = [_camera(model, X_WO, marks, azimuth)[:3, 3] for azimuth in azimuths]
+    seen = np.array([is_seen(model, X_WO, marks[0], p_WC) for p_WC in cameras])
+    towards = np.array([_towards(marks[0], X_WO, p_WC) for p_WC in cameras])
+    normals = np.broadcast_to(marks[0].nhat_Q_O, towards.shape)
+    facing = np.sum(towards * normals, axis=2) > FACING
+
+    # An arrow that points at the camera shows little, so one across the line of sight counts more.
+    across = np.linalg.norm(np.cross(towards, normals), axis=2)
+    worth = (seen & facing) * (1.0 + 0.5 * across)
+
+    # Among equal second views take the one opposite to the first.
+    first = int(np.argmax(worth.sum(axis=1)))
+    opposite = 1e-3 * np.cos(azimuths - azimuths[first])
+    second = int(np.argmax((worth * (worth[first] == 0.0)).sum(axis=1) - opposite))
+    return float(azimuths[first]), float(azimuths[second])
+
+
+def _camera(
+    model: ObjectModel, X_WO: Array, marks: Sequence[Marks], azimuth: float, fill: float = 1.3
+) -> Array:
+    """Return the pose X_WC (4, 4) of a camera that has the object and its marks in view."""
+    around = np.vstack([box_corners(model), *(m.tail_O for m in marks), *(m.tip_O for m in marks)])
+    return camera_pose(transform_points(X_WO, around), azimuth, ELEVATION, fill=fill)
+
+
+def _towards(marks: Marks, X_WO: Array, p_WC: Array) -> Array:
+    """Return the unit vectors (n, 3) in {O} from contacts to a camera at p_WC (3,)."""
+    p_OC = transform_points(invert_pose(X_WO), p_WC[None])[0]
+    away = p_OC - marks.p_OQ
+    return away / np.linalg.norm(away, axis=1, keepdims=True)
+
+
+def is_seen(model: ObjectModel, X_WO: Array, marks: Marks, p_WC: Array) -> npt.NDArray[np.bool_]:
+    """Return (n,), whether a camera at p_WC (3,) sees each contact past the object."""
+    start = marks.p_OQ + HIDDEN * marks.nhat_Q_O
+    hits = first_hits(np.asarray(model.visual.triangles), start, _towards(marks, X_WO, p_WC))
+    return ~np.isfinite(hits)
+
 
 #: Edge of a panel [inch].
 EDGE = 3.3
@@ -157,3 +438,43 @@ def _draw_legend(figure: Figure, verified: Verification, corner: tuple[float, fl
     figure.legend(handles=handles, loc="upper left", bbox_to_anchor=corner, ncols=len(handles),
                   fontsize=9.0, frameon=False, handletextpad=0.2, columnspacing=1.5,
                   borderaxespad=0.0, borderpad=0.0, labelcolor=INK)  # fmt: skip
+
+
+def record_verification(verified: Verification, path: Path) -> None:
+    """Write a recording of a verification, which is simulated again for it, with its explanation.
+
+    The trial is that of the first wrist pose. A row that is no grasp shows the object at rest.
+
+    Args:
+        verified: The verdict.
+        path: The HTML file.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    if verified.pregrasp is None:
+        _record_object(verified, path)
+    else:
+        record_attempt(
+            verified.placed.model,
+            verified.placed.X_TO_simulated,
+            verified.pregrasp,
+            verified.config,
+            path,
+            p_OQ=verified.p_OQ,
+            nhat_Q_O=verified.nhat_Q_O,
+            caption=verified.explain(),
+        )
+
+
+def _record_object(verified: Verification, path: Path) -> None:
+    """Write a recording of the object at rest, with the contacts that forces were judged at."""
+    placed, config = verified.placed, verified.config
+
+    def run(meshcat: Meshcat) -> None:
+        scene = build_object_scene(placed.model, config.physics, meshcat=meshcat)
+        show_object(meshcat, scene, placed.X_TO_simulated, config)
+        if verified.forces is not None:
+            draw_predicted(meshcat, verified.p_OQ, verified.nhat_Q_O)
+
+    record_html(run, path, verified.explain())

@@ -1,18 +1,19 @@
-"""The verdict on one grasp of one object, from its contacts in {O} or from its posture.
+"""The verdict on grasps of objects: each from its contacts in {O} or from its posture.
 
-In: a `PlacedGrasp`. Out: a `Verification`. A posture is tried as it is. Of contacts, method `hand`
-finds palm poses that bring the fingertips to the points, and runs a trial from the best, as a build
-does; if that does not hold, from the others, too. Method `forces` asks whether forces at the
-surface's own contacts can lift the object. Every row of numbers that has contacts is tried, however
-wrong they look: what is measured is judged afterwards. A wrong prediction, a failed solver and a
-lost object are outcomes, not exceptions.
+In: `PlacedGrasp`s. Out: a `Verification` for each, in the caller's order. A posture is tried as it
+is. Of contacts, method `hand` finds palm poses that bring the fingertips to the points, and runs a
+trial from the best, as a build does; if that does not hold, from the others, too. Method `forces`
+asks whether forces at the surface's own contacts can lift the object. Every row of numbers that has
+contacts is tried, however wrong they look: what is measured is judged afterwards. A wrong
+prediction, a failed solver and a lost object are outcomes, not exceptions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from itertools import groupby, islice
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
@@ -24,19 +25,18 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread, timed
+from drakegrasp.runtime.executor import Executor
+from drakegrasp.runtime.progress import Report
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.postures.posture import Posture, start_of
-from drakegrasp.simulation.postures.trial import run_trial
+from drakegrasp.simulation.posture import Posture, run_trial, start_of
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
-from drakegrasp.verification.contact_surface import fit_surface
-from drakegrasp.verification.forces.quality import force_margin
-from drakegrasp.verification.forces.verdict import hand_contacts, judge_forces
-from drakegrasp.verification.hints import find_hints, find_posture_hints, known_frames
+from drakegrasp.verification.forces import force_margin, hand_contacts, judge_forces
+from drakegrasp.verification.hints import find_hints, find_posture_hints, fit_surface, known_frames
 from drakegrasp.verification.result import PoseTrial, Verification
-from drakegrasp.verification.wrist.solver import WristFit, fit_wrist
+from drakegrasp.verification.wrist_solver import WristFit, fit_wrist
 
 METHODS = ("hand", "forces")
 
@@ -350,3 +350,60 @@ def _lift_by_forces(base: Verification) -> Verification:
     if not forces.on_surface:
         outcome = Outcome.OFF_SURFACE
     return replace(base, outcome=outcome, reason=forces.reason, forces=forces)
+
+
+#: Receives results as they come: called with a grasp's index and its result.
+ResultCallback: TypeAlias = Callable[[int, Verification], None]
+
+
+def ignore_result(index: int, result: Verification) -> None:
+    """Do nothing with a result; the default `ResultCallback`."""
+
+
+def verify_batch(
+    grasps: Sequence[PlacedGrasp],
+    execute: Executor,
+    report: Report,
+    on_result: ResultCallback = ignore_result,
+    *,
+    together: int = 1,
+) -> list[Verification]:
+    """Return the results of grasps in the caller's order.
+
+    Args:
+        grasps: With indices 0 to n - 1, in any order; those of one object stand together.
+        execute: Runs the verifications.
+        report: Is told how many are done and how many succeed.
+        on_result: Is called with each result in the caller's order, once all earlier ones exist.
+        together: Most grasps of one object that are one task: they share its meshes on the way to
+            a worker, and what a worker derives from them.
+    """
+    objects = {g.index: (g.placed, *(placed for placed, _ in g.others)) for g in grasps}
+    results: dict[int, Verification] = {}
+    delivered = holding = 0
+    report(0, len(grasps), holding=holding)
+    for verdicts in execute(_verify_together, _tasks(grasps, together)):
+        for index, result in verdicts:
+            results[index] = replace(result, placed=objects[index][result.stand])
+            holding += result.success
+
+        # Deliver these results, and later ones that were waiting for them.
+        while delivered in results:
+            on_result(delivered, results[delivered])
+            delivered += 1
+        report(len(results), len(grasps), holding=holding)
+    return [results[i] for i in range(len(grasps))]
+
+
+def _tasks(grasps: Sequence[PlacedGrasp], together: int) -> Iterator[list[PlacedGrasp]]:
+    """Yield the grasps in lists of at most so many, of one object each."""
+    for _, same in groupby(grasps, key=lambda grasp: id(grasp.placed)):
+        # `itertools.batched` is newer than Python 3.11.
+        while task := list(islice(same, together)):
+            yield task
+
+
+def _verify_together(grasps: Sequence[PlacedGrasp]) -> list[tuple[int, Verification]]:
+    """Return the indices of grasps with their results, without the object: the caller has it."""
+    nothing = cast(PlacedObject, None)
+    return [(g.index, replace(verify_placed(g), placed=nothing)) for g in grasps]

@@ -31,13 +31,14 @@ from drakegrasp.hand.settings import override_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trajectory import lift_path
-from drakegrasp.verification.forces.contact_forces import (
+from drakegrasp.verification.forces import (
+    MAX_DISTANCE,
     ForceProgram,
+    ForceVerdict,
     GraspContacts,
     hardest_forces,
+    judge_forces,
 )
-from drakegrasp.verification.forces.surface_contacts import MAX_DISTANCE
-from drakegrasp.verification.forces.verdict import ForceVerdict, judge_forces
 
 #: Friction coefficients that are tried.
 FRICTIONS = (0.05, 0.71)

@@ -25,7 +25,7 @@ from drakegrasp.errors import DrakegraspError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.outcomes import Outcome, Removal
-from drakegrasp.simulation.postures.posture import joint_order
+from drakegrasp.simulation.posture import joint_order
 
 #: Models of the right hands, and what `hand new` asks of them.
 HANDS = {

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from drakegrasp.dataset.card.holding import wilson_interval
 from drakegrasp.exchange.dexgraspbench import write_object
-from drakegrasp.protocols.grasp_file import read_dictionary
+from drakegrasp.protocols.files import read_dictionary
 
 #: Where the benchmark's example is, and its verdicts on it.
 GRASPS, VERDICTS = "output/example_shadow/graspdata", "output/example_shadow/evaluation"

@@ -45,11 +45,10 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import prepare_object
 from drakegrasp.objects.sources import MeshSource, file_frame
 from drakegrasp.outcomes import Outcome
-from drakegrasp.protocols.grasp_file import read_grasp_file
-from drakegrasp.protocols.object_folder import read_object_folder
+from drakegrasp.protocols.files import read_grasp_file, read_object_folder
 from drakegrasp.simulation import construction, trial
 from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.postures.posture import make_posture, start_of
+from drakegrasp.simulation.posture import make_posture, start_of
 from drakegrasp.simulation.scene import Scene
 
 #: The palm in the root of the benchmark's hand [m]; its fingers, first the joint that closes one.

@@ -15,7 +15,7 @@ from drakegrasp.commissioning.model_checks import check_masses
 from drakegrasp.commissioning.run import check_hand
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import MODELS, hand_names
-from drakegrasp.verification.wrist.hand_constants import hand_constants
+from drakegrasp.verification.wrist_problem import hand_constants
 
 
 def copied(folder: Path, name: str = "barrett") -> Path:

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 from helpers.datasets import make_dataset
 
-from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
-from drakegrasp.exchange.export import export_dataset
-from drakegrasp.exchange.publication import Publication
+from drakegrasp.exchange.croissant import Publication
+from drakegrasp.exchange.export import ClosedGrasp, export_dataset, read_closed_grasps
 
 #: What the publishers of the exported dataset say.
 PUBLICATION = Publication(

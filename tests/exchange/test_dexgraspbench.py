@@ -16,15 +16,18 @@ import yaml
 pytest.importorskip("coacd")
 mujoco = pytest.importorskip("mujoco")
 
-from drakegrasp.exchange.closed_grasps import ClosedGrasp  # noqa: E402
 from drakegrasp.exchange.dexgraspbench import APART, grasp_dictionary  # noqa: E402
+from drakegrasp.exchange.export import ClosedGrasp  # noqa: E402
 from drakegrasp.frames import Array, multiply  # noqa: E402
 from drakegrasp.hand.description import load_hand  # noqa: E402
 from drakegrasp.hand.kinematics import fingertip_poses  # noqa: E402
 from drakegrasp.mjcf.hand_model import make_hand_model  # noqa: E402
 from drakegrasp.pictures.still_scene import StillScene  # noqa: E402
-from drakegrasp.protocols.grasp_file import one_motion, read_grasp_file  # noqa: E402
-from drakegrasp.protocols.object_folder import read_object_folder  # noqa: E402
+from drakegrasp.protocols.files import (  # noqa: E402
+    one_motion,
+    read_grasp_file,
+    read_object_folder,
+)
 
 
 def pose_of(vector: Array) -> Array:

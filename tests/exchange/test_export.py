@@ -13,8 +13,7 @@ from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
 from drakegrasp.exchange import dexgraspbench
-from drakegrasp.exchange.closed_grasps import ClosedGrasp
-from drakegrasp.exchange.export import export_dataset
+from drakegrasp.exchange.export import ClosedGrasp, export_dataset
 
 
 def test_closed_grasps_are_the_samples_of_all_splits(

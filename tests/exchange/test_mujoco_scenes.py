@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("coacd")
 mujoco = pytest.importorskip("mujoco")
 
-from drakegrasp.exchange.closed_grasps import ClosedGrasp  # noqa: E402
+from drakegrasp.exchange.export import ClosedGrasp  # noqa: E402
 from drakegrasp.frames import invert_pose  # noqa: E402
 from drakegrasp.hand.description import load_hand  # noqa: E402
 from drakegrasp.pictures.still_scene import Poses, StillScene  # noqa: E402

@@ -11,8 +11,8 @@ import pytest
 import trimesh
 
 from drakegrasp.dataset.paths import model_path
-from drakegrasp.exchange.closed_grasps import ClosedGrasp
-from drakegrasp.exchange.posed_scenes import X_UT, link_meshes, posed_scene
+from drakegrasp.exchange.export import ClosedGrasp
+from drakegrasp.exchange.glb import X_UT, link_meshes, posed_scene
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import load_object

@@ -20,8 +20,8 @@ from drakegrasp.exchange.posture_rows import quaternion_poses
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
-from drakegrasp.simulation.postures.posture import joint_order
-from drakegrasp.simulation.postures.table import PostureTable
+from drakegrasp.simulation.posture import joint_order
+from drakegrasp.simulation.posture_table import PostureTable
 
 HAND = load_hand("allegro")
 ORDER = joint_order(HAND)

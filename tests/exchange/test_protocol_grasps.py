@@ -18,8 +18,8 @@ pytest.importorskip("mujoco")
 pytest.importorskip("coacd")
 
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.exchange.closed_grasps import ClosedGrasp
 from drakegrasp.exchange.dexgraspbench import OBJECTS
+from drakegrasp.exchange.export import ClosedGrasp
 from drakegrasp.exchange.posture_files import holds_postures
 from drakegrasp.exchange.posture_rows import quaternion_poses
 from drakegrasp.exchange.protocol_grasps import PlacedPosture, fitted_postures, write_grasps
@@ -32,7 +32,7 @@ from drakegrasp.mjcf import convex_parts
 from drakegrasp.runtime import environment
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.postures.posture import Posture, joint_order
+from drakegrasp.simulation.posture import Posture, joint_order
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.verify import PlacedGrasp, first_fit
 

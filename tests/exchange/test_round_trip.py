@@ -38,7 +38,7 @@ from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.scoring.run import VERDICTS
-from drakegrasp.simulation.postures.posture import joint_order
+from drakegrasp.simulation.posture import joint_order
 
 NAME, HAND = "1_brick_a", "allegro_four"
 #: What decides verdicts and is in no file that was exported.

@@ -39,14 +39,14 @@ from drakegrasp.runtime.files import seal
 from drakegrasp.scoring.verdict import verdict_of
 from drakegrasp.simulation.candidates import Source
 from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.postures.posture import joint_order
-from drakegrasp.simulation.postures.table import (
+from drakegrasp.simulation.posture import joint_order
+from drakegrasp.simulation.posture_table import (
     PostureTable,
     make_table,
     unknown_objects,
 )
 from drakegrasp.simulation.trial import run_attempt
-from drakegrasp.verification.placed_postures import place_postures_on_dataset
+from drakegrasp.verification.placing import place_postures_on_dataset
 from drakegrasp.verification.result_files import write_results
 from drakegrasp.verification.verify import verify_placed
 

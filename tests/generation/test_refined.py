@@ -44,7 +44,7 @@ from drakegrasp.page.catalog import Catalog
 from drakegrasp.page.query import Query, select
 from drakegrasp.pictures.figures.held_grasps import read_approaches, read_held
 from drakegrasp.runtime.executor import run_here
-from drakegrasp.verification.placed_grasp import place_on_rows
+from drakegrasp.verification.placing import place_on_rows
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 

@@ -14,8 +14,8 @@ from helpers.successes import good
 from drakegrasp.config import CandidateConfig, Config, FilterConfig
 from drakegrasp.dataset.filters import judge_successes
 from drakegrasp.errors import HandError
-from drakegrasp.exchange.closed_grasps import ClosedGrasp
 from drakegrasp.exchange.dexgraspbench import grasp_dictionary
+from drakegrasp.exchange.export import ClosedGrasp
 from drakegrasp.exchange.isaac_grasp import grasp_entry
 from drakegrasp.generation.columns import trial_rows
 from drakegrasp.grasp import unused_fingers

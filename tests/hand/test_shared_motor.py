@@ -13,9 +13,8 @@ from drakegrasp.errors import HandError
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import closed_positions, coordinate_limits, open_together
 from drakegrasp.hand.strength import fingertip_forces
-from drakegrasp.simulation.postures.posture import Posture, start_of
-from drakegrasp.verification.wrist.initial_guesses import make_postures
-from drakegrasp.verification.wrist.solver import fit_wrist
+from drakegrasp.simulation.posture import Posture, start_of
+from drakegrasp.verification.wrist_solver import fit_wrist, make_postures
 
 OWN, DRIVEN = slider_fingers(60.0, finger="left")
 REFUSALS = {

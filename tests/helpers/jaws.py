@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 
 from drakegrasp.exchange.dexgraspbench import write_object
-from drakegrasp.protocols.object_folder import ObjectFolder, read_object_folder
+from drakegrasp.protocols.files import ObjectFolder, read_object_folder
 from drakegrasp.protocols.protocol import GraspMotion
 
 #: Edge of the box [m].

@@ -12,11 +12,9 @@ from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.trial import Closed, TrialRecord
-from drakegrasp.verification.forces.contact_forces import ContactForces
-from drakegrasp.verification.forces.surface_contacts import SurfaceContacts
-from drakegrasp.verification.forces.verdict import ForceVerdict
+from drakegrasp.verification.forces import ContactForces, ForceVerdict, SurfaceContacts
 from drakegrasp.verification.result import PoseTrial
-from drakegrasp.verification.wrist.solver import WristFit
+from drakegrasp.verification.wrist_solver import WristFit
 
 
 def some_contacts(**values: Any) -> Contacts:

@@ -29,7 +29,7 @@ from drakegrasp.pictures.recording import record_attempt
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
 from drakegrasp.simulation.trial import run_attempt
-from drakegrasp.verification.recording import record_verification
+from drakegrasp.verification.figure import record_verification
 
 pytestmark = pytest.mark.sim
 

@@ -12,9 +12,8 @@ from helpers.jaws import EDGE, HAND, box_folder, jaws
 
 pytest.importorskip("mujoco")
 
-from drakegrasp.protocols.catalog import DexGraspBench
-from drakegrasp.protocols.object_folder import ObjectFolder
-from drakegrasp.protocols.protocol import GraspMotion, MujocoProtocol, PostureVerdict
+from drakegrasp.protocols.files import ObjectFolder
+from drakegrasp.protocols.protocol import DexGraspBench, GraspMotion, MujocoProtocol, PostureVerdict
 from drakegrasp.protocols.scene import ProtocolScene
 
 

@@ -18,15 +18,14 @@ from helpers.jaws import HERE, jaws
 
 from drakegrasp.errors import ConfigError, DataError, HandError, MachineError
 from drakegrasp.exchange.dexgraspbench import write_object
-from drakegrasp.protocols.catalog import find_protocol
-from drakegrasp.protocols.grasp_file import one_motion, read_grasp_file
-from drakegrasp.protocols.object_folder import read_object_folder
+from drakegrasp.protocols.files import one_motion, read_grasp_file, read_object_folder
 from drakegrasp.protocols.postures import (
     PostureTrials,
     json_line,
     prepare_trials,
     verify_postures,
 )
+from drakegrasp.protocols.protocol import find_protocol
 
 OWN = """
 from dataclasses import dataclass, replace

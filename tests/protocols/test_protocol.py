@@ -14,14 +14,15 @@ from helpers.jaws import EDGE, HAND, HERE, box_folder, jaws
 from drakegrasp import registry
 from drakegrasp.errors import ConfigError
 from drakegrasp.exchange.dexgraspbench import write_object
-from drakegrasp.protocols.catalog import (
+from drakegrasp.protocols.files import ObjectFolder, read_object_folder
+from drakegrasp.protocols.protocol import (
     DexGraspBench,
     DexGraspBenchTabletop,
     DexonomyHard,
+    PostureVerdict,
+    displacement,
     find_protocol,
 )
-from drakegrasp.protocols.object_folder import ObjectFolder, read_object_folder
-from drakegrasp.protocols.protocol import PostureVerdict, displacement
 from drakegrasp.protocols.scene import ProtocolScene
 
 Judge = Callable[..., PostureVerdict]

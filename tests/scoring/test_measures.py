@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from helpers.scores import grouping, judged, verdict
 
-from drakegrasp.scoring.bootstrap import resample
 from drakegrasp.scoring.measures import (
     Judged,
     by_class,
@@ -19,6 +18,7 @@ from drakegrasp.scoring.measures import (
     diversity,
     estimates,
     first_table,
+    resample,
 )
 from drakegrasp.scoring.ranked import rank
 

@@ -18,8 +18,8 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.scoring.ranked import rank_postures
 from drakegrasp.scoring.run import VERDICTS
-from drakegrasp.simulation.postures.posture import joint_order
-from drakegrasp.verification.placed_postures import place_postures_on_rows
+from drakegrasp.simulation.posture import joint_order
+from drakegrasp.verification.placing import place_postures_on_rows
 
 HAND = load_hand()
 

@@ -18,7 +18,7 @@ from drakegrasp.frames import transform_points
 from drakegrasp.generation.scenes.make import make_scenes
 from drakegrasp.scoring.references import REFERENCES, Scene
 from drakegrasp.scoring.run import own_contacts
-from drakegrasp.verification.placed_grasp import place_on_rows
+from drakegrasp.verification.placing import place_on_rows
 
 pytestmark = pytest.mark.sim
 

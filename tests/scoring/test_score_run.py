@@ -21,7 +21,7 @@ from drakegrasp.foreign_files import read_json
 from drakegrasp.scoring.card import card_text
 from drakegrasp.scoring.ranked import ranked_sets
 from drakegrasp.scoring.run import VERDICTS, Request, own_contacts, score
-from drakegrasp.verification.placed_grasp import dataset_config, place_on_rows
+from drakegrasp.verification.placing import dataset_config, place_on_rows
 
 
 @pytest.fixture(scope="module")

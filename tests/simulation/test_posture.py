@@ -19,15 +19,15 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.drive import disengage, engage
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.postures.posture import (
+from drakegrasp.simulation.posture import (
     OPENED,
     Posture,
     joint_order,
     make_posture,
     opened,
+    run_trial,
     start_of,
 )
-from drakegrasp.simulation.postures.trial import run_trial
 from drakegrasp.simulation.scene import (
     closing_angles,
     command_joints,

@@ -12,8 +12,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.simulation.trajectory import LiftPath, carrying_force, lift_path
-from drakegrasp.verification.forces.quality import force_margin
-from drakegrasp.verification.forces.verdict import hand_contacts
+from drakegrasp.verification.forces import force_margin, hand_contacts
 
 GRAVITY = 9.81
 HALF = CUBE / 2.0

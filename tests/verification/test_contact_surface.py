@@ -11,7 +11,7 @@ from helpers.objects import box_model, model_of
 
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.verification.contact_surface import WALL, SurfaceFit, fit_surface
+from drakegrasp.verification.hints import WALL, SurfaceFit, fit_surface
 
 EXTENTS = np.array([0.06, 0.08, 0.1])
 #: Outer and inner half edge of the open box below [m]: walls of 2 mm.

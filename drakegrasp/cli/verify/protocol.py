@@ -63,7 +63,7 @@ def is_lift(name: str, simulator: str | None) -> bool:
         ConfigError: If there is no such protocol.
         click.UsageError: If it does not run in the simulator.
     """
-    from drakegrasp.protocols.catalog import find_protocol
+    from drakegrasp.protocols.protocol import find_protocol
 
     protocol, stored = find_protocol(name)
     if simulator not in (None, protocol.simulator):

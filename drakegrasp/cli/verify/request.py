@@ -27,8 +27,10 @@ from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import find_mesh
 from drakegrasp.simulation.placement import place_object
-from drakegrasp.verification.placed_grasp import dataset_config, place_on_object, place_on_rows
-from drakegrasp.verification.placed_postures import (
+from drakegrasp.verification.placing import (
+    dataset_config,
+    place_on_object,
+    place_on_rows,
     place_postures_on_dataset,
     place_postures_on_object,
     place_postures_on_rows,

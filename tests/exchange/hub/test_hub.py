@@ -17,10 +17,10 @@ from drakegrasp.dataset.card.content import LIMITS, card_content
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import DEPTH_UNIT
 from drakegrasp.errors import DataError, MachineError
+from drakegrasp.exchange import hub as hub
+from drakegrasp.exchange import hub as table
+from drakegrasp.exchange.croissant import read_publication
 from drakegrasp.exchange.export import export_dataset
-from drakegrasp.exchange.hub import folder as hub
-from drakegrasp.exchange.hub import table
-from drakegrasp.exchange.publication import read_publication
 
 pytest.importorskip("pyarrow")
 

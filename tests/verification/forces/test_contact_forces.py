@@ -7,17 +7,15 @@ import pytest
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.verification.forces.contact_forces import (
+from drakegrasp.verification.forces import (
+    FRICTION_TOLERANCE,
+    MAX_FRICTION,
     ContactForces,
     ForceProgram,
     GraspContacts,
     contact_axes,
     grasp_map,
     hardest_forces,
-)
-from drakegrasp.verification.forces.quality import (
-    FRICTION_TOLERANCE,
-    MAX_FRICTION,
     smallest_friction,
 )
 

@@ -16,9 +16,13 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.trajectory import PEAK_ACCELERATION, lift_duration
-from drakegrasp.verification.forces.quality import force_margin
-from drakegrasp.verification.forces.surface_contacts import TORSION_RADIUS
-from drakegrasp.verification.forces.verdict import ForceVerdict, hand_contacts, judge_forces
+from drakegrasp.verification.forces import (
+    TORSION_RADIUS,
+    ForceVerdict,
+    force_margin,
+    hand_contacts,
+    judge_forces,
+)
 
 GRAVITY, HALF = 9.81, CUBE / 2.0
 #: Two contacts on one face of the cube, one in the middle of the opposite face.

@@ -7,11 +7,13 @@ import pytest
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.verification.forces.contact_forces import GraspContacts, contact_axes, grasp_map
-from drakegrasp.verification.forces.quality import (
+from drakegrasp.verification.forces import (
     FRICTION_EDGES,
+    GraspContacts,
     characteristic_length,
+    contact_axes,
     ferrari_canny,
+    grasp_map,
 )
 
 #: A contact in the middle of each face of a cube with edges of 2 m.

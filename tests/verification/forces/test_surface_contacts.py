@@ -10,7 +10,7 @@ import trimesh
 from helpers.objects import CUBE, box_model, model_of
 
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.verification.forces.surface_contacts import (
+from drakegrasp.verification.forces import (
     MAX_ANGLE,
     MAX_DISTANCE,
     RING_POINTS,

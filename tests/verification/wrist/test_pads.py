@@ -18,7 +18,7 @@ from drakegrasp.hand import shapes
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import hull_triangles, link_shapes, pad_surfaces
-from drakegrasp.verification.wrist.pads import (
+from drakegrasp.verification.wrist_problem import (
     ROUNDING,
     Pads,
     make_pads,

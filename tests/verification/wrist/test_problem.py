@@ -19,9 +19,7 @@ from drakegrasp.hand.kinematics import (
     still_links,
 )
 from drakegrasp.hand.shapes import link_shapes
-from drakegrasp.verification.wrist.hand_constants import hand_constants
-from drakegrasp.verification.wrist.pads import signed_distance
-from drakegrasp.verification.wrist.problem import (
+from drakegrasp.verification.wrist_problem import (
     CLEARANCE_ROUNDING,
     CLOSING_WEIGHT,
     NORMAL_WEIGHT,
@@ -29,6 +27,8 @@ from drakegrasp.verification.wrist.problem import (
     POSTURE_WEIGHT,
     WristProblem,
     evaluate,
+    hand_constants,
+    signed_distance,
 )
 
 SEEDS = range(12)

@@ -11,20 +11,20 @@ import pytest
 from helpers.hands import write_pincer
 from scipy.spatial.transform import Rotation
 
-import drakegrasp.verification.wrist.initial_guesses
+import drakegrasp.verification.wrist_solver
 from drakegrasp.frames import Array, invert_pose, make_pose, rotate_vectors, transform_points
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
 from drakegrasp.hand.shapes import link_shapes
-from drakegrasp.verification.wrist.hand_constants import hand_constants
-from drakegrasp.verification.wrist.initial_guesses import (
+from drakegrasp.verification.wrist_problem import hand_constants, nearest_on_pads, signed_distance
+from drakegrasp.verification.wrist_solver import (
     DIFFERENT,
     LEVER,
+    WristFit,
     find_starts,
+    fit_wrist,
     make_postures,
 )
-from drakegrasp.verification.wrist.pads import nearest_on_pads, signed_distance
-from drakegrasp.verification.wrist.solver import WristFit, fit_wrist
 
 SEEDS = range(25)
 #: Of the table's normal; above the table by so much that it never matters [m].
@@ -367,7 +367,7 @@ def test_starts_differ_and_the_best_comes_first(pincer: str, seed: int) -> None:
 
 def test_starts_tell_left_from_right(monkeypatch: pytest.MonkeyPatch) -> None:
     """Mirrored contacts have the same lengths and angles; their posture must be another."""
-    monkeypatch.setattr(drakegrasp.verification.wrist.initial_guesses, "NEAREST", 1)
+    monkeypatch.setattr(drakegrasp.verification.wrist_solver, "NEAREST", 1)
     postures, mirror = make_postures(hand_of("barrett")), np.diag([-1.0, 1.0, 1.0])
     wanted = np.deg2rad([33.75, 32.0, 88.0, 56.0])
     row = int(np.abs(postures.coordinates - wanted).max(axis=1).argmin())
@@ -384,9 +384,7 @@ def test_search_by_shape_finds_what_laying_over_every_posture_finds(
 ) -> None:
     postures, made = make_postures(hand_of("barrett")), touched("barrett", seed)
     (quick,) = find_starts(postures, made.p_OQ, made.nhat_Q_O, 1)
-    monkeypatch.setattr(
-        drakegrasp.verification.wrist.initial_guesses, "NEAREST", len(postures.coordinates)
-    )
+    monkeypatch.setattr(drakegrasp.verification.wrist_solver, "NEAREST", len(postures.coordinates))
     (best,) = find_starts(postures, made.p_OQ, made.nhat_Q_O, 1)
     least = misfit("barrett", best.X_OG, best.coordinates, made)
     assert misfit("barrett", quick.X_OG, quick.coordinates, made) < 1.2 * least

@@ -1,21 +1,83 @@
-"""Croissant metadata of a folder for the Hub (version 1.1 of mlcommons.org/croissant).
+"""What a publication says: who publishes a dataset, and its metadata in Croissant 1.1.
 
-In: the Parquet files of the folder, their columns, the data card, and what the publishers say.
-Out: the content of `croissant.json`, with the fields of Croissant's RAI vocabulary 1.0.
+In: a YAML file of what only the publishers can say (name, version, authors, date); the Parquet
+files of a folder for the Hub, their columns and the data card. Out: a `Publication`, and the
+content of `croissant.json` (mlcommons.org/croissant), with the fields of its RAI vocabulary 1.0.
 """
 
 from __future__ import annotations
 
+import datetime
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import Field as Key
 
+from drakegrasp.config import describe_mistake
 from drakegrasp.dataset.schema import Field
-from drakegrasp.exchange.hub.table import ParquetFile
-from drakegrasp.exchange.publication import Publication
+from drakegrasp.errors import DataError, one_line
+from drakegrasp.foreign_files import read_text
+from drakegrasp.yaml_text import parse_yaml
+
+if TYPE_CHECKING:
+    from drakegrasp.exchange.hub import ParquetFile
+
+
+class Publication(BaseModel):
+    """Attributes are the keys of the file, all optional.
+
+    Attributes:
+        name: Of the dataset, e.g. "Mugs and bowls, Allegro Hand".
+        version: Semantic version of the dataset, e.g. 1.0.0.
+        url: Address of its page.
+        creators: Names of people or groups.
+        published: Day on which it was published.
+        licence: Identifier, e.g. cc-by-4.0.
+        citation: How to cite it, as BibTeX.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str | None = Key(default=None, min_length=1)
+    version: str | None = Key(default=None, pattern=r"^\d+\.\d+\.\d+([-+].+)?$")
+    url: str | None = Key(default=None, pattern=r"^https?://\S+$")
+    creators: tuple[str, ...] = ()
+    published: datetime.date | None = None
+    licence: str | None = Key(default=None, min_length=1)
+    citation: str | None = Key(default=None, min_length=1)
+
+
+#: What Croissant 1.1 demands and no program knows.
+REQUIRED = ("name", "url", "creators", "published", "licence")
+
+
+def read_publication(path: Path) -> Publication:
+    """Return the content of a file.
+
+    Raises:
+        DataError: If it is not readable YAML, has an unknown key, or a value of another form.
+    """
+    try:
+        content = parse_yaml(read_text(path))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise DataError(f"{path}: must be a readable YAML file, got: {one_line(error)}") from error
+    try:
+        return Publication.model_validate({} if content is None else content)
+    except ValidationError as error:
+        keys = ", ".join(Publication.model_fields)
+        line = describe_mistake(error.errors()[0], whole="the file", legal=f"a known key ({keys})")
+        raise DataError(f"{path}: {line}") from error
+
+
+def not_said(publication: Publication) -> list[str]:
+    """Return the keys that a published dataset must have and this one lacks."""
+    return [key for key in REQUIRED if not getattr(publication, key)]
+
 
 #: Types of Croissant by NumPy's letter of a kind.
 _TYPES = {"f": "sc:Float", "i": "sc:Integer", "u": "sc:Integer", "b": "sc:Boolean"}

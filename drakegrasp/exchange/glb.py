@@ -17,7 +17,7 @@ import trimesh
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import model_path
-from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
+from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.shapes import hull_triangles, link_shapes

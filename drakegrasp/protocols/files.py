@@ -1,11 +1,14 @@
-"""Grasps as DexGraspBench stores them: a .npy file with postures and the pose of an object.
+"""Grasps and objects as DexGraspBench stores them.
 
-In: the file, which may be a stranger's. Out: its `StoredGrasps`, and the `GraspMotion` of one. Such
-a file is a pickle; only arrays, numbers, texts and containers are read from it, and no code runs.
+In: a .npy file with postures and the pose of an object, and the object's folder, which may be a
+stranger's. Out: `StoredGrasps`, the `GraspMotion` of one, and an `ObjectFolder`. Such a file is a
+pickle; only arrays, numbers, texts and containers are read from it, and no code runs.
 """
 
 from __future__ import annotations
 
+import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from drakegrasp.errors import DataError, GraspError
+from drakegrasp.errors import DataError, GraspError, one_line
+from drakegrasp.foreign_files import read_json
 from drakegrasp.frames import Array
 from drakegrasp.protocols.protocol import GraspMotion
 from drakegrasp.runtime.plain_pickle import read_plain_pickle
@@ -197,3 +201,59 @@ def _unit(vector: Array, key: str) -> Array:
     if not length > 0.0:
         raise DataError(f"{key} must have a quaternion, got zeros")
     return np.concatenate([vector[:3], vector[3:7] / length, vector[7:]])
+
+
+#: Where the parts and the volume are.
+PARTS, INFO = "urdf/meshes", "info/simplified.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectFolder:
+    """Convex parts in the object's frame {O}.
+
+    Attributes:
+        parts: Wavefront files, sorted by name.
+        scale: By which their coordinates are multiplied.
+        volume: Of the scaled object [m^3].
+        digest: 16 digits of the SHA-256 of the parts and the volume.
+    """
+
+    parts: tuple[Path, ...]
+    scale: float
+    volume: float
+    digest: str
+
+
+def read_object_folder(folder: Path, scale: float) -> ObjectFolder:
+    """Return the object of a folder.
+
+    Args:
+        folder: Of DexGraspBench's layout.
+        scale: Of the object.
+
+    Raises:
+        DataError: If the folder has no parts, or its volume cannot be read.
+    """
+    parts = tuple(sorted((folder / PARTS).glob("*.obj")))
+    if not parts:
+        raise DataError(f"{folder / PARTS}: must hold the object's convex parts (.obj), got none")
+    if not (math.isfinite(scale) and scale > 0.0):
+        raise DataError(f"{folder}: scale must be a positive number, got {scale}")
+    try:
+        info = read_json(folder / INFO)
+        unit = info["mass"] / (info["density"] * info["scale"] ** 3)
+    except (KeyError, TypeError, ArithmeticError, OSError, ValueError) as error:
+        raise DataError(
+            f"{folder / INFO}: must have mass, density and scale, got {one_line(error)}"
+        ) from None
+    if not (math.isfinite(unit) and unit > 0.0):
+        raise DataError(f"{folder / INFO}: the volume must be positive, got {unit}")
+
+    # What the object is, whatever its folder is called.
+    text = hashlib.sha256()
+    for part in parts:
+        text.update(part.read_bytes())
+    text.update(repr((unit, scale)).encode())
+    return ObjectFolder(
+        parts=parts, scale=scale, volume=unit * scale**3, digest=text.hexdigest()[:16]
+    )

@@ -2,7 +2,7 @@
 
 In: a hand, k contact points with outward normals in {O}, and the height of the table. Out: the
 residuals whose sum of squares is to be minimised and the clearances that must not be negative,
-with exact derivatives. `solver` minimises.
+with exact derivatives. `wrist_solver` minimises.
 
 The objective is that of Veres et al. (2017), appendix, sum |C_i - Y_i|^2 over the rotations
 and translations of X_OG, with the hand's joints as further unknowns. Y_i is the predicted
@@ -10,17 +10,336 @@ point and C_i the nearest point of fingertip i, because a real contact may lie a
 fingertip. Terms with small weights (our own) decide what the points leave open: each pad should
 face the predicted normal, each finger should close against it, the contacts should be near
 the hand file's pad points, and the joints near those of the start. `evaluate` has the formulas.
+
+The surfaces of the fingertips are smooth signed distances (`Pads`): the distance of p from a convex
+body with face planes n_j . p = d_j is at least the largest of n_j . p - d_j, and equal to it in
+front of a face. Here the largest is replaced by the smooth maximum s log sum exp((n_j . p - d_j)/s)
+(Boyd and Vandenberghe, "Convex Optimization", 3.1.5), which rounds edges with a radius of about s.
+A fingertip may touch within its pad region only. The planes of the region are no surface, so the
+distance is that of the whole fingertip, and how far a point is outside of the region is told beside
+it: a point on the fingertip but so far outside is about as far from the pad.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
+import trimesh
+from scipy.linalg import block_diag
+from scipy.spatial import ConvexHull
 
-from drakegrasp.frames import Array, make_pose
-from drakegrasp.verification.wrist.hand_constants import HandConstants, skew
-from drakegrasp.verification.wrist.pads import PadContact, signed_distance
+from drakegrasp.errors import HandError
+from drakegrasp.frames import Array, make_pose, transform_points
+from drakegrasp.hand.description import Hand
+from drakegrasp.hand.file_format import HalfSpace
+from drakegrasp.hand.kinematics import coordinate_limits, link_poses, still_links
+from drakegrasp.hand.shapes import link_shapes, pad_surfaces
+
+#: Rounding s of the edges [m]: about the unevenness of the pads themselves.
+ROUNDING = 0.7e-3
+#: Faces whose normals and offsets agree to this many decimals are one plane.
+SAME_PLANE = 6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pads:
+    """The surfaces of k fingertips, each with m planes and h half-spaces (padded).
+
+    Attributes:
+        normals: (k, m, 3), unit, outward, in each fingertip's frame.
+        offsets: (k, m), n . p on the plane [m]; padded with planes at infinity.
+        region_normals: (k, h, 3), unit, into the pad region; padded with zeros.
+        region_offsets: (k, h), n . p on the border of the region [m]; padded with -1.
+        triangles: For each fingertip (t, 3, 3), the corners of its pad's triangles [m].
+    """
+
+    normals: Array
+    offsets: Array
+    region_normals: Array
+    region_offsets: Array
+    triangles: tuple[Array, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PadContact:
+    """Distances and normals of k pads at k points, one each.
+
+    Attributes:
+        distance: (k,), smooth signed distance from the pad, negative inside [m].
+        normal: (k, 3), unit outward normal of the pad next to the point.
+        gradient: (k, 3), derivative of `distance` by the point; along `normal`, shorter than one at
+            edges.
+        normal_jacobian: (k, 3, 3), derivative of `normal` by the point [1/m].
+        outside: (k, h), how far the point is outside of each half-space of the pad region, 0 inside
+            [m].
+        outside_gradient: (k, h, 3), derivative of `outside` by the point.
+    """
+
+    distance: Array
+    normal: Array
+    gradient: Array
+    normal_jacobian: Array
+    outside: Array
+    outside_gradient: Array
+
+
+def make_pads(
+    corners: Sequence[Array], regions: Sequence[Sequence[HalfSpace]], triangles: Sequence[Array]
+) -> Pads:
+    """Return the pads of k fingertips.
+
+    Args:
+        corners: (n, 3), of each fingertip; its shape is their convex hull [m].
+        regions: Half-spaces of each pad.
+        triangles: (t, 3, 3), surface of each pad, see `hand.shapes.pad_surfaces` [m].
+    """
+    # The planes of each hull; a row of equations is a unit normal and minus the offset.
+    hulls = [ConvexHull(points) for points in corners]
+    planes = [np.unique(np.round(hull.equations, SAME_PLANE), axis=0) for hull in hulls]
+
+    # Stack them; a plane at infinity never has the largest n . p - d.
+    most = max(map(len, planes))
+    normals = np.zeros((len(planes), most, 3))
+    offsets = np.full((len(planes), most), np.inf)
+    for i, equations in enumerate(planes):
+        normals[i, : len(equations)] = equations[:, :3]
+        offsets[i, : len(equations)] = -equations[:, 3]
+
+    # Stack the half-spaces; every point is in one without a normal whose border is at -1.
+    most = max(map(len, regions))
+    region_normals = np.zeros((len(planes), most, 3))
+    region_offsets = np.full((len(planes), most), -1.0)
+    for i, region in enumerate(regions):
+        for j, (*normal, offset) in enumerate(region):
+            length = np.linalg.norm(normal)
+            region_normals[i, j] = np.array(normal) / length
+            region_offsets[i, j] = offset / length
+
+    return Pads(
+        normals=normals,
+        offsets=offsets,
+        region_normals=region_normals,
+        region_offsets=region_offsets,
+        triangles=tuple(triangles),
+    )
+
+
+def nearest_on_pads(pads: Pads, p_FiQ: Array) -> Array:
+    """Return the point of each pad, without rounding, that is nearest to a point.
+
+    Args:
+        pads: Of k fingertips.
+        p_FiQ: (k, 3), a point in each fingertip's frame [m].
+
+    Returns:
+        (k, 3), in the fingertips' frames [m].
+    """
+    nearest = []
+    for triangles, point in zip(pads.triangles, p_FiQ, strict=True):
+        near = trimesh.triangles.closest_point(triangles, np.tile(point, (len(triangles), 1)))
+        nearest.append(near[np.argmin(np.sum((near - point) ** 2, axis=1))])
+    return np.array(nearest)
+
+
+def signed_distance(pads: Pads, p_FiQ: Array) -> PadContact:
+    """Return the smooth signed distance of each point from its pad, with derivatives.
+
+    With the heights h_j = n_j·p − d_j of a point p over the face planes and the rounding s:
+
+        φ = s log Σ_j exp(h_j / s),   max h_j ≤ φ ≤ max h_j + s log M for M planes
+        w_j = exp(h_j / s) / Σ exp(h_j / s)
+        g = ∇φ = Σ_j w_j n_j
+        H = ∇∇φ = (Σ_j w_j n_j n_jᵀ − g gᵀ) / s
+        m = g / |g|,   ∂m/∂p = (1 − m mᵀ) H / |g|
+
+    (Boyd and Vandenberghe, 3.1.5), and outside of a half-space n·p ≥ d of the pad region by
+    o = max(0, d − n·p).
+
+    Args:
+        pads: Of k fingertips.
+        p_FiQ: (k, 3), a point in each fingertip's frame [m].
+    """
+    # The smooth maximum of the heights over the planes, and the weights of the planes.
+    height = (np.matmul(pads.normals, p_FiQ[:, :, None])[..., 0] - pads.offsets) / ROUNDING
+    highest = height.max(axis=1)
+    weight = np.exp(height - highest[:, None])
+    total = weight.sum(axis=1)
+    weight /= total[:, None]
+
+    # First and second derivatives by the point.
+    gradient = np.matmul(weight[:, None, :], pads.normals)[:, 0]
+    weighted = pads.normals * weight[:, :, None]
+    outer = gradient[:, :, None] * gradient[:, None, :]
+    hessian = (np.matmul(weighted.transpose(0, 2, 1), pads.normals) - outer) / ROUNDING
+
+    # The normal m = g / |g|; its derivative is (1 - m m') H / |g|.
+    length = np.sqrt((gradient * gradient).sum(axis=1))
+    normal = gradient / length[:, None]
+    along = np.matmul(normal[:, None, :], hessian)
+    normal_jacobian = (hessian - normal[:, :, None] * along) / length[:, None, None]
+
+    # How far outside of the pad region the point is.
+    outside = pads.region_offsets - np.matmul(pads.region_normals, p_FiQ[:, :, None])[..., 0]
+
+    return PadContact(
+        distance=ROUNDING * (highest + np.log(total)),
+        normal=normal,
+        gradient=gradient,
+        normal_jacobian=normal_jacobian,
+        outside=np.maximum(outside, 0.0),
+        outside_gradient=-pads.region_normals * (outside > 0.0)[..., None],
+    )
+
+
+#: A vector times this, reshaped to 3 x 3, is the matrix of its cross product.
+_SKEW = np.array([np.cross(e, np.eye(3)).T for e in np.eye(3)]).reshape(3, 9)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HandConstants:
+    """A hand of k fingers with chains of m joints as stacked arrays; shorter chains are padded.
+
+    Attributes:
+        X_PJ: (m, k, 4, 4), pose of each joint in the moving frame of the joint before it; that
+            of the first joint is in {G}.
+        axis: (m, k, 3), unit axis in the joint's frame; zero if the joint slides.
+        slide: (m, k, 3), unit direction in the joint's frame; zero if the joint turns.
+        slides: (m, k), whether the joint slides.
+        twist, twist2: (m, k, 4, 4), matrix of the joint's motion per position, and its square: of
+            the cross product by its axis, or of its direction.
+        gain: (m, k, 1 + k), joint position per coordinate.
+        offset: (m, k), joint positions at zero coordinates [rad or m].
+        finger_gain: (k, m, 1 + k), the gain by finger.
+        closing_gain: (m, k), joint position per closing position of the joint's own finger.
+        X_JFi: (k, 4, 4), pose of the fingertip link in the moving frame of the last joint.
+        pads: The fingertips' surfaces.
+        pad_points: (k, 3), nominal contact points in {Fi} [m].
+        limits: (1 + m, 2), of the coordinates: the spread, and the closing of each finger that has
+            a motor [rad or m].
+        units: (1 + m,), what counts as a radian of each coordinate [rad or m].
+        fingertips: (k, n, 3), corners of the fingertips in {Fi} [m].
+        closing_ratio: (k, m), see `Hand.closing_ratio`.
+        motor_of: (k,), the motor that moves each finger.
+        palm: (n, 3), corners of the palm and of what is fixed to it, in {G} [m].
+    """
+
+    X_PJ: Array
+    axis: Array
+    slide: Array
+    slides: Array
+    twist: Array
+    twist2: Array
+    gain: Array
+    offset: Array
+    finger_gain: Array
+    closing_gain: Array
+    X_JFi: Array
+    pads: Pads
+    pad_points: Array
+    limits: Array
+    units: Array
+    fingertips: Array
+    palm: Array
+    closing_ratio: Array
+    motor_of: npt.NDArray[np.int64]
+
+
+@lru_cache(maxsize=4)
+def hand_constants(hand: Hand) -> HandConstants:
+    """Return the constants of a hand.
+
+    Raises:
+        HandError: If its palm or a fingertip has no shape, or one that is not convex.
+    """
+    # The palm and the fingertips need shapes; those of a palm may be on links fixed to it.
+    shapes = link_shapes(hand)
+    still = [link for link in still_links(hand) if shapes[link]]
+    missing = [] if still else [hand.palm_link]
+    missing += [link for link in hand.fingertip_links if not shapes[link]]
+    if missing:
+        raise HandError(
+            f"{hand.model.path}: link {missing[0]!r} must have a collision shape, got none"
+        )
+
+    # Corners of the fingertips, stacked.
+    corners = [np.concatenate(shapes[finger.fingertip]) for finger in hand.fingers]
+    most = max(map(len, corners))
+    # n copies of a corner lower the smooth minimum by at most its rounding times log n.
+    padded = np.stack([np.pad(c, ((0, most - len(c)), (0, 0)), mode="edge") for c in corners])
+
+    # Corners of the palm, from the links' frames to {G}.
+    open_hand = np.zeros(hand.num_fingers)
+    palm = np.concatenate(
+        [
+            transform_points(
+                link_poses(hand, link, spread=0.0, closing=open_hand), np.concatenate(shapes[link])
+            )
+            for link in still
+        ]
+    )
+
+    chains = _stack_chains(hand)
+    moved = [0, *(1 + i for i in hand.motor_fingers)]
+    return HandConstants(
+        **chains,
+        pads=make_pads(corners, [finger.pad_region for finger in hand.fingers], pad_surfaces(hand)),
+        pad_points=np.array([finger.p_FiP for finger in hand.fingers]),
+        limits=coordinate_limits(hand)[moved],
+        units=np.r_[1.0, hand.closing_unit][moved],
+        closing_ratio=hand.closing_ratio,
+        motor_of=hand.motor_of,
+        fingertips=padded,
+        palm=palm,
+    )
+
+
+def _stack_chains(hand: Hand) -> dict[str, Array]:
+    """Return the attributes of `HandConstants` that describe the joints, by name."""
+    # Pad all chains to the length of the longest.
+    m = max(len(chain.axis) for chain in hand.chains)
+    X_PJ, axis, slides, gain, offset = [], [], [], [], []
+    for chain in hand.chains:
+        # Padding joints come last and do not move, so they have no effect.
+        missing = m - len(chain.axis)
+        X_PJ.append(np.concatenate([chain.X_PJ, np.tile(np.eye(4), (missing, 1, 1))]))
+        axis.append(np.concatenate([chain.axis, np.tile([0.0, 0.0, 1.0], (missing, 1))]))
+        slides.append(np.pad(chain.slides, (0, missing)))
+        gain.append(np.pad(chain.gain, ((0, missing), (0, 0))))
+        offset.append(np.pad(chain.offset, (0, missing)))
+
+    # The motions of the joints as matrices: the cross product by an axis, or a translation.
+    along, sliding = np.stack(axis, axis=1), np.stack(slides, axis=1)
+    turn = np.where(sliding[..., None], 0.0, along)
+    slide = np.where(sliding[..., None], along, 0.0)
+    k = len(hand.chains)
+    by_motor = block_diag(1.0, hand.closing_ratio)
+    twist = np.zeros((m, k, 4, 4))
+    twist[..., :3, :3] = skew(turn)
+    twist[..., :3, 3] = slide
+
+    return {
+        "X_PJ": np.stack(X_PJ, axis=1),
+        "axis": turn,
+        "slide": slide,
+        "slides": sliding,
+        "twist": twist,
+        "twist2": twist @ twist,
+        "gain": np.stack(gain, axis=1) @ by_motor,
+        "offset": np.stack(offset, axis=1),
+        "finger_gain": np.stack(gain) @ by_motor,
+        "closing_gain": np.stack(gain, axis=1)[:, range(k), 1 + np.arange(k)],
+        "X_JFi": np.stack([chain.X_JFi for chain in hand.chains]),
+    }
+
+
+def skew(a: Array) -> Array:
+    """Return the matrices (..., 3, 3) of the cross products by a (..., 3)."""
+    return np.asarray((a @ _SKEW).reshape(*a.shape, 3))
+
 
 #: Number of unknowns of the palm's pose: three angles and three translations.
 POSE = 6

@@ -30,7 +30,7 @@ from drakegrasp.simulation.candidates import (
     Source,
     is_audited,
 )
-from drakegrasp.simulation.postures.posture import Posture, exact_pose, preshape_index, start_of
+from drakegrasp.simulation.posture import Posture, exact_pose, preshape_index, start_of
 from drakegrasp.simulation.settle import SAME_UP
 
 #: Frames of a table: those of a posture, and {M}, the axes and the origin of the mesh file.

@@ -18,8 +18,8 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import model_path
-from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
 from drakegrasp.exchange.dexgraspbench import pose_vector
+from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import Hand, load_plain_hand
 from drakegrasp.mesh.wavefront import hull_text

@@ -1,1 +1,0 @@
-"""The folder of a dataset for the Hugging Face Hub."""

@@ -1,1 +1,0 @@
-"""Wrists with joints from outside, and how they are tried."""

@@ -1,1 +1,0 @@
-"""Lifting by forces at the contacts alone, and measures of grasp quality."""

@@ -1,1 +1,0 @@
-"""The palm pose that brings the fingertips to predicted contacts."""
