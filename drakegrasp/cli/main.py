@@ -67,7 +67,7 @@ def objects() -> None:
 @objects.command("list")
 def list_objects() -> None:
     """Print every built-in class, with the parameters that are drawn."""
-    from drakegrasp.shapes.classes import CLASSES
+    from drakegrasp.shapes.catalog import CLASSES
 
     for item in CLASSES:
         sizes = ", ".join(f"{name} {span}" for name, span in item.parameters.items())

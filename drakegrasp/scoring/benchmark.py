@@ -28,8 +28,7 @@ from drakegrasp.objects.sources import MANIFEST_NAME
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.shapes.catalog import LICENCE, BuiltinObject, draw_builtin, wavefront
-from drakegrasp.shapes.classes import CLASSES
+from drakegrasp.shapes.catalog import CLASSES, LICENCE, BuiltinObject, draw_builtin, wavefront
 
 NAME, PRESET = "drakegrasp-bench-1", "bench1"
 #: Masses [kg] and friction coefficients that the objects draw from.

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import generated_page
 
 from drakegrasp.config import BuiltinConfig
-from drakegrasp.shapes.classes import CLASSES, ObjectClass
+from drakegrasp.shapes.catalog import CLASSES, ObjectClass
 
-_HEAD = f"""<!-- Made by `make docs-pages` from shapes/classes.py: change that. -->
+_HEAD = f"""<!-- Made by `make docs-pages` from shapes/catalog.py: change that. -->
 
 # Built-in objects
 
@@ -50,7 +50,7 @@ In Python, `export_builtin("MESHES", ["1_mug_1", "1_mug_2"])` of
 `drakegrasp.shapes.catalog` writes single objects, and `builtin_object("1_mug_2",
 seed=3).sizes` are the sizes of one. To add a class, write a function in
 `drakegrasp/shapes/`, add a row at the end of the table in
-`drakegrasp/shapes/classes.py`, and run `make docs-pages`.
+`drakegrasp/shapes/catalog.py`, and run `make docs-pages`.
 """
 
 

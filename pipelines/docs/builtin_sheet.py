@@ -18,8 +18,7 @@ from drakegrasp.config import CameraConfig
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.pictures.style import INK, add_axes, hide_ticks, save_figure
-from drakegrasp.shapes.catalog import BuiltinObject
-from drakegrasp.shapes.classes import CLASSES
+from drakegrasp.shapes.catalog import CLASSES, BuiltinObject
 from drakegrasp.vision.rendering import build_renderer, render
 
 #: Objects per line of the sheet, and the edge of each picture [inch].

@@ -12,7 +12,7 @@ from drakegrasp.config import ObjectConfig
 from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
-from drakegrasp.shapes import packaging, vessels
+from drakegrasp.shapes import kitchen
 from drakegrasp.shapes.catalog import wavefront
 
 G3DB = Path(__file__).resolve().parents[3] / "shared/meshes/g3db"
@@ -26,7 +26,7 @@ BOX = (0.06, 0.10, 0.04)
 
 #: Objects of fixed sizes, whatever the ranges of their classes are; easy to grasp.
 FIXED = {
-    "8_wineglass_flute": vessels.wineglass(
+    "8_wineglass_flute": kitchen.wineglass(
         foot_radius=0.034,
         stem_radius=0.006,
         belly_radius=0.028,
@@ -34,7 +34,7 @@ FIXED = {
         height=0.180,
         stem_height=0.065,
     ),
-    "10_box_tall": packaging.box(width=0.070, depth=0.050, height=0.150),
+    "10_box_tall": kitchen.box(width=0.070, depth=0.050, height=0.150),
 }
 
 

@@ -35,8 +35,7 @@ from drakegrasp.scoring.benchmark import (
     rows_digest,
     write_objects,
 )
-from drakegrasp.shapes.catalog import draw_builtin
-from drakegrasp.shapes.classes import CLASSES
+from drakegrasp.shapes.catalog import CLASSES, draw_builtin
 
 CONFIG = load_config(PRESET)
 SCORED = override_config(CONFIG, ["verify.max_tries=1"])

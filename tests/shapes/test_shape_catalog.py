@@ -17,16 +17,20 @@ from drakegrasp.config import BuiltinConfig
 from drakegrasp.errors import MeshError
 from drakegrasp.mesh.surfaces import overlap_share
 from drakegrasp.seeding import Stream
-from drakegrasp.shapes import packaging, vessels
+from drakegrasp.shapes import kitchen
 from drakegrasp.shapes.catalog import (
+    CLASSES,
     BuiltinObject,
+    ObjectClass,
+    Range,
     builtin_object,
     builtin_sources,
+    deg,
     draw_builtin,
     export_builtin,
+    mm,
+    pieces,
 )
-from drakegrasp.shapes.classes import CLASSES, ObjectClass
-from drakegrasp.shapes.parameters import Range, deg, mm, pieces
 
 #: What lies lower than this bears on the table [m].
 CONTACT_HEIGHT = 0.001
@@ -134,19 +138,19 @@ def test_as_many_of_each_class_as_asked_for() -> None:
 
 
 def test_box_volume_is_exact() -> None:
-    mesh = packaging.box(width=0.1, depth=0.07, height=0.06)
+    mesh = kitchen.box(width=0.1, depth=0.07, height=0.06)
     assert mesh.volume == pytest.approx(0.1 * 0.07 * 0.06, rel=1e-6)
     np.testing.assert_allclose(mesh.bounds, [[-0.05, -0.035, 0.0], [0.05, 0.035, 0.06]], atol=1e-7)
 
 
 def test_can_volume_is_that_of_a_cylinder() -> None:
-    mesh = packaging.can(radius=0.033, height=0.12)
+    mesh = kitchen.can(radius=0.033, height=0.12)
     assert mesh.volume == pytest.approx(np.pi * 0.033**2 * 0.12, rel=0.02)
 
 
 def test_mug_is_a_shell_with_a_handle() -> None:
     radius, height, wall, floor = 0.044, 0.1, 0.005, 0.007
-    mesh = vessels.mug(
+    mesh = kitchen.mug(
         radius=radius, height=height, handle_reach=0.034, handle_radius=0.006, wall=wall
     )
     shell = np.pi * (radius**2 * height - (radius - wall) ** 2 * (height - floor))

@@ -1,7 +1,7 @@
 """Curves in the plane: corners and sizes in metres come in, evenly spaced points go out.
 
-A curve is a polyline. It is a profile (r, z) that `drakegrasp.shapes.modelling.solids` turns
-about z, or an outline (x, y) that it moves along a path.
+A curve is a polyline. It is a profile (r, z) that `drakegrasp.shapes.solids` turns about z, or an
+outline (x, y) that it moves along a path.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import PchipInterpolator
 
+from drakegrasp.arithmetic import sin_cos_deg
 from drakegrasp.frames import Array
 
 #: Usual edge length where fingers touch [m]: below the width of a fingertip.
@@ -25,6 +26,9 @@ COARSE = 1.7
 
 #: Possible numbers of points of a ring: few, so that neighbouring rings mostly have the same.
 RING_SIZES = np.array([8, 12, 16, 24, 32, 48, 64])
+
+#: A piece of a curve begins where the last one ends if it is as near as that [m].
+MEETS = 1e-9
 
 #: How far from its ends an inset profile starts to follow the given one [m].
 OVERLAP = 0.001
@@ -41,6 +45,26 @@ def resample(points: npt.ArrayLike, step: float) -> Array:
     return np.concatenate(pieces)
 
 
+def spaced(step: float, *knots: float) -> Array:
+    """Return numbers (n,) from knot to knot, no more than `step` apart."""
+    return resample([[knot] for knot in knots], step)[:, 0]
+
+
+def scaled(shares: npt.ArrayLike, *sizes: float) -> Array:
+    """Return points (n, d) whose coordinates are given as shares of the sizes (d,) [m]."""
+    return np.asarray(shares, dtype=float) * sizes
+
+
+def joined(*pieces: npt.ArrayLike) -> Array:
+    """Return curves (n, d) as one; where one begins at the end of the last, this point is one."""
+    curve = np.asarray(pieces[0], dtype=float)
+    for piece in pieces[1:]:
+        points = np.asarray(piece, dtype=float)
+        meets = np.abs(points[0] - curve[-1]).max() < MEETS
+        curve = np.vstack([curve, points[int(meets) :]])
+    return curve
+
+
 def smooth(points: npt.ArrayLike, step: float) -> Array:
     """Return points (n, d) about `step` [m] apart on a curve through `points` (k, d).
 
@@ -49,6 +73,13 @@ def smooth(points: npt.ArrayLike, step: float) -> Array:
     knots = np.asarray(points, dtype=float)
     fine = PchipInterpolator(arc_length(knots), knots)(np.linspace(0.0, arc_length(knots)[-1], 400))
     return spread_evenly(fine, step)
+
+
+def between(knots: npt.ArrayLike, at: npt.ArrayLike) -> Array:
+    """Return the values at `at` (n,) of a monotone cubic through knots (k, 2) or (k, 1 + d)."""
+    rows = np.asarray(knots, dtype=float)
+    values = rows[:, 1] if rows.shape[1] == 2 else rows[:, 1:]
+    return np.asarray(PchipInterpolator(rows[:, 0], values)(at))
 
 
 def inset(side: npt.ArrayLike, distance: float, *, floor: float) -> Array:
@@ -69,12 +100,30 @@ def inset(side: npt.ArrayLike, distance: float, *, floor: float) -> Array:
 
 def bevelled(radius: float, height: float, bevel: float) -> list[tuple[float, float]]:
     """Return corners (r, z) of an upright wall with a bevelled foot and head, off the axis."""
-    return [
-        (radius - bevel, 0.0),
-        (radius, bevel),
-        (radius, height - bevel),
-        (radius - bevel, height),
-    ]
+    foot = foot_and_wall(radius, height - bevel, bevel)
+    return [*foot, (radius - bevel, height)]
+
+
+def foot_and_wall(radius: float, height: float, bevel: float) -> list[tuple[float, float]]:
+    """Return corners (r, z) of an upright wall with a bevelled foot alone."""
+    return [(radius - bevel, 0.0), (radius, bevel), (radius, height)]
+
+
+def arch(
+    a: float, b: float, *, x: float = 0.0, z: float, degrees: tuple[float, float], count: int
+) -> Array:
+    """Return an arc (count, 3) of an ellipse of half-axes `a` and `b` [m] in the plane y = 0.
+
+    Args:
+        a: Along x.
+        b: Along z.
+        x: Of its middle [m].
+        z: Of its middle [m].
+        degrees: Where it begins and ends.
+        count: Of points.
+    """
+    s, c = sin_cos_deg(np.linspace(*degrees, count))
+    return np.column_stack([x + a * c, 0.0 * c, z + b * s])
 
 
 def ellipse(a: float, b: float, *, edge: float) -> Array:

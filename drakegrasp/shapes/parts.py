@@ -1,6 +1,6 @@
 """Parts of shapes: sizes and places in metres come in, watertight parts go out.
 
-A class of objects is a handful of these parts, made one by `drakegrasp.shapes.modelling.solids`.
+A class of objects is a handful of these parts, made one by `drakegrasp.shapes.solids`.
 Parts overlap where they are to be joined.
 """
 
@@ -12,16 +12,19 @@ import trimesh
 
 from drakegrasp.arithmetic import dot, multiply, norm, sin_cos_deg
 from drakegrasp.frames import Array
-from drakegrasp.shapes.modelling.profiles import (
+from drakegrasp.shapes.curves import (
     COARSE,
     EDGE,
     arc_length,
+    ellipse,
+    inset,
     resample,
     ring_angles,
     ring_size,
     rounded_rectangle,
+    spread_evenly,
 )
-from drakegrasp.shapes.modelling.solids import extrude, revolve, skin, solid
+from drakegrasp.shapes.solids import cut, extrude, revolve, skin, solid, sweep
 
 #: Rings of a flat end, as shares of its outline: the triangles at the centre stay plump.
 FLAT_END = (0.0, 0.5, 0.93)
@@ -87,6 +90,19 @@ def rod(
     return solid(multiply(upright.vertices, _axes((q - p) / length).T) + p, upright.faces)
 
 
+def post(
+    low: float,
+    high: float,
+    radius: float,
+    end_radius: float | None = None,
+    *,
+    at: tuple[float, float] = (0.0, 0.0),
+    edge: float = EDGE,
+) -> trimesh.Trimesh:
+    """Return an upright `rod` from z = `low` to z = `high` [m] at the place `at` (x, y) [m]."""
+    return rod((*at, low), (*at, high), radius, end_radius, edge=edge)
+
+
 def tube(path: npt.ArrayLike, radius: npt.ArrayLike, *, edge: float = EDGE) -> trimesh.Trimesh:
     """Return a round bar along a curve, with flat ends.
 
@@ -113,12 +129,18 @@ def tube(path: npt.ArrayLike, radius: npt.ArrayLike, *, edge: float = EDGE) -> t
     for place in (0, -1):
         if len(rings[place]) > 1:
             rings.insert(0, points[:1]) if place == 0 else rings.append(points[-1:])
-    return skin(rings, closed=False)
+    return skin(rings)
+
+
+def hoop(path: Array, radius: float, *, edge: float) -> list[trimesh.Trimesh]:
+    """Return a round bar along a closed curve (k, 3), its last point its first, in two parts."""
+    half = len(path) // 2
+    return [tube(part, radius, edge=edge) for part in (path[: half + 2], path[half - 1 :])]
 
 
 def block(
-    size: npt.ArrayLike,
-    centre: npt.ArrayLike,
+    size: tuple[float, float, float],
+    centre: tuple[float, float, float],
     *,
     corner: float = 0.002,
     edge: float = 1.2 * EDGE,
@@ -131,9 +153,8 @@ def block(
         corner: Radius of the upright edges [m].
         edge: Edge length [m].
     """
-    width, depth, height = (float(value) for value in np.asarray(size, dtype=float))
-    x, y, z = (float(value) for value in np.asarray(centre, dtype=float))
-    levels = [(z - height / 2.0, width, depth, x, y), (z + height / 2.0, width, depth, x, y)]
+    (width, depth, height), (x, y, z) = size, centre
+    levels = [(z + share * height, width, depth, x, y) for share in (-0.5, 0.5)]
     return pillar(levels, corner=corner, edge=edge)
 
 
@@ -168,7 +189,7 @@ def pillar(
 
     low = [ring(first, share) for share in FLAT_END]
     high = [ring(last, share) for share in FLAT_END[::-1]]
-    return skin([*low, ring(first), *map(ring, rows), ring(last), *high], closed=False)
+    return skin([*low, ring(first), *map(ring, rows), ring(last), *high])
 
 
 def prism(
@@ -211,8 +232,10 @@ def scalloped(radius: float, depth: float, count: int, *, edge: float = EDGE) ->
     return np.column_stack([reach * cosine, reach * sine])
 
 
-def moved(mesh: trimesh.Trimesh, offset: npt.ArrayLike) -> trimesh.Trimesh:
-    """Return a mesh moved by `offset` (3,) [m]."""
+def moved(mesh: trimesh.Trimesh, offset: npt.ArrayLike, **turns: float) -> trimesh.Trimesh:
+    """Return a mesh turned about axes by angles, such as `x=90.0` [deg], then moved by (3,) [m]."""
+    for axis, degrees in turns.items():
+        mesh = rotated(mesh, axis, degrees)
     return solid(mesh.vertices + np.asarray(offset, dtype=float), mesh.faces)
 
 
@@ -233,3 +256,64 @@ def _axes(direction: Array) -> Array:
     x = np.cross(helper, direction)
     x /= norm(x)
     return np.column_stack([x, np.cross(direction, x), direction])
+
+
+def vessel(
+    side: npt.ArrayLike, *, wall: float, floor: float, edge: float = EDGE
+) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
+    """Return an open vessel and the core that its handles must keep clear of.
+
+    The core fills the cavity and half of the wall: what is cut by it ends inside the wall.
+
+    Args:
+        side: Outer profile (r, z) [m] from the foot, z = 0, to the rim.
+        wall: Thickness of the wall, across it [m].
+        floor: Thickness of the floor [m].
+        edge: Edge length outside [m].
+    """
+    outer = np.asarray(side, dtype=float)
+    coarse = COARSE * edge
+    inner = spread_evenly(inset(outer, wall, floor=floor), coarse)[::-1]
+    foot = resample([(0.0, 0.0), outer[0]], coarse)[:-1]
+    bottom = resample([inner[-1], (0.0, floor)], coarse)[1:]
+    profile = np.vstack([foot, outer, inner, bottom])
+    edges = np.full(len(profile), coarse)
+    edges[len(foot) : len(foot) + len(outer)] = edge
+
+    middle = spread_evenly(inset(outer, wall / 2.0, floor=floor / 2.0), coarse)
+    top = middle[-1] + [0.0, 0.1]
+    core = np.vstack([(0.0, middle[0, 1]), middle, top, (0.0, top[1])])
+    return revolve(profile, edge=edges), revolve(core, edge=coarse)
+
+
+def loop_handle(
+    *, x: float, top: float, bottom: float, reach: float, radius: float, edge: float = EDGE
+) -> trimesh.Trimesh:
+    """Return a D-shaped handle in the plane y = 0, open towards -x.
+
+    Args:
+        x: Where both ends lie, inside the body's wall [m].
+        top: Height of the upper end's centre line [m].
+        bottom: Height of the lower end's centre line [m].
+        reach: How far the centre line goes beyond `x` [m].
+        radius: Half the thickness in the plane; the handle is 1.3 times as wide [m].
+        edge: Edge length [m].
+    """
+    angles = np.linspace(0.0, np.pi, 200)
+    middle, half = (top + bottom) / 2.0, (top - bottom) / 2.0
+    # A power below one makes the half ellipse squarer, like a real handle.
+    curve = np.column_stack(
+        [
+            x + reach * np.sin(angles) ** 0.7,
+            np.zeros_like(angles),
+            middle + half * np.sign(np.cos(angles)) * np.abs(np.cos(angles)) ** 0.85,
+        ]
+    )
+    section = ellipse(radius, 1.3 * radius, edge=edge * 0.7)
+    return sweep(spread_evenly(curve, edge), section, normal=(0.0, 1.0, 0.0), scale=1.0)
+
+
+def trimmed(part: trimesh.Trimesh, core: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the piece of a handle that lies outside the core, without crumbs."""
+    pieces = cut(part, core).split(only_watertight=True)
+    return max(pieces, key=lambda piece: piece.volume)

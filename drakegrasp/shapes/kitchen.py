@@ -1,0 +1,406 @@
+"""Things of a kitchen and of a shop: vessels, machines, what is bought packed.
+
+One function per class: sizes come in, a watertight mesh goes out; see `drakegrasp.shapes.catalog`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+from drakegrasp.shapes.curves import (
+    BROAD,
+    COARSE,
+    EDGE,
+    LARGE,
+    bevelled,
+    ellipse,
+    foot_and_wall,
+    inset,
+    joined,
+    resample,
+    rounded_rectangle,
+    scaled,
+    smooth,
+    spaced,
+    spread_evenly,
+)
+from drakegrasp.shapes.parts import (
+    ball,
+    block,
+    lathe,
+    loop_handle,
+    moved,
+    pillar,
+    post,
+    rod,
+    rotated,
+    scalloped,
+    trimmed,
+    tube,
+    vessel,
+)
+from drakegrasp.shapes.solids import bar, cut, extrude, fuse, grid_box, revolve, solid, sweep
+
+# Tables of points and sizes are laid out by hand.
+# fmt: off
+
+
+def mug(
+    *, radius: float, height: float, handle_reach: float, handle_radius: float, wall: float = 0.005,
+) -> trimesh.Trimesh:
+    """Return a hollow straight mug with a handle at +x; `handle_reach` is how far it stands out."""
+    shell, core = vessel(resample(foot_and_wall(radius, height, 0.004), EDGE), wall=wall,
+        floor=0.007)
+    handle = loop_handle(x=radius - wall / 2.0, top=0.84 * height, bottom=0.2 * height,
+        reach=handle_reach - handle_radius + wall / 2.0, radius=handle_radius)
+    return fuse(shell, trimmed(handle, core))
+
+
+def cup(
+    *, top_radius: float, bottom_radius: float, height: float, wall: float = 0.0045,
+) -> trimesh.Trimesh:
+    """Return a hollow tapered cup without a handle."""
+    side = resample([(bottom_radius, 0.0), (top_radius, height)], EDGE)
+    return vessel(side, wall=wall, floor=0.006)[0]
+
+
+def bowl(
+    *, radius: float, height: float, foot_radius: float, wall: float = 0.005,
+) -> trimesh.Trimesh:
+    """Return a hollow bowl on a ring foot."""
+    side = smooth([
+        (foot_radius, 0.0), (foot_radius + 0.001, 0.005), (0.72 * radius, 0.22 * height),
+        (0.92 * radius, 0.58 * height), (radius, height),
+    ], EDGE)
+    return vessel(side, wall=wall, floor=0.008)[0]
+
+
+def vase(
+    *, foot_radius: float, belly_radius: float, neck_radius: float, lip_radius: float,
+    height: float, wall: float = 0.005, edge: float = 0.007,
+) -> trimesh.Trimesh:
+    """Return a hollow vase with a belly, a neck and a lip."""
+    side = smooth([
+        (foot_radius, 0.0), (belly_radius, 0.4 * height), (neck_radius, 0.82 * height),
+        (lip_radius, height),
+    ], edge)
+    return vessel(side, wall=wall, floor=0.008, edge=edge)[0]
+
+
+def wineglass(
+    *, foot_radius: float, stem_radius: float, belly_radius: float, rim_radius: float,
+    height: float, stem_height: float, wall: float = 0.0045,
+) -> trimesh.Trimesh:
+    """Return a wineglass: a solid foot and stem, a hollow cup."""
+    # The cup, outside and inside.
+    cup_height = height - stem_height
+    outer = smooth([
+        (stem_radius, stem_height), (0.75 * belly_radius, stem_height + 0.14 * cup_height),
+        (belly_radius, stem_height + 0.42 * cup_height), (rim_radius, height),
+    ], EDGE)
+    floor = stem_height + 0.012
+    inner = spread_evenly(inset(outer, wall, floor=floor), COARSE * EDGE)[::-1]
+
+    # Foot and stem.
+    foot = resample([(0.0, 0.0), (foot_radius, 0.0), (foot_radius, 0.005)], EDGE)
+    stem = smooth([
+        (foot_radius, 0.005), (0.4 * foot_radius, 0.009), (stem_radius, 0.3 * stem_height),
+        (stem_radius, stem_height),
+    ], EDGE)
+
+    # One outline, with longer edges inside.
+    bottom = resample([inner[-1], (0.0, floor)], COARSE * EDGE)[1:]
+    profile = np.vstack([foot, stem[1:], outer[1:], inner, bottom])
+    edges = np.full(len(profile), EDGE)
+    edges[len(profile) - len(inner) - len(bottom) :] *= COARSE
+    return revolve(profile, edge=edges)
+
+
+def pitcher(
+    *, foot_radius: float, belly_radius: float, neck_radius: float, rim_radius: float,
+    height: float, handle_reach: float, handle_radius: float, lip: float, wall: float = 0.005,
+    edge: float = 0.008,
+) -> trimesh.Trimesh:
+    """Return a hollow pitcher with a handle at +x and a lip pulled out by `lip` at -x."""
+    side = smooth([
+        (foot_radius, 0.0), (belly_radius, 0.35 * height), (neck_radius, 0.8 * height),
+        (rim_radius, height),
+    ], edge)
+    shell, core = vessel(side, wall=wall, floor=0.008, edge=edge)
+    handle = loop_handle(x=neck_radius - wall / 2.0, top=0.85 * height, bottom=0.3 * height,
+        reach=belly_radius - neck_radius + handle_reach, radius=handle_radius, edge=edge)
+    body = fuse(shell, trimmed(handle, core))
+
+    # The lip: points near the rim on the far side move outwards, the wall with them.
+    x, y, z = body.vertices.T
+    rise = np.clip((z / height - 0.7) / 0.3, 0.0, 1.0)
+    pull = lip * rise**2 * np.exp(-((np.arctan2(y, -x) / 0.4) ** 2))
+    return solid(np.column_stack([x - pull, y, z]), body.faces)
+
+
+def saucepan(
+    *, radius: float, height: float, handle_length: float, wall: float = 0.005,
+) -> trimesh.Trimesh:
+    """Return a hollow saucepan with a straight handle along +x."""
+    edge = 1.2 * EDGE
+    shell, core = vessel(resample(foot_and_wall(radius, height, 0.005), edge), wall=wall,
+        floor=0.007, edge=edge)
+    z = 0.78 * height
+    handle = bar((radius - wall, 0.0, z), (radius + handle_length, 0.0, z),
+        ellipse(0.008, 0.011, edge=edge), normal=(0.0, 1.0, 0.0),
+        scale=((0.0, 0.9), (0.4, 0.8), (1.0, 1.0)), edge=edge)
+    return fuse(shell, trimmed(handle, core))
+
+
+def funnel(
+    *, radius: float, spout_radius: float, cone_height: float, height: float, wall: float = 0.0045,
+) -> trimesh.Trimesh:
+    """Return a funnel, open at both ends, that stands on its wide end."""
+    outer = resample([
+        (radius, 0.0), (radius, 0.008), (spout_radius + 0.002, cone_height), (spout_radius, height),
+    ], EDGE)
+    # Across a sloping wall the thickness is measured along r: wall / sin(slope).
+    slope = np.arctan2(cone_height - 0.008, radius - spout_radius)
+    step = wall / np.sin(slope)
+    inner = resample([
+        (spout_radius - wall, height), (spout_radius + 0.002 - wall, cone_height),
+        (radius - step, 0.008), (radius - step, 0.0),
+    ], COARSE * EDGE)
+    profile = np.vstack([outer, inner])
+    edges = np.r_[np.full(len(outer), EDGE), np.full(len(inner), COARSE * EDGE)]
+    return revolve(profile, edge=edges, closed=True)
+
+
+def toaster(*, length: float, width: float, height: float) -> trimesh.Trimesh:
+    """Return a toaster with two slots along x and a lever at +x."""
+    foot = 0.006
+    across = rounded_rectangle(height - foot, width, 0.2 * width, edge=LARGE)
+    half = length / 2.0
+    stations = spaced(LARGE, -half, 0.004 - half, half - 0.004, half)
+    middle = (height + foot) / 2.0
+    path = np.column_stack([stations, 0.0 * stations, np.full_like(stations, middle)])
+    scale = np.ones(len(stations))
+    scale[[0, -1]] = 0.94
+    body = sweep(path, across, normal=(0.0, 1.0, 0.0), scale=scale)
+    feet = [
+        block((0.014, 0.014, 2.0 * foot + 0.016),
+            (0.36 * x * length, 0.24 * y * width, foot + 0.008), edge=LARGE)
+        for x in (-1.0, 1.0) for y in (-1.0, 1.0)]
+
+    slots = [
+        block((0.78 * length, 0.17 * width, 0.11),
+            (0.0, 0.19 * side * width, 0.42 * height + 0.055), edge=LARGE) for side in (-1.0, 1.0)]
+    groove = block((0.02, 0.009, 0.5 * height), (length / 2.0 + 0.005, 0.0, 0.56 * height))
+    lever = block((0.03, 0.30 * width, 0.011), (length / 2.0 + 0.004, 0.0, 0.72 * height))
+    dial = rod((length / 2.0 - 0.01, 0.3 * width, 0.3 * height),
+        (length / 2.0 + 0.008, 0.3 * width, 0.3 * height), 0.0085, edge=0.7 * EDGE)
+    return fuse(cut(fuse(body, *feet), *slots, groove), lever, dial)
+
+
+def coffeemaker(*, width: float, depth: float, height: float) -> trimesh.Trimesh:
+    """Return a coffee machine with its tank at -x and its jug in front, towards +x."""
+    tank = 0.36 * depth
+    jug, floor, head = 0.36 * width, 0.020, 0.24 * height
+    x = 0.5 * depth - 0.42 * width
+    # Base, tank, head, and the filter under it.
+    parts = [
+        block((depth, width, floor), (0.0, 0.0, floor / 2.0), corner=0.01, edge=2.0 * BROAD),
+        block((tank, width, height), ((tank - depth) / 2.0, 0.0, height / 2.0), corner=0.01,
+            edge=2.0 * BROAD),
+        pillar([(height - head, 0.86 * depth, 0.94 * width), (height, depth, width)], corner=0.012,
+            edge=2.0 * BROAD),
+        moved(lathe(resample([(0.45 * jug, 0.0), (0.8 * jug, 0.02)], BROAD), edge=LARGE),
+            (x, 0.0, height - head - 0.014))]
+
+    # The jug on its plate, with a handle.
+    top = 0.52 * height
+    side = smooth(scaled([(0.8, 0.0), (1.0, 0.3), (0.9, 0.65), (0.62, 0.9), (0.68, 1.0)], jug,
+        top - floor), LARGE)
+    parts.append(moved(lathe(side, edge=LARGE), (x, 0.0, floor - 0.002)))
+    handle = loop_handle(x=x + 0.6 * jug, top=0.92 * top, bottom=floor + 0.22 * (top - floor),
+        reach=0.78 * jug, radius=0.0045, edge=LARGE)
+    parts.append(handle)
+    lamp = ball((0.5 * depth, 0.25 * width, height - 0.5 * head), 0.006, edge=0.6 * EDGE)
+    return fuse(*parts, lamp)
+
+
+def teapot(*, radius: float, height: float, spout: float) -> trimesh.Trimesh:
+    """Return a teapot with its lid on: spout towards +x by `spout`, handle at -x."""
+    body = lathe(smooth(scaled([(0.58, 0.0), (0.62, 0.03), (1.0, 0.42), (0.78, 0.76), (0.46, 0.86)],
+        radius, height), BROAD), edge=BROAD)
+    lid = lathe([
+        *resample([(0.5 * radius, 0.84 * height), (0.5 * radius, 0.88 * height)], BROAD),
+        *smooth([(0.4 * radius, 0.93 * height), (0.12 * radius, height)], BROAD)], edge=BROAD)
+    button = ball((0.0, 0.0, 1.06 * height), (0.17 * radius, 0.17 * radius, 0.09 * height))
+
+    # An S-shaped spout that narrows, and a round handle.
+    path = smooth([
+        (0.7 * radius, 0.0, 0.3 * height), (radius + 0.35 * spout, 0.0, 0.4 * height),
+        (radius + 0.65 * spout, 0.0, 0.66 * height), (radius + spout, 0.0, 0.86 * height),
+    ], EDGE)
+    size = np.linspace(0.24 * radius, 0.11 * radius, len(path))
+    handle = loop_handle(x=0.72 * radius, top=0.76 * height, bottom=0.24 * height,
+        reach=0.78 * radius, radius=0.11 * radius, edge=BROAD)
+    pipe = tube(path, size, edge=0.9 * EDGE)
+    return fuse(body, lid, button, pipe, rotated(handle, "z", 180.0))
+
+
+def juicer(*, radius: float, rim: float, cone: float) -> trimesh.Trimesh:
+    """Return a citrus juicer: a dish with a rim of height `rim`, and in it a ribbed `cone`."""
+    wall = 0.005
+    side = smooth(scaled([(0.7, 0.0), (0.92, 0.3), (1.0, 1.0)], radius, rim), BROAD)
+    inner = smooth([(radius - wall, rim), (0.86 * radius, 0.5 * rim), (0.62 * radius, 0.32 * rim)],
+        BROAD)
+    dish = revolve(joined(
+        resample([(0.0, 0.0), side[0]], 1.5 * BROAD), side, inner,
+        resample([inner[-1], (0.0, 0.3 * rim)], 1.5 * BROAD)), edge=BROAD)
+    ribs = scalloped(0.5 * radius, 0.07 * radius, 10, edge=BROAD)
+    heights = np.linspace(0.0, 1.0, max(5, round(cone / BROAD)) + 1)
+    profile = [
+        *((0.9 * share, 0.2 * rim) for share in (0.0, 0.5)),
+        *((float(np.sqrt(max(0.0, 1.0 - h ** 1.6))), 0.2 * rim + h * (cone - 0.2 * rim))
+            for h in heights)]
+
+    handle = block((0.5 * radius, 0.36 * radius, 0.008), (-1.15 * radius, 0.0, rim - 0.006),
+        corner=0.12 * radius)
+    lip = pillar([(rim - 0.015, 0.1 * radius, 0.12 * radius, 0.93 * radius, 0.0),
+        (rim, 0.3 * radius, 0.3 * radius, 1.03 * radius, 0.0)], corner=0.04 * radius)
+    return fuse(dish, extrude(ribs, profile), handle, lip)
+
+
+def pepper_mill(*, radius: float, waist: float, height: float) -> trimesh.Trimesh:
+    """Return a turned pepper mill: `radius` of its foot, `waist` the radius at its narrowest."""
+    side = smooth([
+        (radius, 0.0), (radius, 0.1 * height), (0.82 * radius, 0.15 * height),
+        (waist, 0.38 * height), (0.92 * radius, 0.6 * height), (0.8 * radius, 0.66 * height),
+        (0.52 * radius, 0.69 * height), (0.86 * radius, 0.74 * height),
+        (0.92 * radius, 0.8 * height), (0.66 * radius, 0.89 * height),
+        (0.16 * radius, 0.915 * height),
+    ], 0.8 * EDGE)
+    button = ball((0.0, 0.0, 0.945 * height), 0.055 * height)
+    return fuse(lathe(side), button)
+
+
+def box(*, width: float, depth: float, height: float, edge: float = 1.2 * EDGE) -> trimesh.Trimesh:
+    """Return an upright box: `width` along x, `depth` along y."""
+    return grid_box((width, depth, height), centre=(0.0, 0.0, height / 2.0), edge=edge)
+
+
+def can(*, radius: float, height: float) -> trimesh.Trimesh:
+    """Return a closed can: a cylinder with bevelled rims."""
+    return lathe(resample(bevelled(radius, height, 0.002), EDGE))
+
+
+def bottle(*, radius: float, height: float, neck_radius: float) -> trimesh.Trimesh:
+    """Return a closed bottle, solid, with a shoulder, a neck and a cap."""
+    shoulder, neck, cap = 0.58 * height, 0.78 * height, 0.9 * height
+
+    # From the bottom up: body, shoulder, neck and cap.
+    wide = neck_radius + 0.003
+    return lathe(joined(
+        resample(foot_and_wall(radius, shoulder, 0.004), BROAD),
+        smooth([(radius, shoulder), (0.8 * radius, 0.66 * height), (neck_radius, neck)], BROAD),
+        resample([
+            (neck_radius, neck), (neck_radius, cap), (wide, cap), (wide, height - 0.003),
+            (neck_radius, height),
+        ], BROAD)))
+
+
+def jar(*, radius: float, height: float, lid_radius: float, lid_height: float) -> trimesh.Trimesh:
+    """Return a closed jar, solid: a body, a short neck and a lid."""
+    shoulder = height - lid_height - 0.018
+    neck = min(lid_radius - 0.004, radius - 0.008)
+
+    # From the bottom up: body, shoulder, lid.
+    return lathe(joined(
+        resample(foot_and_wall(radius, shoulder, 0.005), EDGE),
+        smooth([
+            (radius, shoulder), (radius - 0.25 * (radius - neck), shoulder + 0.006),
+            (neck, shoulder + 0.013),
+        ], EDGE / 2.0),
+        resample([
+            (neck, height - lid_height), (lid_radius, height - lid_height),
+            (lid_radius, height - 0.003), (lid_radius - 0.003, height),
+        ], EDGE)))
+
+
+def carton(*, width: float, height: float, roof: float) -> trimesh.Trimesh:
+    """Return a milk carton with a gable of height `roof` and a screw cap at -y."""
+    fin = 0.014
+    shell = pillar([
+        (0.0, width, width), (height, width, width), (height + roof, width, 0.008),
+        (height + roof + fin, width, 0.008),
+    ], corner=0.003, edge=LARGE)
+    # The gable's ends are folded inwards.
+    folds = []
+    for side in (-1.0, 1.0):
+        fold = pillar([(height + 0.004, 0.0105, 0.86 * width),
+            (height + 0.86 * roof, 0.024, 0.005)])
+        folds.append(moved(fold, (0.5 * side * width, 0.0, 0.0)))
+    slope = np.degrees(np.arctan2(roof, 0.5 * width - 0.004))
+    cap = rotated(post(-0.006, 0.011, 0.15 * width + 0.003), "x", slope)
+    return fuse(cut(shell, *folds), moved(cap, (0.0, -0.27 * width, height + 0.48 * roof)))
+
+
+def spray_bottle(
+    *, width: float, depth: float, height: float, edge: float = 0.007,
+) -> trimesh.Trimesh:
+    """Return a spray bottle, solid: an oval body, a neck, a head and a trigger towards +x."""
+    body_height = 0.68 * height
+    neck, section = 0.013, rounded_rectangle(width, depth, 0.45 * depth, edge=edge)
+    foot = [(0.0, 0.0), (0.5, 0.0), (0.94, 0.0), (1.0, 0.004)]
+    heights = spaced(edge, 0.004, 0.72 * body_height)[1:]
+    shoulder = smooth([
+        (width / 2.0, 0.72 * body_height), (0.42 * width, 0.85 * body_height), (neck, body_height),
+    ], edge)[1:]
+    shoulder = shoulder / [width / 2.0, 1.0]
+    profile = [*foot, *((1.0, z) for z in heights), *shoulder, (0.0, body_height)]
+    body = extrude(section, profile)
+
+    head_z = height - 0.014
+    collar = revolve(resample([
+        (0.0, body_height - 0.01), (neck + 0.002, body_height - 0.01),
+        (neck + 0.002, body_height + 0.014), (0.011, body_height + 0.018), (0.011, head_z),
+        (0.0, head_z),
+    ], edge))
+    head = bar((-0.028, 0.0, head_z), (0.048, 0.0, head_z),
+        rounded_rectangle(0.028, 0.024, 0.007, edge=edge), normal=(0.0, 1.0, 0.0),
+        scale=((0.0, 0.75), (0.35, 1.0), (0.75, 0.9), (1.0, 0.55)))
+    reach = np.linspace(0.0, 1.0, 50)
+    bend = np.column_stack([0.026 + 0.014 * np.sin(1.6 * reach), 0.0 * reach,
+        head_z - 0.055 * reach])
+    trigger = sweep(
+        spread_evenly(bend, edge), rounded_rectangle(0.008, 0.014, 0.003, edge=edge),
+        normal=(0.0, 1.0, 0.0), scale=1.0)
+    return fuse(body, collar, head, trigger)
+
+
+def soap_dispenser(*, width: float, depth: float, height: float) -> trimesh.Trimesh:
+    """Return a soap dispenser: an oval bottle and a pump whose spout points towards +x."""
+    body = 0.64 * height
+    bottle = pillar(scaled([
+        (0.0, 0.94, 0.94), (0.3, 1.0, 1.0), (0.75, 1.0, 1.0), (0.93, 0.72, 0.76), (1.0, 0.42, 0.52),
+    ], body, width, depth), corner=0.48 * depth, edge=BROAD)
+
+    # The pump: collar, stem and spout.
+    collar, stem = 0.25 * depth + 0.004, 0.006
+    z = height - 0.012
+    spout = tube(smooth([
+        (-0.012, 0.0, z), (0.2 * width, 0.0, z), (0.46 * width, 0.0, z - 0.001),
+        (0.56 * width, 0.0, z - 0.011),
+    ], EDGE), 0.0062)
+    return fuse(
+        bottle, post(body - 0.006, body + 0.016, collar), post(body, z, stem),
+        post(z - 0.01, height, 0.013, 0.0125), spout)
+
+
+def towel_roll(*, radius: float, height: float, core: float) -> trimesh.Trimesh:
+    """Return a paper towel roll that stands, with an open `core` and a loose sheet at +y."""
+    paper = revolve(joined(
+        resample(bevelled(radius, height, 0.002), BROAD),
+        resample([(core, height), (core, 0.0)], 1.5 * BROAD),
+        resample([(core, 0.0), (radius - 0.002, 0.0)], 2.0 * BROAD)[:-1]), edge=BROAD, closed=True)
+    sheet = block((0.62 * radius, 0.005, height - 0.004),
+        (0.36 * radius, radius - 0.0035, height / 2.0), corner=0.0015, edge=BROAD)
+    return fuse(paper, sheet)

@@ -1,1 +1,0 @@
-"""How the shapes are made: curves, solids, parts and booleans."""
