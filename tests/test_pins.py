@@ -1,0 +1,53 @@
+"""What comes out of all rooms is what it was: see `helpers/pins.py`.
+
+Exact on any machine are the draws, labels, counts and words. Simulated numbers round otherwise on
+another CPU, see docs/explanation/determinism.md, so they are near.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import pins
+
+EXPECTED = Path(pins.__file__).with_name("pins.npz")
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> pins.Pins:
+    return pins.everything(tmp_path_factory.mktemp("pins"))
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_nothing_that_is_pinned_has_changed(found: pins.Pins) -> None:
+    assert pins.far(pins.summaries(found), pins.read_values(EXPECTED)) == []
+
+
+def test_differences_are_told_by_name() -> None:
+    expected = {"same": "1", "other": "2", "lost": "3"}
+    found = {"same": "1", "other": "4", "more": "5"}
+    assert pins.differences(found, expected) == ["differs: other", "gone: lost", "new: more"]
+
+
+def test_near_numbers_are_the_same_and_exact_ones_are_not() -> None:
+    expected = {"slip": np.array([0.1, np.nan]), "seed": np.array([2**63], np.uint64)}
+    near = {"slip": np.array([0.1 + 1e-9, np.nan]), "seed": np.array([2**63], np.uint64)}
+    assert pins.far(near, expected) == []
+    other = {"slip": np.array([0.1, 0.0]), "seed": np.array([2**63 + 1], np.uint64)}
+    assert pins.far(other, expected) == ["differs: seed", "differs: slip"]
+
+
+def test_values_come_back(tmp_path: Path) -> None:
+    found = {"a/b": np.arange(3.0), "c": np.asarray(2.5), "d": np.asarray("word")}
+    pins.write_values(tmp_path / "values.npz", found)
+    assert pins.far(pins.read_values(tmp_path / "values.npz"), found) == []
+
+
+def test_json_is_pinned_without_what_the_machine_says() -> None:
+    told = json.loads('{"a": [1, null], "versions": {"x": "1"}, "seconds": 2.0, "b": {"c": "d"}}')
+    found = {name: value.item() for name, value in pins.leaves(told, "card").items()}
+    assert found == {"card/a/0": 1, "card/a/1": "null", "card/b/c": "d"}
