@@ -11,12 +11,11 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePath
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import yaml
 from pydantic import (
@@ -27,6 +26,7 @@ from pydantic import (
     Field,
     PrivateAttr,
     ValidationError,
+    create_model,
     field_validator,
     model_validator,
 )
@@ -34,6 +34,7 @@ from pydantic_core import PydanticCustomError
 
 from drakegrasp import registry
 from drakegrasp.errors import ConfigError, one_line
+from drakegrasp.filters import LIMITS
 from drakegrasp.foreign_files import read_text
 from drakegrasp.yaml_text import parse_yaml
 
@@ -410,32 +411,42 @@ class ScenesConfig(_Section):
         return self
 
 
-class FilterConfig(_ExtensibleSection):
-    """Which successes become samples, decided when the files are assembled.
-
-    Null switches a limit off. Limits of the hold are own choices; docs/reference/outcomes.md.
-    """
-
-    # "held" switches max_slip, max_turn_deg and other_links off: every success that the filters
-    # of images and contacts keep.
+class _Filters(_ExtensibleSection):
+    # "held" switches the rules of the hold off: every success that the filters of images and
+    # contacts keep.
     require: Literal["held", "limits"] = "limits"
-    max_slip: Positive | None = 0.010  # [m], of the object in the hand during the lift
-    max_turn_deg: Positive | None = 10.0  # of the object in the hand during the lift
-    other_links: NonNegativeCount | None = 0  # that touch the object after the lift, at most
-    min_depth_variance: NonNegative = 1e-3  # [m^2], flatter otm depth images are removed
-    min_camera_height: Number = 0.01  # [m] above the table; lower cameras see the table edge-on
-    outlier_sigma: NonNegative = 4.0  # per object and component of the grasp; 0 switches it off
-    max_surface_distance: Positive = 2e-3  # [m], of a contact point from the object's surface
-    # Between a contact's mean normal and the object's nearest face; the paper removed by eye.
-    max_normal_angle_deg: Positive | None = 30.0
-    # Limits of the suspicion score and of parts of it, see dataset/suspicion.py; off: as thresholds
-    # they also remove sound grasps.
-    max_suspicion: Positive | None = None
-    max_penetration: Positive | None = None  # [m], of the object in a fingertip
-    max_imbalance: Positive | None = None  # of the fingertips' forces, as a share of the weight
-    max_normal_sum: Positive | None = None  # of the contact normals, per finger: 0 balanced, 1 not
+
+    if TYPE_CHECKING:
+
+        def __init__(self, **values: Any) -> None: ...
+
+        def __getattr__(self, name: str) -> Any: ...
+
+
+_KINDS: dict[str, Any] = {
+    "number": Number,
+    "positive": Positive,
+    "not negative": NonNegative,
+    "count": NonNegativeCount,
+}
+
+
+def _filter_config() -> type[_Filters]:
+    """Return section `filters`: its settings are those of `drakegrasp.filters.LIMITS`."""
+    settings: dict[str, Any] = {
+        name: (_KINDS[limit.kind] | None if limit.off else _KINDS[limit.kind], limit.default)
+        for name, limit in LIMITS.items()
+    }
     # Filters of the user's own, `file.py:Name` each.
-    own: Annotated[tuple[str, ...], BeforeValidator(_own_filters)] = ()
+    settings["own"] = (Annotated[tuple[str, ...], BeforeValidator(_own_filters)], ())
+    doc = "Which successes become samples, decided when the files are assembled; null: no limit."
+    return create_model("FilterConfig", __base__=_Filters, __doc__=doc, **settings)
+
+
+if TYPE_CHECKING:
+    FilterConfig = _Filters
+else:
+    FilterConfig = _filter_config()
 
 
 class SplitConfig(_Section):
@@ -464,14 +475,6 @@ class SplitConfig(_Section):
         return self
 
 
-#: Limits of verification in configurations of older versions: those that decided what is tried, and
-#: those of the lift that method `forces` simulated.
-OLD_LIMITS = (
-    *("max_surface_distance", "max_residual", "max_normal_error_deg"),
-    *("max_position_error", "max_angle_error_deg"),
-)
-
-
 class VerifyConfig(_Section):
     """How predicted grasps are tried and judged; see docs/how-to/verify-predictions.md."""
 
@@ -479,16 +482,6 @@ class VerifyConfig(_Section):
     open_margin_deg: Positive = 20.0  # by which fingers are opened first; 1 rad as 0.1 m of a slide
     # Wrist poses that are simulated until one holds; 1: the best fit alone, which decides success.
     max_tries: Annotated[int, Field(ge=1, le=5)] = 5
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_old_limits(cls, tree: Any) -> Any:
-        # Keys of one version ago.
-        old = [key for key in OLD_LIMITS if isinstance(tree, dict) and key in tree]
-        for key in old:
-            message = f"verify.{key} has no effect any more; leave it out"
-            warnings.warn(message, FutureWarning, stacklevel=2)
-        return {k: v for k, v in tree.items() if k not in old} if old else tree
 
 
 #: Palm poses in the first work unit of an object, and the most in one.
@@ -600,11 +593,14 @@ class Config(_Section):
         """Return the resolved values as plain JSON types.
 
         `filters.own` and `candidates.postures` leave no trace where there are none, nor do `scenes`
-        that are the defaults. `parse_stored` reads it.
+        and later limits of the filters that are the defaults. `parse_stored` reads it.
         """
         tree = self.model_dump(mode="json")
         if not self.filters.own:
             del tree["filters"]["own"]
+        for name, limit in LIMITS.items():
+            if limit.later and tree["filters"][name] == limit.default:
+                del tree["filters"][name]
         if self.candidates.postures is None:
             del tree["candidates"]["postures"]
         if self.scenes == ScenesConfig():
@@ -738,24 +734,17 @@ def parse_config(tree: dict[str, Any]) -> Config:
 def parse_stored(tree: Any) -> Config:
     """Return the configuration that a file of a dataset holds, as JSON.
 
-    Without `split.by` it was written when there was the split by class alone; without
-    `certify.share`, when successes were certified otherwise; without `close.scrape_depth`, when
-    hands might come below the table's top while they closed. With one of
-    `OLD_LIMITS`, `verify.max_contact_error` decided what is tried, too, and does not count.
+    Without `certify.share` it was written when successes were certified otherwise; without
+    `close.scrape_depth`, when hands might come below the table's top while they closed.
 
     Raises:
         ConfigError: See `load_config`.
     """
-    if isinstance(tree, dict) and isinstance(split := tree.get("split"), dict):
-        tree = {**tree, "split": {"by": "class", **split}}
     certify = tree.get("certify") if isinstance(tree, dict) else None
     if isinstance(certify, dict) and certify.get("repeats"):
         tree = {**tree, "certify": {"share": None, **certify}}
     if isinstance(tree, dict) and isinstance(close := tree.get("close"), dict):
         tree = {**tree, "close": {"scrape_depth": None, **close}}
-    if isinstance(tree, dict) and isinstance(verify := tree.get("verify"), dict):
-        old = {*OLD_LIMITS, "max_contact_error"} if verify.keys() & {*OLD_LIMITS} else set()
-        tree = {**tree, "verify": {k: v for k, v in verify.items() if k not in old}}
     return parse_config(tree)
 
 

@@ -28,11 +28,11 @@ from scipy.stats import rankdata
 
 from drakegrasp.arithmetic import Array
 from drakegrasp.config import FilterConfig
-from drakegrasp.dataset.filters import breaks_hold
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.errors import DataError
+from drakegrasp.filters import first_removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.lift_chance import (
     FEATURES,
@@ -42,7 +42,8 @@ from drakegrasp.hand.lift_chance import (
     features,
     read_lift_chance,
 )
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.table import Table
 
 #: Weight of the squares of the standardized weights.
 RIDGE = 3.0
@@ -109,10 +110,11 @@ def read_lifts(out: Path) -> Lifts:
         )
         values[own] = np.stack(list(features(grasp).values()), axis=-1)
 
-    hold = (columns[name] for name in ("lifted_other_links", "slip", "turn"))
+    hold = Table(
+        other_links=columns["lifted_other_links"], slip=columns["slip"], turn=columns["turn"]
+    )
     sample = columns["outcome"] == Outcome.SUCCESS
-    for _, broken in breaks_hold(FilterConfig(), *hold):
-        sample &= ~broken
+    sample &= first_removal(hold, FilterConfig()) == Removal.KEPT
     return Lifts(
         features=values,
         sample=sample,

@@ -300,13 +300,6 @@ def test_the_defaults_are_the_papers_numbers_but_for_the_split() -> None:
     assert {key: values[key] for key in PAPER} == PAPER
 
 
-def test_a_stored_configuration_without_the_rule_is_of_the_split_by_class() -> None:
-    tree = load_config().to_dict()
-    assert parse_stored(tree) == load_config()
-    del tree["split"]["by"]
-    assert parse_stored(tree) == load_config("paper")
-
-
 def test_a_split_by_object_has_no_classes_to_train_and_leaves_some_objects_to_train() -> None:
     by_class = "split: by must be class or auto where train_classes is given, got object"
     with pytest.raises(ConfigError, match=by_class):
@@ -600,20 +593,3 @@ def test_simulation_hash_is_that_of_the_value_not_of_its_spelling() -> None:
     two = load_config(overrides=["objects.mass=2.0", "candidates.standoffs=[1.0, 5e-1]"])
     assert one.simulation_hash() == two.simulation_hash()
     assert re.fullmatch(r"[0-9a-f]{16}", one.simulation_hash())
-
-
-def test_limits_of_the_version_before_are_left_out_with_a_warning() -> None:
-    with pytest.warns(FutureWarning, match="verify.max_residual has no effect any more"):
-        config = load_config(overrides=["verify.max_residual=0.005"])
-    assert config == load_config()
-
-
-def test_limits_in_a_file_of_the_version_before_do_not_count() -> None:
-    """There, `max_contact_error` decided what is tried, too."""
-    tree = load_config().to_dict()
-    tree["verify"] |= {"max_residual": 0.008, "max_contact_error": 0.01, "max_tries": 3}
-    stored = parse_stored(tree)
-    assert stored.verify.max_contact_error == 0.02
-    assert stored.verify.max_tries == 3
-    tree["verify"].pop("max_residual")
-    assert parse_stored(tree).verify.max_contact_error == 0.01

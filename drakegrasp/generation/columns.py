@@ -2,31 +2,22 @@
 
 In: attempts, their records and what was measured of them. Out: arrays by the names of
 `drakegrasp.dataset.schema`. This only lays out values; `drakegrasp.generation.attempts` makes
-them. Of a trial alone, `judge_sample` lays out a row and asks the filters of a dataset; what a
-filter needs and a trial lacks (the images, the other grasps of the object) counts as passed.
+them. A verdict asks the filters of a dataset about the columns that a trial alone has.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config, FilterConfig
-from drakegrasp.dataset.assembly.survey import SURVEYED, successes_of
-from drakegrasp.dataset.filters import judge_successes
-from drakegrasp.dataset.hdf5 import AnyArray
-from drakegrasp.dataset.schema import (
-    CERTIFICATE_FIELDS,
-    LOOK_FIELDS,
-    NO_PRESHAPE,
-    TRIAL_FIELDS,
-    sizes,
-)
+from drakegrasp.dataset.assembly.survey import successes_of
+from drakegrasp.dataset.schema import LOOK_FIELDS, NO_PRESHAPE, Field, sizes
 from drakegrasp.dataset.shards import trial_columns
+from drakegrasp.filters import RULES, first_removal
 from drakegrasp.frames import pack_pose
 from drakegrasp.generation.attempts import TrialSetup, View
 from drakegrasp.grasp import unused_fingers
@@ -36,7 +27,8 @@ from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.randomization.conditions import Conditions, usual_conditions
 from drakegrasp.simulation.scene import hand_joint_names
 from drakegrasp.simulation.trial import TrialRecord
-from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, intrinsics
+from drakegrasp.table import AnyArray, Table
+from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto
 
 
 class TrialRow(NamedTuple):
@@ -77,19 +69,26 @@ def trial_rows(
     columns["preshape"][:] = NO_PRESHAPE if hand.preshapes else 0
     for i, (attempt, record, fit) in enumerate(zip(attempts, records, fits, strict=True)):
         row = TrialRow(attempt, attempt.conditions or usual, record, fit)
-        used = ~unused_fingers(attempt.unused, hand.num_fingers)
-        for field in fields:
-            # What a stage did not reach keeps the column's fill value.
-            value = field.value_of(row)
-            if value is None:
-                continue
-            if field.shape.startswith("k"):
-                # A finger that a preshape does not use has no contact, and no force.
-                columns[field.name][i] = np.nan if field.per_finger else 0
-                columns[field.name][i][used] = value
-            else:
-                columns[field.name][i] = pack_pose(value) if field.shape == "12" else value
+        _fill_row(columns, i, fields, row, hand.num_fingers)
     return columns
+
+
+def _fill_row(
+    columns: dict[str, AnyArray], i: int, fields: Sequence[Field], row: TrialRow, fingers: int
+) -> None:
+    """Put the values of a row into its place of the columns."""
+    used = ~unused_fingers(row.attempt.unused, fingers)
+    for field in fields:
+        # What a stage did not reach keeps the column's fill value.
+        value = field.value_of(row)
+        if value is None:
+            continue
+        if field.shape.startswith("k"):
+            # A finger that a preshape does not use has no contact, and no force.
+            columns[field.name][i] = np.nan if field.per_finger else 0
+            columns[field.name][i][used] = value
+        else:
+            columns[field.name][i] = pack_pose(value) if field.shape == "12" else value
 
 
 def empty_looks(setup: TrialSetup, count: int) -> dict[str, AnyArray]:
@@ -137,36 +136,9 @@ def judge_sample(
     """
     if trial.outcome is not Outcome.SUCCESS:
         return None
-    rules = config.filters.model_copy(update={"min_depth_variance": 0.0, "outlier_sigma": 0.0})
-    successes = successes_of(
-        _trial_columns(model, trial, config),
-        _looks(trial, config),
-        np.zeros((1, 1, 1)),
-        object=0,
-        K=intrinsics(config.camera),
-    )
-    if not views:
-        height = np.full(1, np.inf)
-        successes = replace(successes, in_view=np.ones(1, dtype=np.bool_), camera_height=height)
-    (removal,) = judge_successes(successes, rules, removed_by_own=np.zeros(1, dtype=np.bool_))
-    return Removal(int(removal))
-
-
-def unjudged(rules: FilterConfig) -> tuple[Removal, ...]:
-    """Return the filters, of those that are on, about which a verdict knows nothing."""
-    on = {
-        Removal.NOT_SEEN: True,
-        Removal.FLAT_DEPTH: rules.min_depth_variance > 0.0,
-        Removal.OUTLIER: rules.outlier_sigma > 0.0,
-        Removal.OWN: bool(rules.own),
-    }
-    return tuple(removal for removal, is_on in on.items() if is_on)
-
-
-def _trial_columns(model: ObjectModel, trial: TrialRecord, config: Config) -> dict[str, AnyArray]:
-    """Return what a row of `/trials` would hold of a trial, of the columns that filters need."""
     assert trial.closed is not None
     closed = trial.closed.contacts
+    fingers = len(closed.touching)
     row = TrialRow(
         attempt=Attempt(
             X_OG=trial.X_OG, spread=0.0, candidate=0, standoff_index=0, standoff=0.0, seed=0
@@ -175,21 +147,27 @@ def _trial_columns(model: ObjectModel, trial: TrialRecord, config: Config) -> di
         trial=trial,
         fit=fit_contacts(model, closed.p_OQ, closed.nhat_Q_O),
     )
-    shape = sizes(fingers=len(closed.touching), joints=len(trial.closed.q), image=0)
-    columns = {}
-    for field in TRIAL_FIELDS:
-        if field.name in SURVEYED:
-            column, value = field.empty(1, shape), field.value_of(row)
-            column[0] = pack_pose(value) if field.shape == "12" else value
-            columns[field.name] = column
-    return columns
+    fields = [field for field in trial_columns() if field.of]
+    shape = sizes(fingers=fingers, joints=len(trial.closed.q), image=0)
+    columns = {field.name: field.empty(1, shape) for field in fields}
+    _fill_row(columns, 0, fields, row, fingers)
+    if views:
+        X_TG = multiply(trial.X_TO, trial.X_OG)
+        for name, pose in (("oto", camera_pose_oto), ("otm", camera_pose_otm)):
+            columns[f"X_TC_{name}"] = pack_pose(pose(X_TG, config.camera))[None]
+    successes = successes_of(Table(columns), config.camera)
+    return Removal(int(first_removal(successes, config.filters)[0]))
 
 
-def _looks(trial: TrialRecord, config: Config) -> dict[str, AnyArray]:
-    """Return the row of `/looks` with the poses of the usual cameras, which see the object."""
-    X_TG, size = multiply(trial.X_TO, trial.X_OG), config.camera.size
-    looks: dict[str, AnyArray] = {field.name: np.full(1, np.nan) for field in CERTIFICATE_FIELDS}
-    for name, pose in (("oto", camera_pose_oto), ("otm", camera_pose_otm)):
-        looks[f"X_TC_{name}"] = pack_pose(pose(X_TG, config.camera))[None]
-        looks[f"mask_{name}"] = np.ones((1, size, size), dtype=np.uint8)
-    return looks
+#: Of the filters' columns, those that only pictures of a success show.
+_OF_PICTURES = {"seen", "depth_variance"}
+
+
+def unjudged(rules: FilterConfig) -> tuple[Removal, ...]:
+    """Return the filters, of those that are on, about which a verdict knows nothing."""
+    of_pictures = (rule for rule in RULES if rule.is_on(rules) and {*rule.needs} & _OF_PICTURES)
+    others = {Removal.OUTLIER: rules.outlier_sigma > 0.0, Removal.OWN: bool(rules.own)}
+    return (
+        *(rule.removal for rule in of_pictures),
+        *(reason for reason, on in others.items() if on),
+    )

@@ -17,7 +17,7 @@ from pathlib import Path, PurePath
 from drakegrasp.config import CarriedHand, Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked
 from drakegrasp.dataset.assembly.survey import headers_by_object
-from drakegrasp.dataset.filters import own_filters
+from drakegrasp.dataset.filtering import own_filters
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (
     REQUIRED_VERSIONS,

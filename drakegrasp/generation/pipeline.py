@@ -18,7 +18,7 @@ from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.assembly.split import rank_in_split
 from drakegrasp.dataset.assembly.survey import headers_by_object
 from drakegrasp.dataset.card.text import write_card
-from drakegrasp.dataset.filters import own_filters
+from drakegrasp.dataset.filtering import own_filters
 from drakegrasp.dataset.lock import Holder, build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,

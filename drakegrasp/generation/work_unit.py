@@ -21,8 +21,7 @@ import numpy as np
 
 from drakegrasp.config import Config, FilterConfig
 from drakegrasp.dataset.assembly.survey import count_samples, successes_of
-from drakegrasp.dataset.filters import judge_successes
-from drakegrasp.dataset.hdf5 import AnyArray
+from drakegrasp.dataset.filtering import judge_successes
 from drakegrasp.dataset.schema import HOLD_FIELDS
 from drakegrasp.dataset.shards import Shard, ShardHeader, read_trials, write_shard
 from drakegrasp.errors import DataError, MachineError
@@ -57,7 +56,7 @@ from drakegrasp.simulation.scene_cache import cached_scene
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.simulation.verdict import judge_closed
-from drakegrasp.vision.camera import intrinsics
+from drakegrasp.table import AnyArray, Table
 
 #: An attempt that takes this many times its limit of computing time hangs: it never looks at it.
 HANG_FACTOR = 1.5
@@ -281,9 +280,8 @@ def _samples(setup: TrialSetup, done: _Round) -> list[int]:
     rows = np.flatnonzero(done.trials["outcome"] == Outcome.SUCCESS)
     trials = {name: values[rows] for name, values in done.trials.items()}
     depths = done.looks["image_otm"][:, 3]
-    successes = successes_of(
-        trials, done.looks, depths, object=0, K=intrinsics(setup.config.camera)
-    )
+    found = Table({**trials, **done.looks}, depth_otm=depths)
+    successes = successes_of(found, setup.config.camera)
     removal = judge_successes(successes, PARENT_FILTERS)
     return rows[removal == Removal.KEPT].tolist()
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from drakegrasp.dataset.filters import own_setting
+from drakegrasp.dataset.filtering import own_setting
 from drakegrasp.dataset.rejections import FILE_NAME, Decisions
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.suspicion import PARTS

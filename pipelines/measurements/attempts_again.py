@@ -27,21 +27,22 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import FilterConfig
-from drakegrasp.dataset.filters import breaks_hold
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
+from drakegrasp.filters import first_removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import override_config
 from drakegrasp.objects.sources import find_meshes
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.trial import run_attempt
+from drakegrasp.table import Table
 
 QUANTILES = (0.1, 0.5, 0.9)
 #: Columns that say what a lift is, and all that are read.
@@ -163,8 +164,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _is_sample(columns: Any, filters: FilterConfig) -> npt.NDArray[np.bool_]:
     """Return whether attempts are held, and the filters of the hold keep them."""
     held = np.asarray(columns["outcome"]) == Outcome.SUCCESS
-    limits = breaks_hold(filters, *(columns[k] for k in ("lifted_other_links", "slip", "turn")))
-    return np.asarray(held & ~np.any([broken for _, broken in limits], axis=0))
+    hold = Table(
+        other_links=columns["lifted_other_links"], slip=columns["slip"], turn=columns["turn"]
+    )
+    return np.asarray(held & (first_removal(hold, filters) == Removal.KEPT))
 
 
 def _measured(

@@ -20,19 +20,20 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from drakegrasp.config import BuiltinConfig, Config
-from drakegrasp.dataset.filters import breaks_hold
 from drakegrasp.errors import MeshError
+from drakegrasp.filters import first_removal
 from drakegrasp.generation.attempts import TrialSetup, list_attempts, predict_attempts
 from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.shapes.catalog import builtin_sources
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
+from drakegrasp.table import Table
 
 
 def sources_of(objects: str, units: str, every: int, folder: Path) -> list[MeshSource]:
@@ -75,10 +76,9 @@ def is_sample(record: TrialRecord, config: Config) -> bool:
     """Return whether the filters of the hold keep a grasp."""
     if record.outcome is not Outcome.SUCCESS or record.lift is None:
         return False
-    limits = breaks_hold(
-        config.filters, [record.lift.contacts.other_links], [record.lift.slip], [record.lift.turn]
-    )
-    return not any(bad[0] for _, bad in limits)
+    lift = record.lift
+    hold = Table(other_links=[lift.contacts.other_links], slip=[lift.slip], turn=[lift.turn])
+    return bool(first_removal(hold, config.filters)[0] == Removal.KEPT)
 
 
 @one_thread

@@ -213,8 +213,8 @@ def test_contact_is_in_view_within_the_image_and_before_the_camera(
     X_TC = make_pose(rotation_about([1.0, 0.0, 0.0], 2.0), [0.1, 0.2, 0.7])
     p_TQ = transform_points(X_TC, np.array([[0.0, 0.0, 0.4], p_CQ, [np.nan] * 3]))
     grasp_T = pack_grasp(p_TQ, np.tile([0.0, 0.0, 1.0], (3, 1)))
-    mask, unused = np.zeros((33, 33)), np.array([False, False, True])
-    assert survey._in_view(K, mask, pack_pose(X_TC), grasp_T, unused) is seen
+    unused = np.array([False, False, True])
+    assert survey._in_view(K, 33, pack_pose(X_TC), grasp_T, unused) is seen
 
 
 def test_limits_of_the_hold_change_without_a_simulation(out: Path) -> None:

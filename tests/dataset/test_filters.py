@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.successes import good
@@ -11,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drakegrasp.config import FilterConfig
-from drakegrasp.dataset.filters import is_outlier, judge_successes
+from drakegrasp.dataset.filtering import judge_successes
+from drakegrasp.filters import is_outlier
 from drakegrasp.outcomes import Removal
 
 
@@ -33,21 +32,21 @@ from drakegrasp.outcomes import Removal
 )
 def test_each_filter_removes_its_own(field: str, value: float, reason: Removal) -> None:
     successes = good(10)
-    values = getattr(successes, field).copy()
+    values = successes[field].copy()
     values[4] = value
-    removal = judge_successes(replace(successes, **{field: values}), FilterConfig())
+    removal = judge_successes(successes.with_columns(**{field: values}), FilterConfig())
     assert removal[4] == reason
     assert np.all(np.delete(removal, 4) == Removal.KEPT)
 
 
 def test_first_reason_counts() -> None:
-    bad = replace(good(3), seen=np.zeros(3, bool), depth_variance=np.zeros(3))
+    bad = good(3).with_columns(seen=np.zeros(3, bool), depth_variance=np.zeros(3))
     assert np.all(judge_successes(bad, FilterConfig(), rejected=[0, 3, 6]) == Removal.NOT_SEEN)
-    worse = replace(bad, slip=np.ones(3), turn=np.ones(3), normal_angle=np.ones(3))
+    worse = bad.with_columns(slip=np.ones(3), turn=np.ones(3), normal_angle=np.ones(3))
     assert np.all(judge_successes(worse, FilterConfig()) == Removal.SLID)
-    worst = replace(worse, other_links=np.ones(3, np.uint8))
+    worst = worse.with_columns(other_links=np.ones(3, np.uint8))
     assert np.all(judge_successes(worst, FilterConfig()) == Removal.OTHER_LINKS)
-    nothing = replace(worst, complete=np.zeros(3, bool), grasp_T=np.full((3, 18), np.nan))
+    nothing = worst.with_columns(complete=np.zeros(3, bool), grasp_T=np.full((3, 18), np.nan))
     assert np.all(judge_successes(nothing, FilterConfig()) == Removal.MISSING_FINGER)
 
 
@@ -61,7 +60,7 @@ def test_first_reason_counts() -> None:
     ],
 )
 def test_null_switches_a_limit_off(field: str, value: float, limit: str) -> None:
-    successes = replace(good(3), **{field: np.full(3, value)})
+    successes = good(3).with_columns(**{field: np.full(3, value)})
     off = FilterConfig.model_validate({limit: None})
     assert np.all(judge_successes(successes, FilterConfig()) != Removal.KEPT)
     assert np.all(judge_successes(successes, off) == Removal.KEPT)
@@ -84,8 +83,8 @@ def test_each_limit_is_the_configured_one(
     limit: str, value: float, field: str, kept: float, removed: float, reason: Removal
 ) -> None:
     """Values of which the usual limit would judge at least one otherwise."""
-    values = np.array([kept, removed], dtype=getattr(good(2), field).dtype)
-    found = judge_successes(replace(good(2), **{field: values}), FilterConfig(**{limit: value}))
+    values = np.array([kept, removed], dtype=good(2)[field].dtype)
+    found = judge_successes(good(2).with_columns(**{field: values}), FilterConfig(**{limit: value}))
     assert found.tolist() == [Removal.KEPT, reason]
 
 
@@ -96,7 +95,9 @@ def test_outliers_are_beyond_the_configured_number_of_deviations(
     """One of twenty is sqrt(19), some 4.4 deviations from the mean."""
     grasps = np.zeros((20, 18))
     grasps[7, 3] = 1.0
-    removal = judge_successes(replace(good(20), grasp_T=grasps), FilterConfig(outlier_sigma=sigma))
+    removal = judge_successes(
+        good(20).with_columns(grasp_T=grasps), FilterConfig(outlier_sigma=sigma)
+    )
     assert np.flatnonzero(removal == Removal.OUTLIER).tolist() == ([7] if outlier else [])
 
 
@@ -105,7 +106,7 @@ def test_outliers_are_judged_among_the_grasps_that_are_left() -> None:
     grasps, slip = np.zeros((40, 18)), np.zeros(40)
     grasps[7, 3] = 1.0
     grasps[20:, 3], slip[20:] = np.linspace(-50.0, 50.0, 20), 1.0
-    removal = judge_successes(replace(good(40), grasp_T=grasps, slip=slip), FilterConfig())
+    removal = judge_successes(good(40).with_columns(grasp_T=grasps, slip=slip), FilterConfig())
     assert removal[7] == Removal.OUTLIER
     assert np.all(removal[20:] == Removal.SLID)
     assert np.count_nonzero(removal == Removal.KEPT) == 19
@@ -129,7 +130,7 @@ def test_numbers_of_removals_are_those_in_files() -> None:
 )
 def test_limits_of_suspicion_are_off_until_they_are_set(field: str, limit: str) -> None:
     values = np.array([0.1, 0.3, np.nan])
-    successes = replace(good(3), **{field: values})
+    successes = good(3).with_columns(**{field: values})
     assert np.all(judge_successes(successes, FilterConfig()) == Removal.KEPT)
     removal = judge_successes(successes, FilterConfig(**{limit: 0.2}))
     assert removal.tolist() == [Removal.KEPT, Removal.SUSPICIOUS, Removal.SUSPICIOUS]
@@ -137,16 +138,16 @@ def test_limits_of_suspicion_are_off_until_they_are_set(field: str, limit: str) 
 
 def test_held_asks_nothing_of_the_hold_and_the_same_of_the_contacts() -> None:
     held = FilterConfig(require="held")
-    bad = replace(
-        good(3), other_links=np.full(3, 4, np.uint8), slip=np.ones(3), turn=np.full(3, 3.0)
+    bad = good(3).with_columns(
+        other_links=np.full(3, 4, np.uint8), slip=np.ones(3), turn=np.full(3, 3.0)
     )
     assert np.all(judge_successes(bad, held) == Removal.KEPT)
-    off = replace(bad, normal_angle=np.ones(3))
+    off = bad.with_columns(normal_angle=np.ones(3))
     assert np.all(judge_successes(off, held) == Removal.NORMAL_OFF)
 
 
 def test_motion_that_is_unknown_is_no_sample() -> None:
-    successes = replace(good(2), slip=np.array([np.nan, 0.0]))
+    successes = good(2).with_columns(slip=np.array([np.nan, 0.0]))
     assert judge_successes(successes, FilterConfig()).tolist() == [Removal.SLID, Removal.KEPT]
 
 
@@ -155,7 +156,7 @@ def test_normal_of_opposed_patches_is_off_the_surface(name: str) -> None:
     """Its length is zero, so that it has no direction: neither grasp of a sample may have one."""
     grasps = good(3).grasp_T.copy()
     grasps[1, 12] = np.nan
-    removal = judge_successes(replace(good(3), **{name: grasps}), FilterConfig())
+    removal = judge_successes(good(3).with_columns(**{name: grasps}), FilterConfig())
     assert removal.tolist() == [Removal.KEPT, Removal.OFF_SURFACE, Removal.KEPT]
 
 
@@ -166,7 +167,9 @@ def test_outlier_is_judged_by_its_own_objects_population() -> None:
     objects = np.repeat([0, 1], 100).astype(np.int32)
     grasps[100:] += 50.0
     grasps[5, 17] = 50.0
-    removal = judge_successes(replace(successes, object=objects, grasp_T=grasps), FilterConfig())
+    removal = judge_successes(
+        successes.with_columns(object=objects, grasp_T=grasps), FilterConfig()
+    )
     assert np.flatnonzero(removal == Removal.OUTLIER).tolist() == [5]
 
 

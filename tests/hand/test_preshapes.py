@@ -12,7 +12,7 @@ import yaml
 from helpers.successes import good
 
 from drakegrasp.config import CandidateConfig, Config, FilterConfig
-from drakegrasp.dataset.filters import judge_successes
+from drakegrasp.dataset.filtering import judge_successes
 from drakegrasp.errors import HandError
 from drakegrasp.exchange.dexgraspbench import grasp_dictionary
 from drakegrasp.exchange.export import ClosedGrasp
@@ -155,7 +155,7 @@ def test_filters_do_not_miss_what_a_preshape_leaves_out() -> None:
     grasp[lacking] = held[lacking] = np.nan
     grasp[3, 4] = np.nan
     grasp[6, 4] = grasp[30, 0] = 50.0
-    shaped = replace(grasps, grasp_T=grasp, held_O=held, unused=unused)
+    shaped = grasps.with_columns(grasp_T=grasp, held_O=held, unused=unused)
     removal = judge_successes(shaped, FilterConfig())
     assert np.flatnonzero(removal).tolist() == [3, 6, 30]
     assert removal[3] == Removal.OFF_SURFACE

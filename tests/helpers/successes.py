@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from drakegrasp.dataset.filters import Successes
+from drakegrasp.table import Table
 
 
-def good(count: int) -> Successes:
+def good(count: int) -> Table:
     """Successes that every filter keeps."""
     rng = np.random.default_rng(0)
-    return Successes(
+    return Table(
         trial_id=np.arange(count, dtype=np.int64) * 3,
         object=np.zeros(count, dtype=np.int32),
         candidate=np.arange(count, dtype=np.int32),

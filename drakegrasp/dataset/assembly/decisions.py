@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,14 +21,9 @@ from drakegrasp.config import CameraConfig
 from drakegrasp.dataset.assembly.pack import TASK_ROWS, PackTask, ShardSlice
 from drakegrasp.dataset.assembly.samples import TEXTS
 from drakegrasp.dataset.assembly.split import split_samples
-from drakegrasp.dataset.assembly.survey import (
-    Survey,
-    headers_by_object,
-    join_seals,
-    join_successes,
-)
+from drakegrasp.dataset.assembly.survey import Survey, headers_by_object, join_seals
 from drakegrasp.dataset.assembly.weights import weigh_samples
-from drakegrasp.dataset.filters import Successes, judge_successes
+from drakegrasp.dataset.filtering import judge_successes
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.manifest import Manifest, origin_attributes
 from drakegrasp.dataset.rejections import AttemptKey
@@ -36,6 +31,7 @@ from drakegrasp.dataset.schema import OBJECT_FIELDS, SUCCESS_FIELDS
 from drakegrasp.frames import Array
 from drakegrasp.outcomes import Removal
 from drakegrasp.runtime.files import temporary_name
+from drakegrasp.table import Table, join
 from drakegrasp.vision.camera import intrinsics
 
 
@@ -51,7 +47,7 @@ class Shards:
     """
 
     slices: Sequence[ShardSlice]
-    successes: Successes
+    successes: Table
     sizes: Mapping[str, int]
     seals: str
 
@@ -72,7 +68,7 @@ class Decisions:
         weights: (n,), weight of each sample; NaN where a success is none.
     """
 
-    successes: Successes
+    successes: Table
     removal: AnyArray
     splits: Mapping[str, npt.NDArray[np.int64]]
     weights: Array
@@ -80,12 +76,11 @@ class Decisions:
     @cached_property
     def ids(self) -> dict[str, npt.NDArray[np.int64]]:
         """Ids of the trials that are samples, in rising order, by split."""
-        return {split: self.successes.trial_id[rows] for split, rows in self.splits.items()}
+        return {split: self.successes["trial_id"][rows] for split, rows in self.splits.items()}
 
     def columns(self) -> dict[str, AnyArray]:
         """Return the columns of /successes: why each success is, or is not, a sample."""
-        names = [field.name for field in SUCCESS_FIELDS if field.name != "removal"]
-        return {"removal": self.removal, **{name: getattr(self.successes, name) for name in names}}
+        return {"removal": self.removal, **self.successes.only(*(f.name for f in SUCCESS_FIELDS))}
 
 
 def number_rows(surveys: Sequence[Survey], manifest: Manifest) -> Shards:
@@ -93,29 +88,30 @@ def number_rows(surveys: Sequence[Survey], manifest: Manifest) -> Shards:
     headers = headers_by_object(manifest)
     first, slices, parts = 0, list[ShardSlice](), []
     for survey in surveys:
-        parts.append(replace(survey.successes, trial_id=survey.successes.trial_id + first))
+        ids = survey.successes["trial_id"] + first
+        parts.append(survey.successes.with_columns(trial_id=ids))
         # Shards behind the last wanted grasp give no rows.
         for header, rows in zip(headers[survey.object], survey.rows, strict=False):
             slices.append(ShardSlice(header=header, object=survey.object, first=first, rows=rows))
             first += rows
     return Shards(
         slices=slices,
-        successes=join_successes(parts),
+        successes=join(parts),
         sizes=surveys[0].sizes,
         seals=join_seals({survey.object: survey.seals for survey in surveys}),
     )
 
 
-def keys_of(manifest: Manifest, successes: Successes) -> dict[AttemptKey, int]:
+def keys_of(manifest: Manifest, successes: Table) -> dict[AttemptKey, int]:
     """Return the trial id of each success, by its identity."""
     names = ("object", "candidate", "standoff_index", "child", "trial_id")
-    rows = zip(*(getattr(successes, name).tolist() for name in names), strict=True)
+    rows = zip(*(successes[name].tolist() for name in names), strict=True)
     return {AttemptKey(manifest.objects[i].name, *key): t for i, *key, t in rows}
 
 
 def decide(
     manifest: Manifest,
-    successes: Successes,
+    successes: Table,
     removed_by_own: npt.NDArray[np.bool_] | None = None,
 ) -> Decisions:
     """Decide which successes are samples, in which split, and what each weighs.
@@ -132,31 +128,34 @@ def decide(
 
     # Only first-round attempts are tested: the others are drawn about held ones.
     splits = _split_successes(manifest, successes, removal)
-    refined = successes.child[splits["test"]] > 0
+    refined = successes["child"][splits["test"]] > 0
     removal[splits["test"][refined]] = Removal.REFINED_TEST
     splits["test"] = splits["test"][~refined]
 
     # The weights, among all samples.
     kept = np.flatnonzero(removal == Removal.KEPT)
     weights = np.full(len(removal), np.nan)
-    numbers, rows = manifest.pose_numbers(), zip(successes.object, successes.resting, strict=True)
+    numbers, rows = (
+        manifest.pose_numbers(),
+        zip(successes["object"], successes["resting"], strict=True),
+    )
     poses = np.array([numbers[i][k] for i, k in rows], dtype=np.int64)[kept]
-    weights[kept] = weigh_samples(poses, successes.X_OG[kept])
+    weights[kept] = weigh_samples(poses, successes["X_OG"][kept])
     return Decisions(successes=successes, removal=removal, splits=splits, weights=weights)
 
 
 def _split_successes(
-    manifest: Manifest, successes: Successes, removal: AnyArray
+    manifest: Manifest, successes: Table, removal: AnyArray
 ) -> dict[str, npt.NDArray[np.int64]]:
     """Return which successes are samples of each split, in rising order."""
     # A first-round attempt and all that was refined from it go to one split.
     kept = np.flatnonzero(removal == Removal.KEPT)
     names = ("object", "candidate", "standoff_index")
-    keys = np.column_stack([getattr(successes, name)[kept] for name in names])
+    keys = np.column_stack([successes[name][kept] for name in names])
     _, first, family = np.unique(keys, axis=0, return_index=True, return_inverse=True)
 
     split = split_samples(
-        successes.object[kept[first]],
+        successes["object"][kept[first]],
         [entry.mesh_name for entry in manifest.objects],
         [entry.class_name for entry in manifest.objects],
         manifest.groups,

@@ -6,39 +6,28 @@ each success what the filters need. A task surveys one object, and verifies the 
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from drakegrasp.config import Config
-from drakegrasp.dataset.filters import Successes, judge_successes
-from drakegrasp.dataset.hdf5 import AnyArray, read_column
+from drakegrasp.config import CameraConfig, Config
+from drakegrasp.dataset.filtering import judge_successes
+from drakegrasp.dataset.hdf5 import read_column
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.schema import CAMERAS, CERTIFICATE_FIELDS, sizes
 from drakegrasp.dataset.shards import ShardHeader, open_shard, read_trials
 from drakegrasp.dataset.suspicion import COLUMNS, suspicion
+from drakegrasp.filters import NEEDED
 from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp, unused_fingers
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.files import read_seal
+from drakegrasp.table import AnyArray, Table, join
 from drakegrasp.vision.camera import intrinsics, project
-
-#: Columns of `/trials` from which the filters' numbers follow.
-SURVEYED = (
-    *COLUMNS,
-    *("candidate", "standoff_index", "child", "resting", "X_TO", "X_OG", "closed_p_OQ"),
-    *("lifted_p_OQ", "lifted_nhat_Q_O", "lifted_touching", "unused"),
-)
-#: Columns of `/looks`, besides the depths of the otm image.
-_LOOKS = (
-    *(f"{name}_{camera}" for name in ("mask", "X_TC") for camera in CAMERAS),
-    *(field.name for field in CERTIFICATE_FIELDS),
-)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,14 +39,14 @@ class SurveyTask:
         object: Row of the object in /objects.
         headers: Its work units, in the order of their candidates.
         wanted: Number of grasps after which its rows end; None for all rows.
-        K: Camera matrix (3, 3) [px].
+        camera: That sees the grasps.
     """
 
     out: str
     object: int
     headers: tuple[ShardHeader, ...]
     wanted: int | None
-    K: Array
+    camera: CameraConfig
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,24 +58,29 @@ class Survey:
         rows: Number of rows that the dataset takes of each shard, from the first; a shard behind
             the last wanted grasp is not in it.
         seals: Hash of the seals of these shards.
-        successes: Those in the rows; `trial_id` counts from the object's first row.
+        successes: Those in the rows, with the columns of `successes_of`; `trial_id` counts from the
+            object's first row.
         sizes: Lengths of the letters in the shapes of `schema`.
     """
 
     object: int
     rows: tuple[int, ...]
     seals: bytes
-    successes: Successes
+    successes: Table
     sizes: Mapping[str, int]
 
 
 def survey_tasks(out: Path, manifest: Manifest) -> Iterator[SurveyTask]:
     """Yield the task of each object that has a palm pose."""
-    K = intrinsics(manifest.config.camera)
+    config = manifest.config
     for i, headers in enumerate(headers_by_object(manifest)):
         if headers:
             yield SurveyTask(
-                out=str(out), object=i, headers=headers, wanted=manifest.config.max_grasps, K=K
+                out=str(out),
+                object=i,
+                headers=headers,
+                wanted=config.max_grasps,
+                camera=config.camera,
             )
 
 
@@ -105,7 +99,7 @@ def survey_object(task: SurveyTask) -> Survey:
         DataError: If one of them is missing or damaged.
     """
     out, first, left = Path(task.out), 0, task.wanted
-    rows, parts, digest = list[int](), list[Successes](), hashlib.sha256()
+    rows, parts, digest = list[int](), list[Table](), hashlib.sha256()
     letters: Mapping[str, int] = {}
     for header in task.headers:
         if left == 0:
@@ -118,16 +112,16 @@ def survey_object(task: SurveyTask) -> Survey:
             left = None if left is None else left - len(hits)
             count = int(hits[-1]) + 1 if left == 0 else len(outcome)
 
-            trials = {name: read_column(file["trials"], name)[hits] for name in SURVEYED}
-            looks = {name: read_column(file["looks"], name)[: len(hits)] for name in _LOOKS}
+            found = {n: read_column(file["trials"], n)[hits] for n in TRIAL_COLUMNS}
+            found |= {n: read_column(file["looks"], n)[: len(hits)] for n in LOOK_COLUMNS}
             images = file["looks/image_otm"]
-            depths = images[: len(hits), 3] if len(hits) else np.zeros((0, 1, 1))
-            successes = successes_of(trials, looks, depths, object=task.object, K=task.K)
-            parts.append(replace(successes, trial_id=first + hits))
+            found["depth_otm"] = images[: len(hits), 3] if len(hits) else np.zeros((0, 1, 1))
+            successes = successes_of(Table(found), task.camera, object=task.object)
+            parts.append(successes.with_columns(trial_id=first + hits))
             letters = letters or sizes(
-                fingers=trials["closed_touching"].shape[1],
+                fingers=found["closed_touching"].shape[1],
                 joints=file["trials/closed_q"].shape[1],
-                image=looks["mask_oto"].shape[1],
+                image=images.shape[-1],
             )
         digest.update(read_seal(header.path(out)))
         rows.append(count)
@@ -136,7 +130,7 @@ def survey_object(task: SurveyTask) -> Survey:
         object=task.object,
         rows=tuple(rows),
         seals=digest.digest(),
-        successes=join_successes(parts),
+        successes=join(parts),
         sizes=letters,
     )
 
@@ -147,16 +141,10 @@ def count_samples(out: Path, header: ShardHeader, config: Config) -> int:
     Raises:
         DataError: If the shard is missing or damaged.
     """
-    K, filters = intrinsics(config.camera), config.filters.model_copy(update={"outlier_sigma": 0.0})
-    task = SurveyTask(out=str(out), object=0, headers=(header,), wanted=None, K=K)
+    filters = config.filters.model_copy(update={"outlier_sigma": 0.0})
+    task = SurveyTask(out=str(out), object=0, headers=(header,), wanted=None, camera=config.camera)
     removal = judge_successes(survey_object(task).successes, filters)
     return int(np.count_nonzero(removal == Removal.KEPT))
-
-
-def join_successes(parts: Sequence[Successes]) -> Successes:
-    """Return the successes of several surveys as one."""
-    names = [f.name for f in dataclasses.fields(Successes)]
-    return Successes(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
 
 
 def shards_sha256(out: Path, manifest: Manifest, execute: Executor = run_here) -> str:
@@ -192,82 +180,167 @@ def _read_seals(task: SurveyTask) -> tuple[int, bytes]:
     return task.object, digest.digest()
 
 
-def successes_of(
-    trials: Mapping[str, AnyArray],
-    looks: Mapping[str, AnyArray],
-    depths: AnyArray,
-    *,
-    object: int,
-    K: Array,
-) -> Successes:
-    """Return what the filters need of n successes; their `trial_id` counts from 0.
+@dataclass(frozen=True)
+class _Derived:
+    """Columns of successes that follow from those of the files.
 
-    Args:
-        trials: Their rows of `/trials`, by the names of `SURVEYED` and more.
-        looks: Their rows of `/looks`, without the images.
-        depths: (n, S, S), their otm depth images [m].
-        object: Row of their object in /objects.
-        K: Camera matrix (3, 3) [px].
+    Attributes:
+        names: Of the columns.
+        needs: Columns of `/trials` and `/looks` that they follow from.
+        derive: Given these and the camera, the arrays (n, ...) of the columns.
     """
-    # The grasps in {T}, and whether both cameras see all their contacts.
-    X_TO = unpack_pose(trials["X_TO"])
-    grasps = [
-        transform_grasp(X, pack_grasp(p, n))
-        for X, p, n in zip(X_TO, trials["closed_p_OQ"], trials["closed_nhat_Q_O"], strict=True)
+
+    names: tuple[str, ...]
+    needs: tuple[str, ...]
+    derive: Callable[[Table, CameraConfig], tuple[AnyArray, ...]]
+
+
+def _fingers(t: Table) -> tuple[AnyArray, ...]:
+    """Return which fingers the preshape leaves out, and whether all others touch both times."""
+    unused = unused_fingers(t["unused"], t["closed_touching"].shape[1])
+    return unused, np.all(t["closed_touching"] & t["lifted_touching"] | unused, axis=1)
+
+
+def _grasp_T(t: Table) -> Array:
+    """Return the grasps (n, 6k) in {T}."""
+    rows = zip(unpack_pose(t["X_TO"]), t["closed_p_OQ"], t["closed_nhat_Q_O"], strict=True)
+    grasps = [transform_grasp(X_TO, pack_grasp(p, n)) for X_TO, p, n in rows]
+    return np.array(grasps).reshape(-1, 6 * t["closed_touching"].shape[1])
+
+
+def _held_O(t: Table) -> Array:
+    """Return the contacts (n, 6k) at the end of the lift in {O}."""
+    parts = [t[f"lifted_{name}"] for name in ("p_OQ", "nhat_Q_O")]
+    return np.concatenate(parts, axis=1).reshape(t.count, 6 * parts[0].shape[1])
+
+
+def _all_in_view(t: Table, camera: CameraConfig) -> tuple[AnyArray]:
+    """Return whether both cameras see all contacts of each grasp."""
+    unused, _ = _fingers(t)
+    K, poses = intrinsics(camera), [t[f"X_TC_{name}"] for name in CAMERAS]
+    rows = zip(_grasp_T(t), unused, *poses, strict=True)
+    seen = [
+        all(_in_view(K, camera.size, X_TC, grasp, lacking) for X_TC in X_TCs)
+        for grasp, lacking, *X_TCs in rows
     ]
-    fingers = trials["closed_touching"].shape[1]
-    length, unused = 6 * fingers, unused_fingers(trials["unused"], fingers)
-    in_view = [
-        all(
-            _in_view(K, looks[f"mask_{c}"][i], looks[f"X_TC_{c}"][i], grasp, unused[i])
-            for c in CAMERAS
-        )
-        for i, grasp in enumerate(grasps)
-    ]
-
-    doubts = suspicion(trials)
-    return Successes(
-        candidate=trials["candidate"],
-        standoff_index=trials["standoff_index"],
-        child=trials["child"],
-        resting=trials["resting"],
-        X_OG=unpack_pose(trials["X_OG"]),
-        trial_id=np.arange(len(X_TO), dtype=np.int64),
-        object=np.full(len(X_TO), object, dtype=np.int32),
-        grasp_T=np.array(grasps).reshape(-1, length),
-        held_O=np.concatenate(
-            [
-                trials[f"lifted_{name}"].reshape(len(X_TO), length // 2)
-                for name in ("p_OQ", "nhat_Q_O")
-            ],
-            axis=1,
-        ),
-        complete=np.all(trials["closed_touching"] & trials["lifted_touching"] | unused, axis=1),
-        unused=unused,
-        other_links=trials["lifted_other_links"],
-        slip=trials["slip"],
-        turn=trials["turn"],
-        seen=np.all([looks[f"mask_{c}"].any(axis=(1, 2)) for c in CAMERAS], axis=0),
-        in_view=np.array(in_view, dtype=bool),
-        # Both cameras are at the same point.
-        camera_height=unpack_pose(looks["X_TC_otm"])[:, 2, 3],
-        depth_variance=depths.astype(float).var(axis=(1, 2)),
-        surface_distance=_largest(trials["surface_distance"], unused),
-        normal_angle=_largest(trials["normal_angle"], unused),
-        suspicion=doubts.score,
-        **{name: doubts.values[name] for name in ("penetration", "imbalance", "normal_sum")},
-        **{field.name: looks[field.name] for field in CERTIFICATE_FIELDS},
-    )
+    return (np.array(seen, dtype=bool),)
 
 
-def _largest(values: Array, unused: AnyArray) -> Array:
-    """Return the largest value (n,) of the fingers (n, k) that are used."""
-    return np.asarray(np.where(unused, 0.0, values).max(axis=1, initial=0.0))
-
-
-def _in_view(K: Array, mask: AnyArray, X_TC: Array, grasp_T: Array, unused: AnyArray) -> bool:
+def _in_view(K: Array, size: int, X_TC: Array, grasp_T: Array, unused: AnyArray) -> bool:
     """Return whether all contacts of a grasp are before a camera and within its image."""
     p_TQ, _ = unpack_grasp(grasp_T)
     p_CQ = transform_points(invert_pose(unpack_pose(X_TC)), p_TQ[~unused])
     uv = project(K, p_CQ)
-    return bool(np.all(p_CQ[:, 2] > 0.0) and np.all(uv >= 0.0) and np.all(uv <= len(mask) - 1))
+    return bool(np.all(p_CQ[:, 2] > 0.0) and np.all(uv >= 0.0) and np.all(uv <= size - 1))
+
+
+def _largest(t: Table) -> tuple[AnyArray, ...]:
+    """Return the largest distance and angle (n,) of the fingers that are used."""
+    unused, _ = _fingers(t)
+    names = "surface_distance", "normal_angle"
+    return tuple(np.where(unused, 0.0, t[name]).max(axis=1, initial=0.0) for name in names)
+
+
+def _doubts(t: Table) -> tuple[AnyArray, ...]:
+    """Return the suspicion score and parts of it, (n,) each."""
+    doubts = suspicion(t)
+    parts = "penetration", "imbalance", "normal_sum"
+    return doubts.score, *(doubts.values[name] for name in parts)
+
+
+_TOUCHING = ("unused", "closed_touching", "lifted_touching")
+_IN_T = ("X_TO", "closed_p_OQ", "closed_nhat_Q_O", "closed_touching")
+_DERIVED = (
+    # (n, k) bool, the fingers that the preshape leaves out; and whether all others touch, after
+    # closing and after the lift.
+    _Derived(("unused", "complete"), _TOUCHING, lambda t, camera: _fingers(t)),
+    _Derived(("grasp_T",), _IN_T, lambda t, camera: (_grasp_T(t),)),
+    _Derived(("held_O",), ("lifted_p_OQ", "lifted_nhat_Q_O"), lambda t, camera: (_held_O(t),)),
+    _Derived(
+        ("other_links",), ("lifted_other_links",), lambda t, camera: (t["lifted_other_links"],)
+    ),
+    # Whether both masks have object pixels.
+    _Derived(
+        ("seen",),
+        tuple(f"mask_{name}" for name in CAMERAS),
+        lambda t, camera: (
+            np.all([t[f"mask_{name}"].any(axis=(1, 2)) for name in CAMERAS], axis=0),
+        ),
+    ),
+    _Derived(
+        ("in_view",),
+        tuple({*_IN_T, *_TOUCHING, *(f"X_TC_{name}" for name in CAMERAS)}),
+        _all_in_view,
+    ),
+    # [m] above the table; both cameras are at the same point.
+    _Derived(
+        ("camera_height",),
+        ("X_TC_otm",),
+        lambda t, camera: (unpack_pose(t["X_TC_otm"])[:, 2, 3],),
+    ),
+    # [m^2], of the otm depth image.
+    _Derived(
+        ("depth_variance",),
+        ("depth_otm",),
+        lambda t, camera: (t["depth_otm"].astype(float).var(axis=(1, 2)),),
+    ),
+    # The largest of the contacts [m], [rad].
+    _Derived(
+        ("surface_distance", "normal_angle"),
+        (*_TOUCHING, "surface_distance", "normal_angle"),
+        lambda t, camera: _largest(t),
+    ),
+    _Derived(
+        ("suspicion", "penetration", "imbalance", "normal_sum"),
+        COLUMNS,
+        lambda t, camera: _doubts(t),
+    ),
+    _Derived(("X_OG",), ("X_OG",), lambda t, camera: (unpack_pose(t["X_OG"]),)),
+)
+_DERIVED_NAMES = {name for each in _DERIVED for name in each.names}
+#: Columns of successes as the files hold them: which attempt each one is, what rules need, and what
+#: is copied to /successes.
+_COPIED = tuple(
+    dict.fromkeys(
+        name
+        for name in ("candidate", "standoff_index", "child", "resting", "slip", "turn", *NEEDED)
+        if name not in _DERIVED_NAMES
+    )
+)
+#: Columns of `/looks`, besides the depths of the otm image.
+LOOK_COLUMNS = (
+    *(f"{name}_{camera}" for name in ("mask", "X_TC") for camera in CAMERAS),
+    *(field.name for field in CERTIFICATE_FIELDS),
+)
+#: Columns of `/trials` from which those of successes follow.
+TRIAL_COLUMNS = tuple(
+    dict.fromkeys(
+        name
+        for name in (*_COPIED, *(name for each in _DERIVED for name in each.needs))
+        if name not in (*LOOK_COLUMNS, "depth_otm")
+    )
+)
+
+
+def successes_of(rows: Table, camera: CameraConfig, *, object: int = 0) -> Table:
+    """Return what filters and splits look at, of n successes; their `trial_id` counts from 0.
+
+    Columns whose sources are not there, as the images of a trial that nobody rendered, are left
+    out: the rules that need them say nothing.
+
+    Args:
+        rows: Columns of their rows of `/trials` and `/looks`, by their names there; `depth_otm`
+            (n, S, S) are their otm depth images [m].
+        camera: That sees the grasps.
+        object: Row of their object in /objects.
+    """
+    found: dict[str, AnyArray] = {
+        "trial_id": np.arange(rows.count, dtype=np.int64),
+        "object": np.full(rows.count, object, dtype=np.int32),
+    }
+    certificates = (field.name for field in CERTIFICATE_FIELDS)
+    found |= rows.only(*_COPIED, *certificates)
+    for each in _DERIVED:
+        if rows.has(*each.needs):
+            found |= zip(each.names, each.derive(rows, camera), strict=True)
+    return Table(found)

@@ -21,13 +21,14 @@ from drakegrasp.dataset.checks.rows import (
     rotation,
     unit_length,
 )
-from drakegrasp.dataset.filters import breaks_hold
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
+from drakegrasp.filters import rules_of_hold
 from drakegrasp.frames import P_WT, X_WT, Array, invert_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.objects.model import ObjectModel, fit_contacts
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.verdict import is_precision, is_stable
+from drakegrasp.table import Table
 from drakegrasp.vision.camera import LOOKS_VERTICALLY
 
 #: How skew an inertia may be, and by how much its moments may be none of a body, for rounding.
@@ -94,10 +95,15 @@ def hold(batch: Batch, filters: FilterConfig) -> Iterator[Violation]:
     """A sample keeps the limits of the hold in `filters`, and is called as it holds."""
     other_links = batch["grasp_props/other_links_held"]
     slip, turn = (batch[f"grasp_props/{name}"].astype(float) for name in ("slip", "turn"))
-    least = slip - MOTION_TOLERANCE, turn - MOTION_TOLERANCE
-    for reason, bad in breaks_hold(filters, other_links, *least):
-        what = f"a sample must pass the filter {reason.label}"
-        yield from batch.broken(what, bad, lambda i: "one that does not")
+    least = Table(
+        other_links=other_links, slip=slip - MOTION_TOLERANCE, turn=turn - MOTION_TOLERANCE
+    )
+    for rule in rules_of_hold():
+        if rule.is_on(filters) and least.has(*rule.needs):
+            what = f"a sample must pass the filter {rule.removal.label}"
+            yield from batch.broken(
+                what, rule.refuses(least, filters), lambda i: "one that does not"
+            )
 
     # On the limit rounding decides.
     success = np.full(len(batch), Outcome.SUCCESS.value)

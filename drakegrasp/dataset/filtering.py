@@ -1,0 +1,97 @@
+"""The filters of a whole dataset: the rules, those of the user's own, outliers and rejections."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.config import FilterConfig
+from drakegrasp.errors import ConfigError
+from drakegrasp.filters import Flags, first_removal, is_outlier
+from drakegrasp.outcomes import Removal
+from drakegrasp.runtime.user_code import own_class, run_own
+from drakegrasp.table import Table
+
+#: The setting that names filters of the user's own.
+_OWN = "filters.own"
+
+
+def judge_successes(
+    successes: Table,
+    config: FilterConfig,
+    rejected: Sequence[int] = (),
+    removed_by_own: Flags | None = None,
+) -> npt.NDArray[np.uint8]:
+    """Return the `Removal` (n,) of each success.
+
+    Args:
+        successes: The n successes, with the columns of `dataset.assembly.survey`.
+        config: Limits of the filters.
+        rejected: Ids of trials that an inspection rejects.
+        removed_by_own: (n,), which the user's own filters remove; None: the filters are run.
+
+    Raises:
+        ConfigError: If a filter of the user's own cannot be run, or returns something else.
+    """
+    if removed_by_own is None:
+        removed_by_own = _removed_by_own(config, successes)
+
+    # Filters that judge a grasp alone.
+    removal = first_removal(successes, config)
+    removal[removed_by_own & (removal == Removal.KEPT)] = Removal.OWN
+
+    # Outliers among the grasps of an object that are left, with the same fingers.
+    kept = removal == Removal.KEPT
+    if config.outlier_sigma > 0.0:
+        groups = np.column_stack([successes["object"], successes["unused"]])
+        for group in np.unique(groups[kept], axis=0):
+            rows = np.flatnonzero(kept & (groups == group).all(axis=1))
+            outside = is_outlier(successes["grasp_T"][rows], config.outlier_sigma)
+            removal[rows[outside]] = Removal.OUTLIER
+
+    # The inspection comes last: it only sees samples.
+    listed = np.isin(successes["trial_id"], np.asarray(rejected, dtype=np.int64))
+    removal[listed & (removal == Removal.KEPT)] = Removal.REJECTED
+    return removal
+
+
+def own_filters(config: FilterConfig) -> list[type[Any]]:
+    """Return the classes of the user's own filters.
+
+    Raises:
+        ConfigError: If one cannot be imported, or is of another signature.
+    """
+    return [
+        own_class(name, config.code, key=_OWN, method="keep", takes=("successes",))
+        for name in config.own
+    ]
+
+
+def own_setting(config: FilterConfig) -> str:
+    """Return the setting `KEY=VALUE` that gives the user's own filters again; empty without any.
+
+    A dataset knows their files by name and no folder.
+    """
+    names = [name.partition("@")[0] for name in config.own]
+    value = names[0] if len(names) == 1 else f"[{', '.join(names)}]"
+    return f"{_OWN}={value}" if names else ""
+
+
+def _removed_by_own(config: FilterConfig, successes: Table) -> Flags:
+    """Return which successes (n,) a filter of the user's own does not keep."""
+    due = (successes.count,)
+    removed = np.zeros(due, dtype=np.bool_)
+    if due == (0,):
+        return removed
+    for name, found in zip(config.own, own_filters(config), strict=True):
+        kept = np.asarray(run_own(name, lambda found=found: found().keep(successes)))
+        if kept.dtype != np.bool_ or kept.shape != due:
+            raise ConfigError(
+                f"{name.partition('@')[0]}: keep must return {due} of bool, "
+                f"got {kept.shape} of {kept.dtype}"
+            )
+        removed |= ~kept
+    return removed

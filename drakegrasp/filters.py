@@ -1,0 +1,206 @@
+"""Which successes become samples: the limits, the reasons, and the rules that apply them.
+
+A filter is a `Rule`: the columns that it needs, and which rows it refuses. A new one is one entry
+in `RULES`, with its reason in `Removal` and its limit in `LIMITS`; the configuration, the writer,
+verdicts, `check` and the docs follow. A filter removes a grasp from the two data files, never from
+trials.hdf5, and a removal has one reason: the first rule that refuses it. The filters of images and
+contacts are the paper's (Veres et al., "Postprocessing"); those of the hold are our own.
+
+Pure functions of arrays; imports NumPy only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import Array
+from drakegrasp.outcomes import Removal
+from drakegrasp.table import Table
+
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Limit:
+    """A setting of the filters: `filters.NAME` of a configuration.
+
+    Attributes:
+        default: Its value where a configuration gives none.
+        kind: Which numbers it may be.
+        meaning: What it limits, with its unit.
+        off: Whether null switches it off.
+        later: Whether it came after the first datasets of this schema: where it has its default it
+            leaves no trace in a dataset, so that older ones are continued.
+    """
+
+    default: float | None
+    kind: Literal["number", "positive", "not negative", "count"]
+    meaning: str
+    off: bool = False
+    later: bool = False
+
+
+#: The settings of the filters; those of the hold are own choices, see docs/reference/outcomes.md.
+LIMITS = {
+    "max_slip": Limit(0.010, "positive", "[m], of the object in the hand during the lift", True),
+    "max_turn_deg": Limit(10.0, "positive", "of the object in the hand during the lift", True),
+    "other_links": Limit(0, "count", "that touch the object after the lift, at most", True),
+    "min_depth_variance": Limit(
+        1e-3, "not negative", "[m^2], flatter otm depth images are removed"
+    ),
+    "min_camera_height": Limit(
+        0.01, "number", "[m] above the table; lower cameras see the table edge-on"
+    ),
+    "outlier_sigma": Limit(
+        4.0, "not negative", "per object and component of the grasp; 0 switches it off"
+    ),
+    "max_surface_distance": Limit(
+        2e-3, "positive", "[m], of a contact point from the object's surface"
+    ),
+    # The paper removed such grasps by eye.
+    "max_normal_angle_deg": Limit(
+        30.0, "positive", "between a contact's mean normal and the object's nearest face", True
+    ),
+    # As thresholds the score and its parts also remove sound grasps: they are off.
+    "max_suspicion": Limit(None, "positive", "score of dataset/suspicion.py", True),
+    "max_penetration": Limit(None, "positive", "[m], of the object in a fingertip", True),
+    "max_imbalance": Limit(
+        None, "positive", "of the fingertips' forces, as a share of the weight", True
+    ),
+    "max_normal_sum": Limit(
+        None, "positive", "of the contact normals, per finger: 0 balanced, 1 not", True
+    ),
+}
+
+
+class Limits(Protocol):
+    """Values of `LIMITS`, by their names: section `filters` of a configuration."""
+
+    @property
+    def require(self) -> str:
+        """`held` switches the rules of the hold off."""
+
+    def __getattr__(self, name: str) -> Any: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rule:
+    """A filter.
+
+    Attributes:
+        removal: The reason that it gives.
+        needs: Names of the columns that it looks at; of a table without one it says nothing.
+        refuses: Given a table of n rows and the limits, which rows (n,) it refuses.
+        limit: Name of its limit, whose null (or 0 for a least value) switches it off; empty: it is
+            always on.
+        of_hold: Whether it judges the hold, which `require: held` switches off.
+    """
+
+    removal: Removal
+    needs: tuple[str, ...]
+    refuses: Callable[[Table, Limits], Flags]
+    limit: str = ""
+    of_hold: bool = False
+
+    def is_on(self, limits: Limits) -> bool:
+        """Return whether the limits switch it on."""
+        if self.of_hold and limits.require == "held":
+            return False
+        if not self.limit:
+            return True
+        value = getattr(limits, self.limit)
+        return value is not None and (value > 0.0 or not self.limit.startswith("min_"))
+
+
+def at_most(
+    removal: Removal, column: str, limit: str, *, scale: float = 1.0, of_hold: bool = False
+) -> Rule:
+    """Return the rule that a value, times `scale`, is not above a limit; NaN is."""
+
+    def refuses(t: Table, limits: Limits) -> Flags:
+        return np.asarray(~(scale * t[column] <= getattr(limits, limit)))
+
+    return Rule(removal=removal, needs=(column,), refuses=refuses, limit=limit, of_hold=of_hold)
+
+
+def _not_finite(column: str) -> Rule:
+    """Return the rule that a contact of a used finger has a point and a normal."""
+
+    def refuses(t: Table, limits: Limits) -> Flags:
+        # Of a finger that is not used a contact is NaN. The mean normal of opposed patches has
+        # length zero: normalised it is NaN.
+        unused = np.tile(np.repeat(t["unused"], 3, axis=1), 2)
+        return np.asarray(~(np.isfinite(t[column]) | unused).all(axis=1))
+
+    return Rule(removal=Removal.OFF_SURFACE, needs=(column, "unused"), refuses=refuses)
+
+
+def _unless(removal: Removal, column: str) -> Rule:
+    """Return the rule that a flag is set."""
+    return Rule(removal=removal, needs=(column,), refuses=lambda t, limits: ~t[column])
+
+
+#: All filters that judge a success alone, in their order: the first one that refuses it counts.
+#: The columns are those of `dataset.assembly.survey`.
+RULES = (
+    # A grasp vector has a contact of every finger that its preshape uses.
+    _unless(Removal.MISSING_FINGER, "complete"),
+    at_most(Removal.OTHER_LINKS, "other_links", "other_links", of_hold=True),
+    at_most(Removal.SLID, "slip", "max_slip", of_hold=True),
+    at_most(Removal.TURNED, "turn", "max_turn_deg", scale=180.0 / np.pi, of_hold=True),
+    _unless(Removal.NOT_SEEN, "seen"),
+    _unless(Removal.OUT_OF_VIEW, "in_view"),
+    Rule(
+        removal=Removal.BISECTS_TABLE,
+        needs=("camera_height",),
+        refuses=lambda t, limits: t["camera_height"] < limits.min_camera_height,
+    ),
+    Rule(
+        removal=Removal.FLAT_DEPTH,
+        needs=("depth_variance",),
+        refuses=lambda t, limits: t["depth_variance"] < limits.min_depth_variance,
+        limit="min_depth_variance",
+    ),
+    _not_finite("grasp_T"),
+    _not_finite("held_O"),
+    at_most(Removal.OFF_SURFACE, "surface_distance", "max_surface_distance"),
+    at_most(Removal.NORMAL_OFF, "normal_angle", "max_normal_angle_deg", scale=180.0 / np.pi),
+    at_most(Removal.SUSPICIOUS, "suspicion", "max_suspicion"),
+    at_most(Removal.SUSPICIOUS, "penetration", "max_penetration"),
+    at_most(Removal.SUSPICIOUS, "imbalance", "max_imbalance"),
+    at_most(Removal.SUSPICIOUS, "normal_sum", "max_normal_sum"),
+)
+#: The columns that the rules look at.
+NEEDED = tuple(dict.fromkeys(name for rule in RULES for name in rule.needs))
+
+
+def first_removal(t: Table, limits: Limits, rules: Sequence[Rule] = RULES) -> npt.NDArray[np.uint8]:
+    """Return the reason of the first rule that refuses each row, `KEPT` (n,) if none does.
+
+    A rule whose columns the table lacks is left out, and so is one that is off.
+    """
+    removal = np.full(t.count, Removal.KEPT, dtype=np.uint8)
+    for rule in rules:
+        if rule.is_on(limits) and t.has(*rule.needs):
+            removal[rule.refuses(t, limits) & (removal == Removal.KEPT)] = rule.removal
+    return removal
+
+
+def rules_of_hold() -> Iterator[Rule]:
+    """Yield the rules that judge how the hand holds the object."""
+    return (rule for rule in RULES if rule.of_hold)
+
+
+def is_outlier(values: Array, sigma: float) -> Flags:
+    """Return for rows (n, d) whether a component is more than sigma deviations from its mean.
+
+    Among n values none is more than sqrt(n - 1) deviations from the mean (Samuelson's
+    inequality), so the paper's 4 sigma removes nothing from objects with fewer than 18 grasps.
+    """
+    deviation = values.std(axis=0)
+    return np.asarray(np.any(np.abs(values - values.mean(axis=0)) > sigma * deviation, axis=1))
