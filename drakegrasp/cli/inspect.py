@@ -54,7 +54,7 @@ def inspect_(
 
     try:
         from drakegrasp.page.serve import serve
-        from drakegrasp.page.static_site import write_site
+        from drakegrasp.page.site import write_site
     except ModuleNotFoundError as error:
         library = (error.name or "").partition(".")[0]
         if library not in ("starlette", "uvicorn", "jinja2"):

@@ -7,17 +7,18 @@ changes a file is a POST with the token of this run, which only our own pages kn
 
 from __future__ import annotations
 
+import os
+import re
 import secrets
 import threading
 from collections import OrderedDict
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
@@ -29,26 +30,20 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from drakegrasp.dataset.paths import SCENES_FILE
 from drakegrasp.errors import DataError, DrakegraspError, printable
 from drakegrasp.foreign_files import parse_json
 from drakegrasp.outcomes import Outcome
-from drakegrasp.page.catalog import Catalog, Snapshot
+from drakegrasp.page.attempts import Attempts
+from drakegrasp.page.catalog import Catalog, Snapshot, Watched
 from drakegrasp.page.decisions import DecisionFile
-from drakegrasp.page.grasp_page import grasp_page
-from drakegrasp.page.links import ServerLinks
-from drakegrasp.page.pages import gallery_page, render
-from drakegrasp.page.plots import plot_svg, plots_values
-from drakegrasp.page.predictions.pages import prediction_page, predictions_page
-from drakegrasp.page.predictions.query import parse_prediction_query, select_predictions
-from drakegrasp.page.predictions.results import Predictions, ResultFile
-from drakegrasp.page.query import Query, count_decisions, parse_query, select
+from drakegrasp.page.gallery import Gallery, Places, Query, Site, render
+from drakegrasp.page.looks import HandView, object_surface, read_look
+from drakegrasp.page.plots import PLOTS, plot_svg, plots_values
+from drakegrasp.page.predictions import Predictions, read_predictions, result_file
 from drakegrasp.page.recording import Recordings
-from drakegrasp.page.rows import read_look, read_rows
-from drakegrasp.page.scene3d import HandView, object_surface, scene_of
-from drakegrasp.page.scenes.file import SceneFile, Scenes
-from drakegrasp.page.scenes.pages import scene_page, scenes_page
-from drakegrasp.page.scenes.query import parse_scene_query, select_scenes
-from drakegrasp.pictures.thumbnails import strip_png
+from drakegrasp.page.scenes import Scenes, read_scenes
+from drakegrasp.pictures.style import colour_png, strip_png
 
 ASSETS = Path(__file__).parent / "static"
 #: Names of this machine that a browser may have asked for.
@@ -64,6 +59,8 @@ HEADERS = {
     "cross-origin-opener-policy": "same-origin",
     "cache-control": "no-store",
 }
+#: A standalone SVG has inline styles only.
+PLOT_POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 #: A recording holds its own scripts; it runs without access to this server or any other.
 RECORDING_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' data: blob:; style-src "
@@ -74,6 +71,7 @@ RECORDING_POLICY = (
 MAX_BODY = 4096
 #: Selections that are kept in memory, and attempts in all of them together: four bytes each.
 KEPT_SELECTIONS, KEPT_PLACES = 16, 10_000_000
+Params: TypeAlias = Mapping[str, str]
 
 
 class Inspection:
@@ -90,37 +88,61 @@ class Inspection:
 
     def __init__(self, out: Path, results: Path | None = None) -> None:
         self.catalog = Catalog(out)
-        self.results = None if results is None else ResultFile(results)
-        if self.results is not None:
-            self.results.current(self.catalog.current())
+        self._results = None if results is None else Watched(result_file(results), read_predictions)
+        if self._results is not None:
+            self._results.current(self.catalog.current())
         self.decisions = DecisionFile(out)
         self.hand = HandView(self.catalog.current().config)
         self.recordings = Recordings(out)
-        self.scenes = SceneFile(out)
+        self._scenes = Watched(out / SCENES_FILE, read_scenes)
         self.token = secrets.token_urlsafe(24)
         self._lock = threading.Lock()
-        self._selections: OrderedDict[Any, npt.NDArray[np.int32]] = OrderedDict()
+        self._selections: OrderedDict[Any, Places] = OrderedDict()
         self._selected_from: Snapshot | None = None
 
-    @property
-    def links(self) -> ServerLinks:
-        """Addresses; scenes may be made while the pages are looked at."""
-        return ServerLinks(predicted=self.results is not None, scened=self.scenes.is_there)
+    def snapshot(self) -> Snapshot:
+        """Return the state of the files."""
+        return self.catalog.current()
 
-    def selection(self, snapshot: Snapshot, query: Query) -> npt.NDArray[np.int32]:
-        """Return the attempts that a query selects; the last selections are remembered."""
-        decisions = self.decisions.read()
-        key = (query.identity, decisions if query.decision else None)
+    def site(self) -> Site:
+        """Return where the pages are; scenes may be made while they are looked at."""
+        scened = os.path.lexists(self._scenes.path)
+        return Site(predicted=self._results is not None, scened=scened)
+
+    def table(self, kind: type[Gallery]) -> Gallery:
+        """Return a table as it is now.
+
+        Raises:
+            HTTPException: If there is none.
+            DataError: If its file cannot be read, or is not of this dataset.
+        """
+        snapshot, site = self.snapshot(), self.site()
+        if kind is Scenes:
+            if not site.scened:
+                raise HTTPException(404, "there are no scenes; drakegrasp scenes makes them")
+            return self._scenes.current(snapshot)
+        if kind is Predictions:
+            if self._results is None:
+                why = "there are no predictions; give drakegrasp inspect --predictions"
+                raise HTTPException(404, why)
+            return self._results.current(snapshot)
+        return Attempts(snapshot, self.decisions.read(), self.token)
+
+    def select(self, table: Gallery, query: Query) -> Places:
+        """Return the rows that a query selects; the last selections of attempts are remembered."""
+        if not isinstance(table, Attempts):
+            return table.select(query)
+        key = (query.params(page=1), table.decisions if query["decision"] else None)
         with self._lock:
-            if self._selected_from is not snapshot:
+            if self._selected_from is not table.snapshot:
                 self._selections.clear()
-                self._selected_from = snapshot
+                self._selected_from = table.snapshot
             if key in self._selections:
                 self._selections.move_to_end(key)
                 return self._selections[key]
-        places = select(snapshot, query, decisions)
+        places = table.select(query)
         with self._lock:
-            if self._selected_from is snapshot:
+            if self._selected_from is table.snapshot:
                 self._selections[key] = places
             while len(self._selections) > KEPT_SELECTIONS or (
                 len(self._selections) > 1 and sum(map(len, self._selections.values())) > KEPT_PLACES
@@ -134,22 +156,178 @@ class Inspection:
         _ = self.hand.links
         image, mask = np.zeros((4, 2, 2), np.float32), np.zeros((2, 2), np.uint8)
         strip_png(image, mask, far=1.0)
-        snapshot, query = self.catalog.current(), Query()
-        places, decisions = self.selection(snapshot, query), self.decisions.read()
-        gallery_page(snapshot, decisions, query, places, self.links, self.token)
+        _gallery(Attempts, self, "", {})
+
+
+# Answers: pages, pictures and meshes, by what stands for {name} in their addresses.
+
+
+def _gallery(kind: type[Gallery], inspection: Inspection, name: str, params: Params) -> Response:
+    table, query = inspection.table(kind), kind.query(params)
+    chosen = inspection.select(table, query)
+    return HTMLResponse(table.gallery_page(query, chosen, inspection.site()))
+
+
+def _row(kind: type[Gallery], inspection: Inspection, name: str, params: Params) -> Response:
+    table, query = inspection.table(kind), kind.query(params)
+    i = _there(table.find(name), kind.NOUN)
+    chosen = inspection.select(table, query)
+    return HTMLResponse(table.row_page(i, query, chosen, inspection.site(), inspection.hand))
+
+
+def _plots(inspection: Inspection, name: str, params: Params) -> Response:
+    values = plots_values(inspection.snapshot())
+    return HTMLResponse(render("plots.html", inspection.site(), **values))
+
+
+def _plot(inspection: Inspection, name: str, params: Params) -> Response:
+    _there(PLOTS.get(name), "plot")
+    svg, headers = plot_svg(inspection.snapshot(), name), {"content-security-policy": PLOT_POLICY}
+    return Response(svg, media_type="image/svg+xml", headers=headers)
+
+
+def _view(inspection: Inspection, name: str, params: Params) -> Response:
+    scenes = inspection.table(Scenes)
+    assert isinstance(scenes, Scenes)
+    label, _, number = name.rpartition("-")
+    views = scenes.views(_there(scenes.find(label), "scene"))
+    known = {str(k): int(view) for k, view in enumerate(views)}
+    colours, *_ = scenes.data.stored_images(_there(known.get(number), "view"))
+    return Response(colour_png(colours), media_type="image/png")
+
+
+def _strip(inspection: Inspection, name: str, params: Params) -> Response:
+    snapshot = inspection.snapshot()
+    label, _, camera = name.rpartition("-")
+    i = snapshot.find(label)
+    look = _there(None if i is None else read_look(snapshot, i, camera), "image")
+    png = strip_png(look.image, look.mask, far=snapshot.config.camera.far)
+    return Response(png, media_type="image/png")
+
+
+def _mesh(inspection: Inspection, name: str, params: Params) -> Response:
+    snapshot, content = inspection.snapshot(), None
+    kind, _, which = name.partition("-")
+    try:
+        if kind == "link":
+            content = inspection.hand.surface(int(which))
+        elif kind == "object":
+            content = object_surface(snapshot, snapshot.numbers[which])
+    except (IndexError, KeyError, ValueError, FileNotFoundError):
+        pass
+    return Response(_there(content, "mesh"), media_type="application/json")
+
+
+def _recording(inspection: Inspection, name: str, params: Params) -> Response:
+    content = _there(inspection.recordings.read(name), "recording")
+    return HTMLResponse(content, headers={"content-security-policy": RECORDING_POLICY})
+
+
+def _there(found: Any, noun: str) -> Any:
+    """Return what was found.
+
+    Raises:
+        HTTPException: If there is no such thing.
+    """
+    if found is None:
+        raise HTTPException(404, f"there is no such {noun}")
+    return found
+
+
+Answer: TypeAlias = Callable[[Inspection, str, Params], Response]
+#: What each address shows: galleries and rows of tables, plots, and what pages are made of.
+PAGES: dict[str, Answer] = {
+    **{kind.HOME: partial(_gallery, kind) for kind in (Attempts, Predictions, Scenes)},
+    **{f"/{kind.ROW}/{{name}}": partial(_row, kind) for kind in (Attempts, Predictions, Scenes)},
+    "/plots": _plots,
+    "/plot/{name}.svg": _plot,
+    "/view/{name}.png": _view,
+    "/strip/{name}.png": _strip,
+    "/mesh/{name}.json": _mesh,
+    "/recording/{name}.html": _recording,
+}
+
+
+def answer(inspection: Inspection, address: str) -> Response:
+    """Return what PAGES has for an address without a query.
+
+    Raises:
+        HTTPException: If there is no such thing.
+    """
+    for pattern, found in PAGES.items():
+        match = re.fullmatch(pattern.replace(".", r"\.").replace("{name}", "([^/]+)"), address)
+        if match is not None:
+            return found(inspection, match[1] if match.groups() else "", {})
+    raise HTTPException(404)
+
+
+# Changes.
+
+
+def _decide(inspection: Inspection, content: dict[str, Any]) -> Response:
+    snapshot, decision = inspection.snapshot(), content.get("decision")
+    i = snapshot.find(str(content.get("label")))
+    if i is None or snapshot.table.outcome[i] != Outcome.SUCCESS:
+        raise HTTPException(404, "the attempt must be a success of the dataset")
+    try:
+        found = inspection.decisions.decide(snapshot.key(i), str(decision), _tab(content))
+    except ValueError as error:
+        raise HTTPException(400, str(error)) from None
+    counts = Attempts(snapshot, found).counts()
+    return JSONResponse({"label": snapshot.label(i), "decision": decision, "counts": counts})
+
+
+def _undo(inspection: Inspection, content: dict[str, Any]) -> Response:
+    undo = inspection.decisions.undo(_tab(content))
+    if undo is None:
+        return JSONResponse({"name": None})
+    snapshot = inspection.snapshot()
+    place = snapshot.find_key(undo.key)
+    return JSONResponse(
+        {
+            "name": printable(str(undo.key)),
+            "label": None if place is None else snapshot.label(place),
+            "decision": undo.decision,
+            "done": undo.done,
+            "counts": Attempts(snapshot, inspection.decisions.read()).counts(),
+        }
+    )
+
+
+def _record(inspection: Inspection, content: dict[str, Any]) -> Response:
+    snapshot, label = inspection.snapshot(), str(content.get("label"))
+    i = snapshot.find(label)
+    trial = None if i is None else snapshot.trial_id(i)
+    if trial is None:
+        raise HTTPException(404, "the attempt must be a row of trials.hdf5")
+    found = inspection.recordings.make(label, trial)
+    return JSONResponse({"url": f"/recording/{label}.html", "same": found.same, "text": found.text})
+
+
+def _tab(content: dict[str, Any]) -> str:
+    """Return which page of a browser sends a request: its decisions are undone together."""
+    return str(content.get("page", ""))[:64]
+
+
+# The application.
 
 
 def make_app(inspection: Inspection) -> Starlette:
     """Return the web application of an inspection."""
 
-    def route(path: str, answer: Callable[[Inspection, Request], Response]) -> Route:
+    def get(path: str, show: Answer) -> Route:
         async def endpoint(request: Request) -> Response:
-            return await run_in_threadpool(answer, inspection, request)
+            name = request.path_params.get("name", "")
+            return await run_in_threadpool(show, inspection, name, request.query_params)
 
         return Route(path, endpoint)
 
-    def post(path: str, answer: Callable[[Inspection, dict[str, Any]], Response]) -> Route:
-        return Route(path, partial(_post, inspection, answer), methods=["POST"])
+    def post(path: str, change: Callable[[Inspection, dict[str, Any]], Response]) -> Route:
+        async def endpoint(request: Request) -> Response:
+            content = await _content(request, inspection.token)
+            return await run_in_threadpool(change, inspection, content)
+
+        return Route(path, endpoint, methods=["POST"])
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
@@ -159,18 +337,7 @@ def make_app(inspection: Inspection) -> Starlette:
     app = Starlette(
         lifespan=lifespan,
         routes=[
-            route("/", _gallery),
-            route("/grasp/{label}", _grasp),
-            route("/strip/{label}-{camera:str}.png", _strip),
-            route("/mesh/{kind}-{name}.json", _mesh),
-            route("/predictions", _predictions),
-            route("/prediction/{label}", _prediction),
-            route("/scenes", _scenes),
-            route("/scene/{label}", _scene),
-            route("/view/{label}-{number:int}.png", _view),
-            route("/plots", _plots),
-            route("/plot/{name}.svg", _plot),
-            route("/recording/{label}.html", _recording),
+            *(get(path, show) for path, show in PAGES.items()),
             post("/decide", _decide),
             post("/undo", _undo),
             post("/record", _record),
@@ -180,11 +347,7 @@ def make_app(inspection: Inspection) -> Starlette:
             Middleware(SecurityHeaders),
             Middleware(TrustedHostMiddleware, allowed_hosts=list(HOSTS), www_redirect=False),
         ],
-        exception_handlers={
-            HTTPException: _http_error,
-            DrakegraspError: _data_error,
-            OSError: _data_error,
-        },
+        exception_handlers=dict.fromkeys((HTTPException, DrakegraspError, OSError), _error),
     )
     app.state.inspection = inspection
     return app
@@ -209,164 +372,10 @@ class SecurityHeaders:
         await self._app(scope, receive, send_with_headers)
 
 
-# Pages
-
-
-def _gallery(inspection: Inspection, request: Request) -> Response:
-    snapshot, query = inspection.catalog.current(), parse_query(request.query_params)
-    places = inspection.selection(snapshot, query)
-    decisions = inspection.decisions.read()
-    return HTMLResponse(
-        gallery_page(snapshot, decisions, query, places, inspection.links, inspection.token)
-    )
-
-
-def _grasp(inspection: Inspection, request: Request) -> Response:
-    snapshot, query = inspection.catalog.current(), parse_query(request.query_params)
-    i = _place(snapshot, request)
-    places = inspection.selection(snapshot, query)
-    (row,) = read_rows(snapshot, [i])
-    scene = scene_of(snapshot, i, row, inspection.hand)
-    return HTMLResponse(
-        grasp_page(
-            snapshot,
-            inspection.decisions.read(),
-            query,
-            places,
-            i,
-            scene,
-            inspection.hand.problem,
-            inspection.links,
-            inspection.token,
-        )
-    )
-
-
-def _plots(inspection: Inspection, request: Request) -> Response:
-    snapshot = inspection.catalog.current()
-    values = plots_values(snapshot)
-    return HTMLResponse(render("plots.html", inspection.links, token="", **values))
-
-
-def _predictions(inspection: Inspection, request: Request) -> Response:
-    predictions = _predicted(inspection)
-    query = parse_prediction_query(request.query_params)
-    chosen = select_predictions(predictions, query)
-    return HTMLResponse(predictions_page(predictions, query, chosen, inspection.links))
-
-
-def _prediction(inspection: Inspection, request: Request) -> Response:
-    predictions = _predicted(inspection)
-    i = predictions.find(request.path_params["label"])
-    if i is None:
-        raise HTTPException(404, "there is no such prediction")
-    query = parse_prediction_query(request.query_params)
-    chosen = select_predictions(predictions, query)
-    page = prediction_page(predictions, query, chosen, i, inspection.hand, inspection.links)
-    return HTMLResponse(page)
-
-
-def _predicted(inspection: Inspection) -> Predictions:
-    if inspection.results is None:
-        raise HTTPException(404, "there are no predictions; give drakegrasp inspect --predictions")
-    return inspection.results.current(inspection.catalog.current())
-
-
-def _scenes(inspection: Inspection, request: Request) -> Response:
-    scenes, query = _scened(inspection), parse_scene_query(request.query_params)
-    chosen = select_scenes(scenes, query)
-    return HTMLResponse(scenes_page(scenes, query, chosen, inspection.links))
-
-
-def _scene(inspection: Inspection, request: Request) -> Response:
-    scenes, i = _found_scene(inspection, request)
-    query = parse_scene_query(request.query_params)
-    chosen = select_scenes(scenes, query)
-    return HTMLResponse(scene_page(scenes, query, chosen, i, inspection.hand, inspection.links))
-
-
-def _found_scene(inspection: Inspection, request: Request) -> tuple[Scenes, int]:
-    """Return the scenes, and the number of the one that a request names."""
-    scenes = _scened(inspection)
-    i = scenes.numbers.get(request.path_params["label"])
-    if i is None:
-        raise HTTPException(404, "there is no such scene")
-    return scenes, i
-
-
-def _scened(inspection: Inspection) -> Scenes:
-    if not inspection.scenes.is_there:
-        raise HTTPException(404, "there are no scenes; drakegrasp scenes makes them")
-    return inspection.scenes.current(inspection.catalog.current())
-
-
-# Pictures and meshes
-
-
-def _view(inspection: Inspection, request: Request) -> Response:
-    scenes, i = _found_scene(inspection, request)
-    views, number = scenes.views(i), request.path_params["number"]
-    if number >= len(views):
-        raise HTTPException(404, "there is no such view")
-    return Response(scenes.png(int(views[number])), media_type="image/png")
-
-
-def _strip(inspection: Inspection, request: Request) -> Response:
-    snapshot = inspection.catalog.current()
-    label, _, camera = f"{request.path_params['label']}-{request.path_params['camera']}".rpartition(
-        "-"
-    )
-    i = snapshot.find(label)
-    look = None if i is None else read_look(snapshot, i, camera)
-    if look is None:
-        raise HTTPException(404, "there is no such image")
-    png = strip_png(look.image, look.mask, far=snapshot.config.camera.far)
-    return Response(png, media_type="image/png")
-
-
-def _mesh(inspection: Inspection, request: Request) -> Response:
-    snapshot = inspection.catalog.current()
-    kind, name = request.path_params["kind"], request.path_params["name"]
-    content = None
-    try:
-        if kind == "link":
-            content = inspection.hand.surface(int(name))
-        elif kind == "object":
-            content = object_surface(snapshot, snapshot.numbers[name])
-    except (IndexError, KeyError, ValueError, FileNotFoundError):
-        pass
-    if content is None:
-        raise HTTPException(404, "there is no such mesh")
-    return Response(content, media_type="application/json")
-
-
-def _plot(inspection: Inspection, request: Request) -> Response:
-    svg = plot_svg(inspection.catalog.current(), request.path_params["name"])
-    if svg is None:
-        raise HTTPException(404, "there is no such plot")
-    # A standalone SVG: inline styles only.
-    policy = "default-src 'none'; style-src 'unsafe-inline'"
-    return Response(svg, media_type="image/svg+xml", headers={"content-security-policy": policy})
-
-
-def _recording(inspection: Inspection, request: Request) -> Response:
-    content = inspection.recordings.read(request.path_params["label"])
-    if content is None:
-        raise HTTPException(404, "there is no such recording")
-    return HTMLResponse(content, headers={"content-security-policy": RECORDING_POLICY})
-
-
-# Decisions
-
-
-async def _post(
-    inspection: Inspection,
-    answer: Callable[[Inspection, dict[str, Any]], Response],
-    request: Request,
-) -> Response:
-    """Answer a POST of JSON that has the token."""
+async def _content(request: Request, token: str) -> dict[str, Any]:
+    """Return the JSON of a POST that has the token."""
     given = request.headers.get(TOKEN_HEADER, "")
-    if not secrets.compare_digest(given.encode(), inspection.token.encode()):
+    if not secrets.compare_digest(given.encode(), token.encode()):
         raise HTTPException(403, "the token must be that of this page; load it again")
     body = b""
     async for chunk in request.stream():
@@ -379,83 +388,15 @@ async def _post(
         content = None
     if not isinstance(content, dict):
         raise HTTPException(400, "the request must be JSON with names and values")
-    return await run_in_threadpool(answer, inspection, content)
+    return content
 
 
-def _decide(inspection: Inspection, content: dict[str, Any]) -> Response:
-    snapshot = inspection.catalog.current()
-    i, decision = _success(snapshot, content), content.get("decision")
-    try:
-        decisions = inspection.decisions.decide(snapshot.key(i), str(decision), _page(content))
-    except ValueError as error:
-        raise HTTPException(400, str(error)) from None
-    counts = count_decisions(snapshot, decisions)
-    return JSONResponse({"label": snapshot.label(i), "decision": decision, "counts": counts})
-
-
-def _undo(inspection: Inspection, content: dict[str, Any]) -> Response:
-    undo = inspection.decisions.undo(_page(content))
-    if undo is None:
-        return JSONResponse({"name": None})
-    snapshot = inspection.catalog.current()
-    place = snapshot.find_key(undo.key)
-    return JSONResponse(
-        {
-            "name": printable(str(undo.key)),
-            "label": None if place is None else snapshot.label(place),
-            "decision": undo.decision,
-            "done": undo.done,
-            "counts": count_decisions(snapshot, inspection.decisions.read()),
-        }
-    )
-
-
-def _record(inspection: Inspection, content: dict[str, Any]) -> Response:
-    snapshot = inspection.catalog.current()
-    i = snapshot.find(str(content.get("label")))
-    trial = None if i is None else snapshot.trial_id(i)
-    if trial is None:
-        raise HTTPException(404, "the attempt must be a row of trials.hdf5")
-    label = str(content.get("label"))
-    found = inspection.recordings.make(label, trial)
-    return JSONResponse({"url": f"/recording/{label}.html", "same": found.same, "text": found.text})
-
-
-def _page(content: dict[str, Any]) -> str:
-    """Return which page of a browser sends a request: its decisions are undone together."""
-    return str(content.get("page", ""))[:64]
-
-
-def _success(snapshot: Snapshot, content: dict[str, Any]) -> int:
-    """Return the place of a success that a request names."""
-    i = snapshot.find(str(content.get("label")))
-    if i is None or snapshot.table.outcome[i] != Outcome.SUCCESS:
-        raise HTTPException(404, "the attempt must be a success of the dataset")
-    return i
-
-
-def _place(snapshot: Snapshot, request: Request) -> int:
-    i = snapshot.find(request.path_params["label"])
-    if i is None:
-        raise HTTPException(404, "there is no such attempt")
-    return i
-
-
-# Errors
-
-
-def _http_error(request: Request, error: Exception) -> Response | Awaitable[Response]:
-    assert isinstance(error, HTTPException)
-    return _error(request, error.status_code, str(error.detail))
-
-
-def _data_error(request: Request, error: Exception) -> Response | Awaitable[Response]:
-    return _error(request, 400 if isinstance(error, DataError) else 500, str(error))
-
-
-def _error(request: Request, status: int, text: str) -> Response:
+def _error(request: Request, error: Exception) -> Response:
     """Return an error as JSON to a script, and as a page to a person."""
+    status, text = 400 if isinstance(error, DataError) else 500, str(error)
+    if isinstance(error, HTTPException):
+        status, text = error.status_code, str(error.detail)
     if request.method == "POST":
         return JSONResponse({"error": text}, status_code=status)
-    page = render("error.html", ServerLinks(), token="", title="error", text=text)
+    page = render("error.html", Site(), title="error", text=text)
     return HTMLResponse(page, status_code=status)

@@ -8,9 +8,9 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
+from typing import NamedTuple
 
 from drakegrasp.dataset.rejections import (
     FILE_NAME,
@@ -30,8 +30,11 @@ PATIENCE = 10.0
 KEPT_PAGES, KEPT_DECISIONS = 100, 1000
 
 
-@dataclass(frozen=True)
-class Undo:
+#: An attempt, and what was decided of it before and after.
+_Step = tuple[AttemptKey, str, str]
+
+
+class Undo(NamedTuple):
     """What came of withdrawing a decision.
 
     Attributes:
@@ -43,13 +46,6 @@ class Undo:
     key: AttemptKey
     decision: str
     done: bool
-
-
-@dataclass(frozen=True)
-class _Step:
-    key: AttemptKey
-    before: str
-    after: str
 
 
 class DecisionFile:
@@ -98,7 +94,7 @@ class DecisionFile:
             if decision == before:
                 return decisions
             write_decisions(self._path, changed)
-            self._steps_of(page).append(_Step(key, before, decision))
+            self._steps_of(page).append((key, before, decision))
             return changed
 
     def undo(self, page: str = "") -> Undo | None:
@@ -114,13 +110,13 @@ class DecisionFile:
             steps = self._steps_of(page)
             if not steps:
                 return None
-            step, decisions = steps[-1], self.read()
-            now = decisions.of(step.key)
-            done = now == step.after
+            (key, before, after), decisions = steps[-1], self.read()
+            now = decisions.of(key)
+            done = now == after
             if done:
-                write_decisions(self._path, decisions.with_decision(step.key, step.before))
+                write_decisions(self._path, decisions.with_decision(key, before))
             steps.pop()
-            return Undo(step.key, step.before if done else now, done)
+            return Undo(key, before if done else now, done)
 
     def _steps_of(self, page: str) -> deque[_Step]:
         steps = self._steps.setdefault(page, deque(maxlen=KEPT_DECISIONS))

@@ -7,8 +7,8 @@ import subprocess
 import sys
 import tempfile
 import threading
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from drakegrasp.errors import DataError
 
@@ -16,8 +16,7 @@ from drakegrasp.errors import DataError
 TIMEOUT = 300.0
 
 
-@dataclass(frozen=True)
-class Rerun:
+class Rerun(NamedTuple):
     """What running an attempt again gave.
 
     Attributes:

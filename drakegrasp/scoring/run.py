@@ -65,7 +65,7 @@ class Score:
         Raises:
             OSError: If the folder cannot be written.
         """
-        from drakegrasp.pictures.score_card import card_picture
+        from drakegrasp.pictures.charts import card_picture
 
         folder.mkdir(parents=True, exist_ok=True)
         contents = {

@@ -55,8 +55,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             ("scenes", "scene", "/scenes?split=train&sort=tested"),
             ("predictions", "prediction", "/predictions?verdict=held&sort=true_error"),
         ):
-            links = inspection.links
-            if not {"scenes": links.scened, "predictions": links.predicted}.get(gallery, True):
+            site = inspection.site()
+            if not {"scenes": site.scened, "predictions": site.predicted}.get(gallery, True):
                 continue
             page.goto(f"{address}{path}")
             page.wait_for_load_state("networkidle")

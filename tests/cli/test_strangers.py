@@ -21,7 +21,7 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
 from drakegrasp.hand.carried import carry_hand
-from drakegrasp.page.pages import TEMPLATES
+from drakegrasp.page.gallery import TEMPLATES
 from drakegrasp.runtime.environment import host_label
 
 #: What a terminal would obey: a title of its window, as bytes of 7 and of 8 bits.

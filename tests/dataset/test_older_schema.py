@@ -22,7 +22,7 @@ from drakegrasp.dataset.statistics import count_funnel, count_splits, count_unfi
 from drakegrasp.errors import DataError
 from drakegrasp.generation.merge import merge
 from drakegrasp.page.catalog import Catalog
-from drakegrasp.page.rows import read_rows
+from drakegrasp.page.looks import read_rows
 
 
 @pytest.fixture

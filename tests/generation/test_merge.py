@@ -38,7 +38,7 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.page.catalog import Catalog
-from drakegrasp.page.rows import read_look
+from drakegrasp.page.looks import read_look
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.files import seal
 

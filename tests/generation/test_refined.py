@@ -40,8 +40,8 @@ from drakegrasp.generation.work_unit import WorkUnit, run_unit
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.page.attempts import Attempts
 from drakegrasp.page.catalog import Catalog
-from drakegrasp.page.query import Query, select
 from drakegrasp.pictures.figures.held_grasps import read_approaches, read_held
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.verification.placing import place_on_rows
@@ -245,7 +245,8 @@ def test_each_of_a_family_is_inspected_by_itself(refined: Path) -> None:
         assert snapshot.find(snapshot.label(i)) == snapshot.find_key(snapshot.key(i)) == i
     key = snapshot.key(refined_ones[0])
     decisions = Decisions(rejected=frozenset({key}))
-    assert select(snapshot, Query(decision="rejected"), decisions).tolist() == [refined_ones[0]]
+    table, query = Attempts(snapshot, decisions), Attempts.query({"decision": "rejected"})
+    assert table.select(query).tolist() == [refined_ones[0]]
 
 
 def test_rejected_child_is_written_and_read(refined: Path, tmp_path: Path) -> None:

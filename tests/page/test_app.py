@@ -40,7 +40,7 @@ from drakegrasp.frames import unpack_pose
 from drakegrasp.outcomes import Removal
 from drakegrasp.page import plots
 from drakegrasp.page.app import HEADERS, TOKEN_HEADER, Inspection, make_app
-from drakegrasp.page.query import PAGE
+from drakegrasp.page.gallery import PAGE
 
 PAGES = ("/", "/?outcome=any&page=2", "/grasp/0-0-0", "/grasp/0-0-1", "/plots")
 

@@ -37,7 +37,7 @@ from drakegrasp.outcomes import Removal
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.page.catalog import Catalog, Snapshot
 from drakegrasp.page.serve import listen
-from drakegrasp.page.static_site import write_site
+from drakegrasp.page.site import write_site
 
 playwright = pytest.importorskip("playwright.sync_api")
 Browser, Page = playwright.Browser, playwright.Page

@@ -19,10 +19,9 @@ from drakegrasp.dataset.trial_files import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.page import catalog as catalog_module
-from drakegrasp.page.catalog import Catalog
-from drakegrasp.page.query import parse_query, select
-from drakegrasp.page.rows import read_look, read_rows
-from drakegrasp.page.table import FEATURES
+from drakegrasp.page.attempts import Attempts
+from drakegrasp.page.catalog import FEATURES, Catalog
+from drakegrasp.page.looks import read_look, read_rows
 
 
 def build_again(out: Path) -> None:
@@ -272,9 +271,9 @@ def test_a_contact_without_a_normal_has_the_largest_angle(out: Path) -> None:
     change(out, TRIALS, "trials/normal_angle", 0, set_at(0, to=np.nan))
     snapshot = Catalog(out).current()
     assert snapshot.table.value("normal_angle", 0) == np.inf
-    places = select(snapshot, parse_query({"min_normal_angle": "10"}), Decisions())
-    assert places.tolist() == [0]
-    assert select(snapshot, parse_query({"sort": "normal_angle"}), Decisions())[0] == 0
+    table = Attempts(snapshot, Decisions())
+    assert table.select(Attempts.query({"min_normal_angle": "10"})).tolist() == [0]
+    assert table.select(Attempts.query({"sort": "normal_angle"}))[0] == 0
 
 
 def test_another_schema_is_one_message(out: Path) -> None:

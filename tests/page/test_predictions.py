@@ -21,7 +21,7 @@ from drakegrasp.dataset.predicted_rows import read_predicted_rows
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
 from drakegrasp.page.app import Inspection, make_app
-from drakegrasp.page.static_site import write_site
+from drakegrasp.page.site import write_site
 
 
 @pytest.fixture

@@ -13,9 +13,8 @@ from helpers.pages import numbered
 from drakegrasp.dataset.rejections import AttemptKey, Decisions
 from drakegrasp.dataset.trial_files import NONE
 from drakegrasp.errors import DataError
-from drakegrasp.page.catalog import Catalog, Snapshot
-from drakegrasp.page.query import QUANTITIES, Query, parse_query, select
-from drakegrasp.page.table import FEATURES
+from drakegrasp.page.attempts import QUANTITIES, Attempts
+from drakegrasp.page.catalog import FEATURES, Catalog, Snapshot
 
 NOTHING = Decisions()
 
@@ -26,8 +25,8 @@ def snapshot(boxes: Path) -> Snapshot:
 
 
 def chosen(snapshot: Snapshot, text: str, decisions: Decisions = NOTHING) -> list[str]:
-    query = parse_query(dict(parse_qsl(text)))
-    return [numbered(snapshot, snapshot.label(i)) for i in select(snapshot, query, decisions)]
+    places = Attempts(snapshot, decisions).select(Attempts.query(dict(parse_qsl(text))))
+    return [numbered(snapshot, snapshot.label(i)) for i in places]
 
 
 def test_successes_are_shown_unless_others_are_asked_for(snapshot: Snapshot) -> None:
@@ -116,12 +115,10 @@ def test_decisions_choose_what_is_left(snapshot: Snapshot) -> None:
 
 def test_address_of_a_query_gives_the_query_again() -> None:
     text = "outcome=any&object=a%26b%3Dc&min_slip=1.5&sort=slip&order=up&page=3&hold=stable"
-    query = parse_query(dict(parse_qsl(text)))
-    assert parse_query(dict(parse_qsl(query.params()))) == query
-    assert query.object_name == "a&b=c"
-    assert Query().params() == ""
-    assert parse_query({}) == Query()
-    assert query.identity == replace(query, page=1).params()
+    query = Attempts.query(dict(parse_qsl(text)))
+    assert Attempts.query(dict(parse_qsl(query.params()))) == query
+    assert query["object"] == "a&b=c" and not query["outcome"]
+    assert Attempts.query().params() == ""
 
 
 @pytest.mark.parametrize(
@@ -136,7 +133,7 @@ def test_address_of_a_query_gives_the_query_again() -> None:
 )
 def test_what_cannot_be_asked_for_is_refused(text: str, words: str) -> None:
     with pytest.raises(DataError, match=words):
-        parse_query(dict(parse_qsl(text)))
+        Attempts.query(dict(parse_qsl(text)))
 
 
 def test_every_feature_has_a_title_and_a_unit() -> None:

@@ -16,7 +16,7 @@ from drakegrasp.dataset.suspicion import GRAVITY
 from drakegrasp.frames import invert_pose, transform_points, unpack_pose
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.page.catalog import Catalog
-from drakegrasp.page.rows import THUMBNAIL, contact_dots, read_rows
+from drakegrasp.page.looks import THUMBNAIL, contact_dots, read_rows
 from drakegrasp.vision.camera import intrinsics, project
 
 

@@ -17,10 +17,10 @@ from PIL import Image
 from starlette.testclient import TestClient
 
 from drakegrasp.generation.scenes.make import make_scenes
-from drakegrasp.page import static_site
+from drakegrasp.page import site as site_module
 from drakegrasp.page.app import Inspection, make_app
-from drakegrasp.page.scenes.pages import FAILS, HOLDS, UNKNOWN
-from drakegrasp.page.static_site import write_site
+from drakegrasp.page.scenes import FAILS, HOLDS, UNKNOWN
+from drakegrasp.page.site import write_site
 
 pytestmark = pytest.mark.sim
 
@@ -178,7 +178,7 @@ def test_every_address_of_the_files_is_there(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Few trials have a page, and few objects a grasp with one.
-    monkeypatch.setattr(static_site, "MAX_GRASPS", 1)
+    monkeypatch.setattr(site_module, "MAX_GRASPS", 1)
     write_site(made, tmp_path / "site")
     pages = [tmp_path / "site" / "scenes.html", *(tmp_path / "site" / "scene").iterdir()]
     assert len(pages) == 4

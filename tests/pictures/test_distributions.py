@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drakegrasp.pictures.distributions import (
+from drakegrasp.pictures.charts import (
     GROUPS,
     MAX_OBJECTS,
     draw_counts,

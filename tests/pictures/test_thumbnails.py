@@ -7,7 +7,7 @@ from io import BytesIO
 import numpy as np
 from matplotlib.image import imread
 
-from drakegrasp.pictures.thumbnails import MASK, NO_DEPTH, strip_png
+from drakegrasp.pictures.style import MASK, NO_DEPTH, strip_png
 
 
 def panels(image: np.ndarray, mask: np.ndarray) -> list[np.ndarray]:

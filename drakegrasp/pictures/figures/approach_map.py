@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
 from drakegrasp.frames import Array
-from drakegrasp.pictures.distributions import GROUPS
+from drakegrasp.pictures.charts import GROUPS
 from drakegrasp.pictures.figures.approach_sphere import map_directions
 from drakegrasp.pictures.figures.orthographic import (
     draw_object,

@@ -24,13 +24,12 @@ from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.statistics import Funnel, count_funnel
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.outcomes import Outcome, Removal
-from drakegrasp.pictures.distributions import (
+from drakegrasp.pictures.charts import (
     FAILED,
     GROUPS,
     draw_counts,
     draw_distributions,
     draw_objects,
-    svg_bytes,
 )
 from drakegrasp.pictures.figures.approach_map import approaches_figure
 from drakegrasp.pictures.figures.approach_sphere import coverage
@@ -40,6 +39,7 @@ from drakegrasp.pictures.figures.palm_poses import caption, palm_poses_figure
 from drakegrasp.pictures.figures.phases import phases_figure
 from drakegrasp.pictures.figures.samplers import METHODS, compare_samplers, palm_rays
 from drakegrasp.pictures.figures.scene_views import scene_views
+from drakegrasp.pictures.style import svg_bytes
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.runtime.progress import Report, silent
 

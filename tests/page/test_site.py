@@ -13,15 +13,15 @@ from drakegrasp.cli.main import main
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 from drakegrasp.errors import DataError
-from drakegrasp.page import static_site
+from drakegrasp.page import site as site_module
 from drakegrasp.page.catalog import Catalog
-from drakegrasp.page.static_site import Site, write_site
+from drakegrasp.page.site import Written, write_site
 
 
 @pytest.fixture(scope="module")
 def site(boxes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site") / "pages"
-    assert write_site(boxes, folder) == Site(grasps=9, successes=9)
+    assert write_site(boxes, folder) == Written(grasps=9, successes=9)
     return folder
 
 
@@ -79,7 +79,7 @@ def test_files_cannot_decide_but_show_decisions(out: Path, tmp_path: Path) -> No
 def test_what_is_left_out_is_told(
     boxes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(static_site, "MAX_GRASPS", 4)
+    monkeypatch.setattr(site_module, "MAX_GRASPS", 4)
     result = CliRunner().invoke(main, ["inspect", str(boxes), "--static", str(tmp_path / "site")])
     assert result.exit_code == 0, result.stderr
     assert "4 grasps in " in result.stdout

@@ -1,0 +1,413 @@
+"""The attempts of a dataset on the page: which are shown, their cards, and the page of one."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.dataset.card.holding import share_text
+from drakegrasp.dataset.filtering import own_setting
+from drakegrasp.dataset.rejections import FILE_NAME, Decisions
+from drakegrasp.dataset.schema import CAMERAS, SPLITS, TRIAL_FIELDS, Shown
+from drakegrasp.dataset.suspicion import PARTS, suspicion
+from drakegrasp.dataset.trial_files import NONE
+from drakegrasp.frames import unpack_pose
+from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.page.catalog import Snapshot
+from drakegrasp.page.gallery import Gallery, Places, Query
+from drakegrasp.page.looks import (
+    THUMBNAIL,
+    HandView,
+    attempt_scene,
+    contact_dots,
+    look_source,
+    read_certificate,
+    read_look,
+    read_rows,
+)
+
+#: Features of an attempt that can be filtered and sorted by, as people read them.
+QUANTITIES = {
+    "suspicion": Shown("suspicion", digits=2),
+    "force": Shown("largest force", "N"),
+    "p_hold": Shown("p_hold: share of disturbed repeats that would be samples", digits=2),
+    **{part.name: part.shown for part in PARTS},
+}
+#: Choices of the split that say more than their values: all samples, and what is no sample.
+SPLIT_NAMES = {"samples": "any sample", "none": "no sample"}
+#: Reasons of suspicion that a card names, and the share from which on it names one.
+REASONS, REASON_SHARE = 2, 0.75
+
+
+class Attempts(Gallery):
+    """The attempts of a dataset.
+
+    Args:
+        snapshot: State of the files.
+        decisions: What was rejected and kept.
+        token: With which a page decides; empty if it cannot.
+    """
+
+    HOME, ROW, NOUN = "/", "grasp", "attempt"
+    CHOICES: ClassVar = {
+        "outcome": ("any", *(outcome.label for outcome in Outcome)),
+        "split": ("samples", *SPLITS, "none"),
+        "hold": ("held", "precision", "stable"),
+        "removal": tuple(removal.label for removal in Removal),
+        "decision": ("rejected", "kept", "open"),
+    }
+    SELECTS: ClassVar = {
+        **{name: name for name in ("class", "object", "outcome", "split")},
+        "hold": "how it holds",
+        "removal": "removed by",
+        "decision": "decision",
+    }
+    QUANTITIES = QUANTITIES
+    RANGES = ("suspicion", "penetration", "slip", "turn", "force", "normal_angle", "p_hold")
+    SORTS: ClassVar = {
+        **{name: quantity.title for name, quantity in QUANTITIES.items()},
+        "row": "row of the dataset",
+    }
+    OUTCOME = "success"
+
+    def __init__(self, snapshot: Snapshot, decisions: Decisions, token: str = "") -> None:
+        self.snapshot, self.decisions, self.token = snapshot, decisions, token
+
+    @property
+    def objects(self) -> npt.NDArray[np.int32]:
+        """Numbers (n,) of the objects of the attempts."""
+        return self.snapshot.table.object
+
+    def column(self, name: str) -> npt.NDArray[Any]:
+        """Return the values (n,) of a feature, or the order of the rows."""
+        table = self.snapshot.table
+        return np.arange(len(table)) if name == "row" else table.feature(name)
+
+    def matches(self, name: str, value: str) -> npt.NDArray[np.bool_]:
+        """Return which attempts (n,) have what can be chosen."""
+        table = self.snapshot.table
+        if name == "outcome":
+            return table.outcome == Outcome[value.upper()]
+        if name == "split":
+            if value == "samples":
+                return table.split != NONE
+            return table.split == (NONE if value == "none" else SPLITS.index(value))
+        if name == "removal":
+            return table.removal == Removal[value.upper()]
+        if name == "decision":
+            return self._decided(value)
+        held = table.outcome == Outcome.SUCCESS
+        return {"held": held, "precision": table.precision, "stable": table.stable}[value]
+
+    def options(self, name: str) -> Mapping[str, str]:
+        """Return what the form offers: outcomes and reasons that occur."""
+        table, named = self.snapshot.table, super().options(name)
+        if name == "outcome":
+            named = _names([Outcome(int(n)).label for n in np.unique(table.outcome)])
+        if name == "removal":
+            known = [Removal(int(n)) for n in np.unique(table.removal) if n != NONE]
+            named = _names([removal.label for removal in known if removal is not Removal.KEPT])
+        return {**named, **SPLIT_NAMES} if name == "split" else named
+
+    def label(self, i: int) -> str:
+        """Return the name of an attempt in addresses."""
+        return self.snapshot.label(i)
+
+    def find(self, label: str) -> int | None:
+        """Return the place of the attempt of a label, or None if there is none."""
+        return self.snapshot.find(label)
+
+    # Decisions.
+
+    def counts(self) -> dict[str, int]:
+        """Return how many attempts are rejected, and kept, and how many rejected are samples."""
+        rejected, kept, samples = self.decisions.rejected, self.decisions.kept, 0
+        if rejected:
+            samples = int((self._decided("rejected") & (self.snapshot.table.split != NONE)).sum())
+        return {"rejected": len(rejected), "kept": len(kept), "samples": samples}
+
+    def _decided(self, decision: str) -> npt.NDArray[np.bool_]:
+        """Return which (n,) are rejected, kept, or still open; only successes are decided."""
+        snapshot, decisions = self.snapshot, self.decisions
+        keys = {"rejected": decisions.rejected, "kept": decisions.kept}.get(
+            decision, decisions.rejected | decisions.kept
+        )
+        numbers = {name: i for i, name in enumerate(snapshot.names)}
+        wanted = [
+            (numbers[key.object], key.candidate, key.standoff_index, key.child)
+            for key in keys
+            if key.object in numbers
+        ]
+
+        # Compare identities as single numbers: there may be thousands of decisions.
+        table = snapshot.table
+        (hits,) = np.nonzero(table.outcome == Outcome.SUCCESS)
+        columns = (table.object, table.candidate, table.standoff_index, table.child)
+        own = np.stack([column[hits] for column in columns], axis=1).astype(np.int64)
+        both = np.concatenate([np.array(wanted, dtype=np.int64).reshape(-1, 4), own])
+        _, codes = np.unique(both, axis=0, return_inverse=True)
+        decided = np.isin(codes[len(wanted) :], codes[: len(wanted)])
+        found = np.zeros(len(table), dtype=bool)
+        found[hits[~decided if decision == "open" else decided]] = True
+        return found
+
+    def _decisions(self) -> dict[str, Any]:
+        """Return how much is decided, and the command that takes rejected grasps out, as values.
+
+        Filters of the user's own are given to it again: a dataset has their names alone.
+        """
+        snapshot = self.snapshot
+        out = snapshot.out
+        words = ["drakegrasp", "assemble", str(out), "--reject", str(out / FILE_NAME)]
+        if own := own_setting(snapshot.config.filters):
+            words += ["--set", own]
+        return {
+            "token": self.token,
+            "counts": self.counts(),
+            "assemble": shlex.join(words),
+            "assembled": snapshot.assembled,
+        }
+
+    # What pages say.
+
+    def identity(self, i: int) -> dict[str, Any]:
+        """Return how people name an attempt, see `name_of`."""
+        return {**super().identity(i), "number": name_of(self.snapshot, i)}
+
+    def summary(self, query: Query, chosen: Places) -> dict[str, Any]:
+        """Return what the gallery says besides its cards."""
+        snapshot = self.snapshot
+        return {
+            "title": snapshot.out.name or str(snapshot.out),
+            "missing": snapshot.missing,
+            "samples": int(np.count_nonzero(snapshot.table.split != NONE)),
+            "only_samples": self._home(query, split="samples", page=1),
+            **self._decisions(),
+        }
+
+    def cards(self, shown: Places) -> list[dict[str, Any]]:
+        """Return what the cards of attempts say."""
+        # Only the columns of the dots are read, and no images: a page must be quick.
+        snapshot, cards = self.snapshot, []
+        rows = read_rows(snapshot, shown.tolist(), THUMBNAIL)
+        for i, row in zip(shown.tolist(), rows, strict=True):
+            outcome = Outcome(int(snapshot.table.outcome[i]))
+            success = outcome is Outcome.SUCCESS
+            cards.append(
+                {
+                    "outcome": outcome.label.replace("_", " "),
+                    "success": success,
+                    "size": snapshot.config.camera.size,
+                    "strip": f"/strip/{snapshot.label(i)}-oto.png",
+                    # Failures have no images.
+                    "dots": contact_dots(snapshot, row, "oto") if success else [],
+                    "words": words_of(snapshot, i),
+                    "suspicion": _text(snapshot, "suspicion", i),
+                    "reasons": _reasons(snapshot, i),
+                    "decision": self.decisions.of(snapshot.key(i)),
+                }
+            )
+        return cards
+
+    def values(self, i: int) -> dict[str, str]:
+        """Return what a page without a server filters and sorts a success by."""
+        table = self.snapshot.table
+        holds = {"held", words_of(self.snapshot, i)[0]}
+        holds |= {"precision"} if table.precision[i] else set()
+        numbers = {name: table.value(name, i) * q.factor for name, q in QUANTITIES.items()}
+        removal = Removal(int(table.removal[i])).label if table.removal[i] != NONE else ""
+        return {
+            **{n: "Infinity" if np.isposinf(v) else f"{v:.6g}" for n, v in numbers.items()},
+            "split": SPLITS[table.split[i]] if table.split[i] != NONE else "none",
+            "hold": " ".join(sorted(holds)),
+            "removal": removal,
+            "row": str(i),
+        }
+
+    def row(self, i: int, hand: HandView) -> dict[str, Any]:
+        """Return what the page of an attempt says.
+
+        Raises:
+            DataError: If a file was replaced meanwhile.
+        """
+        # Its row, and where both cameras see its contacts.
+        snapshot = self.snapshot
+        (row,) = read_rows(snapshot, [i])
+        outcome, trial = Outcome(int(snapshot.table.outcome[i])), snapshot.trial_id(i)
+        views = []
+        for camera in CAMERAS if outcome is Outcome.SUCCESS else ():
+            look = read_look(snapshot, i, camera)
+            unread = look_source(snapshot, i, camera) if look is None else ""
+            strip = f"/strip/{snapshot.label(i)}-{camera}.png"
+            dots = contact_dots(snapshot, row, camera, look)
+            views.append({"camera": camera, "strip": strip, "unread": unread, "dots": dots})
+        key = snapshot.key(i)
+        return {
+            "trial": trial,
+            "replay": shlex.join(
+                ["drakegrasp", "replay", str(snapshot.out), "--trial", f"{trial}"]
+            ),
+            **self._decisions(),
+            "outcome": outcome.label.replace("_", " "),
+            "words": words_of(snapshot, i),
+            "success": outcome is Outcome.SUCCESS,
+            "decision": self.decisions.of(key),
+            "views": views,
+            "score": _text(snapshot, "suspicion", i),
+            "parts": _parts(row),
+            "facts": _facts(snapshot, i, row),
+            "pose": _pose_lines(key.object, row),
+            "fingers": _fingers(row),
+            "scene": attempt_scene(snapshot, i, row, hand),
+        }
+
+
+def name_of(snapshot: Snapshot, i: int) -> str:
+    """Return how people name an attempt: its trial id, or its palm pose before there is one."""
+    trial, key = snapshot.trial_id(i), snapshot.key(i)
+    if trial is not None:
+        return f"trial {trial}"
+    refined = f", refined {key.child}" if key.child else ""
+    return f"pose {key.candidate}, stand-off {key.standoff_index}{refined}"
+
+
+def _names(values: list[str]) -> dict[str, str]:
+    return {value: value.replace("_", " ") for value in values}
+
+
+def _text(snapshot: Snapshot, name: str, i: int) -> str:
+    """Return a feature of an attempt as people read it."""
+    return QUANTITIES[name].text(snapshot.table.value(name, i))
+
+
+def words_of(snapshot: Snapshot, i: int) -> list[str]:
+    """Return the words that describe an attempt: how it holds, its split or why it is no sample."""
+    table = snapshot.table
+    words = []
+    if table.outcome[i] == Outcome.SUCCESS:
+        words.append("stable" if table.stable[i] else "precision" if table.precision[i] else "held")
+    if table.outcome[i] == Outcome.MOVED:
+        words.append("lift ended, not judged")
+    if table.outcome[i] == Outcome.NOT_LIFTED:
+        words.append("not lifted, not judged")
+    if table.split[i] != NONE:
+        words.append(SPLITS[table.split[i]])
+    if table.removal[i] not in (NONE, Removal.KEPT):
+        words.append("no sample: " + Removal(int(table.removal[i])).label.replace("_", " "))
+    return words
+
+
+def _reasons(snapshot: Snapshot, i: int) -> list[str]:
+    """Return the largest parts of an attempt's suspicion, as text."""
+    shares = [(snapshot.table.value(part.name, i) / part.scale, part.name) for part in PARTS]
+    large = sorted((s for s in shares if s[0] >= REASON_SHARE), reverse=True)[:REASONS]
+    # A contact without a normal has no angle of it: an infinite share.
+    return [
+        f"{QUANTITIES[name].title}{'' if np.isfinite(share) else ':'} {_text(snapshot, name, i)}"
+        for share, name in large
+    ]
+
+
+def _parts(row: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the parts of an attempt's suspicion with their shares."""
+    found = suspicion({name: np.asarray(value)[None] for name, value in row.items()})
+    parts = []
+    for part in PARTS:
+        value, share = float(found.values[part.name][0]), float(found.shares[part.name][0])
+        if np.isnan(value) and np.isfinite(share):
+            value = np.inf  # a contact without a normal
+        parts.append(
+            {
+                "title": part.shown.title,
+                "meaning": part.meaning,
+                "value": part.shown.text(value),
+                "scale": part.shown.text(part.scale),
+                "share": None if np.isnan(share) else round(share, 3),
+            }
+        )
+    return parts
+
+
+def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return further numbers of an attempt as names and texts: what no other part shows."""
+    key, rules = snapshot.key(i), snapshot.config.candidates
+    s, standoffs = key.standoff_index, rules.standoffs
+    standoff = f"{1e3 * standoffs[s]:.0f} mm" if s < len(standoffs) else str(s)
+    if rules.postures is not None:
+        standoff = "none, a given posture"
+    in_parts, closed = {part.name for part in PARTS}, np.isfinite(row["time_close"])
+    return [
+        ("palm pose, stand-off", f"{key.candidate}, {standoff}"),
+        *(
+            (field.shown.title, field.shown.text(float(row[field.name])))
+            for field in TRIAL_FIELDS
+            if field.shown is not None and field.name not in in_parts
+        ),
+        ("other links after closing", str(int(row["closed_other_links"])) if closed else "–"),
+        *_bears(row),
+        *_certificate(snapshot, i),
+    ]
+
+
+def _bears(row: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return how much an attempt bears; nothing where that was not tried."""
+    probability, half = row["p_hold_probability"], row["p_hold_half_step"]
+    if np.isnan(probability):
+        return []
+    repeats = int(row["p_hold_repeats"])
+    lines = [
+        (f"disturbed repeats that {what}", share_text(int(row[f"p_hold_{name}"]), repeats))
+        for name, what in (("samples", "would be samples"), ("held", "hold"))
+    ]
+    step = {0.0: "no", 1.0: "yes"}.get(float(half), "not known")
+    return [*lines, ("would be a sample at half the time step", step)]
+
+
+def _certificate(snapshot: Snapshot, i: int) -> list[tuple[str, str]]:
+    """Return how robust a success is; nothing where that was not tried."""
+    if snapshot.table.outcome[i] != Outcome.SUCCESS:
+        return []
+    found, lines = read_certificate(snapshot, i), []
+    share, friction = found["certified_share"], found["certified_friction"]
+    if np.isfinite(share):
+        lines.append(("repeats with noise that hold", f"{100.0 * share:.0f} %"))
+    if not np.isnan(friction):
+        least = f"{friction:.3g}" if np.isfinite(friction) else "more than it has"
+        lines.append(("least friction with the hand that holds", least))
+    return lines
+
+
+def _pose_lines(name: str, row: dict[str, Any]) -> list[str]:
+    """Return palm poses and joints of an attempt as lines of JSON to copy, as far as it got."""
+    values: dict[str, Any] = {"object": name}
+    for key in ("X_TO", "X_OG", "closed_q", "X_OG_lifted", "lifted_q"):
+        value = unpack_pose(row[key]) if key.startswith("X_") else row[key]
+        if np.isfinite(value).all():
+            values[key] = value.tolist()
+    lines = [f" {json.dumps(key)}: {json.dumps(value)}" for key, value in values.items()]
+    return ["{", *(f"{line}," for line in lines[:-1]), lines[-1], "}"]
+
+
+def _fingers(row: dict[str, Any]) -> list[list[str]]:
+    """Return a row per finger: forces, depths, areas, fit to the mesh; a dash for no value."""
+
+    def text(value: Any, factor: float, digits: int) -> str:
+        return f"{factor * value:.{digits}f}" if np.isfinite(value) else "–"
+
+    fingers = []
+    for k in range(len(row["closed_touching"])):
+        cells = []
+        for when in ("closed", "lifted"):
+            force = np.linalg.norm(row[f"{when}_f_Q_O"][k])
+            numbers = force, row[f"{when}_penetration"][k], row[f"{when}_area"][k]
+            touching = bool(row[f"{when}_touching"][k])
+            for value, factor, digits in zip(numbers, (1.0, 1e3, 1e6), (1, 2, 0), strict=True):
+                cells.append(text(float(value) if touching else np.nan, factor, digits))
+        angle, distance = np.rad2deg(float(row["normal_angle"][k])), row["surface_distance"][k]
+        fingers.append([*cells, text(angle, 1.0, 1), text(float(distance), 1e3, 2)])
+    return fingers

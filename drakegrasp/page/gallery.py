@@ -1,0 +1,390 @@
+"""One gallery shows a table of rows, and one page shows a row of it.
+
+In: what an address asks for. Out: HTML. Each table is a `Gallery`: it says by what it is filtered
+and sorted, and what its cards and pages hold. Jinja escapes every value; no page holds a script or
+a style of its own, so the strictest content security policy fits.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, TypeAlias
+from urllib.parse import urlencode
+
+import numpy as np
+import numpy.typing as npt
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+
+from drakegrasp.dataset.schema import Shown
+from drakegrasp.errors import DataError, counted, printable
+from drakegrasp.page.catalog import Snapshot
+from drakegrasp.page.looks import HandView
+from drakegrasp.pictures.style import FINGER_COLOURS, PREDICTED, REACHED, TRUE
+
+Places: TypeAlias = npt.NDArray[np.int32]
+#: Least and largest value; None for no limit.
+Limits: TypeAlias = tuple[float | None, float | None]
+#: Cards on a page of a gallery.
+PAGE = 24
+
+
+def _shown(value: Any) -> Any:
+    """Return a value of a template as it is shown: texts without control characters."""
+    return printable(value) if type(value) is str else value
+
+
+TEMPLATES = Environment(
+    loader=PackageLoader("drakegrasp.page"),
+    autoescape=select_autoescape(default=True, default_for_string=True),
+    undefined=StrictUndefined,
+    finalize=_shown,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+#: Colours of fingers, and of kinds of contacts in the order in which they are drawn.
+TEMPLATES.globals["colours"] = FINGER_COLOURS
+TEMPLATES.globals["kinds"] = {"true": TRUE, "asked": PREDICTED, "reached": REACHED}
+TEMPLATES.globals["counted"] = counted
+
+
+@dataclass(frozen=True, kw_only=True)
+class Site:
+    """Where pages are: at a server, or files that open without one.
+
+    Attributes:
+        predicted, scened: Whether there are pages of predictions, and of scenes.
+        up: Of files, from the page to the folder of all: empty, or "../"; None for a server.
+        grasps: Of files, the addresses of the grasps that have a page.
+        asked: The addresses that pages asked for.
+    """
+
+    predicted: bool = False
+    scened: bool = False
+    up: str | None = None
+    grasps: frozenset[str] = frozenset()
+    asked: set[str] = field(default_factory=set)
+
+    @property
+    def static(self) -> bool:
+        """Whether the pages are files, without a server."""
+        return self.up is not None
+
+    def at(self, address: str) -> str:
+        """Return where a page finds an address of the server; empty if it is not there."""
+        path = address.partition("?")[0]
+        if self.up is None or not path:
+            return address
+        if path.startswith("/grasp/") and path not in self.grasps:
+            return ""
+        self.asked.add(path)
+        return self.up + file_of(path)
+
+
+def file_of(path: str) -> str:
+    """Return the file of an address: without a server a query has no effect.
+
+    A mesh is a script that holds it, since a page of a file may read no file.
+    """
+    name = path.strip("/") or "index"
+    if name.endswith(".json"):
+        return name.removesuffix("json") + "js"
+    return name if "." in name else f"{name}.html"
+
+
+def render(name: str, site: Site, **values: Any) -> str:
+    """Return a page of a template."""
+    return TEMPLATES.get_template(name).render(site=site, **values)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Query:
+    """What a gallery is asked for.
+
+    Attributes:
+        values: By the names of parameters; an empty text asks for anything.
+        ranges: Least and largest value of quantities, in the units that are shown.
+        default: Values that an address need not say.
+    """
+
+    values: Mapping[str, str]
+    ranges: Mapping[str, Limits]
+    default: Mapping[str, str]
+
+    def __getitem__(self, name: str) -> str:
+        """Return what is asked for; empty for anything."""
+        value = self.values.get(name, "")
+        return "" if value == "any" and name in self.default else value
+
+    @property
+    def ascending(self) -> bool:
+        """Whether the smallest come first."""
+        return self["order"] == "up"
+
+    def params(self, **changes: object) -> str:
+        """Return the query as part of an address, with some values changed; defaults are left out.
+
+        Args:
+            changes: Values by the names of the parameters.
+        """
+        bounds = {
+            f"{bound}_{name}": f"{value:g}"
+            for name, limits in self.ranges.items()
+            for bound, value in zip(("min", "max"), limits, strict=True)
+            if value is not None
+        }
+        values = {name: str(v) for name, v in {**self.values, **bounds, **changes}.items()}
+        return urlencode({n: v for n, v in values.items() if v not in ("", self.default.get(n))})
+
+
+class Gallery(ABC):
+    """A table whose rows have cards and pages.
+
+    Attributes:
+        HOME, ROW: Address of its gallery, and folder of the addresses of its rows; the templates
+            are `gallery_ROW.html` and `ROW.html`.
+        NOUN: What a row is.
+        CHOICES: By the names of parameters, what can be asked for besides a class and an object.
+        SELECTS: Titles of the fields of the form, in order.
+        QUANTITIES: Numbers that can be filtered and sorted by, as people read them.
+        RANGES: Those with a range among the filters.
+        SORTS: Orders with their titles, that of the first page first.
+        OUTCOME: The outcome that is asked for unless another is.
+        snapshot: State of the dataset.
+        objects: (n,), numbers of the rows' objects.
+    """
+
+    HOME: ClassVar[str]
+    ROW: ClassVar[str]
+    NOUN: ClassVar[str]
+    CHOICES: ClassVar[Mapping[str, Sequence[str]]]
+    SELECTS: ClassVar[Mapping[str, str]]
+    QUANTITIES: ClassVar[Mapping[str, Shown]] = {}
+    RANGES: ClassVar[Sequence[str]] = ()
+    SORTS: ClassVar[Mapping[str, str]]
+    OUTCOME: ClassVar[str] = ""
+    snapshot: Snapshot
+
+    @property
+    @abstractmethod
+    def objects(self) -> npt.NDArray[np.int32]:
+        """Numbers (n,) of the rows' objects."""
+
+    @abstractmethod
+    def column(self, name: str) -> npt.NDArray[Any]:
+        """Return the values (n,) of a quantity in SI, or of an order."""
+
+    @abstractmethod
+    def matches(self, name: str, value: str) -> npt.NDArray[np.bool_]:
+        """Return which rows (n,) have what can be chosen."""
+
+    def options(self, name: str) -> Mapping[str, str]:
+        """Return what the form offers of a choice, with its text where it is another."""
+        return {value: value.replace("_", " ") for value in self.CHOICES[name]}
+
+    @abstractmethod
+    def label(self, i: int) -> str:
+        """Return the name of a row in addresses."""
+
+    @abstractmethod
+    def find(self, label: str) -> int | None:
+        """Return the row of a label, or None if there is none."""
+
+    @abstractmethod
+    def summary(self, query: Query, chosen: Places) -> dict[str, Any]:
+        """Return what the gallery says besides its cards."""
+
+    @abstractmethod
+    def cards(self, shown: Places) -> list[dict[str, Any]]:
+        """Return what the cards of rows say."""
+
+    @abstractmethod
+    def values(self, i: int) -> dict[str, str]:
+        """Return what a page without a server filters and sorts a row by."""
+
+    @abstractmethod
+    def row(self, i: int, hand: HandView) -> dict[str, Any]:
+        """Return what the page of a row says.
+
+        Raises:
+            DataError: If a file was replaced meanwhile.
+        """
+
+    # What all tables share.
+
+    @classmethod
+    def query(cls, params: Mapping[str, str] | None = None) -> Query:
+        """Return what an address asks for.
+
+        Raises:
+            DataError: If a value is none that can be asked for.
+        """
+        # Texts that must be one of a few; names of objects may be any.
+        params = params or {}
+        for name, allowed in {**cls.CHOICES, "sort": cls.SORTS, "order": ("up", "down")}.items():
+            if params.get(name, "") not in ("", *allowed):
+                raise DataError(f"{name} must be one of {', '.join(allowed)}, got {params[name]!r}")
+        page = params.get("page", "") or "1"
+        if not (page.isascii() and page.isdecimal() and len(page) < 9):
+            raise DataError(f"page must be a number, got {page!r}")
+        limits = {n: (_number(params, f"min_{n}"), _number(params, f"max_{n}")) for n in cls.RANGES}
+
+        default = {"outcome": cls.OUTCOME, "sort": next(iter(cls.SORTS)), "page": "1"}
+        names = ("object", "class", "outcome", "sort", "order", "page", *cls.CHOICES)
+        values = {name: params.get(name, "") or default.get(name, "") for name in names}
+        values["page"] = str(max(1, int(page)))
+        values["order"] = values["order"].replace("down", "")
+        ranges = {name: both for name, both in limits.items() if both != (None, None)}
+        return Query(values=values, ranges=ranges, default=default)
+
+    def select(self, query: Query) -> Places:
+        """Return the rows that a query asks for, in its order.
+
+        Those without a value of what is sorted by come last; ties are in the order of the rows.
+        """
+        # The filters; what has no value is in no range.
+        own = zip(self.snapshot.names, self.snapshot.classes, strict=True)
+        asked = query["object"], query["class"]
+        wanted = [all(a in ("", b) for a, b in zip(asked, names, strict=True)) for names in own]
+        chosen = np.array(wanted, dtype=bool)[self.objects]
+        for name in self.CHOICES:
+            if query[name]:
+                chosen &= self.matches(name, query[name])
+        for name, (least, largest) in query.ranges.items():
+            values = self.column(name) * self.QUANTITIES[name].factor
+            if least is not None:
+                chosen &= values >= least
+            if largest is not None:
+                chosen &= values <= largest
+
+        # The order.
+        places = np.flatnonzero(chosen).astype(np.int32)
+        values = self.column(query["sort"])[places]
+        there = ~np.isnan(values)
+        few = values[there] if query.ascending else -values[there]
+        return np.concatenate([places[there][np.argsort(few, kind="stable")], places[~there]])
+
+    def gallery_page(self, query: Query, chosen: Places, site: Site) -> str:
+        """Return the gallery.
+
+        Args:
+            query: What is asked for; a page beyond the last is the last.
+            chosen: All rows that it selects, in order.
+            site: Files hold all cards, and each what a script filters and sorts by.
+        """
+        pages = max(1, -(-len(chosen) // PAGE))
+        page = min(int(query.values["page"]), pages)
+        shown = chosen if site.static else chosen[(page - 1) * PAGE : page * PAGE]
+        cards = self.cards(shown)
+        for i, card in zip(shown.tolist(), cards, strict=True):
+            card |= self.identity(i) | {"label": self.label(i), "href": self._address(i, query)}
+            named = {"object": card["title"], "class": card["class_name"]}
+            card["values"] = named | self.values(i) if site.static else {}
+        return render(
+            f"gallery_{self.ROW}.html",
+            site,
+            cards=cards,
+            total=len(chosen),
+            all=len(self.objects),
+            page=page,
+            pages=pages,
+            home=self.HOME,
+            noun=self.NOUN,
+            previous=self._home(query, page=page - 1) if page > 1 else "",
+            next=self._home(query, page=page + 1) if page < pages else "",
+            address=self._home(query),
+            form=self._form(query, site),
+            **self.summary(query, chosen),
+        )
+
+    def row_page(self, i: int, query: Query, chosen: Places, site: Site, hand: HandView) -> str:
+        """Return the page of a row.
+
+        Args:
+            i: Its number.
+            query: What next and previous go through.
+            chosen: All rows that it selects, in order.
+            site: Where the other pages are.
+            hand: Of the dataset.
+
+        Raises:
+            DataError: If a file was replaced meanwhile.
+        """
+        values = self.row(i, hand)
+        scene, place = values["scene"], np.flatnonzero(chosen == i)
+        k = int(place[0]) if len(place) else None
+        meshes = (f"link-{number}" for number in range(scene["links"]))
+
+        def address(place: int) -> str:
+            return self._address(int(chosen[place]), query)
+
+        return render(
+            f"{self.ROW}.html",
+            site,
+            label=self.label(i),
+            noun=self.ROW,
+            position="not in the selection" if k is None else f"{k + 1:,} of {len(chosen):,}",
+            previous=address(k - 1) if k else "",
+            next=address(k + 1) if k is not None and k + 1 < len(chosen) else "",
+            gallery=self._home(query),
+            meshes={
+                "object": site.at(f"/mesh/object-{scene['objectCode']}.json"),
+                "links": [site.at(f"/mesh/{name}.json") for name in meshes],
+            },
+            problem=hand.problem,
+            size=self.snapshot.config.camera.size,
+            **self.identity(i),
+            **values,
+        )
+
+    def identity(self, i: int) -> dict[str, Any]:
+        """Return how people name a row: its object's name and class."""
+        number = self.objects[i]
+        return {"title": self.snapshot.names[number], "class_name": self.snapshot.classes[number]}
+
+    def _address(self, i: int, query: Query) -> str:
+        params = query.params()
+        return f"/{self.ROW}/{self.label(i)}" + f"?{params}" * bool(params)
+
+    def _home(self, query: Query, **changes: object) -> str:
+        params = query.params(**changes)
+        return self.HOME + f"?{params}" * bool(params)
+
+    def _form(self, query: Query, site: Site) -> dict[str, Any]:
+        """Return the fields of the form of filters and order; files hold one outcome alone."""
+        names = {"object": self.snapshot.names, "class": sorted(set(self.snapshot.classes))}
+        selects = []
+        for name, title in self.SELECTS.items():
+            known = {n: n for n in names[name]} if name in names else self.options(name)
+            any_ = "any" if query.default.get(name) else ""
+            options = [(value, text, value == query[name]) for value, text in known.items()]
+            if not (any_ and site.static):
+                selects.append((name, title, [(any_, "any", not query[name]), *options]))
+        ranges = []
+        for name in self.RANGES:
+            bounds = query.ranges.get(name, (None, None))
+            least, largest = ("" if value is None else f"{value:g}" for value in bounds)
+            quantity = self.QUANTITIES[name]
+            ranges.append((name, quantity.title, quantity.unit, least, largest))
+        return {
+            "selects": selects,
+            "ranges": ranges,
+            "sorts": [(name, text, name == query["sort"]) for name, text in self.SORTS.items()],
+            "ascending": query.ascending,
+            "outcome": self.OUTCOME,
+        }
+
+
+def _number(params: Mapping[str, str], name: str) -> float | None:
+    """Return a number of an address, None without one."""
+    text = params.get(name, "").strip()
+    if not text:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise DataError(f"{name} must be a number, got {text!r}")
+    return value

@@ -1,0 +1,387 @@
+"""What pages show of single rows: numbers, images with their contacts, and the 3D view.
+
+In: attempts, read from the files when asked for, and the hand. The 3D view is plain lists for JSON.
+Everything in it is in {T}, on the object in its resting pose: what was lifted is moved back with
+the object, as in the dataset's `_held` fields, so that a slip in the hand shows as another place of
+the hand.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.config import Config
+from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.paths import DATA_FILES, shards_folder
+from drakegrasp.dataset.schema import CERTIFICATE_FIELDS, SPLITS
+from drakegrasp.dataset.shards import trial_columns
+from drakegrasp.dataset.trial_files import NONE
+from drakegrasp.errors import DrakegraspError
+from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points, unpack_pose
+from drakegrasp.page.catalog import Snapshot, find_model
+from drakegrasp.pictures.style import HIDDEN
+from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, intrinsics, project
+
+#: Object meshes that are kept in memory.
+KEPT_MESHES = 32
+#: Columns that the dots on a thumbnail need.
+THUMBNAIL = ("X_TO", "X_OG", "X_C0C", "closed_p_OQ", "closed_nhat_Q_O")
+#: Length of the arrows along the normals [m].
+ARROW = 0.03
+_CAMERA_POSES = {"oto": camera_pose_oto, "otm": camera_pose_otm}
+
+
+class Look(NamedTuple):
+    """The images of a success by one camera.
+
+    Attributes:
+        image: (4, S, S) float32: R, G, B in 0..1 and depth [m].
+        mask: (S, S) uint8, 1 where the object is seen.
+    """
+
+    image: npt.NDArray[np.float32]
+    mask: npt.NDArray[np.uint8]
+
+
+class Dot(NamedTuple):
+    """A contact on an image: its pixel, and that of the tip of its normal.
+
+    Attributes:
+        finger: In grasp order.
+        u, v: Pixel of the contact.
+        tip_u, tip_v: Pixel of the tip of its normal.
+        hidden: Whether the object hides it.
+    """
+
+    finger: int
+    u: float
+    v: float
+    tip_u: float
+    tip_v: float
+    hidden: bool
+
+
+def read_rows(
+    snapshot: Snapshot, places: Sequence[int], names: Sequence[str] | None = None
+) -> list[dict[str, Any]]:
+    """Return what `/trials` says of attempts.
+
+    Args:
+        snapshot: State of the files.
+        places: Of the attempts in the table.
+        names: Of the columns; all that a shard has if None.
+
+    Raises:
+        DataError: If a file was replaced meanwhile.
+    """
+    columns = snapshot.trials[places].columns(names or [f.name for f in trial_columns()])
+    return [
+        dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)
+    ]
+
+
+def read_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
+    """Return the images of an attempt, or None if there are none.
+
+    A sample's are in the data file. Those of other successes are in their shard.
+
+    Raises:
+        DataError: If a file was replaced meanwhile.
+    """
+    try:
+        if snapshot.table.split[i] != NONE:
+            look = _sample_look(snapshot, i, camera)
+        else:
+            look = _shard_look(snapshot, i, camera)
+    except (OSError, KeyError, ValueError, IndexError):
+        look = None
+    snapshot.refuse_replaced()
+    return look
+
+
+def look_source(snapshot: Snapshot, i: int, camera: str) -> str:
+    """Return in words which file `read_look` reads."""
+    is_there = (snapshot.out / DATA_FILES[camera]).is_file()
+    if snapshot.table.split[i] != NONE and is_there:
+        return DATA_FILES[camera]
+    return f"shards of {snapshot.key(i).object}"
+
+
+def _sample_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
+    split = SPLITS[snapshot.table.split[i]]
+    row = int(np.searchsorted(snapshot.sample_ids[split], i))
+    path = snapshot.out / DATA_FILES[camera]
+    if not path.is_file():
+        return _shard_look(snapshot, i, camera)
+    with open_hdf5(path) as file:
+        return Look(image=file[split]["images"][row], mask=file[split]["masks"][row])
+
+
+def _shard_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
+    # The end of a shard's name is that of the object's poses.
+    key, number = snapshot.key(i), snapshot.table.object[i]
+    *_, unit = snapshot.config.unit_ranges(key.candidate + 1)
+    (path,) = shards_folder(snapshot.out, key.object).glob(f"{unit.start:07d}-*.h5")
+    due = snapshot.own_hashes.get(key.object, snapshot.config_hash), snapshot.meshes[number]
+    with open_hdf5(path) as file:
+        # A shard of another configuration or mesh has other attempts.
+        if (file.attrs["config_hash"], file.attrs["mesh_sha256"]) != due:
+            return None
+
+        # The row of the attempt in its shard, then that of its images.
+        trials, looks = file["trials"], file["looks"]
+        here = trials["candidate"][:] == key.candidate
+        here &= trials["standoff_index"][:] == key.standoff_index
+        (rows,) = np.nonzero(here & (trials["child"][:] == key.child))
+        (found,) = np.nonzero(looks["row"][:] == rows[0])
+        if not len(found):
+            return None
+        k = int(found[0])
+        return Look(image=looks[f"image_{camera}"][k], mask=looks[f"mask_{camera}"][k])
+
+
+def contact_dots(
+    snapshot: Snapshot,
+    row: dict[str, Any],
+    camera: str,
+    look: Look | None = None,
+    *,
+    contacts: tuple[Array, Array] | None = None,
+) -> list[Dot]:
+    """Return where a camera sees contacts; those behind it are left out.
+
+    Args:
+        snapshot: With the configuration of the cameras.
+        row: With the columns THUMBNAIL.
+        camera: `oto` or `otm`.
+        look: Its images, which tell what the object hides; without them nothing is hidden.
+        contacts: Points and normals (k, 3) in {O}; those of the row after closing if None.
+    """
+    # The contacts and the tips of their normals in {C}.
+    p_OQ, nhat_Q_O = contacts or (row["closed_p_OQ"], row["closed_nhat_Q_O"])
+    config = snapshot.config.camera
+    X_TO, X_OG = unpack_pose(row["X_TO"]), unpack_pose(row["X_OG"])
+    X_TC = _CAMERA_POSES[camera](multiply(X_TO, X_OG), config, unpack_pose(row["X_C0C"]))
+    X_CO = multiply(invert_pose(X_TC), X_TO)
+    p_CQ, nhat_Q_C = transform_points(X_CO, p_OQ), rotate_vectors(X_CO, nhat_Q_O)
+
+    def is_hidden(finger: int, u: float, v: float) -> bool:
+        # Something nearer is seen at the pixel of the contact, as on contact sheets.
+        if look is None:
+            return False
+        last = look.image.shape[-1] - 1
+        column, pixel_row = (min(max(round(x), 0), last) for x in (u, v))
+        return float(p_CQ[finger, 2]) > float(look.image[3, pixel_row, column]) + HIDDEN
+
+    return dots_of(intrinsics(config), p_CQ, nhat_Q_C, config.near, is_hidden)
+
+
+def dots_of(
+    K: Array,
+    p_CQ: Array,
+    nhat_Q_C: Array,
+    near: float,
+    is_hidden: Callable[[int, float, float], bool],
+) -> list[Dot]:
+    """Return contacts (k, 3) in {C} as dots; those that are not before the near plane are left out.
+
+    Args:
+        K: (3, 3), camera matrix [px].
+        p_CQ: (k, 3), points [m]; NaN where there is none.
+        nhat_Q_C: (k, 3), normals; their tips are at `ARROW` times them.
+        near: Near plane [m].
+        is_hidden: Whether the camera does not see a finger's contact, which it has at u, v [px].
+    """
+    p_CE, dots = p_CQ + ARROW * np.nan_to_num(nhat_Q_C), []
+    for finger, (point, tip) in enumerate(zip(p_CQ, p_CE, strict=True)):
+        if np.isfinite(point).all() and min(point[2], tip[2]) > near:
+            (u, v), (tip_u, tip_v) = project(K, np.array([point, tip])).tolist()
+            dots.append(Dot(finger, u, v, tip_u, tip_v, is_hidden(finger, u, v)))
+    return dots
+
+
+def read_certificate(snapshot: Snapshot, i: int) -> dict[str, float]:
+    """Return how robust a success is, by the names of CERTIFICATE_FIELDS; NaN if not certified.
+
+    Raises:
+        DataError: If a file was replaced meanwhile.
+    """
+    group, key = ("successes", "trial_id") if snapshot.assembled else ("looks", "row")
+    part, row = snapshot.trials.part_of(i)
+    try:
+        with open_hdf5(part.path) as file:
+            (found,) = np.nonzero(file[group][key][:] == row)
+            certificate = {f.name: float(file[group][f.name][found[0]]) for f in CERTIFICATE_FIELDS}
+    except (OSError, KeyError, ValueError, IndexError):
+        certificate = {f.name: float("nan") for f in CERTIFICATE_FIELDS}
+    snapshot.refuse_replaced()
+    return certificate
+
+
+class HandView:
+    """The hand of a dataset for the 3D view; Drake is loaded when it is first asked.
+
+    Args:
+        config: Configuration of the dataset.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._source = config.hand_source
+        self._lock = threading.Lock()
+        self._scene: Any = None
+        self._surfaces: dict[str, bytes] = {}
+        #: Why there is no hand to show, in words; empty if there is one.
+        self.problem = ""
+
+    def load(self) -> None:
+        """Load the hand; a hand that cannot be loaded here is a `problem`, and no error."""
+        with self._lock:
+            if self._scene is not None or self.problem:
+                return
+            from drakegrasp.hand.description import load_hand
+            from drakegrasp.pictures.still_scene import StillScene
+            from drakegrasp.pictures.surfaces import link_surfaces
+
+            try:
+                scene = StillScene(load_hand(self._source))
+                self._surfaces, self._scene = link_surfaces(scene), scene
+            except (DrakegraspError, RuntimeError, OSError) as error:
+                self.problem = f"the hand cannot be shown: {str(error).splitlines()[0]}"
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of the links with a shape, in the order of their numbers in addresses."""
+        self.load()
+        return tuple(self._surfaces)
+
+    def surface(self, number: int) -> bytes:
+        """Return what is shown of a link, see `pictures.surfaces`.
+
+        Raises:
+            IndexError: If there is no link of that number.
+        """
+        link = self.links[number]  # first, since it may load them
+        return self._surfaces[link]
+
+    def poses(self, X_TG: Array, q: Array | None, spread: float) -> list[list[float]]:
+        """Return the poses of the links, column by column as for three.js; none without a hand.
+
+        A dataset that was made with other files of the hand may have another number of joints.
+
+        Args:
+            X_TG: (4, 4), pose of the palm.
+            q: (j,), positions of the joints [rad or m]; None for the open hand.
+            spread: Angle of the spread joints of the open hand [rad].
+        """
+        self.load()
+        if self._scene is None:
+            return []
+        from drakegrasp.pictures.still_scene import Poses
+
+        with self._lock:
+            rest = self._scene.positions(spread)
+            positions = rest if q is None else q
+            if len(positions) != len(rest):
+                return []
+            self._scene.pose(Poses(X_WG=X_TG, q=positions))
+            return [_columns(self._scene.link_pose(link)) for link in self._surfaces]
+
+
+def attempt_scene(
+    snapshot: Snapshot, i: int, row: Mapping[str, Any], hand: HandView
+) -> dict[str, Any]:
+    """Return the 3D view of an attempt as JSON types.
+
+    Args:
+        snapshot: State of the files.
+        i: Place of the attempt in the table.
+        row: All its columns.
+        hand: Of the dataset.
+    """
+    # The start always; closed and lifted as far as the attempt got.
+    X_TO, spread = unpack_pose(row["X_TO"]), float(row["spread"])
+    X_TG = multiply(X_TO, unpack_pose(row["X_OG"]))
+    states: dict[str, Any] = {"start": {"links": hand.poses(X_TG, None, spread), "contacts": []}}
+    if np.isfinite(row["time_close"]):
+        links = hand.poses(X_TG, row["closed_q"], spread)
+        states["closed"] = {"links": links, "contacts": contacts_of(row, "closed_", X_TO)}
+    if np.isfinite(row["time_lift"]) and np.isfinite(row["X_OG_lifted"]).all():
+        X_TG_held = multiply(X_TO, unpack_pose(row["X_OG_lifted"]))
+        links = hand.poses(X_TG_held, row["lifted_q"], spread)
+        states["lifted"] = {"links": links, "contacts": contacts_of(row, "lifted_", X_TO)}
+    return make_scene(snapshot, int(snapshot.table.object[i]), X_TO, states, hand)
+
+
+def make_scene(
+    snapshot: Snapshot, number: int, X_TO: Array, states: dict[str, Any], hand: HandView
+) -> dict[str, Any]:
+    """Return a 3D view as JSON types.
+
+    Args:
+        snapshot: State of the files.
+        number: Of the object.
+        X_TO: (4, 4), its pose.
+        states: By their names, each with the poses of the links and the contacts.
+        hand: Of the dataset.
+    """
+    return {
+        "object": _columns(X_TO),
+        "objectCode": snapshot.codes[number],
+        "objectName": snapshot.names[number],
+        "hasObject": find_model(snapshot.out, snapshot.names[number]) is not None,
+        "links": len(hand.links),
+        "states": states,
+    }
+
+
+def contacts_of(row: Mapping[str, Any], when: str, X_TO: Array) -> list[dict[str, Any]]:
+    """Return the contacts of a row in {T}; `when` begins the names of its columns."""
+    points, normals, forces = (row[f"{when}{name}"] for name in ("p_OQ", "nhat_Q_O", "f_Q_O"))
+    return contacts_in_table(points, normals, forces, X_TO)
+
+
+def contacts_in_table(
+    p_OQ: Array, nhat_Q_O: Array, f_Q_O: Array, X_TO: Array
+) -> list[dict[str, Any]]:
+    """Return contacts (k, 3) in {T} as JSON types; a finger that does not touch has none."""
+    p_TQ = transform_points(X_TO, p_OQ)
+    nhat_T, f_T = (rotate_vectors(X_TO, vectors) for vectors in (nhat_Q_O, f_Q_O))
+    return [
+        {"finger": k, "p": p.tolist(), "n": np.nan_to_num(n).tolist(), "f": f.tolist()}
+        for k, (p, n, f) in enumerate(zip(p_TQ, nhat_T, f_T, strict=True))
+        if np.isfinite(p).all() and np.isfinite(f).all()
+    ]
+
+
+def _columns(X: Array) -> list[float]:
+    """Return a pose as sixteen numbers, column by column, to a micrometre and a microradian."""
+    return [round(value, 6) for value in X.T.ravel().tolist()]
+
+
+def object_surface(snapshot: Snapshot, number: int) -> bytes | None:
+    """Return what is shown of an object by its number, see `pictures.surfaces`.
+
+    It is None if there is no file of the object's meshes.
+
+    Raises:
+        MeshError: If the file cannot be read.
+    """
+    path = find_model(snapshot.out, snapshot.names[number])
+    return None if path is None else _read_surface(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=KEPT_MESHES)
+def _read_surface(path: Path, modified: int) -> bytes:
+    """Return what is shown of an object's file; one written at another time [ns] is read again."""
+    from drakegrasp.objects.model import load_object
+    from drakegrasp.pictures.surfaces import object_json
+
+    return object_json(load_object(path))

@@ -1,0 +1,516 @@
+"""Predictions and their verdicts on the page, beside the rows of the dataset that they are for.
+
+In: the HDF5 file that `drakegrasp verify --out` writes, and a snapshot of the dataset. What filters
+and sorting need is in memory; all else of a verdict is read when a page shows it. A field that the
+file lacks reads as without a value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import multiply, norm
+from drakegrasp.dataset.opening import Difference, opened, read_codes, refuse_first
+from drakegrasp.dataset.predicted_rows import PredictedRows, read_predicted_rows
+from drakegrasp.dataset.schema import (
+    CAMERAS,
+    VERIFICATION_FIELDS,
+    Field,
+    Shown,
+    refuse_other_schema,
+)
+from drakegrasp.dataset.trial_files import Stamp, stamp
+from drakegrasp.errors import DataError
+from drakegrasp.frames import Array, unpack_pose
+from drakegrasp.outcomes import Outcome
+from drakegrasp.page.attempts import name_of, words_of
+from drakegrasp.page.catalog import Snapshot
+from drakegrasp.page.gallery import Gallery, Places, Query
+from drakegrasp.page.looks import (
+    THUMBNAIL,
+    Dot,
+    HandView,
+    Look,
+    contact_dots,
+    contacts_in_table,
+    make_scene,
+    read_look,
+    read_rows,
+)
+
+#: Group of the verdicts in a result file.
+GROUP = "grasps"
+FIELDS: Mapping[str, Field] = {field.name: field for field in VERIFICATION_FIELDS}
+#: What a verdict cannot do without.
+NEEDED = ("object", "outcome", "p_OQ", "nhat_Q_O")
+#: Numbers of a prediction that can be filtered and sorted by, as people read them; of several
+#: contacts the largest.
+QUANTITIES = {
+    "error": Shown("asked to reached", "mm"),
+    "normal_error": Shown("asked to reached normal", "°"),
+    "true_error": Shown("asked to true", "mm"),
+    "surface": Shown("asked to surface", "mm"),
+    "slip": Shown("slip", "mm"),
+    "turn": Shown("turn", "°"),
+    "friction": Shown("least friction", digits=2),
+}
+#: Those that are columns of the file.
+_MEASURED = {
+    "contact_error": "error",
+    "normal_error": "normal_error",
+    "surface_distance": "surface",
+    "slip": "slip",
+    "turn": "turn",
+    "smallest_friction": "friction",
+}
+#: Words of a verdict on a grasp that is held; and all, to filter by.
+WORDS = ("held", "success", "precision", "stable", "sample")
+VERDICTS = ("fails", *WORDS, "held_any")
+#: Kinds of contacts with the columns of a verdict that hold them.
+_CONTACTS = {"asked": ("p_OQ", "nhat_Q_O"), "reached": ("closed_p_OQ", "closed_nhat_Q_O")}
+#: Fields of a verdict that its card needs.
+ON_CARDS = ("reason", *(name for names in _CONTACTS.values() for name in names))
+#: Width of the part of an image that is shown over that of its marks, and the least share of it.
+LOOSE, LEAST_SHOWN = 1.7, 0.4
+#: Numbers that a verdict and the row's own trial both have.
+_BOTH = {
+    "slip": Shown("slip", "mm"),
+    "turn": Shown("turn", "°"),
+    "time_close": Shown("time of closing", "s", 2),
+    "time_lift": Shown("time of the lift", "s", 2),
+}
+#: Numbers of a verdict alone, of the fingers the largest.
+_OWN = {
+    "contact_error": Shown("asked to reached", "mm"),
+    "normal_error": Shown("asked to reached normal", "°"),
+    "surface_distance": Shown("asked to surface", "mm"),
+    "fit_residual": Shown("asked to fingertip of the fit", "mm"),
+    "fit_normal_error": Shown("asked normal to pad of the fit", "°"),
+    "tries": Shown("wrist poses tried", digits=0),
+    "smallest_friction": Shown("least friction at the asked contacts", digits=2),
+    "epsilon": Shown("epsilon of the asked contacts", digits=3),
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Predictions(Gallery):
+    """n predictions, in the order of the result file.
+
+    Attributes:
+        path: The result file.
+        stamp: Of the file when it was read.
+        snapshot: State of the dataset.
+        rows: The rows that they are for.
+        outcome: (n,) uint8, `Outcome`.
+        words: By the names of VERDICTS, (n,) bool; those that the file tells.
+        features: By the names of QUANTITIES, (n,), in SI; NaN where a verdict has none.
+    """
+
+    HOME, ROW, NOUN = "/predictions", "prediction", "prediction"
+    CHOICES: ClassVar = {
+        "verdict": VERDICTS,
+        "outcome": tuple(outcome.label for outcome in Outcome),
+    }
+    SELECTS: ClassVar = {name: name for name in ("verdict", "outcome", "class", "object")}
+    QUANTITIES = QUANTITIES
+    RANGES = ("error", "normal_error", "true_error", "surface", "slip", "turn")
+    SORTS: ClassVar = {
+        "worst": "worst verdict",
+        **{name: quantity.title for name, quantity in QUANTITIES.items()},
+        "row": "row of the dataset",
+    }
+
+    path: Path
+    stamp: Stamp
+    snapshot: Snapshot
+    rows: PredictedRows
+    outcome: npt.NDArray[np.uint8]
+    words: Mapping[str, npt.NDArray[np.bool_]]
+    features: Mapping[str, Array]
+
+    @property
+    def places(self) -> npt.NDArray[np.int64]:
+        """Places (n,) of their rows in the table of the snapshot."""
+        return self.rows.trial_id
+
+    @property
+    def objects(self) -> npt.NDArray[np.int32]:
+        """Numbers (n,) of their objects."""
+        return self.snapshot.table.object[self.places]
+
+    def column(self, name: str) -> npt.NDArray[Any]:
+        """Return the values (n,) of a quantity, or of an order.
+
+        The worst are those that fail, and of these those whose hand reached no contact; then the
+        distance of asked from reached contacts decides.
+        """
+        if name == "row":
+            return self.rows.row
+        if name != "worst":
+            return self.features[name]
+        error = self.features["error"]
+        # Below 1, in the order of the errors.
+        share = np.where(np.isnan(error), 1.0, error / (1.0 + error))
+        return np.asarray(np.where(self.words["held"], share, 2.0 + share))
+
+    def matches(self, name: str, value: str) -> npt.NDArray[np.bool_]:
+        """Return which predictions (n,) have what can be chosen."""
+        if name == "outcome":
+            return self.outcome == Outcome[value.upper()]
+        return self.words.get(value, np.zeros(len(self.outcome), dtype=bool))
+
+    def options(self, name: str) -> Mapping[str, str]:
+        """Return what the form offers: verdicts that the file tells, outcomes that occur."""
+        there = {Outcome(int(n)).label for n in np.unique(self.outcome)} | self.words.keys()
+        return {value: text for value, text in super().options(name).items() if value in there}
+
+    def label(self, i: int) -> str:
+        """Return the name of a prediction in addresses: its number in the file."""
+        return str(i)
+
+    def find(self, label: str) -> int | None:
+        """Return the number of the prediction of a label, or None if there is none."""
+        there = label.isascii() and label.isdecimal() and len(label) < 10
+        return int(label) if there and int(label) < len(self.outcome) else None
+
+    def read(self, numbers: Sequence[int], names: Iterable[str] = FIELDS) -> list[dict[str, Any]]:
+        """Return fields of some predictions; None for a field that the file lacks.
+
+        Args:
+            numbers: Of the predictions.
+            names: Of the fields.
+
+        Raises:
+            DataError: If the file was replaced meanwhile, or is damaged.
+        """
+        rows, back = np.unique(np.asarray(numbers, dtype=np.int64), return_inverse=True)
+        with opened(self.path, "a result file of drakegrasp verify", again=True) as file:
+            if stamp(self.path) != self.stamp:
+                raise DataError(f"{self.path}: must stay while it is read, got another; load again")
+            columns = {name: _column(file[GROUP], FIELDS[name], rows) for name in names}
+        return [{n: None if v is None else v[k] for n, v in columns.items()} for k in back]
+
+    # What pages say.
+
+    def identity(self, i: int) -> dict[str, Any]:
+        """Return how people name a prediction, its object and its row."""
+        row = f"row {self.rows.row[i]} of {self.rows.split}"
+        return {**super().identity(i), "number": f"prediction {i}", "row": row}
+
+    def summary(self, query: Query, chosen: Places) -> dict[str, Any]:
+        """Return what the gallery says besides its cards."""
+        out = self.snapshot.out
+        return {
+            "title": self.path.name,
+            "dataset": out.name or str(out),
+            "split": self.rows.split,
+            "rows": len(np.unique(self.rows.row)),
+            "held": int(np.count_nonzero(self.words["held"][chosen])),
+        }
+
+    def cards(self, shown: Places) -> list[dict[str, Any]]:
+        """Return what the cards of predictions say."""
+        snapshot, camera = self.snapshot, self.rows.camera
+        places, cards = self.places[shown].tolist(), []
+        rows, verdicts = read_rows(snapshot, places, THUMBNAIL), self.read(shown.tolist(), ON_CARDS)
+        for i, at, row, verdict in zip(shown.tolist(), places, rows, verdicts, strict=True):
+            numbers = {name: float(values[i]) for name, values in self.features.items()}
+            marks, size = self._marks(verdict, row, camera), snapshot.config.camera.size
+            cards.append(
+                {
+                    "strip": f"/strip/{snapshot.label(at)}-{camera}.png",
+                    "marks": marks,
+                    "window": _window(marks, size),
+                    "size": size,
+                    "verdict": self._verdict(i),
+                    "reason": verdict["reason"] or "",
+                    "numbers": [
+                        (QUANTITIES[n].title, QUANTITIES[n].text(numbers[n]))
+                        for n in ("error", "true_error", "slip", "turn")
+                    ],
+                }
+            )
+        return cards
+
+    def values(self, i: int) -> dict[str, str]:
+        """Return what a page without a server filters and sorts a prediction by."""
+        numbers = {name: QUANTITIES[name].factor * v[i] for name, v in self.features.items()}
+        return {
+            "outcome": Outcome(int(self.outcome[i])).label,
+            "verdict": " ".join(word for word, those in self.words.items() if those[i]),
+            **{name: f"{value:.6g}" for name, value in numbers.items()},
+            "worst": f"{self.column('worst')[i]:.9g}",
+            "row": f"{self.rows.row[i]}",
+        }
+
+    def row(self, i: int, hand: HandView) -> dict[str, Any]:
+        """Return what the page of a prediction says.
+
+        Raises:
+            DataError: If a file was replaced meanwhile.
+        """
+        # The verdict, the row, and where both cameras see the contacts; first that of the file.
+        snapshot, at, size = self.snapshot, int(self.places[i]), self.snapshot.config.camera.size
+        (verdict,), (row,) = self.read([i]), read_rows(snapshot, [at])
+        views = []
+        for camera in sorted(CAMERAS, key=lambda name: name != self.rows.camera):
+            look = read_look(snapshot, at, camera)
+            strip = f"/strip/{snapshot.label(at)}-{camera}.png"
+            marks = self._marks(verdict, row, camera, look)
+            window = _window(marks, size, wide=camera != self.rows.camera)
+            views.append({"camera": camera, "strip": strip, "marks": marks, "window": window})
+        return {
+            "verdict": self._verdict(i),
+            "reason": verdict.get("reason") or "",
+            "hints": verdict.get("hints") or "",
+            "trial": name_of(snapshot, at),
+            "row_words": [_outcome(row["outcome"]), *words_of(snapshot, at)],
+            "row_page": f"/grasp/{snapshot.label(at)}",
+            "views": views,
+            "numbers": self._numbers(i, verdict, row),
+            "fingers": _fingers(verdict, row),
+            "scene": self._scene(i, verdict, row, hand),
+        }
+
+    def _verdict(self, i: int) -> list[tuple[str, str]]:
+        """Return the words of a verdict, each with the name of its look."""
+        words = {word for word, those in self.words.items() if those[i]}
+        if "held" in words:
+            return [("held", word) for word in WORDS if word in words]
+        by_another = [("", "held by another wrist pose")] if "held_any" in words else []
+        return [("failed", _outcome(self.outcome[i])), *by_another]
+
+    def _marks(
+        self, verdict: Mapping[str, Any], row: dict[str, Any], camera: str, look: Look | None = None
+    ) -> dict[str, list[Dot]]:
+        """Return where a camera sees the contacts of each kind."""
+        marks = {"true": contact_dots(self.snapshot, row, camera, look)}
+        for kind, names in _CONTACTS.items():
+            points, normals = (verdict[name] for name in names)
+            there = points is not None and normals is not None
+            contacts = (points, normals)
+            marks[kind] = (
+                contact_dots(self.snapshot, row, camera, look, contacts=contacts) if there else []
+            )
+        return marks
+
+    def _numbers(
+        self, i: int, verdict: Mapping[str, Any], row: Mapping[str, Any]
+    ) -> list[tuple[str, str, str | None]]:
+        """Return lines of title, the prediction's value and the row's own, None if it has none."""
+        true = QUANTITIES["true_error"]
+        lines: list[tuple[str, str, str | None]] = [
+            (true.title, true.text(float(self.features["true_error"][i])), None)
+        ]
+        for name, shown in (_OWN | _BOTH).items():
+            other = shown.text(row[name]) if name in _BOTH else None
+            lines.append((shown.title, shown.text(float(_largest(verdict.get(name))[0])), other))
+        force = Shown("largest force after closing", "N")
+        own, other = (
+            force.text(float(_largest(_lengths(source.get("closed_f_Q_O")))[0]))
+            for source in (verdict, row)
+        )
+        return [*lines, (force.title, own, other)]
+
+    def _scene(
+        self, i: int, verdict: Mapping[str, Any], row: Mapping[str, Any], hand: HandView
+    ) -> dict[str, Any]:
+        """Return the 3D view: the hand as it was tried, and the dataset's own grasp."""
+        # Everything is on the object in the resting pose of the row.
+        X_TO = unpack_pose(row["X_TO"])
+        marks = [
+            *_contacts("true", row, "closed_", X_TO),
+            *_contacts("asked", verdict, "", X_TO),
+            *_contacts("reached", verdict, "closed_", X_TO),
+        ]
+
+        # The hand as far as the trial got, and that of the dataset.
+        states, tried = {}, {"closed": ("X_OG", "closed_q"), "lifted": ("X_OG_lifted", "lifted_q")}
+        for name, (palm, q) in tried.items():
+            links = _hand(hand, X_TO, verdict.get(palm), verdict.get(q))
+            if links is not None:
+                forces = _contacts("force", verdict, f"{name}_", X_TO)
+                states[name] = {"links": links, "contacts": [*marks, *forces]}
+        own = _hand(hand, X_TO, row["X_OG"], row["closed_q"]) or []
+        forces = _contacts("force", row, "closed_", X_TO)
+        states["dataset's grasp"] = {"links": own, "contacts": [*marks, *forces]}
+        return make_scene(self.snapshot, int(self.objects[i]), X_TO, states, hand)
+
+
+def result_file(path: Path) -> Path:
+    """Return the HDF5 file of the name that `--out` was given, or of that of its JSON lines."""
+    beside = path.with_suffix(".h5")
+    lines = path.suffix.lower() in (".jsonl", ".json") or not path.is_file()
+    return beside if lines and beside.is_file() else path
+
+
+def read_predictions(path: Path, read_at: Stamp, snapshot: Snapshot) -> Predictions:
+    """Return the predictions of a result file beside a state of the dataset.
+
+    Args:
+        path: The file.
+        read_at: Its stamp.
+        snapshot: State of the dataset.
+
+    Raises:
+        DataError: If the file cannot be read, or is not of this dataset.
+    """
+    with opened(path, "a result file of drakegrasp verify") as file:
+        group = file.get(GROUP)
+        if not isinstance(group, h5py.Group) or not all(name in group for name in NEEDED):
+            raise DataError(f"{path}: must be a result file of drakegrasp verify, got another")
+        refuse_other_schema(path, file.attrs.get("schema_version"))
+        count = len(group["outcome"])
+        refuse_first(path, _mistakes(group, count))
+        rows = _matched(path, file, snapshot, group["object"].asstr()[:].tolist())
+        outcome = read_codes(group["outcome"], list(Outcome))
+
+        # What the words and numbers are made of.
+        told = [name for name in VERDICTS if name in group and name != "held"]
+        words = {name: group[name][:] for name in told}
+        values = {name: group[name][:] if name in group else None for name in _MEASURED}
+        p_OQ = group["p_OQ"][:]
+    held = outcome == Outcome.SUCCESS
+    true = snapshot.trials[rows.trial_id.tolist()]["closed_p_OQ"]
+    # Another hand may have another number of fingers.
+    apart = norm(p_OQ - true) if p_OQ.shape == true.shape else None
+    features = {name: _largest(values[column], count) for column, name in _MEASURED.items()}
+    features["true_error"] = _largest(apart, count)
+    return Predictions(
+        path=path,
+        stamp=read_at,
+        snapshot=snapshot,
+        rows=rows,
+        outcome=outcome,
+        words={"fails": ~held, "held": held, **words},
+        features=features,
+    )
+
+
+def _matched(path: Path, file: h5py.File, snapshot: Snapshot, names: list[str]) -> PredictedRows:
+    """Return the rows of the dataset that a result file is for.
+
+    Raises:
+        DataError: If it does not say so, or they are those of another dataset.
+    """
+    again = "give the predictions to drakegrasp verify --dataset again"
+    rows = read_predicted_rows(file)
+    if rows is None:
+        raise DataError(f"{path}: must say which rows of a dataset it is for, got none; {again}")
+    if not snapshot.assembled or rows.shards != snapshot.trials.attributes.get("shards"):
+        raise DataError(f"{path}: must be for {snapshot.out} as it is now, got another; {again}")
+
+    # Rows that exist, of the objects that the verdicts name.
+    ids = rows.trial_id
+    there = len(ids) == len(rows.row) == len(names) and bool(
+        ((ids >= 0) & (ids < len(snapshot.table))).all()
+    )
+    if not there or [snapshot.names[k] for k in snapshot.table.object[ids]] != names:
+        raise DataError(f"{path}: must be for rows of {snapshot.out}, got others; {again}")
+    return rows
+
+
+def _mistakes(group: h5py.Group, count: int) -> list[Difference]:
+    """Return what is wrong with the types and shapes of the fields that are there."""
+    shape = group["p_OQ"].shape
+    sizes = {"k": shape[1] if len(shape) == 3 else 0, "j": 0}
+    if isinstance(joints := group.get("closed_q"), h5py.Dataset) and joints.ndim == 2:
+        sizes["j"] = joints.shape[1]
+    mistakes = []
+    for name in FIELDS.keys() & group.keys():
+        field, found = FIELDS[name], group[name]
+        text = field.dtype == "str"
+        right = isinstance(found, h5py.Dataset) and (
+            found.shape == (count, *field.row_shape(sizes))
+            and (h5py.check_string_dtype(found.dtype) is not None) == text
+            and (text or found.dtype.kind == np.dtype(field.dtype).kind)
+        )
+        if not right:
+            got = getattr(found, "shape", "a group")
+            must = f"{GROUP}/{name} must be (n, {field.shape}) of {field.dtype}"
+            mistakes.append(Difference(what=must, got=str(got)))
+    return mistakes
+
+
+def _column(group: h5py.Group, field: Field, rows: npt.NDArray[np.int64]) -> Any:
+    """Return rows of a field; None if the file lacks it."""
+    if field.name not in group:
+        return None
+    column = group[field.name]
+    return (column.asstr(errors="replace") if field.dtype == "str" else column)[rows]
+
+
+def _largest(values: Any, count: int = 1) -> Array:
+    """Return the largest value (n,) of each row; NaN where it has none."""
+    if values is None:
+        return np.full(count, np.nan)
+    flat = np.asarray(values, dtype=np.float64).reshape(count, -1)
+    return np.asarray(np.fmax.reduce(flat, axis=1, initial=np.nan))
+
+
+def _outcome(outcome: int) -> str:
+    return Outcome(int(outcome)).label.replace("_", " ")
+
+
+def _window(
+    marks: Mapping[str, list[Dot]], size: int, *, wide: bool = False
+) -> tuple[float, float, float]:
+    """Return the square of an image that shows its marks: left, top, and width [px].
+
+    Args:
+        marks: By kind.
+        size: Width of the image [px].
+        wide: Whether to show the whole image.
+    """
+    dots = [(dot.u, dot.v) for of_kind in marks.values() for dot in of_kind]
+    if wide or not dots:
+        return -0.5, -0.5, float(size)
+    low, high = np.min(dots, axis=0), np.max(dots, axis=0)
+    width = min(max(LOOSE * float((high - low).max()), LEAST_SHOWN * size), float(size))
+    left, top = np.clip((low + high - width) / 2.0, -0.5, size - width - 0.5).tolist()
+    return left, top, width
+
+
+def _fingers(verdict: Mapping[str, Any], row: Mapping[str, Any]) -> list[list[str]]:
+    """Return the distances and forces of each finger as text."""
+    asked, reached, true = verdict["p_OQ"], verdict["closed_p_OQ"], row["closed_p_OQ"]
+    count = len(asked)
+    columns = [
+        (1e3, _lengths(None if reached is None else asked - reached)),
+        (1e3, _lengths(asked - true) if true.shape == asked.shape else None),
+        (1e3, verdict["surface_distance"]),
+        (1.0, _lengths(verdict["closed_f_Q_O"])),
+        (1.0, _lengths(row["closed_f_Q_O"])),
+    ]
+    known = [np.full(count, np.nan) if v is None else factor * v for factor, v in columns]
+    return [[f"{v[k]:.1f}" if np.isfinite(v[k]) else "–" for v in known] for k in range(count)]
+
+
+def _lengths(vectors: Array | None) -> Array | None:
+    return None if vectors is None else np.linalg.norm(vectors, axis=-1)
+
+
+def _hand(
+    hand: HandView, X_TO: Array, X_OG: Array | None, q: Array | None
+) -> list[list[float]] | None:
+    """Return the poses of the links; None if the trial did not get so far."""
+    if X_OG is None or q is None or not (np.isfinite(X_OG).all() and np.isfinite(q).all()):
+        return None
+    return hand.poses(multiply(X_TO, unpack_pose(X_OG)), q, 0.0)
+
+
+def _contacts(kind: str, source: Mapping[str, Any], when: str, X_TO: Array) -> list[dict[str, Any]]:
+    """Return the contacts of a kind; those of the kind `force` with their forces."""
+    points, normals, forces = (source.get(f"{when}{n}") for n in ("p_OQ", "nhat_Q_O", "f_Q_O"))
+    if kind != "force" and points is not None:
+        forces = np.zeros_like(points)
+    if points is None or normals is None or forces is None:
+        return []
+    return [{"kind": kind, **c} for c in contacts_in_table(points, normals, forces, X_TO)]

@@ -1,0 +1,284 @@
+"""Scenes to train on, on the page: the scenes.hdf5 of a dataset beside its other files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.dataset.opening import refuse_other_codes
+from drakegrasp.dataset.scenes.reader import SceneDataset
+from drakegrasp.dataset.scenes.rows import refuse_other_state
+from drakegrasp.dataset.schema import SPLITS, VIEW_KINDS, Shown
+from drakegrasp.dataset.trial_files import Stamp
+from drakegrasp.errors import DataError
+from drakegrasp.frames import unpack_pose
+from drakegrasp.outcomes import Outcome
+from drakegrasp.page.catalog import Snapshot
+from drakegrasp.page.gallery import Gallery, Places, Query
+from drakegrasp.page.looks import ARROW, HandView, contacts_in_table, dots_of, make_scene
+from drakegrasp.pictures.style import REACHED, TRUE
+
+Rows = npt.NDArray[np.int64]
+#: Palms that the 3D view shows, and how many of these with the hand; lines of the table.
+PALMS, HANDS, LINES = 100, 8, 100
+#: Length of the line along +Gz from a palm's origin on an image [m].
+PALM = 0.06
+#: What the label of a grasp says of it: the word, its look, and the colour of its palm.
+HOLDS, FAILS, UNKNOWN = (
+    ("holds", "held", TRUE),
+    ("fails", "failed", REACHED),
+    ("not tested", "", "#F0E442"),
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scenes(Gallery):
+    """All scenes of a dataset.
+
+    Attributes:
+        snapshot: State of the other files.
+        data: All tables, and the images of all views.
+    """
+
+    HOME, ROW, NOUN = "/scenes", "scene", "scene"
+    CHOICES: ClassVar = {"split": SPLITS}
+    SELECTS: ClassVar = {name: name for name in ("class", "object", "split")}
+    SORTS: ClassVar = {
+        "sample": "samples",
+        "held": "grasps that hold",
+        "tested": "tested grasps",
+        "grasps": "grasps",
+        "row": "row of the file",
+    }
+
+    snapshot: Snapshot
+    data: SceneDataset
+
+    @cached_property
+    def objects(self) -> npt.NDArray[np.int32]:
+        """Numbers (n,) of the objects in the snapshot."""
+        known = {name: number for number, name in enumerate(self.snapshot.names)}
+        numbers = np.array([known[name] for name in self.data.names], dtype=np.int32)
+        return numbers[self.data.tables["scenes"]["object"][:, 0]]
+
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        """Of each scene for addresses: the code of its object, and the resting pose."""
+        resting = self.data.tables["scenes"]["resting"][:, 0].tolist()
+        codes = (self.snapshot.codes[number] for number in self.objects.tolist())
+        return tuple(f"{code}-{pose}" for code, pose in zip(codes, resting, strict=True))
+
+    @cached_property
+    def counts(self) -> Mapping[str, Rows]:
+        """(n,) each: how many grasps there are, are tested, held, samples; and the views."""
+        tables, count = self.data.tables, len(self.objects)
+        grasps = tables["grasps"]
+        of = {name: grasps["scene"][grasps[name]] for name in ("sample", "held", "tested")}
+        of |= {"grasps": grasps["scene"], "views": tables["views"]["scene"]}
+        return {name: np.bincount(rows, minlength=count) for name, rows in of.items()}
+
+    def column(self, name: str) -> Rows:
+        """Return the values (n,) of an order."""
+        return np.arange(len(self.objects)) if name == "row" else self.counts[name]
+
+    def matches(self, name: str, value: str) -> npt.NDArray[np.bool_]:
+        """Return which scenes (n,) are of a split."""
+        return np.asarray(self.data.tables["scenes"]["split"] == SPLITS.index(value))
+
+    def options(self, name: str) -> Mapping[str, str]:
+        """Return what the form offers: splits that occur."""
+        splits = np.unique(self.data.tables["scenes"]["split"])
+        return {SPLITS[number]: SPLITS[number] for number in splits}
+
+    def label(self, i: int) -> str:
+        """Return the name of a scene in addresses."""
+        return self.labels[i]
+
+    def find(self, label: str) -> int | None:
+        """Return the number of the scene of a label, or None if there is none."""
+        return self.labels.index(label) if label in self.labels else None
+
+    def views(self, scene: int) -> Rows:
+        """Return the rows of a scene's views."""
+        return np.flatnonzero(self.data.tables["views"]["scene"] == scene)
+
+    def grasps(self, scene: int) -> Rows:
+        """Return the rows of a scene's grasps: samples, others that hold, that fail, untested."""
+        grasps, rows = self.data.tables["grasps"], self.data.rows_in(scene)
+        sample, held, tested = (grasps[name][rows] for name in ("sample", "held", "tested"))
+        return rows[np.argsort(-(4 * sample + 2 * held + 1 * tested), kind="stable")]
+
+    # What pages say.
+
+    def identity(self, i: int) -> dict[str, Any]:
+        """Return how people name a scene, and how many grasps it has."""
+        table = self.data.tables["scenes"]
+        return {
+            **super().identity(i),
+            "resting": int(table["resting"][i, 0]),
+            "split": SPLITS[table["split"][i]],
+            "counts": {name: int(values[i]) for name, values in self.counts.items()},
+        }
+
+    def summary(self, query: Query, chosen: Places) -> dict[str, Any]:
+        """Return what the gallery says besides its cards."""
+        out = self.snapshot.out
+        views = int(self.counts["views"][chosen].sum())
+        return {"title": out.name or str(out), "views": views}
+
+    def cards(self, shown: Places) -> list[dict[str, Any]]:
+        """Return what the cards of scenes say, with the views that see their grasps best."""
+        cards = []
+        for i in shown.tolist():
+            drawn, best = self._drawn(i), 0
+            if drawn is not None and len(self.views(i)):
+                best = int(np.argmax(self._visible(i, np.array([drawn])).sum(axis=(1, 2))))
+            cards.append({"view": self._seen(i, best, drawn) if len(self.views(i)) else None})
+        return cards
+
+    def values(self, i: int) -> dict[str, str]:
+        """Return what a page without a server filters and sorts a scene by."""
+        split = SPLITS[self.data.tables["scenes"]["split"][i]]
+        counts = {name: f"{values[i]}" for name, values in self.counts.items()}
+        return {"split": split, **counts, "row": f"{i}"}
+
+    def row(self, i: int, hand: HandView) -> dict[str, Any]:
+        """Return what the page of a scene says."""
+        grasps, drawn = self.grasps(i), self._drawn(i)
+        trials = self.data.tables["grasps"]["trial_id"]
+        return {
+            "drawn": None if drawn is None else int(trials[drawn]),
+            "views": [self._seen(i, k, drawn) for k in range(len(self.views(i)))],
+            "grasps": self._lines(i, grasps[:LINES]),
+            "more": max(0, len(grasps) - LINES),
+            "facts": self._facts(i),
+            "looks": [HOLDS, FAILS, UNKNOWN],
+            "scene": self._scene(i, grasps, hand),
+        }
+
+    def _drawn(self, i: int) -> int | None:
+        """Return the row of the grasp that is drawn into the views: the best, if it holds."""
+        grasps, held = self.grasps(i), self.data.tables["grasps"]["held"]
+        return int(grasps[0]) if len(grasps) and held[grasps[0]] else None
+
+    def _seen(self, i: int, k: int, drawn: int | None) -> dict[str, Any]:
+        """Return a view of a scene, the k-th, and where it sees a grasp's palm and contacts."""
+        view = int(self.views(i)[k])
+        dots, palm = [], []
+        if drawn is not None:
+            grasps, row = self.data.grasps_in(view, frame="camera"), drawn - self.data.rows_in(i)[0]
+            K = self.data.tables["views"]["K"][view].reshape(3, 3)
+            p_CQ, nhat, X_CG = (
+                grasps[name][row].astype(float) for name in ("p_AQ", "nhat_Q_A", "X_AG")
+            )
+            visible, near = grasps["visible"][row], self.data.near
+            dots = dots_of(K, p_CQ, nhat, near, lambda finger, u, v: not visible[finger])
+            # A dot with a line, too, in the place of a contact.
+            along = PALM / ARROW * X_CG[None, :3, 2]
+            palm = dots_of(K, X_CG[None, :3, 3], along, near, lambda finger, u, v: False)
+        return {
+            "href": f"/view/{self.labels[i]}-{k}.png",
+            "size": self.data.image_size,
+            "kind": VIEW_KINDS[self.data.tables["views"]["kind"][view]],
+            "dots": [dot for dot in dots if np.isfinite(dot).all()],
+            "palm": [dot for dot in palm if np.isfinite(dot).all()],
+        }
+
+    def _visible(self, i: int, grasps: Rows) -> npt.NDArray[np.bool_]:
+        """Return which views (v,) see the contacts (v, g, k) of some of its grasps (g,)."""
+        places, views = grasps - self.data.rows_in(i)[:1], self.views(i).tolist()
+        return np.array([self.data.visible_in(view)[places] for view in views])
+
+    def _lines(self, i: int, grasps: Rows) -> list[dict[str, Any]]:
+        """Return the lines of the table of grasps."""
+        table, lines = self.data.tables["grasps"], []
+        seen = self._visible(i, grasps).sum(axis=0) if len(grasps) else np.zeros((0, 0))
+        for row, views in zip(grasps.tolist(), seen.tolist(), strict=True):
+            trial, sample = int(table["trial_id"][row]), table["sample"][row]
+            # As on the pages of grasps: how it holds, else why it does not.
+            words = [name for name in ("stable", "precision", "held") if table[name][row]][:1]
+            words = words or [Outcome(int(table["outcome"][row])).label.replace("_", " ")]
+            lines.append(
+                {
+                    "trial": trial,
+                    "href": f"/grasp/{self.snapshot.label(trial)}",
+                    "holds": self._holds(row),
+                    "outcome": ", ".join([*words, *["sample"] * bool(sample)]),
+                    "weight": f"{float(table['weight'][row]):.2f}" if sample else "–",
+                    "seen": views,
+                }
+            )
+        return lines
+
+    def _holds(self, row: int) -> tuple[str, str, str]:
+        """Return what the labels of a grasp say of it: HOLDS, FAILS or UNKNOWN."""
+        table = self.data.tables["grasps"]
+        if table["held"][row]:
+            return HOLDS
+        return FAILS if table["tested"][row] else UNKNOWN
+
+    def _facts(self, i: int) -> list[tuple[str, str]]:
+        """Return lines of name and value of what lies on the table."""
+        values = {name: column[i] for name, column in self.data.tables["scenes"].items()}
+        x, y = unpack_pose(values["X_TO"][0])[:2, 3]
+        return [
+            ("mass", Shown("", "kg", 3).text(values["mass"][0])),
+            ("friction with the hand", f"{values['friction_hand'][0]:.3f}"),
+            ("friction with the table", f"{values['friction_table'][0]:.3f}"),
+            ("share of the drops that end so", f"{100.0 * values['probability'][0]:.0f} %"),
+            ("place on the table", f"({1e3 * x:.0f}, {1e3 * y:.0f}) mm"),
+        ]
+
+    def _scene(self, i: int, grasps: Rows, hand: HandView) -> dict[str, Any]:
+        """Return the 3D view: the hands of the best grasps, and more palms, in {T}."""
+        table = self.data.tables["grasps"]
+        X_TO = unpack_pose(self.data.tables["scenes"]["X_TO"][i, 0])
+        X_TG = unpack_pose(table["X_TG"][grasps].astype(float))
+        known = np.isfinite(X_TG).all(axis=(1, 2)) & np.isfinite(table["q"][grasps]).all(axis=1)
+
+        # The hands of the best ones, with their contacts; the palms of more.
+        states, palms, rows = {}, [], grasps[known][:PALMS].tolist()
+        for k, (row, X) in enumerate(zip(rows, X_TG[known], strict=False)):
+            if k < HANDS:
+                points, normals, forces = (
+                    table[name][row].astype(float) for name in ("p_TQ", "nhat_Q_T", "f_Q_T")
+                )
+                states[f"trial {table['trial_id'][row]}"] = {
+                    "links": hand.poses(X, table["q"][row].astype(float), 0.0),
+                    "contacts": contacts_in_table(points, normals, forces, np.eye(4)),
+                }
+            colour = self._holds(row)[2]
+            palms.append({"p": X[:3, 3].tolist(), "z": X[:3, 2].tolist(), "colour": colour})
+        states = states or {"no grasp": {"links": [], "contacts": []}}
+        scene = make_scene(self.snapshot, int(self.objects[i]), X_TO, states, hand)
+        return scene | {"palms": palms}
+
+
+def read_scenes(path: Path, read_at: Stamp, snapshot: Snapshot) -> Scenes:
+    """Return the scenes of a file beside a state of the dataset.
+
+    Args:
+        path: The file.
+        read_at: Its stamp.
+        snapshot: State of the dataset.
+
+    Raises:
+        DataError: If the file cannot be read, or is not of this dataset.
+    """
+    refuse_other_state(path, snapshot.trials)
+    data = SceneDataset(path, points=None)
+    grasps, views = data.tables["grasps"], data.tables["views"]
+    refuse_other_codes(path, "/grasps/outcome", grasps["outcome"], list(Outcome))
+    refuse_other_codes(path, "/grasps/trial_id", grasps["trial_id"], len(snapshot.table))
+    refuse_other_codes(path, "/views/kind", views["kind"], len(VIEW_KINDS))
+    if not np.isfinite(data.tables["scenes"]["X_TO"]).all():
+        raise DataError(f"{path}: /scenes/X_TO must be finite, got other numbers")
+    if others := set(data.names) - set(snapshot.names):
+        raise DataError(f"{path}: must be of objects of {snapshot.out}, got {min(others)}")
+    return Scenes(snapshot=snapshot, data=data)

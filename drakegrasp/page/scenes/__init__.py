@@ -1,1 +1,0 @@
-"""Scenes on the page: views by cameras that know no grasp, and the hands that closed in them."""

@@ -1,0 +1,269 @@
+"""Plots of numbers: of a whole dataset, and of a score card.
+
+In: counts and columns, or a card as `scoring.card` makes it. Out: figures. Names are drawn as they
+are: a dollar sign starts no formula.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from drakegrasp.frames import Array
+from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.pictures.style import INK, PREDICTED, png_bytes, shortened
+
+#: Colours of grasps that are held, precision and stable (Okabe and Ito), and of failures.
+HELD, PRECISION, STABLE, FAILED = "#E69F00", "#56B4E9", "#009E73", "#9AA0A8"
+GROUPS = {"held": HELD, "precision": PRECISION, "stable": STABLE}
+#: Objects in a plot, at most: those with the most grasps.
+MAX_OBJECTS = 60
+#: Bins of a histogram, and the share of the values that it shows: a few wild ones squeeze the rest.
+BINS, SHOWN = 40, 0.98
+#: Colours of the reference rows (Okabe and Ito: safe for the colour-blind); predictions are blue.
+_COLOURS = ("#000000", "#D55E00", "#999999", "#B9B9B9", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+#: Of predictions in the order of their sets.
+_OWN = (PREDICTED, "#56B4E9")
+#: Longest name of a set in the picture [characters].
+LONGEST = 28
+#: Width that the caption needs [in].
+NARROWEST = 7.6
+
+
+def draw_codes(
+    counts: Sequence[int] | npt.NDArray[np.int64], first: Outcome | Removal, what: str
+) -> tuple[Figure, dict[str, int]]:
+    """Return how many there are of each code that occurs, as bars and as numbers.
+
+    Args:
+        counts: By the codes.
+        first: The code that is wanted.
+        what: What is counted, e.g. "attempts".
+    """
+    shown = [code for code in type(first) if counts[code] or code is first]
+    shown.sort(key=lambda code: (code is not first, -counts[code]))
+    names = {code: "samples" if code is Removal.KEPT else code.label for code in shown}
+    numbers = {names[code]: int(counts[code]) for code in shown}
+    return draw_counts(numbers, what), numbers
+
+
+def draw_counts(
+    counts: Mapping[str, int], what: str, *, colours: Sequence[str] | None = None
+) -> Figure:
+    """Return how many there are of each kind, as bars on a logarithmic scale.
+
+    Args:
+        counts: Numbers by kind, in the order of the bars; the first is the one that is wanted.
+        what: What is counted, e.g. "attempts".
+        colours: Of the bars; that of the first is another if None.
+    """
+    names, numbers = list(counts), np.array(list(counts.values()))
+    figure = Figure(figsize=(8.0, 0.9 + 0.3 * len(names)), layout="constrained")
+    axes = figure.add_subplot()
+    colours = colours or [STABLE if i == 0 else FAILED for i in range(len(names))]
+    bars = axes.barh(range(len(names)), np.maximum(numbers, 0.8), color=colours, height=0.72)
+    axes.bar_label(bars, [f"{n:,}" for n in numbers], padding=3, color=INK, fontsize=9)
+    _name_bars(axes, [name.replace("_", " ") for name in names])
+    axes.set_xscale("log")
+    axes.set_xlim(0.8, 6.0 * max(10, numbers.max(initial=0)))
+    axes.set_xlabel(what)
+    return figure
+
+
+def draw_objects(names: Sequence[str], counts: Mapping[str, Sequence[int]]) -> Figure:
+    """Return how many grasps each object has, and how well they hold.
+
+    Args:
+        names: Of the objects.
+        counts: Numbers of grasps by object that are `held`, `precision` and `stable`; each is a
+            part of the one before.
+    """
+    # The objects with the most grasps, the largest on top.
+    held = np.array(counts["held"], dtype=int)
+    order = np.argsort(-held, kind="stable")[:MAX_OBJECTS]
+    figure = Figure(figsize=(8.0, 1.1 + 0.22 * max(len(order), 1)), layout="constrained")
+    axes = figure.add_subplot()
+
+    # Bars over one another: stable are precision, and precision are held.
+    for group, colour in GROUPS.items():
+        numbers = np.array(counts[group], dtype=int)[order]
+        axes.barh(range(len(order)), numbers, color=colour, height=0.78, label=group)
+    _name_bars(axes, [names[i] for i in order])
+    axes.set_xlabel("grasps")
+    figure.legend(
+        loc="outside upper center", ncols=3, frameon=False, labelcolor=INK, title=_left_out(names)
+    )
+    return figure
+
+
+def draw_distributions(
+    quantities: Sequence[tuple[str, Array]], groups: Mapping[str, Array]
+) -> Figure:
+    """Return histograms of quantities of the held grasps, one panel each.
+
+    A panel ends where all but 2 % of the values are; what is beyond is counted in its last bin.
+
+    Args:
+        quantities: Title with unit, and values (n,) of all held grasps.
+        groups: Which (n,) of them are in each group, by the names of GROUPS.
+    """
+    columns = 2
+    rows = -(-len(quantities) // columns)
+    figure = Figure(figsize=(8.0, 2.0 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in panels[len(quantities) :]:
+        axes.set_visible(False)
+    for axes, (title, values) in zip(panels, quantities, strict=False):
+        _histogram(axes, title, values, groups)
+    figure.supylabel("grasps", fontsize="medium", color=INK)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
+    return figure
+
+
+def _histogram(axes: Axes, title: str, values: Array, groups: Mapping[str, Array]) -> None:
+    """Draw the histogram of one quantity, a colour per group."""
+    finite = values[np.isfinite(values)]
+    end = float(np.quantile(finite, SHOWN)) if len(finite) else 1.0
+    edges = np.linspace(0.0, end if end > 0.0 else 1.0, BINS + 1)
+    for group, members in groups.items():
+        shown = np.minimum(values[members & np.isfinite(values)], edges[-1])
+        counts, _ = np.histogram(shown, edges)
+        axes.stairs(counts, edges, fill=True, color=GROUPS[group], label=group)
+    axes.set_xlabel(title)
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
+    _plain(axes)
+
+
+def _name_bars(axes: Axes, names: Sequence[str]) -> None:
+    """Name horizontal bars, the first on top."""
+    axes.set_yticks(range(len(names)))
+    axes.set_yticklabels([name.replace("$", r"\$") for name in names], fontsize=9)
+    axes.invert_yaxis()
+    _plain(axes)
+
+
+def _plain(axes: Axes) -> None:
+    """Remove what says nothing from axes."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(color=INK, labelcolor=INK, labelsize=9)
+    axes.xaxis.label.set_color(INK)
+
+
+def _left_out(names: Sequence[str]) -> str | None:
+    """Return how many objects a plot leaves out, in words."""
+    more = len(names) - MAX_OBJECTS
+    return f"{more:,} objects with fewer are left out" if more > 0 else None
+
+
+def card_picture(card: Mapping[str, Any], *, dpi: int = 150) -> bytes:
+    """Return a card as PNG, at a resolution [pixels per inch]."""
+    calibrated = {n: s["calibration"] for n, s in card["sets"].items() if s["calibration"]}
+    protocol = card["settings"].get("protocol")
+    columns = 1 + (protocol is None) + bool(calibrated)
+    size = (max(4.6 * columns, NARROWEST), 1.6 + 0.36 * max(len(card["sets"]), 6))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(1, columns, squeeze=False)[0]
+    colours = _colours(card)
+
+    _draw_headline(axes[0], card, colours)
+    if protocol is None:
+        _draw_curves(axes[1], card, colours)
+    if calibrated:
+        _draw_calibration(axes[-1], calibrated, colours)
+    for panel in axes:
+        for side in ("top", "right"):
+            panel.spines[side].set_visible(False)
+        panel.tick_params(colors=INK)
+    _caption(figure, card)
+
+    return png_bytes(figure, dpi=dpi)
+
+
+def _colours(card: Mapping[str, Any]) -> dict[str, str]:
+    """Return the colour of each set."""
+    own, references = iter(_OWN * len(card["sets"])), iter(_COLOURS * len(card["sets"]))
+    return {name: next(own if name in card["headline"] else references) for name in card["sets"]}
+
+
+def _draw_headline(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, str]) -> None:
+    """Draw the headline of each set with its interval, and what is held beside it."""
+    for i, (name, each) in enumerate(card["sets"].items()):
+        value, low, high = (100.0 * each["measures"]["headline"][k] for k in _ENDS)
+        axes.plot([low, high], [i, i], color=colours[name], linewidth=2.2, solid_capstyle="round")
+        axes.plot(value, i, "o", color=colours[name], markersize=7)
+        if "held" in card["measures"]:
+            held = 100.0 * each["measures"]["held"]["value"]
+            axes.plot(held, i, "|", color=colours[name], markersize=11, markeredgewidth=1.4)
+
+    # The names of the sets, in their colours.
+    axes.set_yticks(range(len(card["sets"])), [shortened(name, LONGEST) for name in card["sets"]])
+    for label, name in zip(axes.get_yticklabels(), card["sets"], strict=True):
+        label.set_color(colours[name])
+    axes.set_ylim(len(card["sets"]) - 0.5, -0.5)
+    axes.set_xlim(-2.0, 102.0)
+    axes.grid(axis="x", color="#E3E6EA")
+    axes.set_axisbelow(True)
+    axes.set_xlabel("per cent of rows, mean over objects", color=INK)
+    protocol = card["settings"].get("protocol")
+    title = f"Sample within {card['limit_mm']:g} mm, 95 % interval\n(tick: held anywhere)"
+    if protocol is not None:
+        title = f"Success by {protocol['protocol']}, 95 % interval"
+    axes.set_title(title, fontsize="medium", color=INK)
+
+
+_ENDS = ("value", "low", "high")
+
+
+def _draw_curves(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, str]) -> None:
+    """Draw held(d) of each set, in the colour of its name in the first panel."""
+    for name, each in card["sets"].items():
+        curve = each["held_within_mm"]
+        values = [100.0 * share for share in curve.values()]
+        wide = 2.4 if name in card["headline"] else 1.5
+        limits = [float(d) for d in curve]
+        axes.plot(limits, values, color=colours[name], linewidth=wide)
+    axes.axvline(card["limit_mm"], color=INK, linewidth=0.8, linestyle=":")
+    axes.set_xlim(0.0, max(float(d) for d in curve))
+    axes.set_ylim(-2.0, 102.0)
+    axes.grid(color="#E3E6EA")
+    axes.set_axisbelow(True)
+    axes.set_xlabel("d: farthest contact from the one asked for [mm]", color=INK)
+    axes.set_title("held(d) [%]", fontsize="medium", color=INK)
+
+
+def _draw_calibration(
+    axes: Axes, groups: Mapping[str, Sequence[Mapping[str, float]]], colours: Mapping[str, str]
+) -> None:
+    """Draw the share that counts against the stated confidence."""
+    for name, each in groups.items():
+        stated = [group["confidence"] for group in each]
+        shares = [100.0 * group["share"] for group in each]
+        axes.plot(stated, shares, "o-", color=colours[name])
+        if min(stated) >= 0.0 and max(stated) <= 1.0:
+            axes.plot([0.0, 1.0], [0.0, 100.0], color=INK, linewidth=0.8, linestyle=":")
+    axes.set_ylim(-2.0, 102.0)
+    axes.grid(color="#E3E6EA")
+    axes.set_axisbelow(True)
+    axes.set_xlabel("stated confidence, five groups", color=INK)
+    axes.set_title("share that counts [%]", fontsize="medium", color=INK)
+
+
+def _caption(figure: Figure, card: Mapping[str, Any]) -> None:
+    """Write what was scored under the picture."""
+    where, protocol = card["dataset"], card["settings"].get("protocol")
+    simulator = f"Drake {card['settings']['versions']['drake']}"
+    if protocol is not None:
+        simulator = f"MuJoCo {protocol['versions']['mujoco']}"
+    text = (
+        f"{card['rows']} rows, {card['objects']} objects, {card['classes']} classes of "
+        f"{where['file']} ({where['split']}, {where['rows_sha256'][:8]}); "
+        f"drakegrasp {card['settings']['versions']['drakegrasp']}, {simulator}"
+    )
+    figure.supxlabel(text, fontsize="small", color=INK)
