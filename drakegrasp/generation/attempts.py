@@ -35,7 +35,7 @@ from drakegrasp.simulation.sampling.centring import centred
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes
 from drakegrasp.simulation.screen import Prediction, predict
-from drakegrasp.simulation.trial import TrialRecord, run_attempt
+from drakegrasp.simulation.trial import TrialRecord, lift_on, run_attempt
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
 from drakegrasp.vision.depth_sensor import spoil_depth
 from drakegrasp.vision.rendering import Renderer, paint, render
@@ -197,11 +197,24 @@ def try_attempt(
     record = run_attempt(
         setup.scene_of(attempt), X_TO, attempt, setup.config, prediction, is_visible=is_visible
     )
+    _replace_failed(setup, record)
+    return record
+
+
+def lift_scraped(setup: TrialSetup, attempt: Attempt, record: TrialRecord) -> TrialRecord:
+    """Lift the hand of `try_attempt`, which only scraped the table; see `lift_on`."""
+    is_visible = partial(_is_visible, setup, attempt, record.X_TO)
+    lifted = lift_on(setup.scene_of(attempt), record, attempt, setup.config, is_visible=is_visible)
+    _replace_failed(setup, lifted)
+    return lifted
+
+
+def _replace_failed(setup: TrialSetup, record: TrialRecord) -> None:
+    """Replace the scene if Drake failed in it."""
     if record.outcome is Outcome.SOLVER_ERROR:
         forget_scenes()
         config = setup.config
         setup.scene = cached_scene(setup.prepared.model, config.physics, config.hand_source)
-    return record
 
 
 def _is_visible(setup: TrialSetup, attempt: Attempt, X_TO: Array) -> bool:

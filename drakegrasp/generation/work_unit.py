@@ -27,6 +27,7 @@ from drakegrasp.dataset.shards import Shard, ShardHeader, read_trials, write_sha
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.generation.attempts import (
     TrialSetup,
+    lift_scraped,
     list_attempts,
     list_children,
     measure_contacts,
@@ -37,7 +38,6 @@ from drakegrasp.generation.attempts import (
 )
 from drakegrasp.generation.columns import empty_looks, fill_look, judge_sample, trial_rows
 from drakegrasp.generation.target import has_target
-from drakegrasp.hand.description import Hand
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.runtime.environment import one_thread, timed, trim_memory
 from drakegrasp.runtime.files import disk_full_named
@@ -54,8 +54,7 @@ from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.robustness import Certificate, certify, is_drawn
 from drakegrasp.simulation.scene_cache import cached_scene
 from drakegrasp.simulation.screen import Prediction
-from drakegrasp.simulation.trial import TrialRecord
-from drakegrasp.simulation.verdict import judge_closed
+from drakegrasp.simulation.trial import TrialRecord, has_only_scraped
 from drakegrasp.table import AnyArray, Table
 
 #: An attempt that takes this many times its limit of computing time hangs: it never looks at it.
@@ -166,16 +165,19 @@ def _run_experiment(unit: WorkUnit, journal: Journal) -> UnitSummary:
 
     # Run the attempts, then those about the samples among them, and so on.
     rounds = list[_Round]()
+    refines = unit.refined and config.refine.children > 0
     while attempts:
         first = sum(len(done.attempts) for done in rounds)
-        rounds.append(_run_round(setup, attempts, first, journal, seconds))
+        has_children = refines and len(rounds) < config.refine.generations
+        done = _run_round(setup, attempts, first, journal, seconds, has_children=has_children)
+        rounds.append(done)
         if config.certified:
             with timed(seconds, "certify"):
-                _certify_lifts(setup, rounds[-1], first, journal, likely_tested=unit.likely_tested)
+                _certify_lifts(setup, done, first, journal, likely_tested=unit.likely_tested)
         attempts = []
-        if unit.refined and config.refine.children:
+        if has_children:
             with timed(seconds, "try"):
-                attempts = _children(setup, rounds[-1], journal, first)
+                attempts = _children(setup, done)
 
     # Write the shard: all of it or nothing.
     with _stage(journal, "write", header.object_name, seconds):
@@ -194,10 +196,14 @@ def _run_experiment(unit: WorkUnit, journal: Journal) -> UnitSummary:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Round:
-    """Attempts of a unit, their records, and their columns of `/trials` and `/looks`."""
+    """Attempts of a unit, their records, and their columns of `/trials` and `/looks`.
+
+    In the rows `scraping` are hands that would be samples if they had not scraped the table.
+    """
 
     attempts: Sequence[Attempt]
     records: Sequence[TrialRecord]
+    scraping: Sequence[int]
     trials: dict[str, AnyArray]
     looks: dict[str, AnyArray]
 
@@ -208,12 +214,16 @@ def _run_round(
     first: int,
     journal: Journal,
     seconds: dict[str, float],
+    *,
+    has_children: bool,
 ) -> _Round:
     """Try attempts, the first of which is in row `first` of the unit; measure, render."""
     # Try each attempt: what geometry already decides is not simulated.
     with timed(seconds, "try"):
         predictions = _predict_all(setup, attempts, journal)
-        records = _try_all(setup, attempts, predictions, journal, first)
+        records, scraping = _try_all(
+            setup, attempts, predictions, journal, first, has_children=has_children
+        )
 
     # Measure how the contacts of each lift lie on the object's true surface.
     with _stage(journal, "measure", setup.prepared.model.name, seconds):
@@ -224,55 +234,19 @@ def _run_round(
         looks = render_successes(setup, attempts, records, journal, first)
 
     trials = trial_rows(setup, attempts, records, fits)
-    return _Round(attempts=attempts, records=records, trials=trials, looks=looks)
+    return _Round(attempts=attempts, records=records, scraping=scraping, trials=trials, looks=looks)
 
 
-def _children(setup: TrialSetup, done: _Round, journal: Journal, first: int) -> list[Attempt]:
+def _children(setup: TrialSetup, done: _Round) -> list[Attempt]:
     """Return attempts about each of a round that is a sample by the default filters.
 
     Or would be one if it did not scrape the table: most palm poses about such a one do not.
     """
-    parents = {*_samples(setup, done)}
-    for row, (attempt, record) in enumerate(zip(done.attempts, done.records, strict=True)):
-        if _only_scrapes(setup.scene_of(attempt).hand, record):
-            step = f"lift {first + row}"
-            if _is_sample_but_for_scraping(setup, attempt, journal, step):
-                parents.add(row)
     return [
         child
-        for row in sorted(parents)
+        for row in sorted({*_samples(setup, done), *done.scraping})
         for child in list_children(setup.prepared, done.attempts[row], setup.config)
     ]
-
-
-def _only_scrapes(hand: Hand, record: TrialRecord) -> bool:
-    """Return whether a hand would have been lifted if it had not scraped the table."""
-    if record.outcome is not Outcome.TABLE_CONTACT or record.closed is None or record.lift:
-        return False
-    contacts = record.closed.contacts
-    verdict = judge_closed(
-        contacts.touching,
-        contacts.other_links,
-        contacts.hand_on_table,
-        required=hand.required,
-    )
-    return bool(verdict == Outcome.SUCCESS)
-
-
-def _is_sample_but_for_scraping(
-    setup: TrialSetup, attempt: Attempt, journal: Journal, step: str
-) -> bool:
-    """Lift a hand that scrapes the table; return whether a trial alone shows it no sample."""
-    # If that ended its process, it costs the children.
-    if journal.verdict(step) is not None:
-        return False
-    close = setup.config.close.model_copy(update={"scrape_depth": None})
-    rules = setup.config.model_copy(update={"close": close, "filters": PARENT_FILTERS})
-    free = replace(setup, config=rules)
-    with journal.step(step, HANG_FACTOR * rules.attempt_seconds):
-        record = try_attempt(free, attempt)
-    setup.scene = free.scene  # one in which Drake failed was replaced
-    return judge_sample(setup.prepared.model, record, rules) is Removal.KEPT
 
 
 def _samples(setup: TrialSetup, done: _Round) -> list[int]:
@@ -370,19 +344,27 @@ def _try_all(
     predictions: Sequence[Prediction | None],
     journal: Journal,
     first: int,
-) -> list[TrialRecord]:
-    """Return the records of attempts in their order; the first is in row `first` of the unit.
+    *,
+    has_children: bool,
+) -> tuple[list[TrialRecord], list[int]]:
+    """Return the records of attempts in their order, and the rows of `_Round.scraping`.
 
-    Attempts in which an earlier process died, and that are not yet judged, run first: then a
-    failing one is found at once.
+    The first attempt is in row `first` of the unit. Attempts in which an earlier process died, and
+    that are not yet judged, run first: then a failing one is found at once. Hands that scrape are
+    lifted at once, while they are still closed, where a round has children.
     """
     steps = [f"{ATTEMPT} {first + row}" for row in range(len(attempts))]
     unresolved = set(journal.unresolved)
     order = sorted(range(len(attempts)), key=lambda row: steps[row] not in unresolved)
-    records = {
-        row: _try_step(setup, attempts[row], predictions[row], journal, steps[row]) for row in order
-    }
-    return [records[row] for row in range(len(attempts))]
+    records, scraping = dict[int, TrialRecord](), list[int]()
+    for row in order:
+        attempt = attempts[row]
+        records[row] = _try_step(setup, attempt, predictions[row], journal, steps[row])
+        if has_children and _only_scrapes(
+            setup, attempt, records[row], journal, f"lift {first + row}"
+        ):
+            scraping.append(row)
+    return [records[row] for row in range(len(attempts))], scraping
 
 
 def _try_step(
@@ -400,6 +382,21 @@ def _try_step(
     with journal.step(step, HANG_FACTOR * setup.config.attempt_seconds):
         inject_fault(setup.prepared.model.name, attempt.candidate, attempt.standoff_index)
         return try_attempt(setup, attempt, prediction)
+
+
+def _only_scrapes(
+    setup: TrialSetup, attempt: Attempt, record: TrialRecord, journal: Journal, step: str
+) -> bool:
+    """Return whether a trial shows no sample only because the hand scraped the table.
+
+    Whether it would be one is seen by lifting it. If that ended its process, it costs the children.
+    """
+    if not has_only_scraped(record) or journal.verdict(step) is not None:
+        return False
+    rules = setup.config.model_copy(update={"filters": PARENT_FILTERS})
+    with journal.step(step, HANG_FACTOR * rules.attempt_seconds):
+        lifted = lift_scraped(setup, attempt, record)
+    return judge_sample(setup.prepared.model, lifted, rules) is Removal.KEPT
 
 
 def _certify_lifts(

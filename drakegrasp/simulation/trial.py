@@ -206,35 +206,91 @@ def run_attempt(
         if verdict != Outcome.SUCCESS:
             return replace(record, outcome=Outcome(int(verdict)))
 
-        # Choose what is worth a lift, by what is known now; some are lifted all the same.
-        record = replace(record, chance=_chance(scene, X_TO, attempt, contacts))
-        if not attempt.audited and (record.chance < config.lift.least_chance or not is_visible()):
-            return replace(record, outcome=Outcome.NOT_LIFTED)
-
-        # Lift: object and wrist are free, and the wrist moves to its target.
-        end = lift(scene, limits, config)
-        record = replace(record, lift=end)
-
-        # Judge the lifted object: all fingertips must still hold it, clear of the table. A lift
-        # that was ended because the object moved has no such verdict.
-        if end.moved:
-            return replace(record, outcome=Outcome.MOVED)
-        contacts = end.contacts
-        verdict = judge_lifted(
-            contacts.touching,
-            contacts.other_links,
-            contacts.object_on_table,
-            required=required,
-            scraped=scrapes(end.clearance, config.close),
-        )
-        return replace(record, outcome=Outcome(int(verdict)))
-    except TrialTimeout:
-        return replace(start, outcome=Outcome.TIMEOUT)
-    except (MachineError, MemoryError, OSError):
-        raise  # the machine's failure, not the attempt's
+        return _lift_closed(scene, record, attempt, config, limits, is_visible)
     # A failed assertion within Drake arrives as SystemExit, everything else as RuntimeError.
     except (Exception, SystemExit) as error:
-        return replace(start, outcome=Outcome.SOLVER_ERROR, message=first_line(error))
+        return _failed(start, error)
+
+
+def has_only_scraped(record: TrialRecord) -> bool:
+    """Return whether a hand would have been lifted if it had not scraped the table."""
+    if record.outcome is not Outcome.TABLE_CONTACT or record.closed is None or record.lift:
+        return False
+    # Of all rules of the closed hand that of the table comes last.
+    touched = record.closed.contacts
+    return not touched.hand_on_table
+
+
+def lift_on(
+    scene: Scene,
+    record: TrialRecord,
+    attempt: Pregrasp,
+    config: Config,
+    *,
+    is_visible: Callable[[], bool] = lambda: True,
+) -> TrialRecord:
+    """Return the record of a hand that has only scraped as it would be without `scrape_depth`.
+
+    The hand is still closed in the scene: nothing else may have run there since `run_attempt`.
+
+    Args:
+        scene: That `run_attempt` was given.
+        record: What it returned, see `has_only_scraped`.
+        attempt: See `run_attempt`.
+        config: See `run_attempt`.
+        is_visible: See `run_attempt`.
+    """
+    if attempt.path is not None and attempt.path.own_motors and scene.own_motors is not None:
+        scene = scene.own_motors()
+    close = config.close.model_copy(update={"scrape_depth": None})
+    rules = config.model_copy(update={"close": close})
+    try:
+        return _lift_closed(scene, record, attempt, rules, start_limits(rules), is_visible)
+    except (Exception, SystemExit) as error:
+        return _failed(record, error)
+
+
+def _failed(start: TrialRecord, error: BaseException) -> TrialRecord:
+    """Return the record of an attempt whose simulation raised; the machine's failure goes on."""
+    if isinstance(error, TrialTimeout):
+        return replace(start, outcome=Outcome.TIMEOUT)
+    if isinstance(error, MachineError | MemoryError | OSError):
+        raise error
+    return replace(start, outcome=Outcome.SOLVER_ERROR, message=first_line(error))
+
+
+def _lift_closed(
+    scene: Scene,
+    record: TrialRecord,
+    attempt: Pregrasp,
+    config: Config,
+    limits: TrialLimits,
+    is_visible: Callable[[], bool],
+) -> TrialRecord:
+    """Return the record of an attempt whose closed hand may lift, from there to the verdict."""
+    assert record.closed is not None
+    # Choose what is worth a lift, by what is known now; some are lifted all the same.
+    record = replace(record, chance=_chance(scene, record.X_TO, attempt, record.closed.contacts))
+    if not attempt.audited and (record.chance < config.lift.least_chance or not is_visible()):
+        return replace(record, outcome=Outcome.NOT_LIFTED)
+
+    # Lift: object and wrist are free, and the wrist moves to its target.
+    end = lift(scene, limits, config)
+    record = replace(record, lift=end)
+
+    # Judge the lifted object: all fingertips must still hold it, clear of the table. A lift
+    # that was ended because the object moved has no such verdict.
+    if end.moved:
+        return replace(record, outcome=Outcome.MOVED)
+    contacts = end.contacts
+    verdict = judge_lifted(
+        contacts.touching,
+        contacts.other_links,
+        contacts.object_on_table,
+        required=scene.hand.required,
+        scraped=scrapes(end.clearance, config.close),
+    )
+    return replace(record, outcome=Outcome(int(verdict)))
 
 
 def start_meetings(scene: Scene, X_TO: Array, attempt: Pregrasp) -> dict[str, list[str]]:
