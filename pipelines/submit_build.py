@@ -29,7 +29,7 @@ from drakegrasp.cli.options import build_options, chosen_tls, parse_request, sha
 from drakegrasp.cluster.connect import dashboard_line
 from drakegrasp.cluster.launch import start_cluster
 from drakegrasp.cluster.request import KINDS, ClusterRequest, describe, worker_count
-from drakegrasp.exchange.posture_files import read_postures
+from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.hand.description import load_hand
 
 
@@ -99,7 +99,7 @@ def main(
     running = _present(start_cluster(cluster, request.out), request.show)
     postures = None
     if request.postures is not None:
-        postures = read_postures(request.postures, load_hand(request.config.hand_source))
+        postures = read_attempts(request.postures, load_hand(request.config.hand_source))
     report = build_on(
         running,
         sources,

@@ -21,7 +21,7 @@ import yaml
 from helpers.commands import run
 
 from drakegrasp.dataset.scenes.reader import SceneDataset
-from drakegrasp.exchange.posture_files import read_postures
+from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.hand.description import load_hand
 from drakegrasp.simulation.candidates import Source
 
@@ -256,7 +256,7 @@ def test_from_scenes_to_predictions(out: Path) -> None:
         confidence = file["confidence"][:].reshape(-1, 2)
     assert (confidence[:, 0] >= confidence[:, 1]).all()
     # A build takes them as they are.
-    assert not any(read_postures(out / "p.h5", load_hand()).invalid)
+    assert not any(read_attempts(out / "p.h5", load_hand()).invalid)
     done = script("predict.py", out / "contacts one.pt", oto, out / "c.h5")
     assert done.returncode == 0, done.stderr
     assert_assessed(out, scenes)

@@ -19,7 +19,7 @@ from drakegrasp.dataset.manifest import claim_directory, release_directory
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
 from drakegrasp.dataset.paths import FILE_NAME as MANIFEST
 from drakegrasp.errors import DataError, GraspError
-from drakegrasp.exchange.posture_files import read_postures
+from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.generation.pipeline import (
     BuildReport,
     build_locked,
@@ -35,8 +35,8 @@ from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.scoring.benchmark import NAME, PRESET, write_objects
 from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
+from drakegrasp.simulation.attempts import Attempts, unknown_objects
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.posture_table import PostureTable, unknown_objects
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -50,7 +50,7 @@ def build_dataset(
     units: str = "m",
     manifest: str | Path | None = None,
     only: Sequence[str] = (),
-    postures: str | Path | PostureTable | None = None,
+    postures: str | Path | Attempts | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
@@ -95,7 +95,7 @@ def build_dataset(
     hand = load_hand(config.hand_source)
     drive_of(hand, config.lift)
     if isinstance(postures, str | Path):
-        postures = read_postures(Path(postures), hand)
+        postures = read_attempts(Path(postures), hand)
     sources = find_sources(objects, units, manifest)
     return build_on(
         announced(cluster, show), sources, out, config, only=only, postures=postures, show=show
@@ -122,7 +122,7 @@ def build_on(
     config: Config,
     *,
     only: Sequence[str] = (),
-    postures: PostureTable | None = None,
+    postures: Attempts | None = None,
     show: bool = True,
 ) -> BuildReport:
     """Build a dataset on the workers of a cluster; see `build_dataset`.

@@ -26,7 +26,7 @@ from drakegrasp.scoring.references import REFERENCES
 from drakegrasp.scoring.run import Request, Score
 from drakegrasp.scoring.run import score as score_request
 from drakegrasp.scoring.verdict import Verdict, protocol_verdict, verdict_of
-from drakegrasp.simulation.posture_table import PostureTable
+from drakegrasp.simulation.attempts import Attempts
 from drakegrasp.verification.placing import (
     dataset_config,
     overridden_keys,
@@ -123,8 +123,8 @@ def score(
     )
 
     # Its verdicts, by this process or workers, and the card.
-    def try_all(grasps: Array | PostureTable, chosen: Sequence[int], deliver: Deliver) -> None:
-        if isinstance(grasps, PostureTable):
+    def try_all(grasps: Array | Attempts, chosen: Sequence[int], deliver: Deliver) -> None:
+        if isinstance(grasps, Attempts):
             placed = place_postures_on_rows(grasps, dataset, chosen, overrides=settings)
         else:
             placed = place_on_rows(grasps, dataset, chosen, overrides=settings)

@@ -112,7 +112,7 @@ def score(
     from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.dataset.scenes.rows import open_rows
     from drakegrasp.errors import DataError, GraspError
-    from drakegrasp.exchange.posture_files import holds_postures
+    from drakegrasp.exchange.attempts import holds_postures
     from drakegrasp.scoring.references import REFERENCES
 
     workers = chosen_workers(options)

@@ -1,4 +1,6 @@
-"""The files of DexGraspBench (github JYChen18/DexGraspBench), so that its code evaluates samples.
+"""The files of DexGraspBench (github JYChen18/DexGraspBench), which BODex and Dexonomy write, too.
+
+Samples go out so that its code evaluates them, and its grasps come in as attempts.
 
 In: a dataset. Out: a folder whose content is copied into that repository: hand (MJCF and YAML),
 objects (convex parts, and the volume from which the benchmark has the density) and a .npy file per
@@ -22,7 +24,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from itertools import groupby
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -34,6 +36,7 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import model_path
+from drakegrasp.errors import DataError, GraspError
 from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
 from drakegrasp.frames import Array, invert_pose
 from drakegrasp.grasp import unused_fingers
@@ -41,9 +44,10 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.mesh.wavefront import hull_text
 from drakegrasp.objects.model import load_object
 from drakegrasp.pictures.still_scene import StillScene
-from drakegrasp.protocols.files import POSTURES
+from drakegrasp.protocols.files import POSTURES, read_grasp_file
 from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.progress import Report
+from drakegrasp.simulation.attempts import quaternion_poses
 
 #: What `drakegrasp export --help` says of the format.
 HELP = (
@@ -218,3 +222,45 @@ def pose_vector(X_AB: npt.ArrayLike) -> Array:
     X = np.asarray(X_AB, dtype=float)
     x, y, z, w = Rotation.from_matrix(X[:3, :3]).as_quat(canonical=True)
     return np.array([*X[:3, 3], w, x, y, z])
+
+
+def read_dexgraspbench(path: Path, hand: Hand) -> dict[str, Any]:
+    """Return the grasps of a .npy file as arguments of `make_attempts`, see `attempts`.
+
+    The object's frame is that of its mesh file; in what drakegrasp itself exports it is {O}.
+
+    Raises:
+        GraspError: If it is none.
+    """
+    try:
+        stored = read_grasp_file(path)
+    except DataError as error:
+        raise GraspError(f"{path}: {error}") from None
+
+    # The root of the hand in the object's frame, in metres.
+    grasp, pose = stored.postures["grasp"], stored.object_pose
+    X_WM, no_object = quaternion_poses(pose[:, :3], pose[:, 3:])
+    X_WL, no_hand = quaternion_poses(grasp[:, :3], grasp[:, 3:7])
+    q = {f"q_{stage}": rows[:, 7:] for stage, rows in stored.postures.items()}
+    numbers: dict[str, Any] = {"scale": stored.object_scale}
+    count, trial = len(grasp), stored.trial_id
+    if stored.exported:
+        numbers = {"X_TO": X_WM}
+        if stored.conditions is not None:
+            numbers["conditions"] = np.tile(stored.conditions, (count, 1))
+        if stored.start is not None:
+            q["q_pregrasp"] = np.tile(stored.start, (count, 1))
+    return {
+        "objects": [PurePosixPath(stored.object_path).name] * count,
+        "X_FG": multiply(invert_pose(X_WM), X_WL),
+        "link": hand.palm_link,
+        "frame": "object" if stored.exported else "mesh",
+        **q,
+        "joints": stored.joints,
+        **numbers,
+        "preshape": [stored.preshape] * count,
+        "trial": None if trial is None else np.full(count, trial, dtype=np.int64),
+        "hand": stored.hand or None,
+        "said": [path.name] * count,
+        "invalid": [one or other for one, other in zip(no_object, no_hand, strict=True)],
+    }

@@ -26,7 +26,7 @@ from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.runtime.files import atomic_folder
 from drakegrasp.runtime.progress import Report, silent
-from drakegrasp.simulation.posture_table import CONDITIONS
+from drakegrasp.simulation.attempts import CONDITIONS
 
 
 def export_dataset(

@@ -18,9 +18,9 @@ import yaml
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import model_path
+from drakegrasp.errors import GraspError, one_line
 from drakegrasp.exchange.dexgraspbench import pose_vector
 from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
-from drakegrasp.exchange.foreign_postures import CREATED_WITH
 from drakegrasp.frames import invert_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
@@ -28,9 +28,12 @@ from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import load_object
 from drakegrasp.runtime.progress import Report
+from drakegrasp.simulation.attempts import CONDITIONS, quaternion_poses
 from drakegrasp.simulation.posture import joint_order
-from drakegrasp.simulation.posture_table import CONDITIONS
+from drakegrasp.yaml_text import parse_yaml
 
+#: What a file of ours says of its origin.
+CREATED_WITH = "drakegrasp"
 #: What `drakegrasp export --help` says of the format.
 HELP = "a YAML file per object: poses of the palm link, joints by name"
 
@@ -92,3 +95,91 @@ def grasp_entry(hand: Hand, grasp: ClosedGrasp) -> dict[str, Any]:
     if grasp.conditions is not None:
         entry["conditions"] = dict(zip(CONDITIONS, grasp.conditions.tolist(), strict=True))
     return entry
+
+
+def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
+    """Return the grasps of a file as arguments of `make_attempts`; its name is that of the object.
+
+    The object's frame is that of its mesh file; in what drakegrasp itself exports it is {O}.
+
+    Raises:
+        GraspError: If it is none.
+    """
+    try:
+        tree: Any = parse_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise GraspError(f"{path}: must be YAML, got: {one_line(error)}") from None
+    if not isinstance(tree, dict) or tree.get("format") != "isaac_grasp":
+        raise GraspError(f"{path}: format must be isaac_grasp, got another file")
+    if str(tree.get("format_version")) not in ("1.0", "1"):
+        raise GraspError(f"{path}: format_version must be 1.0, got {tree.get('format_version')!r}")
+    grasps = tree.get("grasps")
+    if not isinstance(grasps, dict) or not grasps:
+        raise GraspError(f"{path}: grasps must be there, got none")
+
+    # Each grasp with the joints of the first that names some.
+    stages = [each.get("cspace_position") for each in grasps.values() if isinstance(each, dict)]
+    named = next((stage for stage in stages if isinstance(stage, dict) and stage), None)
+    if named is None:
+        raise GraspError(f"{path}: grasps must have cspace_position, joints by name, got none")
+    joints, invalid = [str(joint) for joint in named], [""] * len(grasps)
+    ours = tree.get("created_with") == CREATED_WITH
+    numbers = np.full((len(grasps), 7 + 2 * len(joints)), np.nan)
+    known = np.full((len(grasps), 8 + len(CONDITIONS)), np.nan)
+    preshape = [""] * len(grasps)
+    for i, (name, grasp) in enumerate(grasps.items()):
+        try:
+            numbers[i] = _isaac_numbers(grasp, joints)
+            if ours:
+                known[i], preshape[i] = _of_export(grasp), str(grasp.get("preshape", ""))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            invalid[i] = (
+                f"{name} must have position, orientation and cspace_position of the joints "
+                f"{', '.join(joints)}, got none ({one_line(error)})"
+            )
+    X_FL, reasons = quaternion_poses(numbers[:, :3], numbers[:, 3:7])
+    X_TO, no_rest = quaternion_poses(known[:, :3], known[:, 3:7])
+    told = np.isfinite(known[:, :7]).any(axis=1)
+    invalid = [
+        one or (f"resting_pose: {other}" if other and is_told else "")
+        for one, other, is_told in zip(invalid, no_rest, told, strict=True)
+    ]
+    trials = known[:, 7]
+    grasp_q, pregrasp_q = np.split(numbers[:, 7:], 2, axis=1)
+    return {
+        "objects": [path.stem] * len(grasps),
+        "X_FG": X_FL,
+        "link": hand.palm_link,
+        "frame": "object" if ours else "mesh",
+        "q_grasp": grasp_q,
+        "q_pregrasp": pregrasp_q,
+        "joints": joints,
+        "said": [
+            f"{name}, confidence {grasp.get('confidence') if isinstance(grasp, dict) else None}"
+            for name, grasp in grasps.items()
+        ],
+        "invalid": [one or other for one, other in zip(invalid, reasons, strict=True)],
+        "X_TO": X_TO,
+        "conditions": known[:, 8:],
+        "preshape": preshape,
+        "trial": None if np.isnan(trials).any() else trials.astype(np.int64),
+        "hand": str(tree["hand"]) if ours and "hand" in tree else None,
+    }
+
+
+def _of_export(grasp: Any) -> list[float]:
+    """Return the object's pose (7,), the trial, and the conditions of a grasp; NaN if not told."""
+    found, lies = [np.nan] * 7, grasp.get("resting_pose")
+    if lies is not None:
+        found = [*lies["position"], lies["orientation"]["w"], *lies["orientation"]["xyz"]]
+    told = grasp.get("conditions", {})
+    found += [grasp.get("trial_id", np.nan), *(told.get(name, np.nan) for name in CONDITIONS)]
+    return [float(value) for value in found]
+
+
+def _isaac_numbers(grasp: Any, joints: list[str]) -> list[float]:
+    """Return position, quaternion, grasp and pregrasp of a grasp; NaN for a missing pregrasp."""
+    turn, before = grasp["orientation"], grasp.get("pregrasp_cspace_position")
+    q = [grasp["cspace_position"], before or dict.fromkeys(joints, np.nan)]
+    place = [*grasp["position"], turn["w"], *turn["xyz"]]
+    return [float(v) for v in (*place, *(stage[joint] for stage in q for joint in joints))]

@@ -27,8 +27,8 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ContactFit, ObjectModel, fit_contacts
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import release_memory
+from drakegrasp.simulation.attempts import posture_attempts
 from drakegrasp.simulation.candidates import Attempt, children, family_member, make_attempts
-from drakegrasp.simulation.posture_table import posture_attempts
 from drakegrasp.simulation.randomization.conditions import usual_conditions
 from drakegrasp.simulation.randomization.draws import draw_conditions
 from drakegrasp.simulation.sampling.centring import centred

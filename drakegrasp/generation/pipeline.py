@@ -51,8 +51,8 @@ from drakegrasp.objects.sources import MeshSource, source_sha256
 from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
+from drakegrasp.simulation.attempts import Attempts, misfits
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.posture_table import PostureTable, misfits
 from drakegrasp.simulation.sampling.own import own_sampler
 
 #: By how much a rank may be off the border of a split that depends on which objects have samples.
@@ -97,7 +97,7 @@ class _Job:
     execute: Executor
     pool: WorkerPool | None
     events: BuildEvents
-    postures: PostureTable | None
+    postures: Attempts | None
     show: bool
 
 
@@ -107,7 +107,7 @@ def build(
     config: Config,
     execute: Executor,
     *,
-    postures: PostureTable | None = None,
+    postures: Attempts | None = None,
     pool: WorkerPool | None = None,
     show: bool = True,
 ) -> BuildReport:
@@ -143,7 +143,7 @@ def build(
         )
 
 
-def posture_config(config: Config, postures: PostureTable | None) -> Config:
+def posture_config(config: Config, postures: Attempts | None) -> Config:
     """Return the configuration of a build that tries postures instead of palm poses of samplers.
 
     Raises:
@@ -181,7 +181,7 @@ def build_locked(
     execute: Executor,
     *,
     dead: Holder | None,
-    postures: PostureTable | None = None,
+    postures: Attempts | None = None,
     pool: WorkerPool | None = None,
     show: bool = True,
 ) -> BuildReport:
@@ -303,7 +303,7 @@ def _build(
     )
 
 
-def _refused_postures(postures: PostureTable, manifest: Manifest) -> str:
+def _refused_postures(postures: Attempts, manifest: Manifest) -> str:
     """Return which rows of the postures are not tried, and why; empty if all are.
 
     Raises:

@@ -28,8 +28,8 @@ from drakegrasp.runtime.journal import (
     inject_fault,
     open_journal,
 )
+from drakegrasp.simulation.attempts import Attempts, given_candidates
 from drakegrasp.simulation.candidates import sample_candidates
-from drakegrasp.simulation.posture_table import PostureTable, given_candidates
 from drakegrasp.simulation.settle import find_resting_poses
 
 #: Computing time after which preparing a mesh hangs [s].
@@ -54,7 +54,7 @@ class PrepareTask:
     mesh_sha256: str
     out: Path
     config: Config
-    postures: PostureTable | None = None
+    postures: Attempts | None = None
     restartable: bool
 
 
@@ -137,9 +137,7 @@ def _refused(task: PrepareTask, reason: str, *, again: bool = False) -> RefusedM
     return RefusedMesh(name=name, mesh_sha256=digest, reason=reason, again=again)
 
 
-def prepare(
-    source: MeshSource, config: Config, postures: PostureTable | None = None
-) -> PreparedObject:
+def prepare(source: MeshSource, config: Config, postures: Attempts | None = None) -> PreparedObject:
     """Return a mesh as an object at rest on the table, with its palm poses.
 
     Args:

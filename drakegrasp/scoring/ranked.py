@@ -17,10 +17,11 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
-from drakegrasp.exchange.posture_files import digest_of, holds_postures
-from drakegrasp.exchange.predicted_postures import read_predicted_postures
+from drakegrasp.exchange.attempts import digest_of, holds_postures, read_attempts
 from drakegrasp.frames import Array, as_numbers
-from drakegrasp.simulation.posture_table import PostureTable
+from drakegrasp.hand.description import load_hand
+from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.verification.placing import dataset_config
 from drakegrasp.verification.prediction import ROWS, read_predictions
 
 Rows = npt.NDArray[np.int64]
@@ -46,7 +47,7 @@ class Ranked:
     ranks: Rows
     confidence: Array | None = None
     sha256: str
-    table: PostureTable | None = None
+    table: Attempts | None = None
 
     def of_rows(self, rows: Sequence[int]) -> Ranked:
         """Return the predictions for some rows."""
@@ -70,7 +71,7 @@ def rank(
     rows: npt.ArrayLike | None = None,
     confidence: npt.ArrayLike | None = None,
     sha256: str | None = None,
-    table: PostureTable | None = None,
+    table: Attempts | None = None,
 ) -> Ranked:
     """Return predictions in the order of rows and ranks.
 
@@ -168,20 +169,20 @@ def rank_postures(path: Path, data: GraspDataset) -> Ranked:
     """Return the predicted postures of a file.
 
     Args:
-        path: See `read_predicted_postures`; `confidence` ranks those of a row.
+        path: See `read_attempts`; `confidence` ranks those of a row.
         data: The split.
 
     Raises:
         GraspError: If the file holds anything else; the message names it.
         ConfigError, HandError, DataError, MachineError: If dataset or hand cannot be used.
     """
-    table, rows, confidence = read_predicted_postures(path, data)
+    table = read_attempts(path, load_hand(dataset_config(data).hand_source), of=data)
     return rank(
         str(path),
         table.numbers(),
         length=len(data),
-        rows=rows,
-        confidence=confidence,
+        rows=table.of_row,
+        confidence=table.confidence,
         sha256=digest_of(path),
         table=table,
     )

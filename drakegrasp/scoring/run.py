@@ -29,12 +29,12 @@ from drakegrasp.scoring.ranked import Ranked, rank
 from drakegrasp.scoring.references import REFERENCES, Scene
 from drakegrasp.scoring.verdict import Verdict, VerdictFile, verdict_key
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.simulation.posture_table import PostureTable
+from drakegrasp.simulation.attempts import Attempts
 
 #: Tries grasps (n, 6k), or n postures, on rows (n,) and calls back with the place of each and its
 #: verdict.
 Verify: TypeAlias = Callable[
-    [Array | PostureTable, Sequence[int], Callable[[int, Verdict], None]], object
+    [Array | Attempts, Sequence[int], Callable[[int, Verdict], None]], object
 ]
 #: Files of a score.
 CARD_JSON, CARD_TEXT, CARD_PICTURE, VERDICTS = "card.json", "card.md", "card.png", "verdicts.jsonl"

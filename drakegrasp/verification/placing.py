@@ -31,6 +31,13 @@ from drakegrasp.frames import (
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import hand_digest, is_hand
 from drakegrasp.hand.settings import override_config
+from drakegrasp.simulation.attempts import (
+    CONDITIONS,
+    UNTOLD,
+    Attempts,
+    misfits,
+    unknown_objects,
+)
 from drakegrasp.simulation.placement import (
     PlacedObject,
     canonical_pose,
@@ -39,13 +46,6 @@ from drakegrasp.simulation.placement import (
     refuse_other_objects,
 )
 from drakegrasp.simulation.posture import Posture
-from drakegrasp.simulation.posture_table import (
-    CONDITIONS,
-    UNTOLD,
-    PostureTable,
-    misfits,
-    unknown_objects,
-)
 from drakegrasp.simulation.settle import find_resting_poses
 from drakegrasp.verification.hints import known_frames
 from drakegrasp.verification.prediction import GraspRows, frame_poses, read_grasps
@@ -382,7 +382,7 @@ SAME_POSE = 1e-6
 
 
 def place_postures_on_object(
-    table: PostureTable, placed: PlacedObject, *, overrides: Sequence[str] = ()
+    table: Attempts, placed: PlacedObject, *, overrides: Sequence[str] = ()
 ) -> list[PlacedGrasp]:
     """Return the postures of a table on one object, whatever they call it.
 
@@ -403,7 +403,7 @@ def place_postures_on_object(
 
 
 def place_postures_on_dataset(
-    table: PostureTable,
+    table: Attempts,
     out: Path,
     config: Config | None = None,
     *,
@@ -442,7 +442,7 @@ def place_postures_on_dataset(
 
 
 def place_postures_on_rows(
-    table: PostureTable,
+    table: Attempts,
     dataset: GraspDataset,
     rows: Sequence[int],
     *,
@@ -478,7 +478,7 @@ def place_postures_on_rows(
 
 
 def _placed_postures(
-    table: PostureTable,
+    table: Attempts,
     rows: Sequence[int],
     things: Sequence[PlacedObject],
     config: Config,
@@ -541,7 +541,7 @@ class _Stands:
         self._dropped, self._told = list(things), list[PlacedObject]()
         self._known: dict[tuple[int, bytes], tuple[PlacedObject, Config]] = {}
 
-    def of(self, table: PostureTable, i: int) -> list[PlacedObject]:
+    def of(self, table: Attempts, i: int) -> list[PlacedObject]:
         """Return the object as a row may be for it.
 
         Raises:

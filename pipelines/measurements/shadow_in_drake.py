@@ -34,7 +34,6 @@ from pydrake.multibody.tree import PdControllerGains
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
-from drakegrasp.exchange.posture_rows import quaternion_poses
 from drakegrasp.frames import Array, invert_pose, make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.draft.parsing import read_model
@@ -47,6 +46,7 @@ from drakegrasp.objects.sources import MeshSource, file_frame
 from drakegrasp.outcomes import Outcome
 from drakegrasp.protocols.files import read_grasp_file, read_object_folder
 from drakegrasp.simulation import construction, trial
+from drakegrasp.simulation.attempts import quaternion_poses
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.posture import make_posture, start_of
 from drakegrasp.simulation.scene import Scene

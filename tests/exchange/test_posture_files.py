@@ -14,14 +14,13 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from drakegrasp.errors import GraspError
-from drakegrasp.exchange import posture_files
-from drakegrasp.exchange.posture_files import read_postures
-from drakegrasp.exchange.posture_rows import quaternion_poses
+from drakegrasp.exchange import attempts as posture_files
+from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.simulation.attempts import Attempts, quaternion_poses
 from drakegrasp.simulation.posture import joint_order
-from drakegrasp.simulation.posture_table import PostureTable
 
 HAND = load_hand("allegro")
 ORDER = joint_order(HAND)
@@ -82,11 +81,11 @@ def columns() -> dict[str, list[Any]]:
 def test_a_file_for_a_score_is_built_by_the_objects_that_it_names(tmp_path):
     scored = arrays() | {"row": np.array([7, 3]), "confidence": np.array([0.9, 0.1])}
     np.savez(tmp_path / "p.npz", **scored)
-    assert read_postures(tmp_path / "p.npz", HAND).objects == tuple(OBJECTS)
+    assert read_attempts(tmp_path / "p.npz", HAND).objects == tuple(OBJECTS)
     del scored["object"]
     np.savez(tmp_path / "p.npz", **scored)
     with pytest.raises(GraspError, match="must name an object in each row, got rows of a dataset"):
-        read_postures(tmp_path / "p.npz", HAND)
+        read_attempts(tmp_path / "p.npz", HAND)
 
 
 @pytest.mark.parametrize("suffix", ["npz", "h5", "csv"])
@@ -111,7 +110,7 @@ def test_rows_of_a_preshape_need_not_name_the_joints_that_it_keeps(tmp_path, suf
             with h5py.File(path, "w") as file:
                 for name, value in content.items():
                     file[name] = value
-    table = read_postures(path, hand)
+    table = read_attempts(path, hand)
     assert table.preshape == ("tripod", "tripod")
     expected = joint_positions(tripod, 0.0, [0.1, 0.2, 0.3])
     np.testing.assert_allclose(table.q_grasp[1], [expected[name] for name in joint_order(hand)])
@@ -123,7 +122,7 @@ def test_a_row_of_a_preshape_that_the_hand_lacks_spoils_no_other(tmp_path):
     q = np.zeros((3, len(joint_order(hand))))
     names = ["mug"] * 3
     np.savez(path, object=names, X_FG=[np.eye(4)] * 3, q_grasp=q, preshape=[known, "fist", ""])
-    table = read_postures(path, hand)
+    table = read_attempts(path, hand)
     assert table.preshape == (known, "fist", "")
     assert [bool(reason) for reason in table.invalid] == [False, True, False]
     assert f"preshape must be one of {known}" in table.invalid[1] and "'fist'" in table.invalid[1]
@@ -149,7 +148,7 @@ def write_parquet(folder: Path) -> Path:
 
 @pytest.mark.parametrize("write", [write_npz, write_hdf5, write_csv, write_parquet])
 def test_own_layouts_say_the_same(tmp_path, write):
-    table = read_postures(write(tmp_path), HAND)
+    table = read_attempts(write(tmp_path), HAND)
     assert table.objects == tuple(OBJECTS)
     assert (table.frame, table.resting.tolist(), table.said) == ("object", [0, 2], ("net 7", ""))
     np.testing.assert_allclose(table.X_FG, POSES, atol=1e-12)
@@ -161,7 +160,7 @@ def test_own_layouts_say_the_same(tmp_path, write):
 
 def test_pose_of_the_palm_link_becomes_that_of_the_palm(tmp_path):
     np.savez(tmp_path / "p.npz", **arrays(), link=np.array(HAND.palm_link))
-    table = read_postures(tmp_path / "p.npz", HAND)
+    table = read_attempts(tmp_path / "p.npz", HAND)
     np.testing.assert_allclose(table.X_FG, POSES @ HAND.X_BG, atol=1e-12)
 
 
@@ -174,7 +173,7 @@ def test_joints_that_the_hand_file_moves_may_be_left_out(tmp_path):
         q_grasp=np.array([[0.5, 0.6, 0.7]]),
         joints=np.array(named),
     )
-    q = dict(zip(ORDER, read_postures(tmp_path / "p.npz", HAND).q_grasp[0], strict=True))
+    q = dict(zip(ORDER, read_attempts(tmp_path / "p.npz", HAND).q_grasp[0], strict=True))
     assert q["index_pip_joint"] == pytest.approx(0.7)
     assert q["thumb_ip_joint"] == pytest.approx(0.175)
     assert q["thumb_opposition_joint"] == HAND.preshape["thumb_opposition_joint"]
@@ -183,20 +182,20 @@ def test_joints_that_the_hand_file_moves_may_be_left_out(tmp_path):
 def test_degrees_are_refused_and_one_wild_row_is_not(tmp_path):
     np.savez(tmp_path / "p.npz", **{**arrays(), "q_grasp": np.rad2deg(GRASP + 1.0)})
     with pytest.raises(GraspError, match=r"grasp joints must be in radians, .* look like degrees"):
-        read_postures(tmp_path / "p.npz", HAND)
+        read_attempts(tmp_path / "p.npz", HAND)
 
     wild = np.concatenate([GRASP, GRASP[:1]])
     wild[0, 0] = 50.0
     rows = {name: np.concatenate([v, v[:1]]) for name, v in arrays().items() if len(v) == 2}
     np.savez(tmp_path / "w.npz", **{**arrays(), **rows, "q_grasp": wild})
-    assert read_postures(tmp_path / "w.npz", HAND).q_grasp[0].max() == 50.0
+    assert read_attempts(tmp_path / "w.npz", HAND).q_grasp[0].max() == 50.0
 
 
 @pytest.mark.parametrize("write", [write_npz, write_hdf5, write_parquet])
 def test_arrays_larger_than_any_postures_are_refused(tmp_path, write, monkeypatch):
     monkeypatch.setattr(posture_files, "MOST_BYTES", 100)
     with pytest.raises(GraspError, match=r"arrays must be at most 1e\+02 bytes, got"):
-        read_postures(write(tmp_path), HAND)
+        read_attempts(write(tmp_path), HAND)
 
 
 def test_quaternion_of_another_length_is_none_and_a_rounded_one_is():
@@ -236,7 +235,7 @@ def write_dictionary(path: Path, content: Any) -> Path:
     return path
 
 
-def assert_both(table: PostureTable) -> None:
+def assert_both(table: Attempts) -> None:
     assert (table.objects, table.frame) == (tuple(OBJECTS), "mesh")
     np.testing.assert_allclose(table.X_FG, POSES, atol=1e-9)
     np.testing.assert_array_equal(table.q_grasp, GRASP)
@@ -246,7 +245,7 @@ def assert_both(table: PostureTable) -> None:
 def test_folder_of_dexgraspbench_is_a_table(tmp_path):
     for i, name in enumerate(("a", "b")):
         write_dictionary(tmp_path / name / "0.npy", dexgraspbench(i))
-    table = read_postures(tmp_path, HAND)
+    table = read_attempts(tmp_path, HAND)
     assert_both(table)
     np.testing.assert_array_equal(table.q_squeeze, SQUEEZE)
     assert table.scale.tolist() == [0.08, 0.08]
@@ -257,7 +256,7 @@ def test_several_grasps_of_one_dictionary_are_rows(tmp_path):
     keys = ("pregrasp_qpos", "grasp_qpos", "squeeze_qpos")
     many = {**one, **{key: np.stack([one[key]] * 3) for key in keys}}
     many |= {"joint_names": list(ORDER)}
-    table = read_postures(write_dictionary(tmp_path / "0.npy", many), HAND)
+    table = read_attempts(write_dictionary(tmp_path / "0.npy", many), HAND)
     assert table.objects == ("mug",) * 3
     np.testing.assert_allclose(table.X_FG, POSES[[0, 0, 0]], atol=1e-9)
 
@@ -277,7 +276,7 @@ def test_isaac_grasp_is_of_the_object_that_its_file_is_named_after(tmp_path):
         # Names in another order of files than of objects.
         (tmp_path / f"{i}").mkdir()
         (tmp_path / f"{i}" / f"{name}.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
-    table = read_postures(tmp_path, HAND)
+    table = read_attempts(tmp_path, HAND)
     assert_both(table)
     assert table.said[0] == "grasp_0, confidence 0.5"
 
@@ -295,7 +294,7 @@ def test_palm_link_named_palm_is_no_palm_frame_in_files_of_others(tmp_path):
     }
     tree = {"format": "isaac_grasp", "format_version": 1.0, "grasps": {"grasp_0": grasp}}
     (tmp_path / "mug.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
-    table = read_postures(tmp_path / "mug.yaml", leap)
+    table = read_attempts(tmp_path / "mug.yaml", leap)
     np.testing.assert_allclose(table.X_FG[0], X @ leap.X_BG, atol=1e-9)
 
 
@@ -312,12 +311,12 @@ def test_palm_link_named_palm_is_no_palm_frame_in_files_of_others(tmp_path):
     ],
 )
 def test_bad_row_of_arrays_has_its_reason_and_spoils_no_other(tmp_path, changes, reason):
-    content, good = arrays(), read_postures(write_npz(tmp_path), HAND)
+    content, good = arrays(), read_attempts(write_npz(tmp_path), HAND)
     for name, value in changes.items():
         factor = np.reshape(value, (2, *[1] * (content[name].ndim - 1)))
         content[name] = content[name] * factor if isinstance(value, list) else value
     np.savez(tmp_path / "p.npz", **content)
-    table = read_postures(tmp_path / "p.npz", HAND)
+    table = read_attempts(tmp_path / "p.npz", HAND)
     assert table.invalid[0].startswith(reason)
     assert table.invalid[1] == ""
     np.testing.assert_array_equal(table.X_FG[1], good.X_FG[1])
@@ -337,7 +336,7 @@ def test_bad_line_of_a_table_has_its_reason_and_spoils_no_other(tmp_path):
         ),
     }
     path.write_text("\n".join([header, *lines.values(), second]), encoding="utf-8")
-    table = read_postures(path, HAND)
+    table = read_attempts(path, HAND)
     assert len(table) == 5
     for reason, found in zip([*lines, ""], table.invalid, strict=True):
         assert found.startswith(reason)
@@ -353,7 +352,7 @@ def test_file_in_a_folder_that_is_no_grasp_is_a_row_of_its_own(tmp_path):
     short = {key: np.zeros(10) for key in ("pregrasp_qpos", "grasp_qpos", "squeeze_qpos")}
     write_dictionary(tmp_path / "3.npy", dexgraspbench(1, **short))
     write_dictionary(tmp_path / "4.npy", dexgraspbench(1))
-    table = read_postures(tmp_path, HAND)
+    table = read_attempts(tmp_path, HAND)
     assert table.row.tolist() == [0, 1, 2, 3, 4]
     assert [bool(reason) for reason in table.invalid] == [False, True, True, True, False]
     assert table.invalid[1].startswith(f"{tmp_path / '1.npy'}: must be a .npy file")
@@ -373,7 +372,7 @@ def test_grasp_of_isaac_grasp_that_is_none_is_a_row_of_its_own(tmp_path):
     }
     tree = {"format": "isaac_grasp", "format_version": 1.0, "grasps": grasps}
     (tmp_path / "mug.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
-    table = read_postures(tmp_path / "mug.yaml", HAND)
+    table = read_attempts(tmp_path / "mug.yaml", HAND)
     assert [bool(reason) for reason in table.invalid] == [True, True, False, True]
     assert table.invalid[1].startswith("b must have position, orientation and cspace_position")
     np.testing.assert_array_equal(table.q_grasp[2], 0.1)
@@ -403,7 +402,7 @@ def test_pickle_that_runs_something_is_refused_and_not_run(tmp_path, protocol):
         )
         pickle.dump(array, file, protocol=protocol)
     with pytest.raises(GraspError, match=r"got \w+\.mkdir; nothing of it was run"):
-        read_postures(path, HAND)
+        read_attempts(path, HAND)
     assert not (tmp_path / "ran").exists()
 
 
@@ -418,7 +417,7 @@ def test_pickles_of_every_protocol_are_read(tmp_path):
             )
             pickle.dump(array, file, protocol=protocol)
     np.testing.assert_array_equal(
-        read_postures(tmp_path, HAND).q_grasp, GRASP[[0] * (protocol + 1)]
+        read_attempts(tmp_path, HAND).q_grasp, GRASP[[0] * (protocol + 1)]
     )
 
 
@@ -438,7 +437,7 @@ def test_pickles_of_every_protocol_are_read(tmp_path):
 def test_arrays_that_are_no_postures_are_refused_in_a_line(tmp_path, changes, words):
     np.savez(tmp_path / "p.npz", **{**arrays(), **changes})
     with pytest.raises(GraspError, match=words) as caught:
-        read_postures(tmp_path / "p.npz", HAND)
+        read_attempts(tmp_path / "p.npz", HAND)
     assert str(caught.value).startswith(str(tmp_path / "p.npz"))
     assert "\n" not in str(caught.value)
 
@@ -457,7 +456,7 @@ def test_arrays_that_are_no_postures_are_refused_in_a_line(tmp_path, changes, wo
 def test_dictionaries_that_are_no_grasps_are_refused_in_a_line(tmp_path, changes, words):
     path = write_dictionary(tmp_path / "0.npy", dexgraspbench(**changes))
     with pytest.raises(GraspError, match=words):
-        read_postures(path, HAND)
+        read_attempts(path, HAND)
 
 
 @pytest.mark.parametrize(
@@ -485,7 +484,7 @@ def test_dictionaries_that_are_no_grasps_are_refused_in_a_line(tmp_path, changes
 def test_other_files_are_refused_in_a_line(tmp_path, name, content, words):
     (tmp_path / name).write_text(content, encoding="utf-8")
     with pytest.raises(GraspError, match=words):
-        read_postures(tmp_path / name, HAND)
+        read_attempts(tmp_path / name, HAND)
 
 
 def test_damaged_stream_is_refused_in_a_line(tmp_path):
@@ -498,7 +497,7 @@ def test_damaged_stream_is_refused_in_a_line(tmp_path):
     with pytest.raises(
         GraspError, match=r"must be a readable file of arrays, got: .*inv"
     ) as caught:
-        read_postures(tmp_path / "a.npz", HAND)
+        read_attempts(tmp_path / "a.npz", HAND)
     assert "\n" not in str(caught.value)
 
 
@@ -506,7 +505,7 @@ def test_array_that_is_named_as_several_is_refused(tmp_path):
     with (tmp_path / "a.npz").open("wb") as file:
         np.save(file, GRASP)
     with pytest.raises(GraspError, match="must be a readable file of arrays"):
-        read_postures(tmp_path / "a.npz", HAND)
+        read_attempts(tmp_path / "a.npz", HAND)
 
 
 def test_frame_that_some_rows_lack_is_refused(tmp_path):
@@ -517,14 +516,14 @@ def test_frame_that_some_rows_lack_is_refused(tmp_path):
         pyarrow.table(columns() | {"frame": ["table", None]}), tmp_path / "p.parquet"
     )
     with pytest.raises(GraspError, match="frame must be the same in all rows"):
-        read_postures(tmp_path / "p.parquet", HAND)
+        read_attempts(tmp_path / "p.parquet", HAND)
 
 
 def test_what_is_not_there_is_refused(tmp_path):
     with pytest.raises(GraspError, match="postures must be a file or a folder"):
-        read_postures(tmp_path / "none.npz", HAND)
+        read_attempts(tmp_path / "none.npz", HAND)
     with pytest.raises(GraspError, match=r"must hold \.npy or \.yaml files"):
-        read_postures(tmp_path, HAND)
+        read_attempts(tmp_path, HAND)
 
 
 @pytest.mark.parametrize(
@@ -533,31 +532,31 @@ def test_what_is_not_there_is_refused(tmp_path):
 )
 def test_a_table_from_a_spreadsheet_is_read(tmp_path, comma, blank, mark):
     """With a byte-order mark, blanks around cells, semicolons and Windows' ends of lines."""
-    plain = read_postures(write_csv(tmp_path), HAND)
+    plain = read_attempts(write_csv(tmp_path), HAND)
     text = (tmp_path / "p.csv").read_text().replace(",", f"{blank}{comma}{blank}")
     path = tmp_path / "sheet.csv"
     path.write_bytes((mark + text.replace("\n", "\r\n")).encode())
     assert posture_files.holds_postures(path)
-    assert read_postures(path, HAND).digest() == plain.digest()
+    assert read_attempts(path, HAND).digest() == plain.digest()
 
 
 def test_all_that_is_missing_is_told_at_once(tmp_path):
     np.savez(tmp_path / "p.npz", joints=np.array(ORDER))
     with pytest.raises(GraspError, match=r"object, q_grasp, X_FG \(or position and .* must"):
-        read_postures(tmp_path / "p.npz", HAND)
+        read_attempts(tmp_path / "p.npz", HAND)
     (tmp_path / "p.csv").write_text("x,y,z,qw\n0,0,0,1\n")
     with pytest.raises(GraspError, match="include object, qx, qy, qz, a grasp_JOINT for each jo"):
-        read_postures(tmp_path / "p.csv", HAND)
+        read_attempts(tmp_path / "p.csv", HAND)
     # With the name of the object, none is needed in the file.
     with pytest.raises(GraspError, match="include qx, qy, qz, a grasp_JOINT for each joint, got"):
-        read_postures(tmp_path / "p.csv", HAND, of="mug")
+        read_attempts(tmp_path / "p.csv", HAND, of="mug")
 
 
 def test_rows_without_an_object_are_of_the_one_that_is_named(tmp_path):
     content = arrays()
     del content["object"]
     np.savez(tmp_path / "p.npz", **content)
-    assert read_postures(tmp_path / "p.npz", HAND, of="cup").objects == ("cup", "cup")
+    assert read_attempts(tmp_path / "p.npz", HAND, of="cup").objects == ("cup", "cup")
 
 
 @pytest.mark.parametrize(
@@ -570,14 +569,14 @@ def test_rows_without_an_object_are_of_the_one_that_is_named(tmp_path):
 def test_arrays_of_other_things_get_a_line_that_leads_on(tmp_path, name, value, words):
     np.savez(tmp_path / "p.npz", **{name: value})
     with pytest.raises(GraspError, match=words):
-        read_postures(tmp_path / "p.npz", HAND)
+        read_attempts(tmp_path / "p.npz", HAND)
 
 
 def test_samples_that_were_exported_come_back(exported, grasps):
     hand = load_hand()
     spread = hand.spread.joints[0]
     for form in ONE_FILE:
-        table = read_postures(exported(form), hand)
+        table = read_attempts(exported(form), hand)
         assert table.frame == "object"
         assert sorted(table.objects) == sorted(grasp.object_name for grasp in grasps)
         assert np.abs(table.q_pregrasp[:, joint_order(hand).index(spread)]).min() > 0.0
@@ -591,4 +590,4 @@ def test_samples_that_were_exported_come_back(exported, grasps):
                 if grasp.object_name == name
             )
         with pytest.raises(GraspError, match="hand must be barrett, as the file says"):
-            read_postures(next(exported(form).rglob(ONE_FILE[form])), HAND)
+            read_attempts(next(exported(form).rglob(ONE_FILE[form])), HAND)

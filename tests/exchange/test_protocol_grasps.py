@@ -18,10 +18,9 @@ pytest.importorskip("mujoco")
 pytest.importorskip("coacd")
 
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.exchange.attempts import holds_postures
 from drakegrasp.exchange.dexgraspbench import OBJECTS
 from drakegrasp.exchange.export import ClosedGrasp
-from drakegrasp.exchange.posture_files import holds_postures
-from drakegrasp.exchange.posture_rows import quaternion_poses
 from drakegrasp.exchange.protocol_grasps import PlacedPosture, fitted_postures, write_grasps
 from drakegrasp.frames import invert_pose
 from drakegrasp.grasp import pack_grasp
@@ -30,6 +29,7 @@ from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config
 from drakegrasp.mjcf import convex_parts
 from drakegrasp.runtime import environment
+from drakegrasp.simulation.attempts import quaternion_poses
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import Posture, joint_order

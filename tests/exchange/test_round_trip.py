@@ -27,8 +27,8 @@ from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.trials import Trials
+from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.exchange.export import export_dataset
-from drakegrasp.exchange.posture_files import read_postures
 from drakegrasp.frames import unpack_pose
 from drakegrasp.generation.pipeline import build, posture_config
 from drakegrasp.hand.description import load_hand
@@ -177,7 +177,7 @@ def test_what_goes_out_comes_in_again(
     tmp_path: Path,
 ) -> None:
     path, hand = written(form), load_hand(HAND)
-    table = read_postures(path, hand)
+    table = read_attempts(path, hand)
     order = in_order(samples, table.X_FG)
     np.testing.assert_allclose(table.q_grasp, samples["closed_q"][order], atol=1e-6)
     names = [hand.preshape_names[k] for k in samples["preshape"][order]]
@@ -242,7 +242,7 @@ def test_what_names_no_resting_pose_is_tried_in_all_and_the_best_is_told(
     assert [v["reason"].endswith(told) for v, told in zip(found, best, strict=True)].count(True) > 3
 
     # In a build each is an attempt of the row.
-    table = read_postures(path, load_hand(HAND), of=NAME)
+    table = read_attempts(path, load_hand(HAND), of=NAME)
     table = replace(table, objects=(NAME,) * len(table))
     config = posture_config(load_config("fast", [*RULES, *OBJECTS, *SAMPLES]), table)
     again = tmp_path / "out"

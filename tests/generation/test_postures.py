@@ -37,14 +37,14 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.files import seal
 from drakegrasp.scoring.verdict import verdict_of
+from drakegrasp.simulation.attempts import (
+    Attempts,
+    make_attempts,
+    unknown_objects,
+)
 from drakegrasp.simulation.candidates import Source
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.posture import joint_order
-from drakegrasp.simulation.posture_table import (
-    PostureTable,
-    make_table,
-    unknown_objects,
-)
 from drakegrasp.simulation.trial import run_attempt
 from drakegrasp.verification.placing import place_postures_on_dataset
 from drakegrasp.verification.result_files import write_results
@@ -64,7 +64,7 @@ def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def table(tmp_path_factory: pytest.TempPathFactory) -> PostureTable:
+def table(tmp_path_factory: pytest.TempPathFactory) -> Attempts:
     """Rows of the cube: held by the hand's motors, held by own ones, inside it, below the table."""
     model = box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3, NAME)
     config, attempt = load_config(), from_above(model, STANDOFF)
@@ -80,7 +80,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> PostureTable:
     inside = attempt.X_OG @ make_pose(np.eye(3), [0.0, 0.0, 0.05])
     below = make_pose(np.eye(3), [0.0, 0.0, -0.2])
     nothing = np.full(8, np.nan)
-    return make_table(
+    return make_attempts(
         HAND,
         [NAME] * 4,
         [attempt.X_OG, attempt.X_OG, inside, below],
@@ -91,14 +91,14 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> PostureTable:
     )
 
 
-def built(meshes: Path, out: Path, table: PostureTable, config: Config | None = None) -> Path:
+def built(meshes: Path, out: Path, table: Attempts, config: Config | None = None) -> Path:
     config = posture_config(config or load_config(), table)
     build(find_meshes(meshes), out, config, run_here, postures=table, show=False)
     return out
 
 
 @pytest.fixture(scope="module")
-def dataset(meshes: Path, table: PostureTable, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dataset(meshes: Path, table: Attempts, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built(meshes, tmp_path_factory.mktemp("built") / "out", table)
 
 
@@ -179,7 +179,7 @@ def test_rows_that_are_no_posture_are_told_and_spoil_no_other(meshes, table, dat
     X_FG[4, :3, :3] = 0.0
     resting, scale = np.zeros(len(rows)), np.full(len(rows), np.nan)
     resting[5], scale[6], resting[7], objects[8] = 1.0, 0.1, -1.0, "cup"
-    mixed = make_table(
+    mixed = make_attempts(
         *(HAND, objects, X_FG, q),
         q_pregrasp=table.q_pregrasp[rows],
         q_squeeze=table.q_squeeze[rows],
@@ -233,7 +233,7 @@ def of_preshapes(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
     held = run_attempt(build_scene(model, config.physics, pair), standing(model), attempt, config)
     assert held.outcome is Outcome.SUCCESS
     starts = [joint_positions(pair, 0.0, np.full(2, at)) for at in (0.0, 0.0, BEGUN)]
-    table = make_table(
+    table = make_attempts(
         hand,
         [NAME] * 3,
         [attempt.X_OG] * 3,
@@ -262,7 +262,7 @@ def test_verdict_on_a_posture_of_a_preshape_has_a_place_for_every_finger(of_pres
     config = read_manifest(out).config
     hand = load_hand(config.hand_source)
     row = Trials(out)[[0]]
-    table = make_table(
+    table = make_attempts(
         *(hand, [NAME] * 2, [unpack_pose(row["X_OG"][0])] * 2, [q] * 2),
         preshape=["pair", "fist"],
     )
@@ -300,7 +300,7 @@ def test_scenes_have_the_hand_from_which_a_posture_of_a_preshape_closed(of_presh
 
 def test_the_hash_of_postures_without_preshapes_is_as_before_there_were_any(table):
     """Else no build of an older version went on."""
-    plain = make_table(HAND, ["cup"], [np.eye(4)], np.zeros((1, 8)), resting=[0])
+    plain = make_attempts(HAND, ["cup"], [np.eye(4)], np.zeros((1, 8)), resting=[0])
     assert plain.digest() == "553c8cce98b13896"
     assert replace(plain, preshape=("pair",)).digest() != plain.digest()
 

@@ -18,8 +18,7 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.predicted_rows import PredictedRows
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, GraspError, listed
-from drakegrasp.exchange.posture_files import has_rows, holds_postures, read_postures
-from drakegrasp.exchange.predicted_postures import read_predicted_postures
+from drakegrasp.exchange.attempts import has_rows, holds_postures, read_attempts
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import read_hand_file
@@ -96,8 +95,9 @@ def requested_rows(request: VerifyRequest, count: int) -> PredictedRows | None:
         if request.dataset is None or not has_rows(request.grasps):
             return None
         data = GraspDataset(request.dataset, split=split, fewer_fingers=True)
+        hand = load_hand(dataset_config(data).hand_source)
         return PredictedRows.of(
-            request.dataset, split, read_predicted_postures(request.grasps, data)[1]
+            request.dataset, split, read_attempts(request.grasps, hand, of=data).of_row
         )
     path = _dataset_path(request)
     if path is None:
@@ -211,7 +211,7 @@ def _place_postures(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
     # All are tried on the one object, which they need not name.
     assert request.mesh is not None
     name = find_mesh(request.mesh, units=request.units or "m").name
-    table = read_postures(request.grasps, load_hand(config.hand_source), of=name)
+    table = read_attempts(request.grasps, load_hand(config.hand_source), of=name)
     thing = place_object(request.mesh, units=request.units, config=config)
     others = sorted({each for each in table.objects if each not in ("", name)})
     if others:
@@ -228,14 +228,15 @@ def _postures_on(dataset: Path, request: VerifyRequest) -> tuple[list[PlacedGras
             raise GraspError(f"{name} must be left out with postures and --dataset, got {value}")
     if has_rows(request.grasps):
         data = GraspDataset(dataset, split=request.split or DEFAULT_SPLIT, fewer_fingers=True)
-        table, rows, _ = read_predicted_postures(request.grasps, data)
-        placed = place_postures_on_rows(table, data, rows.tolist(), overrides=request.overrides)
+        hand = load_hand(dataset_config(data).hand_source)
+        table = read_attempts(request.grasps, hand, of=data)
+        placed = place_postures_on_rows(table, data, table.of_row, overrides=request.overrides)
         return placed, dataset_config(data, overrides=request.overrides)
     if request.split is not None:
         raise GraspError(f"--split must be given with `row` in the postures, got {request.split}")
     out = dataset.parent if dataset.is_file() else dataset
     config = override_config(read_manifest(out).config, request.overrides)
-    table = read_postures(request.grasps, load_hand(config.hand_source))
+    table = read_attempts(request.grasps, load_hand(config.hand_source))
     own = config if request.overrides else None
     return place_postures_on_dataset(table, out, own, overrides=request.overrides), config
 

@@ -1,7 +1,8 @@
-"""Files of postures, of our own layouts and of others.
+"""One way from files of others to attempts: postures of our own layouts and of other tools.
 
-In: a file, or a folder of files, and the hand that they are for. Out: a `PostureTable`, or an error
-in one line that names the file and what is wrong. docs/how-to/postures.md lists the layouts.
+In: a file, or a folder of files, the hand that they are for, and what they are of. Out: one table,
+`Attempts`, or an error in one line that names the file and what is wrong. Formats of other tools
+are in the modules that write them. docs/how-to/postures.md lists the layouts.
 """
 
 from __future__ import annotations
@@ -21,15 +22,26 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError, MachineError, listed, one_line
-from drakegrasp.exchange.foreign_postures import read_dexgraspbench, read_isaac_grasp
-from drakegrasp.exchange.posture_rows import Rows, quaternion_poses, table_of
+from drakegrasp.exchange.dexgraspbench import read_dexgraspbench
+from drakegrasp.exchange.isaac_grasp import read_isaac_grasp
 from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.protocols.files import is_grasp_file
-from drakegrasp.simulation.posture_table import CONDITIONS, PostureTable, join_tables
+from drakegrasp.simulation.attempts import (
+    CONDITIONS,
+    Attempts,
+    join_attempts,
+    make_attempts,
+    quaternion_poses,
+    taken,
+)
+from drakegrasp.verification.placing import choose_rows
 
+#: What a file says of all its rows together.
+_OF_FILE = ("frame", "link", "joints", "hand")
 #: Suffixes of the layouts.
 ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml", ".yml")
 #: Arrays are smaller, all together [bytes]: two million postures of a hand with 16 joints.
@@ -46,46 +58,43 @@ _KNOWN = (
 )
 
 
-def read_postures(path: Path, hand: Hand, *, of: str | None = None) -> PostureTable:
-    """Return the postures of a file, or of all files of a folder.
+def read_attempts(path: Path, hand: Hand, *, of: str | GraspDataset | None = None) -> Attempts:
+    """Return the postures of a file, or of all files of a folder, as one table.
 
-    A row that is none stays in the table, with the reason; in a folder a file may be none. What a
-    file says for a score, `row` and `confidence`, is not asked.
+    A row that is none stays in the table, with the reason; in a folder a file may be none.
 
     Args:
         path: The file or the folder.
         hand: The hand.
-        of: Name of the object of rows that name none; None: each must.
+        of: Name of the object of rows that name none; None: each must. Or the split of a dataset
+            whose rows they are for: then `row` says which, or they are one for each row, or
+            exported samples, of which those of the split count. Their objects and the poses of the
+            frame "camera" are those of the rows; `Attempts.of_row` has the rows.
 
     Raises:
         GraspError: If it is no file of postures of this hand, or names no object.
+        DataError: If the dataset cannot be used.
         MachineError: If a package is missing that the format needs.
     """
-
-    def table(rows: Rows) -> PostureTable:
-        if of is not None:
-            rows = replace(rows, objects=[name or of for name in rows.objects])
-        if rows.of_row is not None and not any(rows.objects):
-            raise GraspError(
-                "postures must name an object in each row, got rows of a dataset alone"
-            )
-        return table_of(hand, rows)
-
+    if isinstance(of, GraspDataset):
+        return _for_rows(path, hand, of)
     if not path.is_dir():
         with named(path):
-            return table(read_rows(path, hand, nameless=of is not None))
-    found = list[PostureTable | str]()
+            return _made(hand, _named(_raw(path, hand, nameless=of is not None), of))
+    found = list[Attempts | str]()
     for each in files_in(path):
         try:
             with named(each):
-                found.append(table(read_rows(each, hand)))
+                found.append(_made(hand, _named(_raw(each, hand), of)))
         except GraspError as error:
             found.append(str(error))
-    return join_tables(found)
+    return join_attempts(found)
 
 
-def read_rows(path: Path, hand: Hand, *, nameless: bool = False) -> Rows:
-    """Return what a file says of its postures, before it is compared with the hand.
+def _raw(path: Path, hand: Hand, *, nameless: bool = False) -> dict[str, Any]:
+    """Return what a file says of its postures, as arguments of `make_attempts`.
+
+    Beside these, `hand` is the name of the hand and `trial` (n,) the trials that samples were.
 
     Raises:
         GraspError: If it is no file of postures.
@@ -94,17 +103,88 @@ def read_rows(path: Path, hand: Hand, *, nameless: bool = False) -> Rows:
     suffix = path.suffix.lower()
     if not path.is_file():
         raise GraspError(f"postures must be a file or a folder of files, got {str(path)!r}")
-    with named(path):
-        if suffix in ARRAYS:
-            return _of_arrays(_read_arrays(path), nameless)
-        if suffix in TABLES:
-            return _of_columns(*_read_columns(path), nameless)
-        if suffix == ".npy":
-            return read_dexgraspbench(path, hand)
-        if suffix in YAMLS:
-            return read_isaac_grasp(path, hand)
-        known = ", ".join((*ARRAYS, *TABLES, ".npy", *YAMLS))
-        raise GraspError(f"must be a file of postures ({known}), got another")
+    if suffix in ARRAYS:
+        return _of_arrays(_read_arrays(path), nameless)
+    if suffix in TABLES:
+        return _of_columns(*_read_columns(path), nameless)
+    if suffix == ".npy":
+        return read_dexgraspbench(path, hand)
+    if suffix in YAMLS:
+        return read_isaac_grasp(path, hand)
+    known = ", ".join((*ARRAYS, *TABLES, ".npy", *YAMLS))
+    raise GraspError(f"must be a file of postures ({known}), got another")
+
+
+def _named(raw: dict[str, Any], of: str | None) -> dict[str, Any]:
+    """Return rows whose objects have names; `of` is that of those without."""
+    if of is not None:
+        return {**raw, "objects": [name or of for name in raw["objects"]]}
+    if raw.get("of_row") is not None and not any(raw["objects"]):
+        raise GraspError("postures must name an object in each row, got rows of a dataset alone")
+    return raw
+
+
+def _made(hand: Hand, raw: dict[str, Any]) -> Attempts:
+    """Return the table of what a file says."""
+    told = raw.get("hand")
+    if told not in (None, hand.name):
+        raise GraspError(f"hand must be {told}, as the file says, got {hand.name} (--hand)")
+    said = {name: value for name, value in raw.items() if name not in ("hand", "trial")}
+    try:
+        return make_attempts(hand, **said)
+    except (TypeError, ValueError) as error:
+        raise GraspError(one_line(error)) from None
+
+
+def _for_rows(path: Path, hand: Hand, data: GraspDataset) -> Attempts:
+    """Return the postures that are for rows of a split, see `read_attempts`."""
+    tables, files = list[Attempts | str](), files_in(path) if path.is_dir() else [path]
+    for each in files:
+        with named(each):
+            raw = _of_split(_raw(each, hand, nameless=True), data)
+            if len(raw["objects"]):
+                tables.append(_on_rows(raw, data, hand))
+    if not tables:
+        raise GraspError(
+            f"{path}: samples must be of {data.split} in {data.path.name} (--split), got none"
+        )
+    joined = join_attempts(tables)
+    return joined if len(files) == 1 else replace(joined, confidence=None)
+
+
+def _of_split(raw: dict[str, Any], data: GraspDataset) -> dict[str, Any]:
+    """Return exported samples that are of the split, with their rows; other postures as they are.
+
+    The trial of a sample says which row it is.
+    """
+    if raw.get("of_row") is not None or raw.get("trial") is None:
+        return raw
+    row_of = {trial: row for row, trial in enumerate(data.column("trial_id").tolist())}
+    trials = raw["trial"].tolist()
+    there = [i for i, trial in enumerate(trials) if trial in row_of]
+    known = {
+        name: value if value is None or name in _OF_FILE else taken(value, there)
+        for name, value in raw.items()
+    }
+    return {**known, "of_row": np.array([row_of[trials[i]] for i in there], np.int64)}
+
+
+def _on_rows(raw: dict[str, Any], data: GraspDataset, hand: Hand) -> Attempts:
+    """Return the postures of a file on their rows."""
+    if raw.get("X_TC") is not None:
+        raise GraspError("X_TC must be left out: the camera is that of the row; got it")
+    rows = choose_rows(data, raw.get("of_row"), len(raw["objects"]))
+
+    # What the rows say of object and camera.
+    objects = data.column("object_props/object_name")[rows].tolist()
+    X_TC = unpack_pose(data.column(f"object_props/frame_work2cam_{data.camera}")[rows])
+    other = [
+        f"object must be that of row {row}, {true}, got {told}" if told not in ("", true) else ""
+        for row, told, true in zip(rows.tolist(), raw["objects"], objects, strict=True)
+    ]
+    camera = X_TC if raw.get("frame") == "camera" else None
+    made = _made(hand, {**raw, "objects": objects, "X_TC": camera, "of_row": rows})
+    return made.refuse(other)
 
 
 @contextmanager
@@ -209,7 +289,7 @@ def _dataset(item: h5py.Dataset | h5py.Group) -> Any:
     return item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()]
 
 
-def _of_arrays(arrays: Mapping[str, Any], nameless: bool) -> Rows:
+def _of_arrays(arrays: Mapping[str, Any], nameless: bool) -> dict[str, Any]:
     """Return the rows of our own layout, which may name no object if they are `nameless`."""
     if unknown := [name for name in arrays if name not in _KNOWN]:
         raise GraspError(
@@ -234,25 +314,23 @@ def _of_arrays(arrays: Mapping[str, Any], nameless: bool) -> Rows:
     if "X_TO" in arrays:
         numbers["X_TO"] = _stacked(arrays["X_TO"], "X_TO")
 
-    return Rows(
-        objects=texts["object"] if "object" in texts else [""] * len(X_FG),
-        X_FL=X_FG,
-        link=_link(texts.get("link")),
-        frame=_only(texts.get("frame"), "frame") or "object",
-        q={
-            name: arrays[f"q_{name}"]
-            for name in ("grasp", "pregrasp", "squeeze")
-            if f"q_{name}" in arrays
-        },
-        joints=texts.get("joints"),
-        X_TC=None if "X_TC" not in arrays else _stacked(arrays["X_TC"], "X_TC"),
-        numbers=numbers | _conditions(arrays, len(X_FG)),
-        said=texts.get("source"),
-        invalid=invalid,
-        of_row=arrays.get("row"),
-        confidence=arrays.get("confidence"),
-        preshape=texts.get("preshape"),
-    )
+    stages = ("q_grasp", "q_pregrasp", "q_squeeze")
+    return {
+        "objects": texts["object"] if "object" in texts else [""] * len(X_FG),
+        "X_FG": X_FG,
+        "link": _link(texts.get("link")),
+        "frame": _only(texts.get("frame"), "frame") or "object",
+        **{name: arrays[name] for name in stages if name in arrays},
+        "joints": texts.get("joints"),
+        "X_TC": None if "X_TC" not in arrays else _stacked(arrays["X_TC"], "X_TC"),
+        **numbers,
+        **_conditions(arrays, len(X_FG)),
+        "said": texts.get("source"),
+        "invalid": invalid,
+        "of_row": arrays.get("row"),
+        "confidence": arrays.get("confidence"),
+        "preshape": texts.get("preshape"),
+    }
 
 
 def _leading_on(arrays: Mapping[str, Any], unknown: Sequence[str]) -> str:
@@ -380,7 +458,9 @@ def _read_columns(path: Path) -> tuple[dict[str, list[Any]], list[str]]:
     return {name: [row[i] for row in cells] for i, name in enumerate(header)}, invalid
 
 
-def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str], nameless: bool) -> Rows:
+def _of_columns(
+    columns: Mapping[str, list[Any]], invalid: list[str], nameless: bool
+) -> dict[str, Any]:
     """Return the rows of a plain table, with a column for each number; see `_of_arrays`."""
     place = [*("x", "y", "z"), *("qw", "qx", "qy", "qz")]
     needed = place if nameless or "row" in columns else ["object", *place]
@@ -402,7 +482,9 @@ def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str], nameless: 
             joints = joints or names
             if set(names) != set(joints):
                 raise GraspError(f"{stage}_ columns must be of the joints of grasp_, got others")
-            q[stage] = np.column_stack([_floats(columns, f"{stage}_{n}", invalid) for n in joints])
+            q[f"q_{stage}"] = np.column_stack(
+                [_floats(columns, f"{stage}_{n}", invalid) for n in joints]
+            )
     numbers = np.column_stack([_floats(columns, name, invalid) for name in place])
     known = {n: _floats(columns, n, invalid) for n in _SCALARS if n in columns}
     told_under = {n: _floats(columns, n, invalid) for n in CONDITIONS if n in columns}
@@ -410,20 +492,20 @@ def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str], nameless: 
     X_FL, reasons = quaternion_poses(numbers[:, :3], numbers[:, 3:])
     said = {n: _floats(columns, n, invalid) for n in ("row", "confidence") if n in columns}
     whole = "row" in said and np.array_equal(said["row"], np.floor(said["row"]))
-    return Rows(
-        objects=[str(name) for name in columns.get("object", [""] * len(numbers))],
-        X_FL=X_FL,
-        link=_link(told("link")),
-        frame=_only(told("frame"), "frame") or "object",
-        q=q,
-        joints=joints,
-        numbers=known,
-        said=None if "source" not in columns else [str(text) for text in columns["source"]],
-        of_row=said["row"].astype(np.int64) if whole else said.get("row"),
-        confidence=said.get("confidence"),
-        invalid=[one or other for one, other in zip(invalid, reasons, strict=True)],
-        preshape=[str(name or "") for name in columns.get("preshape", ())] or None,
-    )
+    return {
+        "objects": [str(name) for name in columns.get("object", [""] * len(numbers))],
+        "X_FG": X_FL,
+        "link": _link(told("link")),
+        "frame": _only(told("frame"), "frame") or "object",
+        **q,
+        "joints": joints,
+        **known,
+        "said": None if "source" not in columns else [str(text) for text in columns["source"]],
+        "of_row": said["row"].astype(np.int64) if whole else said.get("row"),
+        "confidence": said.get("confidence"),
+        "invalid": [one or other for one, other in zip(invalid, reasons, strict=True)],
+        "preshape": [str(name or "") for name in columns.get("preshape", ())] or None,
+    }
 
 
 def _floats(

@@ -1,25 +1,27 @@
-"""Many postures of several objects, as a file gives them, and the palm poses of a build from them.
+"""Attempts from outside: many postures of several objects, and the palm poses of a build from them.
 
-In: rows of a file with their joints in the plant's order. Out: a `PostureTable`, which is plain
-data and can be sent to another process; of an object its `Candidates`; and the `Attempt` of each. A
-row that is no posture stays in the table, with the reason, and spoils no other.
+In: what a file, a network or another tool says of n grasps. Out: one table, `Attempts`, in which a
+row that is none keeps the reason and spoils no other. It is plain data and can be sent to another
+process. A build makes its `Candidates` and the `Attempt` of each from it, a verdict and a score put
+its rows on their objects.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.errors import NAMED, GraspError, listed
-from drakegrasp.frames import FARTHEST, X_WT, Array, invert_pose
+from drakegrasp.frames import FARTHEST, X_WT, Array, invert_pose, make_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
@@ -30,7 +32,13 @@ from drakegrasp.simulation.candidates import (
     Source,
     is_audited,
 )
-from drakegrasp.simulation.posture import Posture, exact_pose, preshape_index, start_of
+from drakegrasp.simulation.posture import (
+    Posture,
+    exact_pose,
+    joint_order,
+    preshape_index,
+    start_of,
+)
 from drakegrasp.simulation.settle import SAME_UP
 
 #: Frames of a table: those of a posture, and {M}, the axes and the origin of the mesh file.
@@ -40,13 +48,15 @@ TABLE_FRAMES: tuple[str, ...] = get_args(TableFrame)
 MOST_POSES = 1e6
 #: What `resting` is where nobody named a resting pose: all of the object are tried.
 UNTOLD = -1
-#: What an attempt may have drawn, in the order of `PostureTable.conditions`.
+#: How far the length of a quaternion may be from one.
+UNIT_TOLERANCE = 1e-3
+#: What an attempt may have drawn, in the order of `Attempts.conditions`.
 CONDITIONS = ("friction_hand", "friction_table", "mass")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PostureTable:
-    """n postures of hands with j joints, in the plant's order.
+class Attempts:
+    """n postures of hands with j joints, in the plant's order; made by `make_attempts`.
 
     Attributes:
         objects: (n,), name of the object of each.
@@ -66,6 +76,8 @@ class PostureTable:
             reached under them; a build draws its own.
         row: (n,), row in the file.
         invalid: (n,), why a row is no posture; empty where it is one.
+        of_row: (n,), of predictions: the row of a dataset's split that each is for.
+        confidence: (n,), of predictions: greater is better.
     """
 
     objects: tuple[str, ...]
@@ -84,26 +96,26 @@ class PostureTable:
     conditions: Array
     row: npt.NDArray[np.int64]
     invalid: tuple[str, ...]
+    of_row: Any = None
+    confidence: Any = None
 
     def __len__(self) -> int:
         return len(self.objects)
 
-    def of_object(self, name: str) -> PostureTable:
-        """Return the rows of an object that are postures, in their order."""
-        rows = [
-            i
-            for i, (each, reason) in enumerate(zip(self.objects, self.invalid, strict=True))
-            if each == name and not reason
-        ]
-        return self.at(rows)
+    def __iter__(self) -> Iterator[tuple[str, Any]]:
+        """Yield name and values of each column that the table has."""
+        for f in fields(self):
+            if f.name != "frame" and (value := getattr(self, f.name)) is not None:
+                yield f.name, value
 
-    def at(self, rows: Sequence[int]) -> PostureTable:
+    def of_object(self, name: str) -> Attempts:
+        """Return the rows of an object that are postures, in their order."""
+        said = zip(self.objects, self.invalid, strict=True)
+        return self.at([i for i, (each, reason) in enumerate(said) if each == name and not reason])
+
+    def at(self, rows: Sequence[int]) -> Attempts:
         """Return some rows, in the given order."""
-        chosen: dict[str, Any] = {
-            f.name: tuple(value[i] for i in rows) if isinstance(value, tuple) else value[rows]
-            for f in fields(self)
-            if (value := getattr(self, f.name)) is not None and f.name != "frame"
-        }
+        chosen: dict[str, Any] = {name: taken(value, rows) for name, value in self}
         return replace(self, **chosen)
 
     def posture(self, i: int, X_TO: Array, X_OM: Array | None = None) -> Posture:
@@ -152,7 +164,7 @@ class PostureTable:
         q = [self.q_grasp, self.q_pregrasp, self.q_squeeze]
         return np.column_stack([*(each.reshape(len(self), 16) for each in X), *q])
 
-    def refuse(self, reasons: Sequence[str]) -> PostureTable:
+    def refuse(self, reasons: Sequence[str]) -> Attempts:
         """Return the table with more reasons (n,) why rows are no postures."""
         both = (one or other for one, other in zip(self.invalid, reasons, strict=True))
         return replace(self, invalid=tuple(both))
@@ -173,13 +185,13 @@ class PostureTable:
         return f"{count:,} of {len(self):,} rows of the postures are not tried: {told}{more}"
 
     def digest(self) -> str:
-        """Return a hash (16 hex digits) of all that the table says."""
+        """Return a hash (16 hex digits) of all that decides a build."""
         digest = hashlib.sha256()
         for f in fields(self):
             # Why a row is none follows from the others, and from the meshes; a build draws its own
             # conditions. A table without preshapes or poses is as before there were any.
             value = getattr(self, f.name)
-            if f.name in ("invalid", "conditions"):
+            if f.name in ("invalid", "conditions", "of_row", "confidence"):
                 continue
             if f.name == "preshape" and not any(value):
                 continue
@@ -190,7 +202,14 @@ class PostureTable:
         return digest.hexdigest()[:16]
 
 
-def make_table(
+def taken(value: Any, rows: Sequence[int]) -> Any:
+    """Return some rows of a column: an array, a tuple or a list."""
+    if isinstance(value, np.ndarray):
+        return value[rows]
+    return type(value)(value[i] for i in rows)
+
+
+def make_attempts(
     hand: Hand,
     objects: Sequence[str],
     X_FG: npt.ArrayLike,
@@ -198,6 +217,8 @@ def make_table(
     *,
     q_pregrasp: npt.ArrayLike | None = None,
     q_squeeze: npt.ArrayLike | None = None,
+    joints: Sequence[str] | None = None,
+    link: str | None = None,
     resting: npt.ArrayLike | None = None,
     X_TO: npt.ArrayLike | None = None,
     frame: str = "object",
@@ -208,16 +229,21 @@ def make_table(
     invalid: Sequence[str] | None = None,
     preshape: Sequence[str | None] | None = None,
     conditions: npt.ArrayLike | None = None,
-) -> PostureTable:
+    of_row: Any = None,
+    confidence: Any = None,
+) -> Attempts:
     """Return a table of postures, after checking every row by itself.
 
     Args:
         hand: The hand.
         objects: (n,), names of the objects.
-        X_FG: (n, 4, 4), poses of the palm in the frame.
-        q_grasp: (n, j), in the plant's order.
-        q_pregrasp: (n, j); rows of NaN are not given.
-        q_squeeze: (n, j); rows of NaN are not given.
+        X_FG: (n, 4, 4), poses of the palm, or of the link, in the frame.
+        q_grasp: (n, m), of the joints.
+        q_pregrasp: (n, m); rows of NaN are not given.
+        q_squeeze: (n, m); rows of NaN are not given.
+        joints: (m,), names of the joints; None: all, in the plant's order. A joint that the hand
+            file couples, or that the preshapes of all rows keep, may be missing.
+        link: Name of the palm link, if the poses are of it; None: of the palm frame.
         resting: (n,), index of the object's resting pose; where NaN, or None, all are tried.
         X_TO: (n, 4, 4), poses of the objects on the table, instead; rows of NaN are not given.
         frame: One of `TABLE_FRAMES`.
@@ -228,11 +254,23 @@ def make_table(
         invalid: (n,), why a row is known to be no posture; empty where it may be one.
         preshape: (n,), names of the hand's preshapes; empty: all fingers close.
         conditions: (n, 3), `CONDITIONS`; NaN: those of the object and of the configuration.
+        of_row: (n,), of predictions.
+        confidence: (n,), of predictions.
 
     Raises:
-        GraspError: If there is no row, or the arrays differ in length.
+        GraspError: If there is no row, the arrays differ in length, or the joints or the link are
+            none of this hand.
     """
-    count, joints = len(objects), len(hand.joint_names)
+    given = {"q_grasp": q_grasp, "q_pregrasp": q_pregrasp, "q_squeeze": q_squeeze}
+    given = {name: q for name, q in given.items() if q is not None}
+    count = len(objects)
+    names = tuple(name or "" for name in preshape or [""] * count)
+    unknown, kept = _known_preshapes(names, count, hand)
+    q = _in_order(hand, count, list(joint_order(hand) if joints is None else joints), given, kept)
+    if link not in (None, hand.palm_link):
+        raise GraspError(
+            f"link must be 'palm' for the palm frame, or {hand.palm_link!r}, got {link!r}"
+        )
     if not count:
         raise GraspError("postures must be at least one row, got none")
     if frame not in TABLE_FRAMES:
@@ -241,7 +279,7 @@ def make_table(
         raise GraspError("X_TC must be given with the frame camera, and only then")
 
     # Numbers that every row must have, and those that a row may lack.
-    bad = [""] * count if invalid is None else list(invalid)
+    bad, size = [""] * count if invalid is None else list(invalid), (count, len(hand.joint_names))
     where = _numbers(resting, (count,), "resting", bad, some=True)
     named = (where >= 0) & (where < MOST_POSES) & (where == np.floor(where))
     for i in np.flatnonzero(~(named | np.isnan(where))):
@@ -249,14 +287,15 @@ def make_table(
     known = _numbers(conditions, (count, len(CONDITIONS)), "conditions", bad, each=True)
     for i, k in np.argwhere(known <= 0.0):
         bad[i] = bad[i] or f"{CONDITIONS[k]} must be positive, got {known[i, k]:g}"
+    bad = [one or other for one, other in zip(bad, unknown, strict=True)]
     pregrasp, squeeze = (
-        _numbers(q, (count, joints), name, bad, some=True)
-        for name, q in (("q_pregrasp", q_pregrasp), ("q_squeeze", q_squeeze))
+        _numbers(q.get(name), size, name, bad, some=True) for name in ("q_pregrasp", "q_squeeze")
     )
-    return PostureTable(
+    X = np.asarray(X_FG) if link is None else multiply(np.asarray(X_FG), hand.X_BG)
+    return Attempts(
         objects=tuple(objects),
-        X_FG=_poses(X_FG, count, "the palm's pose", bad),
-        q_grasp=_numbers(q_grasp, (count, joints), "q_grasp", bad),
+        X_FG=_poses(X, count, "the palm's pose", bad),
+        q_grasp=_numbers(q["q_grasp"], size, "q_grasp", bad),
         q_pregrasp=pregrasp,
         q_squeeze=squeeze,
         frame=frame,
@@ -264,16 +303,18 @@ def make_table(
         scale=_numbers(scale, (count,), "scale", bad, some=True),
         log_density=_numbers(log_density, (count,), "log_density", bad, some=True),
         said=("",) * count if said is None else tuple(said),
-        preshape=("",) * count if preshape is None else known_preshapes(preshape, count, hand, bad),
+        preshape=names,
         conditions=known,
         row=np.arange(count, dtype=np.int64),
         resting=np.where(named, where, UNTOLD).astype(np.int64),
         X_TO=_poses(X_TO, count, "X_TO", bad, some=True),
         invalid=tuple(bad),
+        of_row=of_row,
+        confidence=confidence,
     )
 
 
-def join_tables(parts: Sequence[PostureTable | str]) -> PostureTable:
+def join_attempts(parts: Sequence[Attempts | str]) -> Attempts:
     """Return the rows of some tables, one after the other.
 
     Args:
@@ -282,7 +323,7 @@ def join_tables(parts: Sequence[PostureTable | str]) -> PostureTable:
     Raises:
         GraspError: If no part is a table, or they are in different frames.
     """
-    tables = [part for part in parts if isinstance(part, PostureTable)]
+    tables = [part for part in parts if isinstance(part, Attempts)]
     if not tables:
         raise GraspError(str(parts[0]))
     if len(frames := {table.frame for table in tables}) > 1:
@@ -290,15 +331,82 @@ def join_tables(parts: Sequence[PostureTable | str]) -> PostureTable:
 
     # Whatever the numbers of a row are that is none: nobody reads them.
     nothing = replace(tables[0].at([0]), objects=("",), said=("",))
-    whole = [p if isinstance(p, PostureTable) else replace(nothing, invalid=(p,)) for p in parts]
+    whole = [p if isinstance(p, Attempts) else replace(nothing, invalid=(p,)) for p in parts]
     joined: dict[str, Any] = {}
-    for f in fields(PostureTable):
-        values = [getattr(part, f.name) for part in whole]
-        if isinstance(values[0], tuple):
-            joined[f.name] = tuple(each for value in values for each in value)
-        elif isinstance(values[0], np.ndarray):
-            joined[f.name] = np.concatenate(values)
+    for name, value in tables[0]:
+        values = [getattr(part, name) for part in whole]
+        if any(each is None for each in values):
+            joined[name] = None
+        elif isinstance(value, tuple):
+            joined[name] = tuple(each for every in values for each in every)
+        else:
+            joined[name] = np.concatenate(values)
     return replace(tables[0], **{**joined, "row": np.arange(len(joined["row"]), dtype=np.int64)})
+
+
+def _in_order(
+    hand: Hand,
+    count: int,
+    joints: list[str],
+    given: Mapping[str, Any],
+    kept: Sequence[Mapping[str, float] | None],
+) -> dict[str, Array]:
+    """Return joint positions (n, j) by their stage, in the plant's order.
+
+    `kept` has for each row the positions of the joints that its preshape keeps.
+    """
+    order = joint_order(hand)
+    if unknown := [name for name in joints if name not in order]:
+        raise GraspError(
+            f"joints must be those of the hand ({', '.join(order)}), got {unknown[0]!r}"
+        )
+    if len(set(joints)) < len(joints):
+        raise GraspError("joints must be named once each, got one twice")
+
+    # Joints that the hand file moves or keeps may be left out.
+    followers = {
+        c.joint: (hand.fingers[i].closing_joint, c.ratio, c.offset)
+        for i in hand.motor_fingers
+        for c in hand.followers(i)
+    }
+    still = set(order).intersection(*(each for each in kept if each is not None))
+    known = {*joints, *still, *followers}
+    if missing := [name for name in order if name not in known]:
+        raise GraspError(f"joints must include {listed(missing)}, got {listed(joints)}")
+    found = {}
+    turning = [hand.joint_units[name] == "rad" for name in joints]
+    for stage, values in given.items():
+        rows = _joint_rows(values, (count, len(joints)), stage.removeprefix("q_"), turning)
+        columns = dict(zip(joints, rows.T, strict=True))
+        there = ~np.isnan(rows[:, 0])
+        for name in still - columns.keys():
+            held = [np.nan if each is None else each[name] for each in kept]
+            columns[name] = np.where(there, held, np.nan)
+        for name, (leader, ratio, offset) in followers.items():
+            if name not in columns:
+                columns[name] = ratio * columns[leader] + offset
+        found[stage] = np.column_stack([columns[name] for name in order])
+    return found
+
+
+def _joint_rows(values: Any, shape: tuple[int, int], stage: str, turning: list[bool]) -> Array:
+    """Return joint positions as numbers (n, m), of which those that turn are in radians."""
+    try:
+        rows = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise GraspError(f"{stage} joints must be numbers, got something else") from None
+    if rows.shape != shape:
+        raise GraspError(f"{stage} joints must be of shape {shape}, got {rows.shape}")
+
+    # In degrees most rows have a joint beyond a whole turn.
+    angles = rows[:, turning]
+    largest = np.abs(angles[np.isfinite(angles).all(axis=1)]).max(axis=1, initial=0.0)
+    if len(largest) and np.median(largest) > 2.0 * np.pi:
+        raise GraspError(
+            f"{stage} joints must be in radians, got up to {largest.max():.4g}: these look like "
+            "degrees"
+        )
+    return rows
 
 
 def _numbers(
@@ -331,24 +439,62 @@ def _numbers(
     return np.ascontiguousarray(array)
 
 
-def known_preshapes(
-    names: Sequence[str | None], count: int, hand: Hand, bad: list[str]
-) -> tuple[str, ...]:
-    """Return the names of the preshapes of rows, empty where there is none.
-
-    `bad` gets the reason for each row whose preshape the hand lacks.
+def _known_preshapes(
+    names: Sequence[str], count: int, hand: Hand
+) -> tuple[list[str], list[Mapping[str, float] | None]]:
+    """Return for each row why the hand lacks its preshape, and the joints that the preshape keeps.
 
     Raises:
         GraspError: If they are of another number of rows.
     """
     if len(names) != count:
         raise GraspError(f"preshape must be of {count} rows, got {len(names)}")
+    reasons, kept = [""] * count, list[Mapping[str, float] | None]()
     for i, name in enumerate(names):
         try:
-            preshape_index(hand, name or None)
+            kept.append(hand.at(preshape_index(hand, name or None)).preshape)
         except GraspError as error:
-            bad[i] = bad[i] or str(error)
-    return tuple(name or "" for name in names)
+            reasons[i] = str(error)
+            kept.append(None)
+    return reasons, kept
+
+
+def quaternion_poses(
+    positions: npt.ArrayLike, quaternions: npt.ArrayLike
+) -> tuple[Array, list[str]]:
+    """Return poses (n, 4, 4) of positions (n, 3) [m] and quaternions (n, 4) w, x, y, z.
+
+    Returns:
+        The poses, NaN where there is none; and for each the reason, empty where there is one.
+
+    Raises:
+        GraspError: If they are no numbers, or of other shapes.
+    """
+    try:
+        p, wxyz = np.asarray(positions, dtype=float), np.asarray(quaternions, dtype=float)
+    except (TypeError, ValueError):
+        raise GraspError("positions and quaternions must be numbers, got something else") from None
+    if p.ndim != 2 or p.shape[1] != 3 or wxyz.shape != (len(p), 4):
+        raise GraspError(
+            "positions must be of shape (n, 3) and quaternions of (n, 4), "
+            f"got {p.shape} and {wxyz.shape}"
+        )
+    length = np.linalg.norm(wxyz, axis=1)
+    bad = ~np.isfinite(p).all(axis=1) | ~(np.abs(length - 1.0) <= UNIT_TOLERANCE)
+    reasons = [
+        "position and quaternion must be finite, and the quaternion of length 1, got "
+        f"{p[i].tolist()} and {wxyz[i].tolist()}"
+        if none
+        else ""
+        for i, none in enumerate(bad.tolist())
+    ]
+    # In single precision a quaternion is off by some 1e-7.
+    X = np.full((len(p), 4, 4), np.nan)
+    good = np.flatnonzero(~bad)
+    if good.size:
+        R = Rotation.from_quat(wxyz[good] / length[good, None], scalar_first=True).as_matrix()
+        X[good] = [make_pose(*each) for each in zip(R, p[good], strict=True)]
+    return X, reasons
 
 
 def _poses(
@@ -368,13 +514,13 @@ def _poses(
     return array
 
 
-def unknown_objects(table: PostureTable, names: Sequence[str]) -> list[str]:
+def unknown_objects(table: Attempts, names: Sequence[str]) -> list[str]:
     """Return for each row why there is no such object; empty where there is."""
     known, must = set(names), f"object must be one of {listed(list(names))}"
     return ["" if each in known else f"{must}, got {each!r}" for each in table.objects]
 
 
-def misfits(table: PostureTable, name: str, scale: float, poses: Array) -> list[str]:
+def misfits(table: Attempts, name: str, scale: float, poses: Array) -> list[str]:
     """Return for each row why it does not fit an object that it is of; empty where it does.
 
     Args:
@@ -405,7 +551,7 @@ def misfits(table: PostureTable, name: str, scale: float, poses: Array) -> list[
 
 
 def given_candidates(
-    model: ObjectModel, X_TO: Array, table: PostureTable, X_OM: Array, config: Config
+    model: ObjectModel, X_TO: Array, table: Attempts, X_OM: Array, config: Config
 ) -> Candidates:
     """Return the postures of an object as its palm poses, up to `candidates.max` of them.
 
