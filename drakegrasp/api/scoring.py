@@ -31,7 +31,6 @@ from drakegrasp.verification.placing import (
     dataset_config,
     overridden_keys,
     place_on_rows,
-    place_postures_on_rows,
 )
 from drakegrasp.verification.verify import PlacedGrasp
 
@@ -124,10 +123,7 @@ def score(
 
     # Its verdicts, by this process or workers, and the card.
     def try_all(grasps: Array | Attempts, chosen: Sequence[int], deliver: Deliver) -> None:
-        if isinstance(grasps, Attempts):
-            placed = place_postures_on_rows(grasps, dataset, chosen, overrides=settings)
-        else:
-            placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
+        placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
         if peer:
             keep = Path(scratch if out is None else out) / CONVEX_PARTS
             _try_by_protocol(placed, protocol, deliver, keep=keep, workers=workers, show=show)

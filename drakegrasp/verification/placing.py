@@ -53,35 +53,53 @@ from drakegrasp.verification.verify import METHODS, PlacedGrasp
 
 #: What to call the frames of a dataset's cameras: of the data file's, and of the other file's.
 CAMERA, OTHER_CAMERA = "the camera's frame (camera)", "the frame of the dataset's other camera"
+#: Poses of an object at rest that differ by less are one: what is left of rounding in a file.
+SAME_POSE = 1e-6
 
 
 def place_on_object(
-    grasps: npt.ArrayLike,
+    grasps: npt.ArrayLike | Attempts,
     placed: PlacedObject,
     *,
     frame: str = "object",
     X_TC: npt.ArrayLike | None = None,
     method: str = "hand",
     snap_points: bool = False,
+    overrides: Sequence[str] = (),
 ) -> list[PlacedGrasp]:
-    """Return grasps in {O} of one object, in their order; see `api.verify_grasps`."""
-    rows = _read(grasps, method, placed.config)
-    given = None if X_TC is None else read_pose(X_TC, "X_TC")
-    return _placed(
-        placed,
-        np.arange(len(rows.invalid)),
-        rows,
-        frame=frame,
-        X_TC=given,
-        stated=given,
-        method=method,
-        snap_points=snap_points,
-        config=placed.config,
-    )
+    """Return grasps in {O} of one object, in their order; see `api.verify_grasps`.
+
+    Postures are of it, whatever they call it. Those that name no resting pose are for all of a
+    build. `overrides` is what the caller sets, which is stronger than the conditions of a posture.
+
+    Raises:
+        GraspError: If they are in the frame of a mesh file, or as `api.verify_grasps`.
+    """
+    if not isinstance(grasps, Attempts):
+        rows = _read(grasps, method, placed.config)
+        given = None if X_TC is None else read_pose(X_TC, "X_TC")
+        return _placed(
+            placed,
+            np.arange(len(rows.invalid)),
+            rows,
+            frame=frame,
+            X_TC=given,
+            stated=given,
+            method=method,
+            snap_points=snap_points,
+            config=placed.config,
+        )
+
+    named = replace(grasps, objects=(placed.model.name,) * len(grasps))
+    things, config = [placed], placed.config
+    if config.objects.resting_poses > 1:
+        others = find_resting_poses(placed.model, config)[1:]
+        things += [replace(placed, X_TO=resting.X_TO) for resting in others]
+    return _placed_postures(named, range(len(named)), things, config, overrides)
 
 
 def place_on_rows(
-    grasps: npt.ArrayLike,
+    grasps: npt.ArrayLike | Attempts,
     dataset: GraspDataset,
     rows: Sequence[int] | int | None = None,
     *,
@@ -97,18 +115,22 @@ def place_on_rows(
     Those of the same object stand together, so that its scene is built once. Arguments and errors
     are those of `api.verify_grasps`, and of `dataset_config`; one row may be for all grasps. Where
     no configuration is given, each grasp has the friction and mass that were drawn for its row, but
-    for what is overridden.
+    for what is overridden. Postures lie as their rows, whatever they say of object and pose.
     """
     # Read all grasps before any object: a wrong number is reported at once.
     used = dataset_config(dataset, config, hand, overrides)
-    read = _read(grasps, method, used)
+    read = grasps if isinstance(grasps, Attempts) else _read(grasps, method, used)
     chosen = choose_rows(dataset, rows, len(read.invalid))
 
     # Each object in each resting pose once, with its grasps.
-    placed_grasps, cameras = list[PlacedGrasp](), cameras_of_rows(dataset, chosen)
+    found, cameras = list[PlacedGrasp](), cameras_of_rows(dataset, chosen)
     for placed, indices in objects_of_rows(dataset, chosen):
+        if isinstance(read, Attempts):
+            lying = _as_it_lies(read, placed.model.name)
+            found += _placed_postures(lying, indices.tolist(), [placed], used, cameras=cameras)
+            continue
         own = {name: X_TC[indices] for name, X_TC in cameras.items()}
-        placed_grasps += _placed(
+        found += _placed(
             placed,
             indices,
             read,
@@ -119,10 +141,18 @@ def place_on_rows(
             snap_points=snap_points,
             config=used,
         )
+    return found if config is not None else as_drawn(found, dataset, chosen, overrides)
 
-    if config is not None:
-        return placed_grasps
-    return as_drawn(placed_grasps, dataset, chosen, overrides)
+
+def _as_it_lies(table: Attempts, name: str) -> Attempts:
+    """Return postures of one object, without what they say of its pose and conditions."""
+    return replace(
+        table,
+        objects=(name,) * len(table),
+        resting=np.zeros_like(table.resting),
+        X_TO=np.full_like(table.X_TO, np.nan),
+        conditions=np.full_like(table.conditions, np.nan),
+    )
 
 
 def cameras_of_rows(dataset: GraspDataset, rows: npt.NDArray[np.int64]) -> dict[str, Array]:
@@ -377,32 +407,7 @@ def choose_rows(
     return chosen
 
 
-#: Poses of an object at rest that differ by less are one: what is left of rounding in a file.
-SAME_POSE = 1e-6
-
-
-def place_postures_on_object(
-    table: Attempts, placed: PlacedObject, *, overrides: Sequence[str] = ()
-) -> list[PlacedGrasp]:
-    """Return the postures of a table on one object, whatever they call it.
-
-    Args:
-        table: The postures.
-        placed: The object as it is dropped; its other resting poses are those of a build.
-        overrides: What the caller sets, which is stronger than the conditions of a posture.
-
-    Raises:
-        GraspError: If they are in the frame of a mesh file.
-    """
-    named = replace(table, objects=(placed.model.name,) * len(table))
-    things, config = [placed], placed.config
-    if config.objects.resting_poses > 1:
-        others = find_resting_poses(placed.model, config)[1:]
-        things += [replace(placed, X_TO=resting.X_TO) for resting in others]
-    return _placed_postures(named, range(len(table)), things, config, overrides)
-
-
-def place_postures_on_dataset(
+def place_on_dataset(
     table: Attempts,
     out: Path,
     config: Config | None = None,
@@ -439,42 +444,6 @@ def place_postures_on_dataset(
         rows = [i for i, each in enumerate(table.objects) if each == name]
         placed += _placed_postures(table, rows, things, config or own, overrides)
     return placed
-
-
-def place_postures_on_rows(
-    table: Attempts,
-    dataset: GraspDataset,
-    rows: Sequence[int],
-    *,
-    overrides: tuple[str, ...] = (),
-) -> list[PlacedGrasp]:
-    """Return postures on the objects of a dataset's rows, with the friction and mass drawn there.
-
-    Args:
-        table: The postures, whose own objects and resting poses do not count.
-        dataset: The data file.
-        rows: (n,), the row of its split for each.
-        overrides: As for `place_on_rows`.
-
-    Raises:
-        GraspError: If a row does not exist, or the postures are in the frames of mesh files.
-        ConfigError, HandError, DataError: As `dataset_config`.
-    """
-    config, chosen = (
-        dataset_config(dataset, overrides=overrides),
-        choose_rows(dataset, rows, len(table)),
-    )
-    placed, cameras = list[PlacedGrasp](), cameras_of_rows(dataset, chosen)
-    table = replace(
-        table,
-        resting=np.zeros_like(table.resting),
-        X_TO=np.full_like(table.X_TO, np.nan),
-        conditions=np.full_like(table.conditions, np.nan),
-    )
-    for thing, indices in objects_of_rows(dataset, chosen):
-        named = replace(table, objects=(thing.model.name,) * len(table))
-        placed += _placed_postures(named, indices.tolist(), [thing], config, cameras=cameras)
-    return as_drawn(placed, dataset, chosen, overrides)
 
 
 def _placed_postures(

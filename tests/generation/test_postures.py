@@ -46,7 +46,7 @@ from drakegrasp.simulation.candidates import Source
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.posture import joint_order
 from drakegrasp.simulation.trial import run_attempt
-from drakegrasp.verification.placing import place_postures_on_dataset
+from drakegrasp.verification.placing import place_on_dataset
 from drakegrasp.verification.result_files import write_results
 from drakegrasp.verification.verify import verify_placed
 
@@ -266,7 +266,7 @@ def test_verdict_on_a_posture_of_a_preshape_has_a_place_for_every_finger(of_pres
         *(hand, [NAME] * 2, [unpack_pose(row["X_OG"][0])] * 2, [q] * 2),
         preshape=["pair", "fist"],
     )
-    held, none = map(verify_placed, place_postures_on_dataset(table, out))
+    held, none = map(verify_placed, place_on_dataset(table, out))
     assert held.held
     assert none.outcome is Outcome.INVALID
     assert none.reason.startswith("preshape must be one of all, pair for the hand")

@@ -19,7 +19,7 @@ from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.scoring.ranked import rank_postures
 from drakegrasp.scoring.run import VERDICTS
 from drakegrasp.simulation.posture import joint_order
-from drakegrasp.verification.placing import place_postures_on_rows
+from drakegrasp.verification.placing import place_on_rows
 
 HAND = load_hand()
 
@@ -88,7 +88,7 @@ def test_posture_in_the_frame_of_the_rows_camera_is_that_in_the_objects(
     np.savez(tmp_path / "p.npz", **given, frame="camera")
     table = rank_postures(tmp_path / "p.npz", data).table
     assert table is not None
-    placed = sorted(place_postures_on_rows(table, data, rows.tolist()), key=lambda g: g.index)
+    placed = sorted(place_on_rows(table, data, rows.tolist()), key=lambda g: g.index)
     for grasp, X_OG, row in zip(placed, X_OGs, rows.tolist(), strict=True):
         assert grasp.posture is not None
         np.testing.assert_allclose(grasp.posture.X_OG, X_OG, atol=1e-5)

@@ -28,11 +28,9 @@ from drakegrasp.objects.sources import find_mesh
 from drakegrasp.simulation.placement import place_object
 from drakegrasp.verification.placing import (
     dataset_config,
+    place_on_dataset,
     place_on_object,
     place_on_rows,
-    place_postures_on_dataset,
-    place_postures_on_object,
-    place_postures_on_rows,
 )
 from drakegrasp.verification.prediction import (
     HDF5_SUFFIXES,
@@ -217,7 +215,7 @@ def _place_postures(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
     if others:
         told = f"postures of {listed(others)} are tried on {name}, the --object"
         say(f"{request.grasps}: {told}", err=True)
-    return place_postures_on_object(table, thing, overrides=request.overrides), config
+    return place_on_object(table, thing, overrides=request.overrides), config
 
 
 def _postures_on(dataset: Path, request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
@@ -230,7 +228,7 @@ def _postures_on(dataset: Path, request: VerifyRequest) -> tuple[list[PlacedGras
         data = GraspDataset(dataset, split=request.split or DEFAULT_SPLIT, fewer_fingers=True)
         hand = load_hand(dataset_config(data).hand_source)
         table = read_attempts(request.grasps, hand, of=data)
-        placed = place_postures_on_rows(table, data, table.of_row, overrides=request.overrides)
+        placed = place_on_rows(table, data, table.of_row, overrides=request.overrides)
         return placed, dataset_config(data, overrides=request.overrides)
     if request.split is not None:
         raise GraspError(f"--split must be given with `row` in the postures, got {request.split}")
@@ -238,7 +236,7 @@ def _postures_on(dataset: Path, request: VerifyRequest) -> tuple[list[PlacedGras
     config = override_config(read_manifest(out).config, request.overrides)
     table = read_attempts(request.grasps, load_hand(config.hand_source))
     own = config if request.overrides else None
-    return place_postures_on_dataset(table, out, own, overrides=request.overrides), config
+    return place_on_dataset(table, out, own, overrides=request.overrides), config
 
 
 def _refuse_no_grasps(path: Path, grasps: Array, config: Config) -> None:
