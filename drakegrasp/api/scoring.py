@@ -13,7 +13,7 @@ import numpy.typing as npt
 from drakegrasp.api.verifying import run_verification
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError
-from drakegrasp.exchange.protocol_grasps import fitted_postures, write_grasps
+from drakegrasp.exchange.dexgraspbench import fitted_postures, write_grasps
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.protocols.postures import describe, prepare_trials, verify_postures, versions
@@ -21,11 +21,10 @@ from drakegrasp.protocols.protocol import Lift, find_protocol
 from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.executor import processes
 from drakegrasp.runtime.progress import progress_bar
-from drakegrasp.scoring.ranked import Ranked, ranked_sets
 from drakegrasp.scoring.references import REFERENCES
 from drakegrasp.scoring.run import Request, Score
 from drakegrasp.scoring.run import score as score_request
-from drakegrasp.scoring.verdict import Verdict, protocol_verdict, verdict_of
+from drakegrasp.scoring.verdict import Ranked, Verdict, protocol_verdict, ranked_sets, verdict_of
 from drakegrasp.simulation.attempts import Attempts
 from drakegrasp.verification.placing import (
     dataset_config,

@@ -105,11 +105,10 @@ def verify_grasp(
     if row is None and isinstance(on, GraspDataset):
         raise GraspError(f"row must be given with a GraspDataset, 0 to {len(on) - 1}, got None")
 
-    # In this process: to start workers would take longer.
-    (placed,) = _place(
+    (verdict,) = verify_grasps(
         vector,
         on,
-        None if row is None else [row],
+        rows=None if row is None else [row],
         frame=frame,
         X_TC=X_TC,
         units=units,
@@ -119,7 +118,6 @@ def verify_grasp(
         snap_points=snap_points,
         config=config,
     )
-    (verdict,) = _verify_on(None, [placed], show=False)
     return verdict
 
 
@@ -182,48 +180,14 @@ def verify_grasps(
         DataError: If the dataset cannot be used, or has changed since the sample was read.
         MachineError: If a worker would give other results than this machine.
     """
-    placed = _place(
-        grasps,
-        on,
-        rows,
-        frame=frame,
-        X_TC=X_TC,
-        units=units,
-        X_TO=X_TO,
-        hand=hand,
-        method=method,
-        snap_points=snap_points,
-        config=config,
-    )
-    # A worker of somebody's pool may not start processes.
-    alone = len(placed) <= FEW_GRASPS or multiprocessing.current_process().daemon
-    if client is not None or alone:
-        return _verify_on(client, placed, show=show)
-    return run_verification(placed, show=show)
-
-
-def _place(
-    grasps: npt.ArrayLike,
-    on: GraspTarget,
-    rows: Sequence[int] | None,
-    *,
-    frame: str | None,
-    X_TC: npt.ArrayLike | None,
-    units: str | None,
-    X_TO: npt.ArrayLike | None,
-    hand: str | Path | None,
-    method: str,
-    snap_points: bool,
-    config: Config | None,
-) -> list[PlacedGrasp]:
-    """Return grasps on what they are on; arguments that do not go with it are refused."""
     _refuse_other_targets(on)
     how: dict[str, Any] = {"method": method, "snap_points": snap_points}
     if not isinstance(on, Sample | GraspDataset):
         if rows is not None:
             raise GraspError(f"rows must be given with a GraspDataset only, got {rows!r}")
         thing = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
-        return place_on_object(grasps, thing, frame=frame or "object", X_TC=X_TC, **how)
+        placed = place_on_object(grasps, thing, frame=frame or "object", X_TC=X_TC, **how)
+        return _verify(client, placed, show=show)
 
     # Rows of a dataset define the object, how it lies, and the cameras.
     for name, value in {"X_TC": X_TC, "units": units, "X_TO": X_TO}.items():
@@ -244,7 +208,19 @@ def _place(
         key: PlacedObject(model=thing.model, X_TO=thing.X_TO, config=thing.config)
         for key, thing in things.items()
     }
-    return [replace(grasp, placed=doors[id(grasp.placed)]) for grasp in placed]
+    told = [replace(grasp, placed=doors[id(grasp.placed)]) for grasp in placed]
+    return _verify(client, told, show=show)
+
+
+def _verify(
+    client: Client | None, placed: Sequence[PlacedGrasp], *, show: bool
+) -> list[Verification]:
+    """Verify grasps on the workers of a client, or here, or on workers of this machine."""
+    # A worker of somebody's pool may not start processes.
+    alone = len(placed) <= FEW_GRASPS or multiprocessing.current_process().daemon
+    if client is not None or alone:
+        return _verify_on(client, placed, show=show)
+    return run_verification(placed, show=show)
 
 
 def _refuse_other_targets(on: object) -> None:

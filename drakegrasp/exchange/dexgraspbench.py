@@ -1,12 +1,11 @@
 """The files of DexGraspBench (github JYChen18/DexGraspBench), which BODex and Dexonomy write, too.
 
-Samples go out so that its code evaluates them, and its grasps come in as attempts.
-
-In: a dataset. Out: a folder whose content is copied into that repository: hand (MJCF and YAML),
-objects (convex parts, and the volume from which the benchmark has the density) and a .npy file per
-grasp, each a dictionary with the object's pose and three postures of the hand. A posture is the
-palm link's position [m] and quaternion (w, x, y, z), then the joints in the order of `joint_names`
-and the units of `joint_units`, rad or m:
+Samples of a dataset go out so that its code evaluates them, our own predictions so that a protocol
+of MuJoCo tries them, and its grasps come in as attempts. Out: a folder whose content is copied into
+that repository: hand (MJCF and YAML), objects (convex parts, and the volume from which the
+benchmark has the density) and a .npy file per grasp, each a dictionary with the object's pose and
+three postures of the hand. A posture is the palm link's position [m] and quaternion (w, x, y, z),
+then the joints in the order of `joint_names` and the units of `joint_units`, rad or m:
 
 * `grasp_qpos`: after closing, as it is stored;
 * `pregrasp_qpos`: closing and coupled joints opened by `APART`, or as far as they were open;
@@ -16,7 +15,9 @@ and the units of `joint_units`, rad or m:
 Keys that the benchmark does not read say under what the sample held: `hand`, `preshape`,
 `trial_id`, `start_qpos` (the joints of the open hand) and `conditions` (friction of hand and table,
 mass). All poses are over the table, in {T}. The hand is `mjcf.hand_model`: gains, torques and
-damping are those of the benchmark's Shadow Hand.
+damping are those of the benchmark's Shadow Hand. Of predictions, objects stand as
+`PlacedObject.X_TO_simulated` says; contacts become the posture of the first wrist pose that fits
+them, and a grasp that lacks pregrasp or squeeze gets those of the export.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import json
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -41,13 +42,18 @@ from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
 from drakegrasp.frames import Array, invert_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.mesh.wavefront import hull_text
-from drakegrasp.objects.model import load_object
+from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.protocols.files import POSTURES, read_grasp_file
 from drakegrasp.runtime.environment import require_mujoco
-from drakegrasp.runtime.progress import Report
+from drakegrasp.runtime.executor import Executor, run_here
+from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.simulation.attempts import quaternion_poses
+from drakegrasp.simulation.placement import PlacedObject
+from drakegrasp.simulation.posture import Posture, joint_order
+from drakegrasp.verification.verify import PlacedGrasp, first_fit
 
 #: What `drakegrasp export --help` says of the format.
 HELP = (
@@ -264,3 +270,95 @@ def read_dexgraspbench(path: Path, hand: Hand) -> dict[str, Any]:
         "said": [path.name] * count,
         "invalid": [one or other for one, other in zip(no_object, no_hand, strict=True)],
     }
+
+
+#: An object on the table, and a posture in {O}; or why there is none, for a row that is no grasp.
+PlacedPosture: TypeAlias = tuple[PlacedObject, Posture | str]
+
+
+def write_grasps(
+    grasps: Sequence[PlacedPosture],
+    hand: Hand,
+    folder: Path,
+    *,
+    execute: Executor = run_here,
+    keep: Path | None = None,
+    report: Report = silent,
+) -> tuple[Path, list[Path | str]]:
+    """Write grasps, and return the MJCF of the hand, and the file of each or why there is none.
+
+    Args:
+        grasps: In the caller's order.
+        hand: Their hand.
+        folder: To which the paths of objects in the files are relative.
+        execute: Cuts and writes the objects.
+        keep: Folder that keeps the convex parts of objects for the next call; None keeps none.
+        report: Is told how many objects are written.
+
+    Raises:
+        OSError: If a folder cannot be written.
+    """
+    # The hand, and where its spread is among the joints.
+    files = BenchFiles(hand, folder)
+    spread = joint_order(hand).index(hand.spread.joints[0]) if hand.spread.joints else None
+
+    # Each object once.
+    things = (placed.model for placed, posture in grasps if isinstance(posture, Posture))
+    models = {model.name: model for model in things}
+    report(0, len(models))
+    tasks = [(model, folder / OBJECTS / name, keep) for name, model in models.items()]
+    for done, _ in enumerate(execute(_write_parts, tasks), start=1):
+        report(done, len(models))
+
+    # Each grasp.
+    found = list[Path | str]()
+    for number, (placed, posture) in enumerate(grasps):
+        if isinstance(posture, str):
+            found.append(posture)
+            continue
+        grasp = ClosedGrasp(
+            trial_id=number,
+            split="",
+            object_name=placed.model.name,
+            X_TO=placed.X_TO_simulated,
+            X_TG=placed.X_TO_simulated @ posture.X_OG,
+            q=posture.q_grasp,
+            spread=0.0 if spread is None else float(posture.q_grasp[spread]),
+        )
+        path = folder / "grasps" / f"{number}.npy"
+        files.write_grasp(path, grasp, pregrasp=posture.q_pregrasp, squeeze=posture.q_squeeze)
+        found.append(path)
+    return files.hand_path, found
+
+
+def _write_parts(task: tuple[ObjectModel, Path, Path | None]) -> None:
+    """Cut an object into convex parts and write them."""
+    from drakegrasp.mjcf.convex_parts import convex_parts, kept_convex_parts
+
+    model, folder, keep = task
+    write_object(folder, convex_parts(model) if keep is None else kept_convex_parts(model, keep))
+
+
+def fitted_postures(
+    grasps: Sequence[PlacedGrasp], execute: Executor = run_here
+) -> list[PlacedPosture]:
+    """Return the posture of each grasp, in the given order; of contacts the first wrist pose."""
+    contacts = [(i, g) for i, g in enumerate(grasps) if not g.invalid and g.posture is None]
+    fitted = dict(execute(_fit, contacts))
+    return [
+        (g.placed, g.invalid or _told(g) or g.posture or fitted[i]) for i, g in enumerate(grasps)
+    ]
+
+
+def _told(grasp: PlacedGrasp) -> str:
+    """Return why a posture cannot be tried: nobody named its resting pose; empty if it can."""
+    count = 1 + len(grasp.others)
+    return f"resting must be 0 to {count - 1} with a protocol, got none" if count > 1 else ""
+
+
+def _fit(task: tuple[int, PlacedGrasp]) -> tuple[int, Posture]:
+    """Return the number of a grasp of contacts, and the posture of its first wrist pose."""
+    number, grasp = task
+    fit, hand = first_fit(grasp), load_hand(grasp.config.hand_source)
+    named = joint_positions(hand, fit.spread, fit.closing)
+    return number, Posture(fit.X_OG, np.array([named[name] for name in joint_order(hand)]))

@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.frames import Array
-from drakegrasp.scoring.ranked import Ranked
-from drakegrasp.scoring.verdict import Verdict
+from drakegrasp.scoring.verdict import Ranked, Verdict
 from drakegrasp.seeding import Stream, object_key
 
 #: Resamples, and the share of them that an interval holds.

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +35,10 @@ DEPTH_OF_GRASP = 0.03
 FINGER_SPACING = 0.04
 #: Half the edge of the square of pixels from which a normal is fitted.
 PATCH = 2
+
+
+#: Pixels (n, 2), u and v.
+Pixels: TypeAlias = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,37 +81,26 @@ class Scene:
         """Return the stream of a reference for a row; the row's trial names it, not its place."""
         return Stream(self.seed, object_key(name), int(self.data.value("trial_id", row)))
 
-    def visible(self, row: int) -> Visible:
-        """Return what the camera sees of the object of a row."""
+    def visible(self, row: int) -> tuple[Pixels, Array]:
+        """Return the object's pixels in a row, (n, 2) u and v, and their points p_CQ (n, 3) [m]."""
         image, mask = self.data.value("images", row), self.data.value("masks", row)
         v, u = np.nonzero(mask)
-        return Visible(
-            K=self.data.K,
-            pixels=np.column_stack([u, v]),
-            points=unproject(self.data.K, np.column_stack([u, v]), image[3][v, u]),
-        )
+        pixels = np.column_stack([u, v])
+        return pixels, unproject(self.data.K, pixels, image[3][v, u])
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Visible:
-    """The object's pixels: (n, 2) u and v, and their points p_CQ (n, 3) [m]."""
+def _contact(pixels: Pixels, points: Array, pixel: int) -> tuple[Array, Array]:
+    """Return the point of an object pixel and the normal of a plane through its patch.
 
-    K: Array
-    pixels: npt.NDArray[np.int64]
-    points: Array
-
-    def contact(self, pixel: int) -> tuple[Array, Array]:
-        """Return the point of an object pixel and the normal of a plane through its patch.
-
-        The normal points to the camera, as what is seen does.
-        """
-        near = np.abs(self.pixels - self.pixels[pixel]).max(axis=1) <= PATCH
-        patch, point = self.points[near], self.points[pixel]
-        view = -point / np.linalg.norm(point)
-        if len(patch) < 3:
-            return point, view
-        normal = np.linalg.svd(patch - patch.mean(axis=0))[2][2]
-        return point, normal if normal @ view >= 0.0 else -normal
+    The normal points to the camera, as what is seen does.
+    """
+    near = np.abs(pixels - pixels[pixel]).max(axis=1) <= PATCH
+    patch, point = points[near], points[pixel]
+    view = -point / np.linalg.norm(point)
+    if len(patch) < 3:
+        return point, view
+    normal = np.linalg.svd(patch - patch.mean(axis=0))[2][2]
+    return point, normal if normal @ view >= 0.0 else -normal
 
 
 def own(scene: Scene) -> Array:
@@ -179,7 +173,7 @@ def top_down(scene: Scene) -> Array:
 def _from_above(scene: Scene, row: int, X_TC: Array) -> Array:
     """Return the grasp (6k,) of `top_down` for a row, with the pose of its camera."""
     # Visible points from above, and their axes.
-    p_TQ = transform_points(X_TC, scene.visible(row).points)
+    p_TQ = transform_points(X_TC, scene.visible(row)[1])
     centroid = p_TQ[:, :2].mean(axis=0)
     centred = p_TQ[:, :2] - centroid
     major, minor = np.linalg.svd(centred.T @ centred)[0].T
@@ -211,9 +205,9 @@ def palm_normals(scene: Scene) -> Array:
     """
     axis = unpack_grasp(scene.constant)[0]
 
-    def choose(scene: Scene, row: int, seen: Visible, fingers: int) -> list[int]:
+    def choose(scene: Scene, row: int, pixels: Pixels, fingers: int) -> list[int]:
         targets = project(scene.data.K, axis)
-        return [int(np.argmin(((seen.pixels - uv) ** 2).sum(axis=1))) for uv in targets]
+        return [int(np.argmin(((pixels - uv) ** 2).sum(axis=1))) for uv in targets]
 
     return _on_surface(scene, choose)
 
@@ -221,20 +215,21 @@ def palm_normals(scene: Scene) -> Array:
 def surface_points(scene: Scene) -> Array:
     """Return random visible points of the object, with the normals of the depth image."""
 
-    def choose(scene: Scene, row: int, seen: Visible, fingers: int) -> list[int]:
-        drawn = scene.stream("surface", row).integers(len(seen.pixels), fingers)
+    def choose(scene: Scene, row: int, pixels: Pixels, fingers: int) -> list[int]:
+        drawn = scene.stream("surface", row).integers(len(pixels), fingers)
         return [int(pixel) for pixel in drawn]
 
     return _on_surface(scene, choose)
 
 
-def _on_surface(scene: Scene, choose: Callable[[Scene, int, Visible, int], Sequence[int]]) -> Array:
+def _on_surface(scene: Scene, choose: Callable[[Scene, int, Pixels, int], Sequence[int]]) -> Array:
     """Return grasps whose contacts are object pixels that a function chooses for each finger."""
     grasps = []
     for row in scene.rows:
-        seen = scene.visible(row)
+        pixels, points_C = scene.visible(row)
         fingers = len(scene.data.value("grasps", row)) // 6
-        contacts = [seen.contact(pixel) for pixel in choose(scene, row, seen, fingers)]
+        chosen = choose(scene, row, pixels, fingers)
+        contacts = [_contact(pixels, points_C, pixel) for pixel in chosen]
         points, normals = zip(*contacts, strict=True)
         grasps.append(pack_grasp(points, normals))
     return np.array(grasps)

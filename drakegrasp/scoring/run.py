@@ -25,9 +25,8 @@ from drakegrasp.runtime.files import write_atomic
 from drakegrasp.scoring.benchmark import read_benchmark, rows_digest
 from drakegrasp.scoring.card import Origin, card_of, card_text
 from drakegrasp.scoring.measures import Grouping, Judged, seconds
-from drakegrasp.scoring.ranked import Ranked, rank
 from drakegrasp.scoring.references import REFERENCES, Scene
-from drakegrasp.scoring.verdict import Verdict, VerdictFile, verdict_key
+from drakegrasp.scoring.verdict import Ranked, Verdict, VerdictFile, rank, verdict_key
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.attempts import Attempts
 

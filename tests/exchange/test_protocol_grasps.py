@@ -19,9 +19,8 @@ pytest.importorskip("coacd")
 
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.exchange.attempts import holds_postures
-from drakegrasp.exchange.dexgraspbench import OBJECTS
+from drakegrasp.exchange.dexgraspbench import OBJECTS, fitted_postures, write_grasps
 from drakegrasp.exchange.export import ClosedGrasp
-from drakegrasp.exchange.protocol_grasps import PlacedPosture, fitted_postures, write_grasps
 from drakegrasp.frames import invert_pose
 from drakegrasp.grasp import pack_grasp
 from drakegrasp.hand.description import load_hand
@@ -106,9 +105,9 @@ def test_files_say_what_the_posture_says(tmp_path: Path, grasps: list[ClosedGras
     X_OG = invert_pose(grasp.X_TO) @ grasp.X_TG
     squeeze = grasp.q + 0.05
     posture = Posture(X_OG, grasp.q, q_squeeze=squeeze)
-    each = PlacedPosture(placed=PlacedObject(model=model, X_TO=grasp.X_TO), posture=posture)
+    placed = PlacedObject(model=model, X_TO=grasp.X_TO)
     _, (path, why) = write_grasps(
-        [each, PlacedPosture(placed=each.placed, posture="it is none")], HAND, tmp_path / "to"
+        [(placed, posture), (placed, "it is none")], HAND, tmp_path / "to"
     )
     assert why == "it is none" and isinstance(path, Path)
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from drakegrasp.scoring.measures import Grouping, Judged
-from drakegrasp.scoring.ranked import rank
-from drakegrasp.scoring.verdict import Verdict, verdict_of
+from drakegrasp.scoring.verdict import Verdict, rank, verdict_of
 
 FAILS = Verdict(
     outcome="dropped",

@@ -20,7 +20,7 @@ from drakegrasp.scoring.measures import (
     first_table,
     resample,
 )
-from drakegrasp.scoring.ranked import rank
+from drakegrasp.scoring.verdict import rank
 
 DRAWS = resample([f"object {i}" for i in range(3)])
 

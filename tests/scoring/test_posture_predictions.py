@@ -16,8 +16,8 @@ from drakegrasp.errors import GraspError
 from drakegrasp.frames import invert_pose, unpack_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
-from drakegrasp.scoring.ranked import rank_postures
 from drakegrasp.scoring.run import VERDICTS
+from drakegrasp.scoring.verdict import rank_postures
 from drakegrasp.simulation.posture import joint_order
 from drakegrasp.verification.placing import place_on_rows
 

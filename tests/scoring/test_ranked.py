@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drakegrasp.errors import GraspError
-from drakegrasp.scoring.ranked import rank, read_ranked
+from drakegrasp.scoring.verdict import rank, read_ranked
 
 GRASPS = np.arange(2 * 3 * 18, dtype=float).reshape(2, 3, 18)
 

@@ -79,7 +79,7 @@ def test_contacts_on_what_is_seen_lie_on_the_box_and_face_the_camera(scene: Scen
     for make in (references.palm_normals, references.surface_points):
         for row, grasp in zip(scene.rows, make(scene), strict=True):
             points, normals = unpack_grasp(grasp)
-            seen = scene.visible(row).points
+            seen = scene.visible(row)[1]
             away = np.linalg.norm(seen[:, None] - points[None], axis=-1).min(axis=0)
             assert away.max() < 1e-6
             assert ((points * normals).sum(axis=1) <= 0.0).all()

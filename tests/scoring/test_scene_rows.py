@@ -59,7 +59,7 @@ def test_images_show_the_object_where_the_grasp_is(path: Path) -> None:
             X_TO = file["scenes/X_TO"][file["views/scene"][rows.views[row]], 0].reshape(3, 4)
             X_TC = file["views/X_TC"][rows.views[row]].reshape(3, 4)
         p_TQ = transform_points(np.vstack([X_TO, [0, 0, 0, 1]]), contacts.reshape(-1, 3))
-        seen = transform_points(np.vstack([X_TC, [0, 0, 0, 1]]), scene.visible(row).points)
+        seen = transform_points(np.vstack([X_TC, [0, 0, 0, 1]]), scene.visible(row)[1])
         apart = np.linalg.norm(p_TQ.mean(axis=0) - seen.mean(axis=0))
         assert apart < 0.06
         assert rows.value("images", row).shape == (4, 240, 320)

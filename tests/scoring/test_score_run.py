@@ -19,8 +19,8 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
 from drakegrasp.foreign_files import read_json
 from drakegrasp.scoring.card import card_text
-from drakegrasp.scoring.ranked import ranked_sets
 from drakegrasp.scoring.run import VERDICTS, Request, own_contacts, score
+from drakegrasp.scoring.verdict import ranked_sets
 from drakegrasp.verification.placing import dataset_config, place_on_rows
 
 

@@ -132,7 +132,7 @@ def _grasp_files(
 ) -> tuple[Path, Path, list[Path | str], list[Path]]:
     """Return the MJCF of the hand, the folder of objects, and of each grasp its file and name."""
     from drakegrasp.errors import DataError, HandError
-    from drakegrasp.exchange.protocol_grasps import fitted_postures, write_grasps
+    from drakegrasp.exchange.dexgraspbench import fitted_postures, write_grasps
     from drakegrasp.runtime.environment import require_mujoco
 
     # Files of DexGraspBench.
