@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -50,6 +50,7 @@ def declared_glb(content: bytes) -> Declared:
     file = _File(tree, chunk, len(content))
     X_SN = _place_nodes(tree)
     vertices, faces, total = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
+    surfaces: dict[tuple[int, str], list[tuple[Array, Faces]]] = {}
     for number, X in X_SN.items():
         node = tree["nodes"][number]
         if "mesh" not in node:
@@ -58,8 +59,10 @@ def declared_glb(content: bytes) -> Declared:
         weights = node.get("weights", mesh.get("weights", []))
         if "skin" in node:
             X = file.skin_pose(tree["skins"][node["skin"]], X_SN)
-        for primitive in mesh["primitives"]:
-            part, triangles = file.surface(primitive, weights)
+        key = (node["mesh"], repr(weights))
+        if key not in surfaces:
+            surfaces[key] = [file.surface(primitive, weights) for primitive in mesh["primitives"]]
+        for part, triangles in surfaces[key]:
             if np.linalg.det(X[:3, :3]) < 0.0:
                 triangles = triangles[:, ::-1]
             vertices.append(part @ X[:3, :3].T + X[:3, 3])
@@ -166,16 +169,9 @@ class _File:
     tree: dict[str, Any]
     chunk: bytes
     size: int  # of the whole file [bytes]
-    _surfaces: dict[tuple[int, str], tuple[Array, Faces]] = field(default_factory=dict)
 
     def surface(self, primitive: dict[str, Any], weights: list[float]) -> tuple[Array, Faces]:
         """Return the vertices and triangles of a primitive, its morph targets applied."""
-        key = (id(primitive), repr(weights))
-        if key not in self._surfaces:
-            self._surfaces[key] = self._make_surface(primitive, weights)
-        return self._surfaces[key]
-
-    def _make_surface(self, primitive: dict[str, Any], weights: list[float]) -> tuple[Array, Faces]:
         mode = primitive.get("mode", _TRIANGLES)
         if mode not in (_TRIANGLES, _STRIP, _FAN):
             return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)

@@ -19,12 +19,7 @@ from drakegrasp.mesh.surfaces import Faces, compact, stack
 from drakegrasp.mesh.wavefront import declared_obj
 
 #: Mesh files that can be read, and by what; other files are ignored.
-_DECLARED = {
-    ".obj": declared_obj,
-    ".stl": declared_stl,
-    ".ply": declared_ply,
-    ".glb": declared_glb,
-}
+_DECLARED = {".obj": declared_obj, ".stl": declared_stl, ".ply": declared_ply, ".glb": declared_glb}
 SUFFIXES = tuple(_DECLARED)
 #: Share of the largest coordinate by which transforms of the same vertex may differ.
 SAME = 1e-6

@@ -27,10 +27,9 @@ from drakegrasp.errors import MeshError, one_line
 from drakegrasp.foreign_files import is_name, read_content
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import count_parts
-from drakegrasp.mesh.decimation import MOST_FACES, coarsen, decimate
 from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
+from drakegrasp.mesh.remeshing import MOST_FACES, coarsen, decimate, resting_hull
 from drakegrasp.mesh.repair import repair_solid
-from drakegrasp.mesh.resting import resting_hull
 from drakegrasp.mesh.surfaces import Solid, diagonal, signed_volume
 from drakegrasp.objects.sources import (
     MANIFEST_NAME,
@@ -46,6 +45,13 @@ from drakegrasp.seeding import object_key
 #: Smaller objects are sheets or specks, which hydroelastic contact does not resolve.
 MIN_EXTENT = 0.5e-3  # [m]
 MIN_VOLUME = 1e-9  # [m^3]
+#: Type and shape of each array of a model.
+_ARRAYS = {
+    **dict.fromkeys(("visual_vertices", "collision_vertices"), (np.float64, (None, 3))),
+    **dict.fromkeys(("visual_faces", "collision_faces"), (np.int32, (None, 3))),
+    "p_OOcm": (np.float64, (3,)),
+    "I_OOcm_O": (np.float64, (3, 3)),
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,15 +93,7 @@ class ObjectModel:
     up: str = "+z"
 
     def __post_init__(self) -> None:
-        shapes = {
-            "visual_vertices": (np.float64, (None, 3)),
-            "visual_faces": (np.int32, (None, 3)),
-            "collision_vertices": (np.float64, (None, 3)),
-            "collision_faces": (np.int32, (None, 3)),
-            "p_OOcm": (np.float64, (3,)),
-            "I_OOcm_O": (np.float64, (3, 3)),
-        }
-        for key, (dtype, shape) in shapes.items():
+        for key, (dtype, shape) in _ARRAYS.items():
             array = np.array(getattr(self, key), dtype=dtype, order="C")
             if len(array.shape) != len(shape) or array.shape[-1] != 3 or not array.size:
                 raise MeshError(f"{self.name}: {key} must have shape {shape}, got {array.shape}")
@@ -353,15 +351,15 @@ def _mistake(values: dict[str, Any]) -> str | None:
     # Numbers.
     for key in ("mass", "scale", "friction", "collision_error"):
         number = values[key]
-        if key == "friction" and number is None:
-            continue
-        valid = isinstance(number, float) and np.isfinite(number) and number >= 0.0
-        if not valid or (number == 0.0 and key != "collision_error"):
+        unsaid = key == "friction" and number is None
+        least = 0.0 if key == "collision_error" else np.nextafter(0.0, 1.0)
+        if not unsaid and not (isinstance(number, float) and least <= number < np.inf):
             return f"{key} {number!r}"
 
     # Arrays; a face names three vertices.
-    for key in ("visual_vertices", "collision_vertices", "p_OOcm", "I_OOcm_O"):
-        if values[key].dtype.kind != "f" or not np.isfinite(values[key]).all():
+    for key, (dtype, _) in _ARRAYS.items():
+        numbers = values[key]
+        if dtype is np.float64 and not (numbers.dtype.kind == "f" and np.isfinite(numbers).all()):
             return f"{key} that are not finite numbers"
     if values["I_OOcm_O"].shape != (3, 3) or np.linalg.eigvalsh(values["I_OOcm_O"]).min() <= 0.0:
         return "an inertia that no solid has"

@@ -30,8 +30,8 @@ from drakegrasp.config import ObjectConfig
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.crossings import crossing_faces
+from drakegrasp.mesh.remeshing import subdivide
 from drakegrasp.mesh.repair import repair_solid
-from drakegrasp.mesh.resting import subdivide
 from drakegrasp.mesh.surfaces import Faces, diagonal, is_solid_surface, signed_volume
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.sources import (
@@ -89,21 +89,6 @@ class Original:
     vertices: Array
     faces: Faces
     crossing: int
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Morphed:
-    """A morph of an object.
-
-    Attributes:
-        vertices: (n, 3) [m], +z up, as high above z = 0 as the original.
-        faces: (m, 3).
-        draws: How many draws it took; the last one was accepted.
-    """
-
-    vertices: Array
-    faces: Faces
-    draws: int
 
 
 def draw_morph(stream: Stream) -> Morph:
@@ -169,8 +154,11 @@ def load_original(source: MeshSource) -> Original:
     )
 
 
-def morph_object(original: Original, name: str, number: int, seed: int) -> Morphed:
+def morph_object(original: Original, name: str, number: int, seed: int) -> tuple[Array, int]:
     """Return one morph of an object: watertight, and no more self-intersecting than it.
+
+    Of the same faces, it is its vertices (n, 3) [m], as high above z = 0 as the original, and the
+    number of draws that it took.
 
     Args:
         original: From `load_original`.
@@ -188,7 +176,7 @@ def morph_object(original: Original, name: str, number: int, seed: int) -> Morph
             continue
         vertices = np.round(points, DECIMALS) + 0.0
         if _is_sound(vertices, original):
-            return Morphed(vertices=vertices, faces=original.faces, draws=draw)
+            return vertices, draw
     raise MeshError(
         f"{name}: one of {MAX_DRAWS} draws must give a morph that does not pass through itself, "
         "got none"
@@ -279,10 +267,7 @@ def morph_meshes(
         text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
         (folder / MANIFEST_NAME).write_text(text, encoding="utf-8")
     return MorphReport(
-        morphs=len(draws),
-        first_draws=draws.count(1),
-        crossing=crossing,
-        refused=tuple(refused),
+        morphs=len(draws), first_draws=draws.count(1), crossing=crossing, refused=tuple(refused)
     )
 
 
@@ -295,8 +280,8 @@ def _morphs_of(
         # Also checks the name, which is that of a file.
         name = f"{source.class_name}_{source.name}_m{number}"
         MeshSource(name=name, class_name=source.class_name, path=source.path)
-        morphed = morph_object(original, source.name, number, seed)
-        made.append((name, obj_text(morphed.vertices, morphed.faces, normals=False), morphed.draws))
+        vertices, draws = morph_object(original, source.name, number, seed)
+        made.append((name, obj_text(vertices, original.faces, normals=False), draws))
     return made
 
 

@@ -5,47 +5,24 @@ One function per class: sizes come in, a watertight mesh goes out; see `drakegra
 
 from __future__ import annotations
 
+# Names, and tables of points and sizes, are laid out by hand.
+# fmt: off
+# isort: off
 import numpy as np
-import trimesh
+from trimesh import Trimesh
 
 from drakegrasp.arithmetic import sin_cos_deg
 from drakegrasp.frames import Array
 from drakegrasp.shapes.curves import (
-    BROAD,
-    EDGE,
-    LARGE,
-    arch,
-    between,
-    ellipse,
-    joined,
-    resample,
-    rounded_polygon,
-    rounded_rectangle,
-    scaled,
-    smooth,
-    spread_evenly,
-)
+    BROAD, EDGE, LARGE, arch, between, ellipse, joined, resample, rounded_polygon,
+    rounded_rectangle, scaled, smooth, spread_evenly)
 from drakegrasp.shapes.parts import (
-    ball,
-    block,
-    lathe,
-    loop_handle,
-    moved,
-    pillar,
-    post,
-    rod,
-    rotated,
-    scalloped,
-    tube,
-    vessel,
-)
+    ball, block, lathe, loop_handle, moved, pillar, post, rod, rotated, scalloped, tube,
+    vessel)
 from drakegrasp.shapes.solids import bar, cut, extrude, flat_base, fuse, revolve, stand, sweep
 
-# Tables of points and sizes are laid out by hand.
-# fmt: off
 
-
-def apple(*, radius: float, height: float) -> trimesh.Trimesh:
+def apple(*, radius: float, height: float) -> Trimesh:
     """Return an apple with a stem; `height` is without the stem."""
     side = smooth(scaled([
         (0.0, 0.07), (0.18, 0.03), (0.36, 0.0), (0.72, 0.16), (0.95, 0.42), (1.0, 0.62),
@@ -54,7 +31,7 @@ def apple(*, radius: float, height: float) -> trimesh.Trimesh:
     return _with_stem(side, (0.0, 0.0, 0.7 * height), (0.004, 0.0, height + 0.010))
 
 
-def pear(*, radius: float, neck_radius: float, height: float) -> trimesh.Trimesh:
+def pear(*, radius: float, neck_radius: float, height: float) -> Trimesh:
     """Return a pear that stands on its wide end, with a stem; `height` is without the stem."""
     side = smooth([
         (0.0, 0.04 * height), (0.35 * radius, 0.0), (0.85 * radius, 0.14 * height),
@@ -64,13 +41,13 @@ def pear(*, radius: float, neck_radius: float, height: float) -> trimesh.Trimesh
     return _with_stem(side, (0.0, 0.0, 0.85 * height), (-0.004, 0.0, height + 0.014))
 
 
-def _with_stem(side: Array, low: tuple[float, ...], high: tuple[float, ...]) -> trimesh.Trimesh:
+def _with_stem(side: Array, low: tuple[float, ...], high: tuple[float, ...]) -> Trimesh:
     """Return a fruit of a side (r, z) with a stem between two points (3,) [m]."""
     stem = bar(low, high, ellipse(0.0025, 0.0025, edge=0.002), normal=(0.0, 1.0, 0.0))
     return stand(fuse(revolve(side), stem))
 
 
-def banana(*, bend_radius: float, angle: float, thickness: float) -> trimesh.Trimesh:
+def banana(*, bend_radius: float, angle: float, thickness: float) -> Trimesh:
     """Return a bunch of three bananas, bent by `angle` about `bend_radius`, one on the others."""
     # Side by side and halfway above, a little into each other; their stalks meet in a crown.
     half = thickness / 2.0
@@ -87,7 +64,7 @@ def banana(*, bend_radius: float, angle: float, thickness: float) -> trimesh.Tri
         moved(top, (0.0, 0.0, 1.45 * half)), crown))
 
 
-def _single_banana(bend_radius: float, angle: float, thickness: float) -> trimesh.Trimesh:
+def _single_banana(bend_radius: float, angle: float, thickness: float) -> Trimesh:
     """Return a banana that lies on its side."""
     theta = np.linspace(-angle / 2.0, angle / 2.0, round(bend_radius * angle / LARGE) + 1)
     scale = between([
@@ -106,7 +83,7 @@ def _single_banana(bend_radius: float, angle: float, thickness: float) -> trimes
     return sweep(path, section, normal=(0.0, 0.0, 1.0), scale=scale)
 
 
-def mushroom(*, cap: float, stalk: float, height: float) -> trimesh.Trimesh:
+def mushroom(*, cap: float, stalk: float, height: float) -> Trimesh:
     """Return a mushroom: radii of its `cap` and its `stalk`."""
     low = 0.56 * height
     foot = smooth([
@@ -122,7 +99,7 @@ def mushroom(*, cap: float, stalk: float, height: float) -> trimesh.Trimesh:
     return lathe(joined(foot, head[1:]))
 
 
-def pumpkin(*, radius: float, height: float, ribs: int) -> trimesh.Trimesh:
+def pumpkin(*, radius: float, height: float, ribs: int) -> Trimesh:
     """Return a ribbed pumpkin with its stem; `height` is without the stem."""
     section = scalloped(radius, 0.13 * radius, ribs)
     s, c = sin_cos_deg(np.linspace(-90.0, 90.0, max(8, round(1.6 * height / EDGE)) + 1))
@@ -138,7 +115,7 @@ def pumpkin(*, radius: float, height: float, ribs: int) -> trimesh.Trimesh:
     return flat_base(sunk)
 
 
-def cactus(*, pot: float, radius: float, height: float) -> trimesh.Trimesh:
+def cactus(*, pot: float, radius: float, height: float) -> Trimesh:
     """Return a cactus with two arms in a `pot` of that radius at its rim."""
     rim = 0.95 * pot
     bowl = lathe(resample([
@@ -168,7 +145,7 @@ def cactus(*, pot: float, radius: float, height: float) -> trimesh.Trimesh:
     return fuse(*parts)
 
 
-def hammer(*, length: float, head_length: float, head_thickness: float) -> trimesh.Trimesh:
+def hammer(*, length: float, head_length: float, head_thickness: float) -> Trimesh:
     """Return a claw hammer that stands on its head, which is along y; `length` of its handle."""
     half = head_thickness / 2.0
     up = (0.0, 0.0, 1.0)
@@ -192,7 +169,7 @@ def hammer(*, length: float, head_length: float, head_thickness: float) -> trime
     return stand(rotated(fuse(handle, cut(head, notch)), "y", 90.0))
 
 
-def screwdriver(*, handle: float, radius: float, shaft: float) -> trimesh.Trimesh:
+def screwdriver(*, handle: float, radius: float, shaft: float) -> Trimesh:
     """Return a screwdriver that stands on its fluted `handle`, of that length as its `shaft`."""
     knots = [
         (0.86, 0.0), (0.96, 0.03), (1.0, 0.12), (1.0, 0.6), (0.74, 0.78), (0.7, 0.88), (0.8, 0.96),
@@ -213,7 +190,7 @@ def screwdriver(*, handle: float, radius: float, shaft: float) -> trimesh.Trimes
     return fuse(grip, post(low, high - 0.14 * shaft, steel, edge=0.8 * EDGE), blade)
 
 
-def mallet(*, length: float, head_length: float, radius: float) -> trimesh.Trimesh:
+def mallet(*, length: float, head_length: float, radius: float) -> Trimesh:
     """Return a mallet that lies on its side: handle along -x, a round head along y."""
     grip = 0.4 * radius + 0.004
     half, band = head_length / 2.0, radius + 0.002
@@ -230,7 +207,7 @@ def mallet(*, length: float, head_length: float, radius: float) -> trimesh.Trime
     return stand(fuse(head, *bands, handle, knob))
 
 
-def padlock(*, width: float, height: float, depth: float, shackle: float) -> trimesh.Trimesh:
+def padlock(*, width: float, height: float, depth: float, shackle: float) -> Trimesh:
     """Return a closed padlock: its body, and a `shackle` that reaches so far above it."""
     radius = 0.085 * width + 0.001
     body = moved(pillar([(-depth / 2.0, width, height), (depth / 2.0, width, height)],
@@ -249,7 +226,7 @@ def padlock(*, width: float, height: float, depth: float, shackle: float) -> tri
     return fuse(cut(body, fuse(hole, slit)), bow)
 
 
-def watering_can(*, radius: float, height: float, spout: float) -> trimesh.Trimesh:
+def watering_can(*, radius: float, height: float, spout: float) -> Trimesh:
     """Return a watering can: a long `spout` with a rose towards +x, a handle at -x."""
     side = resample(scaled([(1.0, 0.0), (1.0, 0.82), (0.8, 1.0)], radius, height), BROAD)
     body, core = vessel(side, wall=0.005, floor=0.008, edge=BROAD)
@@ -268,7 +245,7 @@ def watering_can(*, radius: float, height: float, spout: float) -> trimesh.Trime
     return fuse(body, cover, cut(fuse(pipe, rose), core), cut(handle, core))
 
 
-def bucket(*, top_radius: float, bottom_radius: float, height: float) -> trimesh.Trimesh:
+def bucket(*, top_radius: float, bottom_radius: float, height: float) -> Trimesh:
     """Return a bucket with its bail up, in the plane y = 0."""
     wall = 0.005
     body = vessel(resample([(bottom_radius, 0.0), (top_radius, height)], BROAD), wall=wall,
@@ -289,7 +266,7 @@ def bucket(*, top_radius: float, bottom_radius: float, height: float) -> trimesh
     return fuse(fuse(body, cut(rim, hole)), *ears, tube(resample(bail, EDGE), 0.004), grip)
 
 
-def traffic_cone(*, base: float, radius: float, height: float) -> trimesh.Trimesh:
+def traffic_cone(*, base: float, radius: float, height: float) -> Trimesh:
     """Return a traffic cone: edge of its square `base`, `radius` of its foot."""
     tip, foot = 0.26 * radius, 0.012
     ridges = []
@@ -302,7 +279,7 @@ def traffic_cone(*, base: float, radius: float, height: float) -> trimesh.Trimes
     return fuse(plate, cone, *ridges)
 
 
-def barrel(*, radius: float, bulge: float, height: float) -> trimesh.Trimesh:
+def barrel(*, radius: float, bulge: float, height: float) -> Trimesh:
     """Return a barrel with four hoops: `radius` of its ends, its middle wider by `bulge`."""
     inset = 0.006
     levels = np.linspace(0.0, 1.0, max(10, round(height / BROAD)) + 1)
@@ -320,7 +297,7 @@ def barrel(*, radius: float, bulge: float, height: float) -> trimesh.Trimesh:
     return fuse(staves, *hoops)
 
 
-def garbage_bin(*, width: float, height: float) -> trimesh.Trimesh:
+def garbage_bin(*, width: float, height: float) -> Trimesh:
     """Return a bin on two wheels, its lid closed: front towards +x, wheels and bar at -x."""
     depth, wheel = 1.08 * width, 0.16 * width
     body = pillar([(0.0, 0.72 * depth, 0.74 * width, 0.05 * depth, 0.0),

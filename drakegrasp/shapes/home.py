@@ -5,41 +5,19 @@ One function per class: sizes come in, a watertight mesh goes out; see `drakegra
 
 from __future__ import annotations
 
+# Names, and tables of points and sizes, are laid out by hand.
+# fmt: off
+# isort: off
 import numpy as np
-import trimesh
+from trimesh import Trimesh
 
 from drakegrasp.arithmetic import sin_cos_deg
 from drakegrasp.frames import Array
 from drakegrasp.shapes.curves import (
-    BROAD,
-    COARSE,
-    EDGE,
-    LARGE,
-    arch,
-    between,
-    ellipse,
-    foot_and_wall,
-    joined,
-    resample,
-    rounded_polygon,
-    scaled,
-    smooth,
-    spaced,
-    spread_evenly,
-)
+    BROAD, COARSE, EDGE, LARGE, arch, between, ellipse, foot_and_wall, joined, resample,
+    rounded_polygon, scaled, smooth, spaced, spread_evenly)
 from drakegrasp.shapes.parts import (
-    ball,
-    block,
-    hoop,
-    lathe,
-    moved,
-    pillar,
-    post,
-    prism,
-    rod,
-    rotated,
-    tube,
-)
+    ball, block, hoop, lathe, moved, pillar, post, prism, rod, rotated, tube)
 from drakegrasp.shapes.solids import bar, capped, cut, flat_base, fuse, revolve, skin, solid, sweep
 
 #: Edge length of a hat [m].
@@ -47,11 +25,8 @@ FELT = 1.2 * EDGE
 #: Edge length of shoes [m].
 LEATHER = 1.3 * EDGE
 
-# Tables of points and sizes are laid out by hand.
-# fmt: off
 
-
-def watertap(*, base: float, pipe: float, height: float, reach: float) -> trimesh.Trimesh:
+def watertap(*, base: float, pipe: float, height: float, reach: float) -> Trimesh:
     """Return a tap on its base: radii of `base` and `pipe`, a spout that reaches towards +x."""
     bend = reach / 2.0
     top = height - bend - pipe
@@ -70,7 +45,7 @@ def watertap(*, base: float, pipe: float, height: float, reach: float) -> trimes
         rod((0.0, 0.0, z), (0.0, y, z), 0.75 * pipe), ball((0.0, y, z), 0.9 * pipe), *wings)
 
 
-def knob(*, rose: float, neck: float, radius: float, height: float) -> trimesh.Trimesh:
+def knob(*, rose: float, neck: float, radius: float, height: float) -> Trimesh:
     """Return a door knob on its `rose`; all but the height are radii."""
     side = [
         *resample([(rose, 0.0), (rose, 0.007)], EDGE),
@@ -82,7 +57,7 @@ def knob(*, rose: float, neck: float, radius: float, height: float) -> trimesh.T
     return lathe(side)
 
 
-def lamp(*, base: float, shade: float, height: float) -> trimesh.Trimesh:
+def lamp(*, base: float, shade: float, height: float) -> Trimesh:
     """Return a table lamp: radii of its `base` and of the rim of its `shade`."""
     low, top = 0.54 * height, 0.58 * shade
     wall = 0.005
@@ -104,7 +79,7 @@ def lamp(*, base: float, shade: float, height: float) -> trimesh.Trimesh:
     return fuse(screen, foot, stem, finial)
 
 
-def iron(*, length: float, width: float, height: float) -> trimesh.Trimesh:
+def iron(*, length: float, width: float, height: float) -> Trimesh:
     """Return a clothes iron on its sole, its tip towards +x, with a closed handle."""
     t = np.linspace(0.0, 1.0, 200)
     nose = 0.5 * width * np.sqrt(1.0 - t**2.2)
@@ -127,7 +102,7 @@ def iron(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     return fuse(sole, body, tube(path, thick), dial)
 
 
-def hourglass(*, radius: float, waist: float, height: float) -> trimesh.Trimesh:
+def hourglass(*, radius: float, waist: float, height: float) -> Trimesh:
     """Return an hourglass between two discs of `radius`, with three posts."""
     plate = 0.009
     bulb = 0.70 * radius
@@ -147,7 +122,7 @@ def hourglass(*, radius: float, waist: float, height: float) -> trimesh.Trimesh:
         post(height - plate, height, radius, edge=BROAD))
 
 
-def bell(*, radius: float, body: float, handle: float) -> trimesh.Trimesh:
+def bell(*, radius: float, body: float, handle: float) -> Trimesh:
     """Return a hand bell that stands on its mouth: heights of its `body` and its `handle`."""
     wall = 0.006
     outer = smooth([
@@ -171,7 +146,7 @@ def bell(*, radius: float, body: float, handle: float) -> trimesh.Trimesh:
     return revolve(joined(inner, outer, grip, head))
 
 
-def candlestick(*, foot_radius: float, stem_radius: float, height: float) -> trimesh.Trimesh:
+def candlestick(*, foot_radius: float, stem_radius: float, height: float) -> Trimesh:
     """Return a candlestick with a wide foot, a knob and a drip cup with a socket."""
     cup, socket = 2.6 * stem_radius, 0.010
     outline = [
@@ -186,7 +161,7 @@ def candlestick(*, foot_radius: float, stem_radius: float, height: float) -> tri
     return revolve(joined(foot, side, resample(top, EDGE)))
 
 
-def book(*, width: float, length: float, thickness: float, edge: float = 0.011) -> trimesh.Trimesh:
+def book(*, width: float, length: float, thickness: float, edge: float = 0.011) -> Trimesh:
     """Return a closed book that lies flat, its round spine along y at -x."""
     cover, inlay, bulge = 0.004, 0.005, 0.008
     x, y, hinge = width / 2.0, length / 2.0, 0.006 - width / 2.0
@@ -221,7 +196,7 @@ def book(*, width: float, length: float, thickness: float, edge: float = 0.011) 
 
 def flashlight(
     *, head_radius: float, body_radius: float, height: float, head_height: float,
-) -> trimesh.Trimesh:
+) -> Trimesh:
     """Return a flashlight that stands on its lens, with a switch at +x."""
     taper = head_height + 0.022
     side = resample([*foot_and_wall(head_radius, head_height, 0.003), (body_radius, taper),
@@ -236,7 +211,7 @@ def flashlight(
 
 def dumbbell(
     *, length: float, head_width: float, head_length: float, grip_radius: float,
-) -> trimesh.Trimesh:
+) -> Trimesh:
     """Return a dumbbell along x with six-sided heads of `head_width` between flats."""
     apothem = head_width / 2.0
     turns = 2.0 * np.pi * (np.arange(6) + 0.5) / 6.0
@@ -257,7 +232,7 @@ def dumbbell(
     return fuse(*heads, grip)
 
 
-def camera(*, width: float, height: float, depth: float, lens: float) -> trimesh.Trimesh:
+def camera(*, width: float, height: float, depth: float, lens: float) -> Trimesh:
     """Return a camera that looks towards -y: its body, and `lens` the radius of its lens."""
     z = 0.46 * height
     front = -depth / 2.0
@@ -283,7 +258,7 @@ def camera(*, width: float, height: float, depth: float, lens: float) -> trimesh
         post(height - 0.004, height + 0.008, 0.012, at=(0.34 * width, 0.0)))
 
 
-def alarm_clock(*, radius: float, depth: float) -> trimesh.Trimesh:
+def alarm_clock(*, radius: float, depth: float) -> Trimesh:
     """Return an alarm clock with two bells on top, its face towards -y."""
     z, face = 0.016 + radius, -depth / 2.0
     case = cut(
@@ -308,7 +283,7 @@ def alarm_clock(*, radius: float, depth: float) -> trimesh.Trimesh:
     return flat_base(fuse(case, *hands, *marks, *bells, *legs, *hammer))
 
 
-def _bell_on_stalk(radius: float, z: float, side: float) -> trimesh.Trimesh:
+def _bell_on_stalk(radius: float, z: float, side: float) -> Trimesh:
     """Return a bell of an alarm clock of a `radius`, whose middle is at height `z` [m].
 
     Args:
@@ -326,7 +301,7 @@ def _bell_on_stalk(radius: float, z: float, side: float) -> trimesh.Trimesh:
     return fuse(moved(leaning, (1.18 * radius * c * side, 0.0, z + 1.18 * radius * s)), stalk)
 
 
-def hat(*, brim: float, crown: float, height: float) -> trimesh.Trimesh:
+def hat(*, brim: float, crown: float, height: float) -> Trimesh:
     """Return a top hat: radii of `brim` and `crown`; the brim is curled up at both sides."""
     wall, thick = 0.006, 0.006
     top = 1.06 * crown
@@ -352,7 +327,7 @@ def hat(*, brim: float, crown: float, height: float) -> trimesh.Trimesh:
     return solid(np.column_stack([x, y * (1.0 - 0.10 * out * share), z + lift]), upright.faces)
 
 
-def comb(*, length: float, depth: float, spine: float, teeth: float, count: int) -> trimesh.Trimesh:
+def comb(*, length: float, depth: float, spine: float, teeth: float, count: int) -> Trimesh:
     """Return a wide comb that stands on its teeth: heights of `spine` and `teeth`."""
     height = spine + teeth
     side = smooth([
@@ -370,7 +345,7 @@ def comb(*, length: float, depth: float, spine: float, teeth: float, count: int)
     return cut(body, *gaps)
 
 
-def shoe(*, length: float, width: float, height: float) -> trimesh.Trimesh:
+def shoe(*, length: float, width: float, height: float) -> Trimesh:
     """Return a laced shoe on its heel and sole; `height` of its collar."""
     last = _last(length, width, 0.62 * height, height)
 
@@ -385,7 +360,7 @@ def shoe(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     return fuse(cut(last, opening), tongue, *laces, _sole(length, width, 0.13 * height))
 
 
-def boot(*, length: float, width: float, height: float) -> trimesh.Trimesh:
+def boot(*, length: float, width: float, height: float) -> Trimesh:
     """Return a rubber boot on its heel and sole, open at the top."""
     foot = _last(length, width, 0.36 * height, 0.5 * height)
     x, radius = -0.24 * length, 0.25 * length
@@ -403,7 +378,7 @@ def boot(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     return fuse(cut(fuse(foot, shaft, *cuff), hole), _sole(length, width, 0.085 * height))
 
 
-def _last(length: float, width: float, instep: float, collar: float) -> trimesh.Trimesh:
+def _last(length: float, width: float, instep: float, collar: float) -> Trimesh:
     """Return the closed upper of a shoe: heights at the `instep` and at the `collar` [m]."""
     # Along the foot: half widths and heights.
     along = np.linspace(-0.49, 0.49, round(length / LEATHER) + 1)
@@ -426,7 +401,7 @@ def _last(length: float, width: float, instep: float, collar: float) -> trimesh.
     return capped(rings)
 
 
-def _sole(length: float, width: float, thick: float) -> trimesh.Trimesh:
+def _sole(length: float, width: float, thick: float) -> Trimesh:
     """Return the sole of a shoe, `thick` [m], its heel apart from it by an arch."""
     along = np.linspace(-0.505, 0.505, round(length / LEATHER) + 1)
     halves = between([
@@ -441,7 +416,7 @@ def _sole(length: float, width: float, thick: float) -> trimesh.Trimesh:
     return cut(slab, gap)
 
 
-def _slab(side: Array, depth: float) -> trimesh.Trimesh:
+def _slab(side: Array, depth: float) -> Trimesh:
     """Return the space below a curve (n, 2) of points (x, z), down to z = 0, as a slab across y."""
     counts = max(2, round(depth / LEATHER))
     y = np.linspace(-depth / 2.0, depth / 2.0, counts + 1)

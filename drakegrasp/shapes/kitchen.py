@@ -5,50 +5,24 @@ One function per class: sizes come in, a watertight mesh goes out; see `drakegra
 
 from __future__ import annotations
 
+# Names, and tables of points and sizes, are laid out by hand.
+# fmt: off
+# isort: off
 import numpy as np
-import trimesh
+from trimesh import Trimesh
 
 from drakegrasp.shapes.curves import (
-    BROAD,
-    COARSE,
-    EDGE,
-    LARGE,
-    bevelled,
-    ellipse,
-    foot_and_wall,
-    inset,
-    joined,
-    resample,
-    rounded_rectangle,
-    scaled,
-    smooth,
-    spaced,
-    spread_evenly,
-)
+    BROAD, COARSE, EDGE, LARGE, bevelled, ellipse, foot_and_wall, inset, joined, resample,
+    rounded_rectangle, scaled, smooth, spaced, spread_evenly)
 from drakegrasp.shapes.parts import (
-    ball,
-    block,
-    lathe,
-    loop_handle,
-    moved,
-    pillar,
-    post,
-    rod,
-    rotated,
-    scalloped,
-    trimmed,
-    tube,
-    vessel,
-)
+    ball, block, lathe, loop_handle, moved, pillar, post, rod, rotated, scalloped, trimmed,
+    tube, vessel)
 from drakegrasp.shapes.solids import bar, cut, extrude, fuse, grid_box, revolve, solid, sweep
-
-# Tables of points and sizes are laid out by hand.
-# fmt: off
 
 
 def mug(
     *, radius: float, height: float, handle_reach: float, handle_radius: float, wall: float = 0.005,
-) -> trimesh.Trimesh:
+) -> Trimesh:
     """Return a hollow straight mug with a handle at +x; `handle_reach` is how far it stands out."""
     shell, core = vessel(resample(foot_and_wall(radius, height, 0.004), EDGE), wall=wall,
         floor=0.007)
@@ -57,17 +31,13 @@ def mug(
     return fuse(shell, trimmed(handle, core))
 
 
-def cup(
-    *, top_radius: float, bottom_radius: float, height: float, wall: float = 0.0045,
-) -> trimesh.Trimesh:
+def cup(*, top_radius: float, bottom_radius: float, height: float, wall: float = 0.0045) -> Trimesh:
     """Return a hollow tapered cup without a handle."""
     side = resample([(bottom_radius, 0.0), (top_radius, height)], EDGE)
     return vessel(side, wall=wall, floor=0.006)[0]
 
 
-def bowl(
-    *, radius: float, height: float, foot_radius: float, wall: float = 0.005,
-) -> trimesh.Trimesh:
+def bowl(*, radius: float, height: float, foot_radius: float, wall: float = 0.005) -> Trimesh:
     """Return a hollow bowl on a ring foot."""
     side = smooth([
         (foot_radius, 0.0), (foot_radius + 0.001, 0.005), (0.72 * radius, 0.22 * height),
@@ -79,7 +49,7 @@ def bowl(
 def vase(
     *, foot_radius: float, belly_radius: float, neck_radius: float, lip_radius: float,
     height: float, wall: float = 0.005, edge: float = 0.007,
-) -> trimesh.Trimesh:
+) -> Trimesh:
     """Return a hollow vase with a belly, a neck and a lip."""
     side = smooth([
         (foot_radius, 0.0), (belly_radius, 0.4 * height), (neck_radius, 0.82 * height),
@@ -91,7 +61,7 @@ def vase(
 def wineglass(
     *, foot_radius: float, stem_radius: float, belly_radius: float, rim_radius: float,
     height: float, stem_height: float, wall: float = 0.0045,
-) -> trimesh.Trimesh:
+) -> Trimesh:
     """Return a wineglass: a solid foot and stem, a hollow cup."""
     # The cup, outside and inside.
     cup_height = height - stem_height
@@ -121,7 +91,7 @@ def pitcher(
     *, foot_radius: float, belly_radius: float, neck_radius: float, rim_radius: float,
     height: float, handle_reach: float, handle_radius: float, lip: float, wall: float = 0.005,
     edge: float = 0.008,
-) -> trimesh.Trimesh:
+) -> Trimesh:
     """Return a hollow pitcher with a handle at +x and a lip pulled out by `lip` at -x."""
     side = smooth([
         (foot_radius, 0.0), (belly_radius, 0.35 * height), (neck_radius, 0.8 * height),
@@ -139,9 +109,7 @@ def pitcher(
     return solid(np.column_stack([x - pull, y, z]), body.faces)
 
 
-def saucepan(
-    *, radius: float, height: float, handle_length: float, wall: float = 0.005,
-) -> trimesh.Trimesh:
+def saucepan(*, radius: float, height: float, handle_length: float, wall: float = 0.005) -> Trimesh:
     """Return a hollow saucepan with a straight handle along +x."""
     edge = 1.2 * EDGE
     shell, core = vessel(resample(foot_and_wall(radius, height, 0.005), edge), wall=wall,
@@ -155,7 +123,7 @@ def saucepan(
 
 def funnel(
     *, radius: float, spout_radius: float, cone_height: float, height: float, wall: float = 0.0045,
-) -> trimesh.Trimesh:
+) -> Trimesh:
     """Return a funnel, open at both ends, that stands on its wide end."""
     outer = resample([
         (radius, 0.0), (radius, 0.008), (spout_radius + 0.002, cone_height), (spout_radius, height),
@@ -172,7 +140,7 @@ def funnel(
     return revolve(profile, edge=edges, closed=True)
 
 
-def toaster(*, length: float, width: float, height: float) -> trimesh.Trimesh:
+def toaster(*, length: float, width: float, height: float) -> Trimesh:
     """Return a toaster with two slots along x and a lever at +x."""
     foot = 0.006
     across = rounded_rectangle(height - foot, width, 0.2 * width, edge=LARGE)
@@ -198,7 +166,7 @@ def toaster(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     return fuse(cut(fuse(body, *feet), *slots, groove), lever, dial)
 
 
-def coffeemaker(*, width: float, depth: float, height: float) -> trimesh.Trimesh:
+def coffeemaker(*, width: float, depth: float, height: float) -> Trimesh:
     """Return a coffee machine with its tank at -x and its jug in front, towards +x."""
     tank = 0.36 * depth
     jug, floor, head = 0.36 * width, 0.020, 0.24 * height
@@ -225,7 +193,7 @@ def coffeemaker(*, width: float, depth: float, height: float) -> trimesh.Trimesh
     return fuse(*parts, lamp)
 
 
-def teapot(*, radius: float, height: float, spout: float) -> trimesh.Trimesh:
+def teapot(*, radius: float, height: float, spout: float) -> Trimesh:
     """Return a teapot with its lid on: spout towards +x by `spout`, handle at -x."""
     body = lathe(smooth(scaled([(0.58, 0.0), (0.62, 0.03), (1.0, 0.42), (0.78, 0.76), (0.46, 0.86)],
         radius, height), BROAD), edge=BROAD)
@@ -246,7 +214,7 @@ def teapot(*, radius: float, height: float, spout: float) -> trimesh.Trimesh:
     return fuse(body, lid, button, pipe, rotated(handle, "z", 180.0))
 
 
-def juicer(*, radius: float, rim: float, cone: float) -> trimesh.Trimesh:
+def juicer(*, radius: float, rim: float, cone: float) -> Trimesh:
     """Return a citrus juicer: a dish with a rim of height `rim`, and in it a ribbed `cone`."""
     wall = 0.005
     side = smooth(scaled([(0.7, 0.0), (0.92, 0.3), (1.0, 1.0)], radius, rim), BROAD)
@@ -269,7 +237,7 @@ def juicer(*, radius: float, rim: float, cone: float) -> trimesh.Trimesh:
     return fuse(dish, extrude(ribs, profile), handle, lip)
 
 
-def pepper_mill(*, radius: float, waist: float, height: float) -> trimesh.Trimesh:
+def pepper_mill(*, radius: float, waist: float, height: float) -> Trimesh:
     """Return a turned pepper mill: `radius` of its foot, `waist` the radius at its narrowest."""
     side = smooth([
         (radius, 0.0), (radius, 0.1 * height), (0.82 * radius, 0.15 * height),
@@ -282,17 +250,17 @@ def pepper_mill(*, radius: float, waist: float, height: float) -> trimesh.Trimes
     return fuse(lathe(side), button)
 
 
-def box(*, width: float, depth: float, height: float, edge: float = 1.2 * EDGE) -> trimesh.Trimesh:
+def box(*, width: float, depth: float, height: float, edge: float = 1.2 * EDGE) -> Trimesh:
     """Return an upright box: `width` along x, `depth` along y."""
     return grid_box((width, depth, height), centre=(0.0, 0.0, height / 2.0), edge=edge)
 
 
-def can(*, radius: float, height: float) -> trimesh.Trimesh:
+def can(*, radius: float, height: float) -> Trimesh:
     """Return a closed can: a cylinder with bevelled rims."""
     return lathe(resample(bevelled(radius, height, 0.002), EDGE))
 
 
-def bottle(*, radius: float, height: float, neck_radius: float) -> trimesh.Trimesh:
+def bottle(*, radius: float, height: float, neck_radius: float) -> Trimesh:
     """Return a closed bottle, solid, with a shoulder, a neck and a cap."""
     shoulder, neck, cap = 0.58 * height, 0.78 * height, 0.9 * height
 
@@ -307,7 +275,7 @@ def bottle(*, radius: float, height: float, neck_radius: float) -> trimesh.Trime
         ], BROAD)))
 
 
-def jar(*, radius: float, height: float, lid_radius: float, lid_height: float) -> trimesh.Trimesh:
+def jar(*, radius: float, height: float, lid_radius: float, lid_height: float) -> Trimesh:
     """Return a closed jar, solid: a body, a short neck and a lid."""
     shoulder = height - lid_height - 0.018
     neck = min(lid_radius - 0.004, radius - 0.008)
@@ -325,7 +293,7 @@ def jar(*, radius: float, height: float, lid_radius: float, lid_height: float) -
         ], EDGE)))
 
 
-def carton(*, width: float, height: float, roof: float) -> trimesh.Trimesh:
+def carton(*, width: float, height: float, roof: float) -> Trimesh:
     """Return a milk carton with a gable of height `roof` and a screw cap at -y."""
     fin = 0.014
     shell = pillar([
@@ -343,9 +311,7 @@ def carton(*, width: float, height: float, roof: float) -> trimesh.Trimesh:
     return fuse(cut(shell, *folds), moved(cap, (0.0, -0.27 * width, height + 0.48 * roof)))
 
 
-def spray_bottle(
-    *, width: float, depth: float, height: float, edge: float = 0.007,
-) -> trimesh.Trimesh:
+def spray_bottle(*, width: float, depth: float, height: float, edge: float = 0.007) -> Trimesh:
     """Return a spray bottle, solid: an oval body, a neck, a head and a trigger towards +x."""
     body_height = 0.68 * height
     neck, section = 0.013, rounded_rectangle(width, depth, 0.45 * depth, edge=edge)
@@ -376,7 +342,7 @@ def spray_bottle(
     return fuse(body, collar, head, trigger)
 
 
-def soap_dispenser(*, width: float, depth: float, height: float) -> trimesh.Trimesh:
+def soap_dispenser(*, width: float, depth: float, height: float) -> Trimesh:
     """Return a soap dispenser: an oval bottle and a pump whose spout points towards +x."""
     body = 0.64 * height
     bottle = pillar(scaled([
@@ -395,7 +361,7 @@ def soap_dispenser(*, width: float, depth: float, height: float) -> trimesh.Trim
         post(z - 0.01, height, 0.013, 0.0125), spout)
 
 
-def towel_roll(*, radius: float, height: float, core: float) -> trimesh.Trimesh:
+def towel_roll(*, radius: float, height: float, core: float) -> Trimesh:
     """Return a paper towel roll that stands, with an open `core` and a loose sheet at +y."""
     paper = revolve(joined(
         resample(bevelled(radius, height, 0.002), BROAD),

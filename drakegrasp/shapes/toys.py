@@ -5,46 +5,26 @@ One function per class: sizes come in, a watertight mesh goes out; see `drakegra
 
 from __future__ import annotations
 
+# Names, and tables of points and sizes, are laid out by hand.
+# fmt: off
+# isort: off
 from itertools import product
 
 import numpy as np
-import trimesh
+from trimesh import Trimesh
 
 from drakegrasp.frames import Array
 from drakegrasp.shapes.curves import (
-    BROAD,
-    EDGE,
-    LARGE,
-    joined,
-    resample,
-    ring_angles,
-    scaled,
-    smooth,
-)
+    BROAD, EDGE, LARGE, joined, resample, ring_angles, scaled, smooth)
 from drakegrasp.shapes.parts import (
-    ball,
-    block,
-    hoop,
-    lathe,
-    loop_handle,
-    moved,
-    pillar,
-    post,
-    rod,
-    rotated,
-    tube,
-    vessel,
-)
+    ball, block, hoop, lathe, loop_handle, moved, pillar, post, rod, rotated, tube, vessel)
 from drakegrasp.shapes.solids import cut, flat_base, fuse
 
 #: Edge length of the animals: they have many parts [m].
 COAT = 1.25 * EDGE
 
-# Tables of points and sizes are laid out by hand.
-# fmt: off
 
-
-def chess_pawn(*, base: float, head: float, height: float) -> trimesh.Trimesh:
+def chess_pawn(*, base: float, head: float, height: float) -> Trimesh:
     """Return a chess pawn: radii of its `base` and its `head`."""
     neck = height - 1.75 * head
     side = joined(
@@ -57,7 +37,7 @@ def chess_pawn(*, base: float, head: float, height: float) -> trimesh.Trimesh:
     return fuse(lathe(side), ball((0.0, 0.0, height - head), head))
 
 
-def chess_rook(*, base: float, top: float, height: float) -> trimesh.Trimesh:
+def chess_rook(*, base: float, top: float, height: float) -> Trimesh:
     """Return a chess rook: radii of its `base` and its `top`, which has six battlements."""
     wall = 0.30 * top
     side = joined(
@@ -75,7 +55,7 @@ def chess_rook(*, base: float, top: float, height: float) -> trimesh.Trimesh:
     return cut(lathe(side), *gaps)
 
 
-def trophy(*, base: float, cup: float, height: float) -> trimesh.Trimesh:
+def trophy(*, base: float, cup: float, height: float) -> Trimesh:
     """Return a cup with two handles on a square pedestal: edge of `base`, radius of `cup`."""
     foot, stem = 0.17 * height, 0.46 * height
     plinth = pillar([(0.0, base, base), (0.7 * foot, 0.94 * base, 0.94 * base)], corner=0.003,
@@ -96,7 +76,7 @@ def trophy(*, base: float, cup: float, height: float) -> trimesh.Trimesh:
     return fuse(plinth, step, column, *(moved(part, (0.0, 0.0, stem)) for part in (bowl, *ears)))
 
 
-def house(*, width: float, depth: float, wall: float, roof: float) -> trimesh.Trimesh:
+def house(*, width: float, depth: float, wall: float, roof: float) -> Trimesh:
     """Return a toy house: heights of `wall` and `roof`, a door towards -y, a chimney."""
     eaves = 0.012
     body = pillar([(0.0, width, depth), (wall + 0.004, width, depth)], corner=0.004, edge=LARGE)
@@ -120,7 +100,7 @@ def house(*, width: float, depth: float, wall: float, roof: float) -> trimesh.Tr
     return fuse(cut(fuse(body, gable), *recesses), chimney)
 
 
-def toy_car(*, length: float, width: float, wheel: float) -> trimesh.Trimesh:
+def toy_car(*, length: float, width: float, wheel: float) -> Trimesh:
     """Return a toy car that drives towards +x: `wheel` is the radius of its wheels."""
     low, belt = 0.55 * wheel, 2.35 * wheel
     roof = belt + 0.24 * length
@@ -153,7 +133,7 @@ def toy_car(*, length: float, width: float, wheel: float) -> trimesh.Trimesh:
     return fuse(body, cut(cabin, *panes), *wheels, *lights)
 
 
-def rocket(*, radius: float, height: float, span: float) -> trimesh.Trimesh:
+def rocket(*, radius: float, height: float, span: float) -> Trimesh:
     """Return a toy rocket on four fins: `radius` of its hull, `span` of its fins from the axis."""
     low = 0.10 * height
     hull = lathe(smooth([
@@ -178,7 +158,7 @@ def rocket(*, radius: float, height: float, span: float) -> trimesh.Trimesh:
     return fuse(hull, nozzle, *fins, cut(window, pane))
 
 
-def dice(*, size: float, pip: float) -> trimesh.Trimesh:
+def dice(*, size: float, pip: float) -> Trimesh:
     """Return a die with its one on top: edge of the cube, radius of a `pip`."""
     half, edge = size / 2.0, BROAD
     cube = pillar(scaled([
@@ -205,7 +185,7 @@ def dice(*, size: float, pip: float) -> trimesh.Trimesh:
     return cut(cube, *pips)
 
 
-def bowling_pin(*, radius: float, height: float) -> trimesh.Trimesh:
+def bowling_pin(*, radius: float, height: float) -> Trimesh:
     """Return a bowling pin: `radius` of its belly."""
     side = smooth(scaled([
         (0.66, 0.0), (0.72, 0.03), (1.0, 0.3), (0.72, 0.52), (0.42, 0.68), (0.44, 0.76),
@@ -224,7 +204,7 @@ def _plinth(base: float) -> Array:
     ], EDGE)
 
 
-def bunny(*, body: float, head: float, ear: float) -> trimesh.Trimesh:
+def bunny(*, body: float, head: float, ear: float) -> Trimesh:
     """Return a sitting bunny: `body` and `head` are radii, `ear` is the length of its ears."""
     seat = 1.02 * body
     chin = 2.0 * body + 0.45 * head
@@ -247,7 +227,7 @@ def bunny(*, body: float, head: float, ear: float) -> trimesh.Trimesh:
     return flat_base(fuse(*parts))
 
 
-def toy_dog(*, length: float, height: float, girth: float) -> trimesh.Trimesh:
+def toy_dog(*, length: float, height: float, girth: float) -> Trimesh:
     """Return a standing dog: `length` of the trunk, `height` of the back, `girth` its radius."""
     leg, front, back = 0.36 * girth, 0.36 * length, -0.36 * length
     z = height - girth
@@ -278,12 +258,12 @@ def toy_dog(*, length: float, height: float, girth: float) -> trimesh.Trimesh:
     return flat_base(fuse(*parts))
 
 
-def snake(*, coil: float, thickness: float, neck: float) -> trimesh.Trimesh:
+def snake(*, coil: float, thickness: float, neck: float) -> Trimesh:
     """Return a coiled snake: radius of its `coil`, `thickness` of its body, height of its head."""
     half = thickness / 2.0
     upper = 2.3 * half
 
-    def ring(radius: float, size: float, z: float) -> trimesh.Trimesh:
+    def ring(radius: float, size: float, z: float) -> Trimesh:
         angles = np.append(ring_angles(max(16, round(2.0 * np.pi * radius / COAT))), 2.0 * np.pi)
         x, y = radius * np.cos(angles), radius * np.sin(angles)
         return fuse(*hoop(np.column_stack([x, y, np.full_like(x, z)]), size, edge=COAT))
@@ -308,7 +288,7 @@ def snake(*, coil: float, thickness: float, neck: float) -> trimesh.Trimesh:
                 edge=0.5 * COAT) for s in (-1.0, 1.0))))
 
 
-def rubber_duck(*, length: float, head: float) -> trimesh.Trimesh:
+def rubber_duck(*, length: float, head: float) -> Trimesh:
     """Return a rubber duck: `length` of its trunk, `head` the radius of its head."""
     a = length / 2.0
     b, c = 0.74 * a, 0.6 * a

@@ -15,7 +15,7 @@ from drakegrasp.arithmetic import dot, multiply, norm
 from drakegrasp.config import Config
 from drakegrasp.errors import MeshError, first_line
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, transform_points
-from drakegrasp.mesh.resting import subdivide
+from drakegrasp.mesh.remeshing import subdivide
 from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key

@@ -1,0 +1,104 @@
+"""Rays and crossing faces against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.meshes import box
+
+from drakegrasp.mesh.crossings import PAIRS, crossing_faces, first_hits
+
+HALF = np.array([0.03, 0.04, 0.05])
+
+
+@pytest.fixture(scope="module")
+def grids() -> np.ndarray:
+    """The triangles of a box whose faces are grids, so that many rays meet edges and corners."""
+    mesh = trimesh.creation.box(2.0 * HALF).subdivide().subdivide().subdivide()
+    return np.asarray(mesh.triangles)
+
+
+def down(xy: np.ndarray, height: float = 0.2) -> tuple[np.ndarray, np.ndarray]:
+    """Return rays from a height, straight down, at points (n, 2)."""
+    p = np.column_stack([xy, np.full(len(xy), height)])
+    return p, np.tile([0.0, 0.0, -1.0], (len(xy), 1))
+
+
+def test_no_ray_slips_through_an_edge_or_a_corner(grids: np.ndarray) -> None:
+    top = grids[np.all(grids[:, :, 2] == HALF[2], axis=1)]
+    middles = (top + np.roll(top, 1, axis=1)) / 2.0
+    xy = np.concatenate([top.reshape(-1, 3), middles.reshape(-1, 3)])[:, :2]
+    assert np.allclose(first_hits(grids, *down(xy)), 0.2 - HALF[2], rtol=0.0, atol=1e-15)
+
+
+def test_a_ray_past_the_silhouette_misses(grids: np.ndarray) -> None:
+    beside = np.array([[HALF[0] + 1e-7, 0.0], [0.0, -HALF[1] - 1e-7], [0.1, 0.1]])
+    assert np.isinf(first_hits(grids, *down(beside))).all()
+
+
+def test_the_first_of_several_walls_counts_and_what_is_behind_does_not(grids: np.ndarray) -> None:
+    inside, away = np.zeros((1, 3)), np.array([[0.0, 0.0, 0.2]])
+    z = np.array([[0.0, 0.0, 1.0]])
+    assert first_hits(grids, inside, z)[0] == pytest.approx(HALF[2])
+    assert np.isinf(first_hits(grids, away, z)[0])
+
+
+def test_slanted_rays_agree_with_the_box_in_closed_form(grids: np.ndarray) -> None:
+    """Slab by slab; more rays than fit into one block."""
+    rng = np.random.default_rng(1)
+    count = 3 * PAIRS // len(grids) + 5
+    p = rng.normal(size=(count, 3))
+    p *= 0.3 / np.linalg.norm(p, axis=1, keepdims=True)
+    z = rng.uniform(-1.2, 1.2, (count, 3)) * HALF - p
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    t = np.sort(np.stack([(-HALF - p) / z, (HALF - p) / z]), axis=0)
+    entry, leave = t[0].max(axis=1), t[1].min(axis=1)
+    expected = np.where(entry <= leave, entry, np.inf)
+    assert np.isfinite(expected).any() and np.isinf(expected).any()
+    assert np.allclose(first_hits(grids, p, z), expected, rtol=0.0, atol=1e-12)
+
+
+def test_no_rays_and_no_triangles(grids: np.ndarray) -> None:
+    none = np.zeros((0, 3))
+    assert first_hits(grids, none, none).shape == (0,)
+    assert np.isinf(first_hits(grids[:0], *down(np.zeros((2, 2))))).all()
+
+
+def joined(*meshes: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    mesh = trimesh.util.concatenate(meshes)
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+@pytest.mark.parametrize(
+    ("shift", "crosses"),
+    [
+        ((0.03, 0.02, 0.01), True),  # corners inside each other
+        ((0.08, 0.0, 0.0), False),  # apart
+        ((0.06, 0.0, 0.0), False),  # they share a wall
+        ((0.06, 0.10, 0.04), False),  # they share a corner
+        ((0.06 - 1e-7, 0.03, 0.0), False),  # by rounding only
+        ((0.06 - 1e-5, 0.03, 0.01), True),  # by a hundredth of a millimetre
+    ],
+)
+def test_two_boxes(shift: tuple[float, ...], crosses: bool) -> None:
+    assert bool(len(crossing_faces(*joined(box(), box(at=shift))))) == crosses
+
+
+def test_sphere_does_not_cross_itself_until_a_vertex_is_pushed_through() -> None:
+    ball = trimesh.creation.icosphere(3, radius=0.05)
+    vertices, faces = np.array(ball.vertices), np.asarray(ball.faces)
+    assert len(crossing_faces(vertices, faces)) == 0
+    vertices[17] = -1.3 * vertices[17] + [0.003, 0.002, -0.001]  # not through an edge
+    found = crossing_faces(vertices, faces)
+    around = np.flatnonzero((faces == 17).any(axis=1))
+    assert set(around) & set(found)
+    assert 3 < len(found) < 100
+
+
+def test_needle_through_the_middle_of_a_face_is_found() -> None:
+    """No vertex lies inside: only an edge passes through a face."""
+    needle = box((1e-3, 1e-3, 0.2))
+    found = crossing_faces(*joined(box(), needle))
+    assert len(found) >= 4
+    assert len(crossing_faces(*joined(box(), box((1e-3, 1e-3, 0.02))))) == 0  # wholly inside
