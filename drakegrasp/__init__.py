@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         verify_grasps,
         verify_rows,
     )
+    from drakegrasp.cluster.connect import connect
     from drakegrasp.config import Config
     from drakegrasp.dataset.checks.findings import Violation
     from drakegrasp.dataset.checks.run import check_dataset
@@ -76,6 +77,7 @@ _HOMES = {
     "Violation": "dataset.checks.findings",
     "build_dataset": "api.building",
     "check_dataset": "dataset.checks.run",
+    "connect": "cluster.connect",
     "load_config": "hand.settings",
     "load_hand": "hand.description",
     "make_benchmark": "api.building",
@@ -119,6 +121,7 @@ __all__ = [
     "Violation",
     "build_dataset",
     "check_dataset",
+    "connect",
     "load_config",
     "load_hand",
     "make_benchmark",

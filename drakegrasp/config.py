@@ -167,7 +167,7 @@ class SettleConfig(_Section):
     )
 
 
-#: Name and digest of a class of the user's own, as `drakegrasp.runtime.user_code` makes them.
+#: Name and digest of a class of the user's own, as `drakegrasp.registry` makes them.
 _OWN_CLASS = re.compile(r"[^/\\:]+\.py:[A-Za-z_]\w*@[0-9a-f]{16}")
 
 

@@ -1,24 +1,39 @@
-"""What is looked up by name: samplers, protocols, exporters, kinds of clusters.
+"""What is looked up by name: samplers, protocols, exporters, kinds of clusters, hands of others.
 
 Each is an entry point of an installed package in the group `drakegrasp.KIND`. Ours stand in
-pyproject.toml like anybody's, and are loaded when they are asked for, so a new one is one module
-and one line. In a checkout that file itself is read: no line in it waits for an installation.
+pyproject.toml like anybody's, and are loaded when they are asked for: a new one is one module and
+one line. A hand of another package is the path of its hand file. In a checkout pyproject.toml
+itself is read, so that no line in it waits for an installation.
+
+A class of the user's own is named `file.py:Name`, and imported from the file's text. A
+configuration keeps the name without folders, followed by 16 digits of the file's SHA-256, so that a
+changed file is another setting. The text travels with the configuration to every worker and is
+written into no file: code is never imported from a dataset, and whoever needs that of one gives the
+file again.
 """
 
 from __future__ import annotations
 
 import ast
+import hashlib
+import inspect
+import sys
 import tomllib
-from functools import cache
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, lru_cache
 from importlib import metadata, util
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Literal, TypeAlias
 
 from drakegrasp.errors import ConfigError, MachineError, listed, one_line
 
 #: What has names; a group of entry points is `drakegrasp.` and one of these.
-Kind: TypeAlias = Literal["clusters", "exporters", "protocols", "samplers"]
+Kind: TypeAlias = Literal["clusters", "exporters", "hands", "protocols", "samplers"]
+#: Processes keep so many imported files.
+_KEPT_FILES = 32
 _PROJECT = Path(__file__).resolve().parent.parent / "pyproject.toml"
 
 
@@ -81,3 +96,117 @@ def _ours(kind: Kind) -> dict[str, EntryPoint]:
 @cache
 def _theirs(kind: Kind) -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in metadata.entry_points(group=f"drakegrasp.{kind}")}
+
+
+# Classes of the user's own
+
+
+def read_class(setting: str) -> tuple[str, str]:
+    """Return the name that a configuration keeps of `path/file.py:Name`, and the file's text.
+
+    Raises:
+        ConfigError: If the file cannot be read, or has no class of that name.
+    """
+    path_text, _, name = setting.rpartition(":")
+    path = Path(path_text)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"{path}: must be a readable UTF-8 file, got: {one_line(error)}"
+        ) from None
+    stored = f"{path.name}:{name}@{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+    _import(stored, text)
+    return stored, text
+
+
+def own_class(
+    stored: str,
+    code: Mapping[str, str],
+    *,
+    key: str,
+    arguments: Sequence[str] = (),
+    method: str,
+    takes: Sequence[str] = (),
+) -> type[Any]:
+    """Return a class of the user's own.
+
+    Args:
+        stored: Its name in a configuration.
+        code: Text of the file by such names; empty for what was read from a dataset.
+        key: The setting that names the class.
+        arguments: Of its constructor, by position.
+        method: What its instances must have.
+        takes: Arguments of the method, by position.
+
+    Raises:
+        ConfigError: If the text is not there or cannot be imported, or the class is of another
+            signature.
+    """
+    if stored not in code:
+        raise ConfigError(
+            f"{stored}: must be given again, --set {key}=FILE.py:NAME, because code of a dataset "
+            "is never imported, got its name alone"
+        )
+    found = _import(stored, code[stored])
+    name = stored.partition("@")[0]
+    if not _accepts(found, arguments):
+        raise ConfigError(f"{name}: must take ({', '.join(arguments)}), got other arguments")
+    if not _accepts(getattr(found, method, None), ("self", *takes)):
+        listed = ", ".join(("self", *takes))
+        raise ConfigError(f"{name}: must have a method {method}({listed}), got none like it")
+    return found
+
+
+def run_own(stored: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call code of the user's own.
+
+    Raises:
+        ConfigError: If it raises an error, with the line of the file.
+    """
+    try:
+        return function(*arguments)
+    except Exception as error:
+        file, _, name = stored.partition("@")[0].partition(":")
+        raise ConfigError(f"{file}:{name}: must run, got {_described(error, file)}") from error
+
+
+def _accepts(function: object, arguments: Sequence[str]) -> bool:
+    """Return whether something can be called with so many arguments by position."""
+    try:
+        inspect.signature(function).bind(*arguments)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def _import(stored: str, text: str) -> type[Any]:
+    """Return the class of a stored name."""
+    place, _, digest = stored.partition("@")
+    file, _, name = place.partition(":")
+    found = getattr(_module(file, digest, text), name, None)
+    if not isinstance(found, type):
+        raise ConfigError(f"{file}: must have a class {name}, got none")
+    return found
+
+
+@lru_cache(maxsize=_KEPT_FILES)
+def _module(file: str, digest: str, text: str) -> ModuleType:
+    """Return the module of a file's text."""
+    # Data classes look for the module of their fields' types among those that are loaded.
+    module = ModuleType(f"drakegrasp_user_{digest}")
+    module.__file__ = file
+    sys.modules[module.__name__] = module
+    try:
+        exec(compile(text, file, "exec"), vars(module))
+    except (Exception, SystemExit) as error:
+        del sys.modules[module.__name__]
+        raise ConfigError(f"{file}: must be imported, got {_described(error, file)}") from error
+    return module
+
+
+def _described(error: BaseException, file: str) -> str:
+    """Return an error with the line of the user's file in which it was raised."""
+    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == file]
+    where = f" in line {lines[-1]}" if lines else ""
+    return f"{type(error).__name__}{where} ({one_line(error)})"

@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from drakegrasp.api.building import build_dataset
-from drakegrasp.cli.build import print_stats
-from drakegrasp.cli.tables import make_console
+from drakegrasp.cli.tables import make_console, print_stats
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.hand.settings import load_config

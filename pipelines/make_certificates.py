@@ -14,7 +14,7 @@ from pathlib import Path
 
 import click
 
-from drakegrasp.cli.errors import OneCommand
+from drakegrasp.cli.console import OneCommand
 from drakegrasp.cli.options import PATH
 from drakegrasp.cluster.certificates import make_certificates
 from drakegrasp.errors import MachineError

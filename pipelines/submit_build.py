@@ -23,12 +23,18 @@ import click
 from distributed import Client
 
 from drakegrasp.api.building import build_on, find_sources
-from drakegrasp.cli.build import print_plan, print_report
-from drakegrasp.cli.errors import OneCommand
-from drakegrasp.cli.options import build_options, chosen_tls, parse_request, shared, tls_options
+from drakegrasp.cli.console import OneCommand
+from drakegrasp.cli.datasets import print_plan, print_report
+from drakegrasp.cli.options import (
+    BUILD,
+    TLS,
+    Named,
+    chosen_tls,
+    parse_request,
+    shared,
+)
 from drakegrasp.cluster.connect import dashboard_line
-from drakegrasp.cluster.launch import start_cluster
-from drakegrasp.cluster.request import KINDS, ClusterRequest, describe, worker_count
+from drakegrasp.cluster.kinds import ClusterRequest, cluster_of, describe
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.hand.description import load_hand
 
@@ -39,15 +45,15 @@ from drakegrasp.hand.description import load_hand
 @click.option(
     "--cluster",
     "kind",
-    type=click.Choice(KINDS),
+    type=Named("clusters"),
     default="local",
     show_default=True,
     help="Where the work runs. Hosts follow ssh, an address follows scheduler, and a path follows "
     "scheduler-file.",
 )
 @click.argument("where", nargs=-1, metavar="[HOST...|ADDRESS|PATH]")
-@build_options
-@shared("--workers", help="Processes in all.  [default with local: one per core]")
+@shared(*BUILD)
+@shared("--workers", text="Processes in all.  [default with local: one per core]")
 @click.option(
     "--cores", type=int, metavar="N", help="Cores of each SSH host or SLURM job, a worker on each."
 )
@@ -57,7 +63,7 @@ from drakegrasp.hand.description import load_hand
     "--interface", metavar="NAME", help="Network interface on which scheduler and workers listen."
 )
 @click.option("--host", metavar="ADDRESS", help="Address on which the scheduler listens, instead.")
-@tls_options
+@shared(*TLS)
 @shared("--times")
 @click.option("--dry-run", is_flag=True, help="Only print what would run.")
 def main(
@@ -76,27 +82,29 @@ def main(
     """Run the script."""
     tls = chosen_tls(options)
     request = parse_request(options)
-    cluster = ClusterRequest(
-        kind=kind,
-        where=where,
-        workers=workers,
-        cores=cores,
-        memory=memory,
-        walltime=walltime,
-        host=host,
-        interface=interface,
-        **tls,
+    cluster = cluster_of(
+        ClusterRequest(
+            kind=kind,
+            where=where,
+            workers=workers,
+            cores=cores,
+            memory=memory,
+            walltime=walltime,
+            host=host,
+            interface=interface,
+            **tls,
+        )
     )
 
     # Say what will run before anything starts.
     click.echo("\n".join(describe(cluster)))
     if request.postures is None:
-        print_plan(request, _count(cluster, request.out), times)
+        print_plan(request, cluster.count(), times)
     if dry_run:
         return
 
     sources = find_sources(request.objects, request.units, request.manifest)
-    running = _present(start_cluster(cluster, request.out), request.show)
+    running = _present(cluster.connected(request.out), request.show)
     postures = None
     if request.postures is not None:
         postures = read_attempts(request.postures, load_hand(request.config.hand_source))
@@ -122,14 +130,6 @@ def _present(cluster: AbstractContextManager[Client], show: bool) -> Iterator[Cl
             click.echo("waiting for the first worker", err=True)
             client.wait_for_workers(1)
         yield client
-
-
-def _count(cluster: ClusterRequest, out: Path) -> int | None:
-    """Return the number of workers; a running scheduler is asked for it."""
-    if cluster.kind not in ("scheduler", "scheduler-file"):
-        return worker_count(cluster)
-    with start_cluster(cluster, out) as client:
-        return max(1, len(client.nthreads()))
 
 
 if __name__ == "__main__":

@@ -73,7 +73,7 @@ WALLS = {
 }
 #: Modules that name a type of a library for the type checker alone: what callers give or get.
 NAMES_TYPES = {
-    *((f"api.{module}", "distributed") for module in ("building", "verifying", "workers")),
+    *((f"api.{module}", "distributed") for module in ("building", "scoring", "verifying")),
     ("verification.result", "matplotlib"),
 }
 #: Reading data: NumPy and h5py, and nothing of these.

@@ -5,13 +5,14 @@ These are the functions that `drakegrasp` exports and the command line calls.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Unpack
 
-from drakegrasp.api.workers import announced, connection, end_imported_script
 from drakegrasp.cluster.admission import admitted_workers
+from drakegrasp.cluster.connect import Workers, dashboard_line, has_dashboard, joined
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.config import Config, continued
 from drakegrasp.dataset.lock import build_lock
@@ -51,12 +52,9 @@ def build_dataset(
     manifest: str | Path | None = None,
     only: Sequence[str] = (),
     postures: str | Path | Attempts | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    scheduler_file: str | Path | None = None,
-    tls: bool = True,
-    tls_files: tuple[Path, Path, Path] | None = None,
+    client: Client | None = None,
     show: bool = True,
+    **workers: Unpack[Workers],
 ) -> BuildReport:
     """Build the dataset of a directory of meshes; the same as `drakegrasp build`.
 
@@ -72,12 +70,9 @@ def build_dataset(
         only: Names of the objects to build; all if empty.
         postures: Instead of drawn palm poses: a file of postures, or a table of them. Only the
             objects that it names are built; rows that are no posture are told, and left out.
-        workers: Processes on this machine; one per core if None.
-        scheduler: Address of a running Dask scheduler to use instead.
-        scheduler_file: Its JSON file, instead of the address.
-        tls: Whether the scheduler must want a certificate.
-        tls_files: Certificate authority, certificate and private key (PEM) for it.
+        client: A Dask client whose workers do the work, e.g. of `connect`.
         show: Whether to show progress on standard error.
+        workers: Instead of a client, the arguments of `connect`; one process per core without any.
 
     Raises:
         MeshError: If there is no mesh.
@@ -89,17 +84,14 @@ def build_dataset(
         MachineError: If there is no scheduler, the workers cannot do the work, or no room is
             left; the same call continues when that is fixed.
     """
-    end_imported_script()
-    cluster = connection(workers, scheduler, scheduler_file, tls, tls_files)
+    cluster = joined(client, workers)
     out, config = Path(out).absolute(), config or load_config()
     hand = load_hand(config.hand_source)
     drive_of(hand, config.lift)
     if isinstance(postures, str | Path):
         postures = read_attempts(Path(postures), hand)
     sources = find_sources(objects, units, manifest)
-    return build_on(
-        announced(cluster, show), sources, out, config, only=only, postures=postures, show=show
-    )
+    return build_on(cluster, sources, out, config, only=only, postures=postures, show=show)
 
 
 def find_sources(
@@ -168,6 +160,8 @@ def build_on(
         config = carry_hand(out, config, before.config.hand if before else None)
         stack.callback(_release_unused, out)
         client = stack.enter_context(cluster)
+        if show and has_dashboard() and client.dashboard_link:
+            sys.stderr.write(f"{dashboard_line(client)}\n")
         stack.enter_context(admitted_workers(client, config))
 
         # The built-in objects become mesh files of the dataset.
@@ -200,12 +194,9 @@ def make_benchmark(
     *,
     only: Sequence[str] = (),
     overrides: Sequence[str] = (),
-    workers: int | None = None,
-    scheduler: str | None = None,
-    scheduler_file: str | Path | None = None,
-    tls: bool = True,
-    tls_files: tuple[Path, Path, Path] | None = None,
+    client: Client | None = None,
     show: bool = True,
+    **workers: Unpack[Workers],
 ) -> BuildReport:
     """Make the frozen benchmark `drakegrasp-bench-1`; the same as `drakegrasp bench-set`.
 
@@ -213,12 +204,9 @@ def make_benchmark(
         out: Directory of the benchmark, which is a dataset whose samples all test.
         only: Names of objects, for a part of the benchmark; all if empty.
         overrides: `"key=value"` settings that differ from the published ones; each card says so.
-        workers: Processes on this machine; one per core if None.
-        scheduler: Address of a running Dask scheduler to use instead.
-        scheduler_file: Its JSON file, instead of the address.
-        tls: Whether the scheduler must want a certificate.
-        tls_files: Certificate authority, certificate and private key (PEM) for it.
+        client: A Dask client whose workers do the work, e.g. of `connect`.
         show: Whether to show progress on standard error.
+        workers: Instead of a client, the arguments of `connect`; one process per core without any.
 
     Raises:
         MeshError: If `only` names no object.
@@ -231,16 +219,7 @@ def make_benchmark(
         with progress_bar("objects", "meshes", show=show) as report:
             meshes = write_objects(folder, config, only=only, progress=report)
     return build_dataset(
-        meshes,
-        folder,
-        config=config,
-        only=only,
-        workers=workers,
-        scheduler=scheduler,
-        scheduler_file=scheduler_file,
-        tls=tls,
-        tls_files=tls_files,
-        show=show,
+        meshes, folder, config=config, only=only, client=client, show=show, **workers
     )
 
 

@@ -6,11 +6,12 @@ from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias, Unpack
 
 import numpy.typing as npt
 
 from drakegrasp.api.verifying import run_verification
+from drakegrasp.cluster.connect import Workers
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.exchange.dexgraspbench import fitted_postures, write_grasps
@@ -33,6 +34,9 @@ from drakegrasp.verification.placing import (
 )
 from drakegrasp.verification.verify import PlacedGrasp
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 #: Folder of the convex parts of objects, for protocols of MuJoCo.
 CONVEX_PARTS = "convex_parts"
 #: Receives verdicts as they come: called with the place of a grasp and its verdict.
@@ -53,12 +57,9 @@ def score(
     protocol: str = "lift",
     out: str | Path | None = None,
     again: str = "drakegrasp.score",
-    workers: int | None = None,
-    scheduler: str | None = None,
-    scheduler_file: str | Path | None = None,
-    tls: bool = True,
-    tls_files: tuple[Path, Path, Path] | None = None,
+    client: Client | None = None,
     show: bool = False,
+    **workers: Unpack[Workers],
 ) -> Score:
     """Return the score of predicted grasps beside reference rows; see docs/how-to/score.md.
 
@@ -81,12 +82,9 @@ def score(
             wrist pose of a prediction in MuJoCo, on this machine.
         out: Folder that keeps verdicts, so that the same call goes on, and gets the card.
         again: What the card says about how to make it again.
-        workers: Processes on this machine; one per core if None.
-        scheduler: Address of a running Dask scheduler to use instead.
-        scheduler_file: Its JSON file, instead of the address.
-        tls: Whether the scheduler must want a certificate.
-        tls_files: Certificate authority, certificate and private key (PEM) for it.
+        client: A Dask client whose workers do the work, e.g. of `connect`.
         show: Whether to show progress on standard error.
+        workers: Instead of a client, the arguments of `connect`; one process per core without any.
 
     Raises:
         GraspError: If predictions and rows do not fit, there is nothing to score, or `train` is of
@@ -102,7 +100,8 @@ def score(
     other = None if against is None else _method(against, dataset)
     rule, stored = find_protocol(protocol)
     peer = not isinstance(rule, Lift)
-    if peer and (scheduler or scheduler_file):
+    elsewhere = client or workers.get("scheduler") or workers.get("scheduler_file")
+    if peer and elsewhere:
         raise ConfigError(f"scheduler must be None with protocol {stored}, got one")
     if peer:
         require_mujoco("mujoco", "coacd")
@@ -125,17 +124,15 @@ def score(
         placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
         if peer:
             keep = Path(scratch if out is None else out) / CONVEX_PARTS
-            _try_by_protocol(placed, protocol, deliver, keep=keep, workers=workers, show=show)
+            count = workers.get("workers")
+            _try_by_protocol(placed, protocol, deliver, keep=keep, workers=count, show=show)
             return
         run_verification(
             placed,
-            workers=workers,
-            scheduler=scheduler,
-            scheduler_file=scheduler_file,
-            tls=tls,
-            tls_files=tls_files,
+            client=client,
             on_result=lambda index, result: deliver(index, verdict_of(result)),
             show=show,
+            **workers,
         )
 
     with TemporaryDirectory() as scratch:

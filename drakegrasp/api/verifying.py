@@ -7,17 +7,17 @@ object that was placed before, a sample, a dataset. The others are short forms o
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, Unpack
 
 import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.api.workers import connection, end_imported_script
 from drakegrasp.cluster.admission import admitted_workers
+from drakegrasp.cluster.connect import Workers, joined
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.config import Config
 from drakegrasp.dataset.reader import GraspDataset, Sample
@@ -52,19 +52,21 @@ FEW_GRASPS = 4
 MOST_TOGETHER, TASKS_PER_WORKER = 16, 4
 
 
+class How(TypedDict, total=False):
+    """What the calls of this module take alike; see `verify_grasps`."""
+
+    frame: str | None
+    X_TC: npt.ArrayLike | None
+    units: str | None
+    X_TO: npt.ArrayLike | None
+    hand: str | Path | None
+    method: str
+    snap_points: bool
+    config: Config | None
+
+
 def verify_grasp(
-    grasp: npt.ArrayLike,
-    on: GraspTarget,
-    *,
-    row: int | None = None,
-    frame: str | None = None,
-    X_TC: npt.ArrayLike | None = None,
-    units: str | None = None,
-    X_TO: npt.ArrayLike | None = None,
-    hand: str | Path | None = None,
-    method: str = "hand",
-    snap_points: bool = False,
-    config: Config | None = None,
+    grasp: npt.ArrayLike, on: GraspTarget, *, row: int | None = None, **how: Unpack[How]
 ) -> Verification:
     """Return whether a predicted grasp holds its object in the simulator, why not, and how.
 
@@ -77,14 +79,8 @@ def verify_grasp(
             a tensor of torch.
         on: What the grasp is on, see `verify_grasps`.
         row: The grasp's row, if `on` is a `GraspDataset`.
-        frame: See `verify_grasps`, as all that follows.
-        X_TC: (4, 4), pose of the camera.
-        units: Of a mesh.
-        X_TO: (4, 4), pose of the object.
-        hand: Name or YAML file.
-        method: "hand" or "forces".
-        snap_points: Whether to move the points to the surface first.
-        config: Hand, physics, lift and rules.
+        how: The arguments of `verify_grasps`: frame, X_TC (4, 4), units, X_TO (4, 4), hand,
+            method, snap_points, config.
 
     Returns:
         The verdict. Numbers that are no grasp, e.g. NaN, have the outcome `invalid`.
@@ -105,19 +101,7 @@ def verify_grasp(
     if row is None and isinstance(on, GraspDataset):
         raise GraspError(f"row must be given with a GraspDataset, 0 to {len(on) - 1}, got None")
 
-    (verdict,) = verify_grasps(
-        vector,
-        on,
-        rows=None if row is None else [row],
-        frame=frame,
-        X_TC=X_TC,
-        units=units,
-        X_TO=X_TO,
-        hand=hand,
-        method=method,
-        snap_points=snap_points,
-        config=config,
-    )
+    (verdict,) = verify_grasps(vector, on, rows=None if row is None else [row], **how)
     return verdict
 
 
@@ -181,16 +165,30 @@ def verify_grasps(
         MachineError: If a worker would give other results than this machine.
     """
     _refuse_other_targets(on)
-    how: dict[str, Any] = {"method": method, "snap_points": snap_points}
-    if not isinstance(on, Sample | GraspDataset):
-        if rows is not None:
-            raise GraspError(f"rows must be given with a GraspDataset only, got {rows!r}")
-        thing = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
-        placed = place_on_object(grasps, thing, frame=frame or "object", X_TC=X_TC, **how)
-        return _verify(client, placed, show=show)
+    how: dict[str, Any] = {"hand": hand, "config": config, "method": method}
+    how["snap_points"] = snap_points
+    if isinstance(on, Sample | GraspDataset):
+        fixed = {"X_TC": X_TC, "units": units, "X_TO": X_TO}
+        placed = _place_on_rows(grasps, on, rows, fixed, frame=frame or "camera", **how)
+        return run_verification(placed, client=client, show=show)
+    if rows is not None:
+        raise GraspError(f"rows must be given with a GraspDataset only, got {rows!r}")
+    thing = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
+    placed = place_on_object(
+        grasps, thing, frame=frame or "object", X_TC=X_TC, method=method, snap_points=snap_points
+    )
+    return run_verification(placed, client=client, show=show)
 
-    # Rows of a dataset define the object, how it lies, and the cameras.
-    for name, value in {"X_TC": X_TC, "units": units, "X_TO": X_TO}.items():
+
+def _place_on_rows(
+    grasps: npt.ArrayLike,
+    on: Sample | GraspDataset,
+    rows: Sequence[int] | None,
+    fixed: Mapping[str, object],
+    **how: Any,
+) -> list[PlacedGrasp]:
+    """Return grasps on rows, which define the object, how it lies, and the cameras."""
+    for name, value in fixed.items():
         if value is not None:
             raise GraspError(
                 f"{name} must be None on a {type(on).__name__}, which defines it, got a value"
@@ -198,9 +196,7 @@ def verify_grasps(
     if isinstance(on, Sample) and rows is not None:
         raise GraspError(f"rows must be None on a Sample, which is one row, got {rows!r}")
     data, chosen = (on.dataset, on.row) if isinstance(on, Sample) else (on, rows)
-    placed = place_on_rows(
-        grasps, data, chosen, frame=frame or "camera", hand=hand, config=config, **how
-    )
+    placed = place_on_rows(grasps, data, chosen, **how)
 
     # The object of a verdict can verify more grasps.
     things = {id(grasp.placed): grasp.placed for grasp in placed}
@@ -208,19 +204,7 @@ def verify_grasps(
         key: PlacedObject(model=thing.model, X_TO=thing.X_TO, config=thing.config)
         for key, thing in things.items()
     }
-    told = [replace(grasp, placed=doors[id(grasp.placed)]) for grasp in placed]
-    return _verify(client, told, show=show)
-
-
-def _verify(
-    client: Client | None, placed: Sequence[PlacedGrasp], *, show: bool
-) -> list[Verification]:
-    """Verify grasps on the workers of a client, or here, or on workers of this machine."""
-    # A worker of somebody's pool may not start processes.
-    alone = len(placed) <= FEW_GRASPS or multiprocessing.current_process().daemon
-    if client is not None or alone:
-        return _verify_on(client, placed, show=show)
-    return run_verification(placed, show=show)
+    return [replace(grasp, placed=doors[id(grasp.placed)]) for grasp in placed]
 
 
 def _refuse_other_targets(on: object) -> None:
@@ -243,16 +227,12 @@ class PlacedObject(ObjectOnTable):
         self,
         grasps: npt.ArrayLike,
         *,
-        frame: str | None = None,
-        X_TC: npt.ArrayLike | None = None,
-        method: str = "hand",
-        snap_points: bool = False,
         client: Client | None = None,
         show: bool = False,
+        **how: Unpack[How],
     ) -> list[Verification]:
         """Return `verify_grasps(grasps, self, ...)`, the verdicts on grasps of this object."""
-        how: dict[str, Any] = {"method": method, "snap_points": snap_points}
-        return verify_grasps(grasps, self, frame=frame, X_TC=X_TC, **how, client=client, show=show)
+        return verify_grasps(grasps, self, client=client, show=show, **how)
 
 
 def place_object(
@@ -293,30 +273,21 @@ def verify_rows(
     predictions: npt.ArrayLike,
     rows: Sequence[int] | None = None,
     *,
-    frame: str | None = None,
-    method: str = "hand",
-    snap_points: bool = False,
-    hand: str | Path | None = None,
-    config: Config | None = None,
     client: Client | None = None,
     show: bool = False,
+    **how: Unpack[How],
 ) -> list[Verification]:
     """Return `verify_grasps(predictions, data, rows=rows, ...)`, the verdicts on rows' grasps."""
-    how: dict[str, Any] = {"frame": frame, "method": method, "snap_points": snap_points}
-    how |= {"hand": hand, "config": config}
-    return verify_grasps(predictions, data, rows=rows, **how, client=client, show=show)
+    return verify_grasps(predictions, data, rows=rows, client=client, show=show, **how)
 
 
 def run_verification(
     grasps: Sequence[PlacedGrasp],
     *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    scheduler_file: str | Path | None = None,
-    tls: bool = True,
-    tls_files: tuple[Path, Path, Path] | None = None,
+    client: Client | None = None,
     on_result: ResultCallback = ignore_result,
     show: bool = True,
+    **workers: Unpack[Workers],
 ) -> list[Verification]:
     """Return the verdicts on placed grasps in the caller's order; the work of `drakegrasp verify`.
 
@@ -325,40 +296,28 @@ def run_verification(
 
     Args:
         grasps: From `verification.placed_grasp`.
-        workers: Processes on this machine; one per core if None.
-        scheduler: Address of a running Dask scheduler to use instead.
-        scheduler_file: Its JSON file, instead of the address.
-        tls: Whether the scheduler must want a certificate.
-        tls_files: Certificate authority, certificate and private key (PEM) for it.
+        client: A Dask client whose workers do the work.
         on_result: Is called with each verdict in the caller's order, once all earlier ones exist.
         show: Whether to show progress on standard error.
+        workers: Instead of a client, the arguments of `connect`.
 
     Raises:
-        ConfigError: If both workers and a scheduler are given, or the scheduler wants no
-            certificate although `tls` says so.
+        ConfigError: As `connect`.
         MachineError: If a worker would give other results than this machine.
     """
-    end_imported_script()
-    cluster = connection(workers, scheduler, scheduler_file, tls, tls_files)
-    alone = len(grasps) <= FEW_GRASPS or count_workers(workers) == 1
-    if alone and not (scheduler or scheduler_file):
-        return _verify_on(None, grasps, on_result, show=show)
-    with cluster as client:
-        return _verify_on(client, grasps, on_result, show=show)
-
-
-def _verify_on(
-    client: Client | None,
-    grasps: Sequence[PlacedGrasp],
-    on_result: ResultCallback = ignore_result,
-    *,
-    show: bool,
-) -> list[Verification]:
-    """Verify grasps on the workers of a client, or in this process without one."""
-    with progress_bar("verify", "grasps", show=show) as report:
-        if client is None or not grasps:
+    # A worker of somebody's pool may not start processes.
+    few = len(grasps) <= FEW_GRASPS or multiprocessing.current_process().daemon
+    elsewhere = client or workers.get("scheduler") or workers.get("scheduler_file")
+    cluster = joined(client, workers) if elsewhere or workers or not few else None
+    alone = not elsewhere and (few or count_workers(workers.get("workers")) == 1)
+    if cluster is None or alone or not grasps:
+        with progress_bar("verify", "grasps", show=show) as report:
             return verify_batch(grasps, run_here, report, on_result)
-        with admitted_workers(client, grasps[0].config):
-            tasks = TASKS_PER_WORKER * max(len(client.nthreads()), 1)
-            together = min(max(len(grasps) // tasks, 1), MOST_TOGETHER)
-            return verify_batch(grasps, DaskExecutor(client), report, on_result, together=together)
+    with (
+        cluster as joint,
+        progress_bar("verify", "grasps", show=show) as report,
+        admitted_workers(joint, grasps[0].config),
+    ):
+        tasks = TASKS_PER_WORKER * max(len(joint.nthreads()), 1)
+        together = min(max(len(grasps) // tasks, 1), MOST_TOGETHER)
+        return verify_batch(grasps, DaskExecutor(joint), report, on_result, together=together)

@@ -8,43 +8,42 @@ from typing import Any
 
 import click
 
-from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import FILE, NEW_FILE, PATH, chosen_settings, shared
+from drakegrasp.cli.console import progress_bar, say
+from drakegrasp.cli.options import FILE, NEW_FILE, PATH, chosen_settings, option, shared
 from drakegrasp.generation.request import BUILTIN
+from drakegrasp.runtime.environment import require_mujoco
 
 
 @click.command()
-@shared("--objects", required=False, default=BUILTIN, show_default=True, help="The meshes.")
+@shared("--objects", required=False, default=BUILTIN, show_default=True, text="The meshes.")
 @shared("--per-class", "--objects-seed")
-@shared("--only", help="Only objects whose names begin with NAME; may be given several times.")
-@shared("--config", help="Configuration.  [default: paper]")
+@shared("--only", text="Only objects whose names begin with NAME; may be given several times.")
+@shared("--config", text="Configuration.  [default: paper]")
 @shared("--set")
-@shared("--candidates", default=100, show_default=True, help="Palm poses per object.")
-@click.option(
+@shared("--candidates", default=100, show_default=True, text="Palm poses per object.")
+@option(
     "--fidelity",
+    "N",
+    "Compare the labels of N attempts per object.",
     type=click.IntRange(min=0),
     default=0,
-    metavar="N",
-    help="Compare the labels of N attempts per object.",
     show_default=True,
 )
-@click.option("--peer", "mujoco", is_flag=True, help="Run the same attempts in MuJoCo as well.")
-@click.option(
+@option("--peer mujoco", None, "Run the same attempts in MuJoCo as well.", is_flag=True)
+@option(
     "--cross-check",
+    "OUT N",
+    "Instead, try N stored lifts of the dataset OUT again in MuJoCo.",
     type=(PATH, click.IntRange(min=1)),
-    metavar="OUT N",
-    help="Instead, try N stored lifts of the dataset OUT again in MuJoCo.",
 )
-@click.option(
-    "--compare", type=FILE, metavar="FILE", help="Print the ratios to this earlier report."
-)
-@click.option(
+@option("--compare", "FILE", "Print the ratios to this earlier report.", type=FILE)
+@option(
     "--out",
+    "FILE",
+    "Where the report goes, as JSON.",
     type=NEW_FILE,
     default=Path("bench.json"),
     show_default=True,
-    metavar="FILE",
-    help="Where the report goes, as JSON.",
 )
 @shared("--units", "--manifest", "--quiet")
 @click.pass_context
@@ -101,11 +100,10 @@ def _measure(
     from drakegrasp.cli import tables
     from drakegrasp.hand.settings import load_config
     from drakegrasp.objects.sources import find_meshes
-    from drakegrasp.runtime.progress import progress_bar
     from drakegrasp.shapes.catalog import builtin_sources
 
     if mujoco:
-        _require_mujoco("--peer")
+        require_mujoco("mujoco", "coacd")
     # The time of OpenGL's threads would count as this core's.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     rules, objects = load_config(config, chosen_settings(options)), options["objects"]
@@ -142,10 +140,9 @@ def _measure(
 
 def _cross_check(dataset: Path, count: int, quiet: bool) -> dict[str, Any]:
     """Try lifts of a dataset again in MuJoCo, print the agreement and return the report."""
-    _require_mujoco("--cross-check")
+    require_mujoco("mujoco", "coacd")
     from drakegrasp.bench.cross_check import cross_check
     from drakegrasp.cli import tables
-    from drakegrasp.runtime.progress import progress_bar
 
     with progress_bar("cross-check", "lifts", show=not quiet) as progress:
         report = cross_check(dataset, count, progress=progress)
@@ -168,19 +165,6 @@ def _refuse_other_options(context: click.Context) -> None:
             raise click.UsageError(
                 f"--cross-check must be used with --out and --quiet alone, got {parameter.opts[0]}"
             )
-
-
-def _require_mujoco(option: str) -> None:
-    """Refuse an option where the libraries of the extra `[peer]` are missing.
-
-    Raises:
-        click.UsageError: If one is missing.
-    """
-    from importlib.util import find_spec
-
-    for module in ("mujoco", "coacd"):
-        if find_spec(module) is None:
-            raise click.UsageError(f"{option} needs {module}: pip install 'drakegrasp[peer]'")
 
 
 def _read_report(path: Path) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import click
 
 from drakegrasp import registry
-from drakegrasp.cli.help import Option
+from drakegrasp.cli.console import Option
 from drakegrasp.errors import first_line
 from drakegrasp.generation.request import BUILTIN, BuildRequest
 
@@ -55,108 +55,108 @@ NEW_FILE = PathType(path_type=Path, dir_okay=False)
 FILE = PathType(path_type=Path, exists=True, dir_okay=False)
 
 
-def _row(metavar: str | None, text: str, **attributes: Any) -> dict[str, Any]:
-    """Return a row of the table: what click calls metavar and help, and its other attributes."""
-    return {"metavar": metavar, "help": text, **attributes}
-
-
 def _set_text(what: str, example: str) -> str:
     """Return the help of a `--set`, with a value that its command takes."""
     return f"Change {what}, e.g. {example}; may be given several times."
 
 
-#: The options that more than one command has.
-_TABLE = {
+#: The options that more than one command has: metavar, help, and what else click shall know.
+_TABLE: dict[str, tuple[str | None, str, dict[str, Any]]] = {
     # What is built.
-    "--objects": _row(
+    "--objects": (
         "MESH_DIR|builtin",
         "A directory of .obj, .stl, .ply or .glb files, or the built-in objects.",
-        required=True,
+        {"required": True},
     ),
-    "--per-class": _row("N", "Built-in objects of each class.  [default: 2]", type=int),
-    "--objects-seed": _row(
-        "S", "Seed of the sizes of the built-in objects.  [default: 0]", type=int
+    "--per-class": ("N", "Built-in objects of each class.  [default: 2]", {"type": int}),
+    "--objects-seed": (
+        "S",
+        "Seed of the sizes of the built-in objects.  [default: 0]",
+        {"type": int},
     ),
-    "--units": _row("m|cm|mm", "Unit of length of the meshes.", default="m", show_default=True),
-    "--manifest": _row(
+    "--units": ("m|cm|mm", "Unit of length of the meshes.", {"default": "m", "show_default": True}),
+    "--manifest": (
         "FILE",
         "YAML file with units and classes by mesh.  [default: objects.yaml beside the meshes]",
-        type=PATH,
+        {"type": PATH},
     ),
-    "--postures": _row(
+    "--postures": (
         "FILE|DIR",
         "Try these postures (wrist and joints) instead of drawn palm poses, on the objects that "
         "they name: .npz, .hdf5, .csv, .parquet, DexGraspBench .npy or isaac_grasp .yaml.",
-        type=PathType(path_type=Path, exists=True),
+        {"type": PathType(path_type=Path, exists=True)},
     ),
-    "--only": _row("NAME", "Build this object only; may be given several times.", multiple=True),
-    "--out": _row(
+    "--only": ("NAME", "Build this object only; may be given several times.", {"multiple": True}),
+    "--out": (
         "DIR",
         "Directory of the dataset. The same command continues an interrupted build.",
-        type=PATH,
-        required=True,
+        {"type": PATH, "required": True},
     ),
     # By which rules.
-    "--config": _row(
+    "--config": (
         "YAML|PRESET",
         "Configuration: a file, or the preset paper, fast, randomized or released.  [default: "
         "paper, but with split.by=auto]",
+        {},
     ),
-    "--set": _row("KEY=VALUE", _set_text("one setting", "lift.hold_time=1"), multiple=True),
-    "--candidates": _row("N", "Palm poses per object.  [default: 10000]", type=int),
-    "--max-grasps": _row("N", "Stop an object after N successes.  [default: no limit]", type=int),
-    "--samples": _row(
+    "--set": ("KEY=VALUE", _set_text("one setting", "lift.hold_time=1"), {"multiple": True}),
+    "--candidates": ("N", "Palm poses per object.  [default: 10000]", {"type": int}),
+    "--max-grasps": ("N", "Stop an object after N successes.  [default: no limit]", {"type": int}),
+    "--samples": (
         "N",
         "Stop when there are N samples, which the objects share in turns; a larger N goes on from "
         "there.  [default: no limit]",
-        type=int,
+        {"type": int},
     ),
-    "--samples-per-object": _row(
-        "N", "Stop an object when it has N samples.  [default: no limit]", type=int
+    "--samples-per-object": (
+        "N",
+        "Stop an object when it has N samples.  [default: no limit]",
+        {"type": int},
     ),
-    "--certify": _row(
+    "--certify": (
         "K",
         "Repeat each sample K times, disturbed, and store how many hold.  [default: 0]",
-        type=int,
+        {"type": int},
     ),
-    "--seed": _row("S", "Seed of all random draws.  [default: 0]", type=int),
+    "--seed": ("S", "Seed of all random draws.  [default: 0]", {"type": int}),
     # Who does the work.
-    "--workers": _row("N", "Processes on this machine.  [default: one per core]", type=int),
-    "--scheduler": _row("ADDRESS", "Use the running Dask scheduler at this address."),
-    "--scheduler-file": _row(
-        "FILE", "Use the running Dask scheduler that wrote this file.", type=PATH
+    "--workers": ("N", "Processes on this machine.  [default: one per core]", {"type": int}),
+    "--scheduler": ("ADDRESS", "Use the running Dask scheduler at this address.", {}),
+    "--scheduler-file": (
+        "FILE",
+        "Use the running Dask scheduler that wrote this file.",
+        {"type": PATH},
     ),
-    "--tls-ca-file": _row(
+    "--tls-ca-file": (
         "FILE",
         "Your own certificate authority (PEM), as a running scheduler needs it; with the next two "
         "options.",
-        type=FILE,
+        {"type": FILE},
     ),
-    "--tls-cert": _row(
+    "--tls-cert": (
         "FILE",
         "Certificate of client, scheduler and workers, signed by that authority.",
-        type=FILE,
+        {"type": FILE},
     ),
-    "--tls-key": _row("FILE", "The certificate's private key.", type=FILE),
-    "--tls/--no-tls": _row(
+    "--tls-key": ("FILE", "The certificate's private key.", {"type": FILE}),
+    "--tls/--no-tls": (
         None,
         "Whether connections need a certificate. Workers that the command starts get one that is "
         "made for the run.",
-        default=True,
-        show_default=True,
+        {"default": True, "show_default": True},
     ),
     # What is said.
-    "--times": _row(
+    "--times": (
         "FILE",
         "Estimate from these times, which measure_stages.py of pipelines/measurements printed.  "
         "[default: OUT/log.jsonl, else times measured on other meshes]",
-        type=FILE,
+        {"type": FILE},
     ),
-    "--quiet": _row(None, "Show no progress.", is_flag=True),
-    "--json": _row(None, "Print one document of JSON, and nothing else.", is_flag=True),
+    "--quiet": (None, "Show no progress.", {"is_flag": True}),
+    "--json": (None, "Print one document of JSON, and nothing else.", {"is_flag": True}),
 }
-#: Options whose parameters have other names.
-_PARAMETERS = {"--set": "overrides", "--json": "as_json"}
+#: Words of options whose parameters have other names.
+_PARAMETERS = {"--set": "--set overrides", "--json": "--json as_json"}
 #: The options of the table that stand for `--set KEY=VALUE`, and their keys.
 SETTINGS = {
     "--per-class": "builtin.per_class",
@@ -168,16 +168,33 @@ SETTINGS = {
     "--certify": "certify.repeats",
     "--seed": "seed",
 }
-_BUILD = (
+#: Groups of options: of a build, of the certificates, and of who does the work.
+BUILD = (
     *("--objects", "--per-class", "--objects-seed", "--out", "--config", "--set", "--candidates"),
     *("--max-grasps", "--samples", "--samples-per-object", "--postures", "--only", "--certify"),
     *("--seed", "--units", "--manifest", "--quiet"),
 )
 _TLS_FILES = ("--tls-ca-file", "--tls-cert", "--tls-key")
-_TLS = ("--tls/--no-tls", *_TLS_FILES)
-#: Options that the help lists behind all others.
-_CLUSTER = ("--scheduler", "--scheduler-file", *_TLS)
-_CONNECTION = ("--workers", "--scheduler", "--scheduler-file")
+TLS = ("--tls/--no-tls", *_TLS_FILES)
+CONNECTION = ("--workers", "--scheduler", "--scheduler-file", *TLS)
+#: Help of a `--set` for some settings alone.
+SET_ASSEMBLED = (
+    f"{_set_text('a setting of the filters or the split', 'filters.outlier_sigma=3')} Filters of "
+    "your own must be given again: filters.own=FILE.py:NAME."
+)
+SET_SCENES = _set_text("a key of `scenes`", "scenes.views=8")
+
+
+def option(words: str, metavar: str | None, text: str, **attributes: Any) -> Callable[[F], F]:
+    """Give a command an option.
+
+    Args:
+        words: Its name, and after a blank the name of its parameter if that differs.
+        metavar: What stands for the value in the help.
+        text: Its help.
+        attributes: What else click shall know.
+    """
+    return click.option(*words.split(), cls=Option, metavar=metavar, help=text, **attributes)
 
 
 def shared(*names: str, **changes: Any) -> Callable[[F], F]:
@@ -190,40 +207,13 @@ def shared(*names: str, **changes: Any) -> Callable[[F], F]:
 
     def give(command: F) -> F:
         for name in reversed(names):
-            words = (name, _PARAMETERS[name]) if name in _PARAMETERS else (name,)
-            heading = {"heading": "Cluster options"} if name in _CLUSTER else {}
-            row = _TABLE[name] | heading | changes
-            command = click.option(*words, cls=Option, **row)(command)
+            metavar, text, attributes = _TABLE[name]
+            heading = {"heading": "Cluster options"} if name in CONNECTION[1:] else {}
+            row = {"metavar": metavar, "text": text, **attributes, **heading, **changes}
+            command = option(_PARAMETERS.get(name, name), **row)(command)
         return command
 
     return give
-
-
-def build_options(command: F) -> F:
-    """Give a command the options of a build; it passes them on to `parse_request`."""
-    return shared(*_BUILD)(command)
-
-
-def postprocessing_options(command: F) -> F:
-    """Give a command the `--set` of what is decided after the simulation."""
-    text = _set_text("a setting of the filters or the split", "filters.outlier_sigma=3")
-    again = "Filters of your own must be given again: filters.own=FILE.py:NAME."
-    return shared("--set", help=f"{text} {again}")(command)
-
-
-def scenes_options(command: F) -> F:
-    """Give a command the `--set` of the scenes."""
-    return shared("--set", help=_set_text("a key of `scenes`", "scenes.views=8"))(command)
-
-
-def tls_options(command: F) -> F:
-    """Give a command the options of TLS; it passes them on to `chosen_tls`."""
-    return shared(*_TLS)(command)
-
-
-def connection_options(command: F) -> F:
-    """Give a command the options of who does the work; it passes them on to `chosen_workers`."""
-    return shared(*_CONNECTION, *_TLS)(command)
 
 
 def _tidied(context: click.Context, parameter: click.Parameter, out: Path) -> Path:
@@ -241,15 +231,13 @@ def dataset_argument(name: str = "out", metavar: str = "OUT") -> Callable[[F], F
 
 
 def chosen_workers(options: dict[str, Any]) -> dict[str, Any]:
-    """Take the values of `connection_options` out of a command's options, for a public call."""
-    return {
-        **{_parameter(name): options.pop(_parameter(name)) for name in _CONNECTION},
-        **chosen_tls(options),
-    }
+    """Take the values of `CONNECTION` out of a command's options: arguments of `connect`."""
+    names = map(_parameter, CONNECTION[:3])
+    return {**{name: options.pop(name) for name in names}, **chosen_tls(options)}
 
 
 def chosen_tls(options: dict[str, Any]) -> dict[str, Any]:
-    """Take the values of `tls_options` out of a command's options.
+    """Take the values of `TLS` out of a command's options.
 
     Returns:
         `tls`, and `tls_files`: the authority, the certificate and its key, or None.
@@ -266,7 +254,7 @@ def chosen_tls(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def parse_request(options: Mapping[str, Any]) -> BuildRequest:
-    """Return what the options of `build_options` ask for, given their values by parameter.
+    """Return what the options of `BUILD` ask for, given their values by parameter.
 
     Raises:
         click.UsageError: If options of the built-in objects are given with other meshes.

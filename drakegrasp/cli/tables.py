@@ -3,25 +3,37 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.table import Table
 
+from drakegrasp.cli.console import say
 from drakegrasp.config import Config
-from drakegrasp.dataset.card.shortfall import objects_without_samples
+from drakegrasp.dataset.card.holding import holding_lines, holding_of
+from drakegrasp.dataset.card.shortfall import objects_without_samples, split_shortfall
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, DATA_FILES
 from drakegrasp.dataset.statistics import (
     NO_NAME,
     Funnel,
     PreshapeCount,
     SplitCount,
     Unfinished,
+    count_funnel,
+    count_splits,
+    count_unfinished,
     held_note,
+    preshapes_of,
+    split_rule_of,
 )
+from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import counted, printable
 from drakegrasp.objects.audit import AuditRow
 from drakegrasp.objects.model import needed_limit
@@ -69,6 +81,65 @@ ROOMY = 110
 WIDTH = 1000
 
 
+def make_table(
+    title: str,
+    heads: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *totals: Sequence[Sequence[str]],
+    caption: str = "",
+) -> Table:
+    """Return a table: a column of names and columns of numbers.
+
+    Args:
+        title: Of the table.
+        heads: Of its columns.
+        rows: Its cells. Names are shown as they are: they neither style it nor steer the terminal.
+        totals: More rows, each group below a line.
+        caption: What is said below it.
+    """
+    table = Table(
+        title=title,
+        title_justify="left",
+        caption=caption or None,
+        caption_justify="left",
+        box=SIMPLE,
+        pad_edge=False,
+        collapse_padding=True,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column(heads[0], no_wrap=True, overflow="ellipsis", max_width=24)
+    for head in heads[1:]:
+        table.add_column(escape(head), justify="right", no_wrap=True)
+    for group in (rows, *totals):
+        for name, *cells in group:
+            table.add_row(_safe(name), *cells)
+        table.add_section()
+    return table
+
+
+def _table_of_objects(
+    title: str,
+    heads: Sequence[str],
+    funnel: Funnel,
+    row: Callable[[slice], list[str]],
+    caption: str = "",
+) -> Table:
+    """Return a table with a row per object and one of all, given the cells of some objects.
+
+    Its last columns are how many samples are refined ones, if any attempt is, and how many
+    samples there are.
+    """
+    some = bool(funnel.refined.any())
+
+    def cells(name: str, objects: slice) -> list[str]:
+        samples = [funnel.refined[objects, 2].sum()] * some + [funnel.samples[objects].sum()]
+        return [name, *row(objects), *map(_count, samples)]
+
+    heads = ("object", *heads, *["+ refined"] * some, "samples")
+    rows = (cells(name, slice(i, i + 1)) for i, name in enumerate(funnel.names))
+    return make_table(title, heads, rows, [cells("all", slice(None))], caption=caption)
+
+
 def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
     """Return the funnel, a row per object and one of all.
 
@@ -78,54 +149,49 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
     """
     shown = [o for o in _OUTCOME_HEADS if funnel.outcomes[:, o].any() or o is Outcome.SUCCESS]
     groups: dict[str, tuple[Outcome, ...]] = {_OUTCOME_HEADS[o]: (o,) for o in shown}
+    removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
     if compact:
         # Room is scarce, and few datasets have lifts that were ended or left out.
-        there = funnel.outcomes.sum(axis=0)
+        there, removed = funnel.outcomes.sum(axis=0), []
         groups = {h: g for h, g in _COMPACT_HEADS.items() if h not in _RARE or there[g[0]]}
-    removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
     heads = ["poses", "attempts", *groups]
-    heads += [] if compact else [f"- {r.label}".replace("_", "\n") for r in removed]
-    heads += ["+ refined"] if funnel.refined.any() else []
-    table = _table("From palm poses to samples", "object", *heads, "samples")
-    if funnel.refined.any():
-        tried, held, samples = funnel.refined.sum(axis=0).tolist()
-        table.caption = (
-            f"refined: palm poses about those of samples, {counted(tried, 'attempt')}, "
-            f"{held:,} held, {counted(samples, 'sample')}; all other columns but the last are of "
-            "the first round"
-        )
+    heads += [f"- {r.label}".replace("_", "\n") for r in removed]
 
     def row(objects: slice) -> list[str]:
         outcomes = funnel.outcomes[objects].sum(axis=0).tolist()
         cells = [funnel.candidates[objects].sum(), sum(outcomes)]
         cells += [sum(outcomes[o] for o in group) for group in groups.values()]
-        cells += [] if compact else [funnel.removals[objects, r].sum() for r in removed]
-        cells += _sample_cells(funnel, objects)
-        return [f"{int(cell):,}" for cell in cells]
+        cells += [funnel.removals[objects, r].sum() for r in removed]
+        return list(map(_count, cells))
 
-    for i, name in enumerate(funnel.names):
-        table.add_row(_safe(name), *row(slice(i, i + 1)))
-    table.add_section()
-    table.add_row("all", *row(slice(None)))
-    return table
-
-
-def _sample_cells(funnel: Funnel, objects: slice) -> list[int]:
-    """Return how many samples are refined ones, if any attempt is, and how many there are."""
-    refined = [int(funnel.refined[objects, 2].sum())] if funnel.refined.any() else []
-    return [*refined, int(funnel.samples[objects].sum())]
+    caption = ""
+    if funnel.refined.any():
+        tried, held, samples = funnel.refined.sum(axis=0).tolist()
+        caption = (
+            f"refined: palm poses about those of samples, {counted(tried, 'attempt')}, "
+            f"{held:,} held, {counted(samples, 'sample')}; all other columns but the last are of "
+            "the first round"
+        )
+    return _table_of_objects("From palm poses to samples", heads, funnel, row, caption)
 
 
 def hold_table(funnel: Funnel) -> Table:
     """Return how well the successes hold, a row per object and one of all."""
+    notes = [
+        "held: the outcome success; precision: with the fingertips alone; stable: of these, moved "
+        "by less than 5 mm and 5° in the hand"
+    ]
     # Where the chance of a sample chose the lifts, only the audited ones tell the share.
     held, stable, head = funnel.outcomes[:, Outcome.SUCCESS], funnel.stable, "stable\nof held"
     whole, part = held, stable
     if not funnel.all_lifted:
         head, (whole, part) = "in the audit:\nstable of held", funnel.audited.T[1:3]
-    heads = ["attempts", "held", "precision", "stable", head]
-    heads += ["+ refined"] if funnel.refined.any() else []
-    table = _table("How well the hand holds", "object", *heads, "samples")
+        notes.append(
+            "in the audit: a part of the hands was lifted whatever the chance of a sample; their "
+            "counts alone say which share of the held grasps is stable"
+        )
+    if note := held_note(funnel):
+        notes.append(note)
 
     def row(objects: slice) -> list[str]:
         counts = (funnel.outcomes.sum(axis=1), held, funnel.precision, stable)
@@ -133,51 +199,33 @@ def hold_table(funnel: Funnel) -> Table:
         share = f"{all_stable / all_held:.0%}" if all_held else "-"
         if not funnel.all_lifted:
             share = f"{all_stable:,} of {all_held:,}, {share}"
-        samples = (f"{n:,}" for n in _sample_cells(funnel, objects))
-        return [*(f"{count[objects].sum():,}" for count in counts), share, *samples]
+        return [*(_count(count[objects].sum()) for count in counts), share]
 
-    for i, name in enumerate(funnel.names):
-        table.add_row(_safe(name), *row(slice(i, i + 1)))
-    table.add_section()
-    table.add_row("all", *row(slice(None)))
-
-    notes = [
-        "held: the outcome success; precision: with the fingertips alone; stable: of these, moved "
-        "by less than 5 mm and 5° in the hand"
-    ]
-    if not funnel.all_lifted:
-        notes.append(
-            "in the audit: a part of the hands was lifted whatever the chance of a sample; their "
-            "counts alone say which share of the held grasps is stable"
-        )
-    if note := held_note(funnel):
-        notes.append(note)
-    table.caption = "\n".join(notes)
-    return table
+    heads = ["attempts", "held", "precision", "stable", head]
+    return _table_of_objects("How well the hand holds", heads, funnel, row, "\n".join(notes))
 
 
 def preshape_table(counts: Sequence[PreshapeCount]) -> Table:
     """Return how the attempts of each preshape ended, a row per preshape."""
-    some = any(count.refined for count in counts)
-    heads = ("attempts", "held", "stable", *["+ refined"] * some, "samples")
-    table = _table("Preshapes", "preshape", *heads)
-    for count in counts:
-        numbers = [count.attempts, count.held, count.stable, *[count.refined] * some, count.samples]
-        table.add_row(_safe(count.preshape), *(f"{n:,}" for n in numbers))
-    if any(count.preshape == NO_NAME for count in counts):
-        table.caption = f"{NO_NAME}: postures for which all fingers close"
-    return table
+    columns = ["attempts", "held", "stable", "refined", "samples"]
+    if not any(count.refined for count in counts):
+        columns.remove("refined")
+    heads = ["preshape", *("+ refined" if name == "refined" else name for name in columns)]
+    rows = ([c.preshape, *(_count(getattr(c, name)) for name in columns)] for c in counts)
+    nameless = any(count.preshape == NO_NAME for count in counts)
+    caption = f"{NO_NAME}: postures for which all fingers close" if nameless else ""
+    return make_table("Preshapes", heads, rows, caption=caption)
 
 
 def split_table(counts: Sequence[SplitCount]) -> Table:
     """Return the paper's Table III with a column of objects."""
-    table = _table("Samples by split", "split", "samples", "in effect", "objects", "classes")
-    for count in counts:
-        effective = "-" if np.isnan(count.effective) else f"{count.effective:,.0f}"
-        numbers = (f"{n:,}" for n in (count.objects, count.classes))
-        table.add_row(count.split, f"{count.samples:,}", effective, *numbers)
-    table.caption = "in effect: where samples with almost the same palm count as one"
-    return table
+    rows = (
+        [c.split, *(_number(n, ",.0f") for n in (c.samples, c.effective, c.objects, c.classes))]
+        for c in counts
+    )
+    heads = ("split", "samples", "in effect", "objects", "classes")
+    caption = "in effect: where samples with almost the same palm count as one"
+    return make_table("Samples by split", heads, rows, caption=caption)
 
 
 def split_line(rule: str, funnel: Funnel, counts: Sequence[SplitCount]) -> str:
@@ -237,10 +285,10 @@ def audit_table(rows: Sequence[AuditRow], *, compact: bool = False) -> Table:
     """
     # Few columns on a narrow terminal; what is unusual is in words in any case.
     columns = [column for column in _AUDIT if column[2] or not compact]
-    table = _table("Meshes", "object", "status", *(head for head, _, _ in columns))
+    heads = ("object", "status", *(head for head, _, _ in columns))
+    table = make_table("Meshes", heads, ())
     table.columns[0].max_width, table.columns[1].justify = 24 if compact else 40, "left"
     table.add_column("notes, and what may be wrong (!)", overflow="fold")
-
     colours = {"fit": "green", "repaired": "yellow", "refused": "red"}
     for row in rows:
         status = f"[{colours[row.status]}]{row.status}[/]"
@@ -250,9 +298,13 @@ def audit_table(rows: Sequence[AuditRow], *, compact: bool = False) -> Table:
     return table
 
 
+def _count(number: int) -> str:
+    return f"{int(number):,}"
+
+
 def _number(value: float | None, form: str, unit: float = 1) -> str:
     """Return a number in another unit, or a dash."""
-    return "-" if value is None else f"{unit * value:{form}}"
+    return "-" if value is None or np.isnan(value) else f"{unit * value:{form}}"
 
 
 def _safe(text: str) -> str:
@@ -283,24 +335,19 @@ def memory_line(rows: Sequence[AuditRow]) -> str:
 
 def verdict_table(results: Sequence[Verification]) -> Table:
     """Return what became of grasps, with shares of those that the simulator could judge."""
-    # How the first trials ended.
     counts = Counter(result.outcome for result in results)
     judged = sum(n for outcome, n in counts.items() if not outcome.inconclusive)
-    table = _table("Verdicts", "outcome", "grasps", "share")
     others = sorted(counts.keys() - {Outcome.SUCCESS}, key=lambda o: (-counts[o], o))
-    for outcome in (Outcome.SUCCESS, *others):
-        share = "-" if outcome.inconclusive or not judged else f"{counts[outcome] / judged:.1%}"
-        label = "held" if outcome is Outcome.SUCCESS else outcome.label
-        table.add_row(label, f"{counts[outcome]:,}", share)
-    table.add_section()
-    table.add_row("all", f"{len(results):,}", "")
 
-    # What is more, and what is less than held.
-    table.add_section()
-    for name, words in _VERDICTS.items():
-        count = sum(getattr(result, name) for result in results)
-        table.add_row(words, f"{count:,}", f"{count / judged:.1%}" if judged else "-")
-    return table
+    def row(label: str, count: int, known: bool = True) -> list[str]:
+        return [label, _count(count), f"{count / judged:.1%}" if known and judged else "-"]
+
+    # How the first trials ended; what is more, and what is less than held.
+    ended = [row("held", counts[Outcome.SUCCESS])]
+    ended += [row(o.label, counts[o], not o.inconclusive) for o in others]
+    more = [row(words, sum(getattr(r, n) for r in results)) for n, words in _VERDICTS.items()]
+    total = ["all", _count(len(results)), ""]
+    return make_table("Verdicts", ("outcome", "grasps", "share"), ended, [total], more)
 
 
 #: Words of a verdict, as a table calls them.
@@ -317,31 +364,27 @@ def bench_table(report: Mapping[str, Any]) -> Table:
     """Return a report of `measure.summarize` as a table: rates, and CPU seconds by stage."""
     stages = ("scene", "field", "screen", "try", "look")
     with_mujoco = "peer" in report["all"]
-    heads = ["faces", "attempts", "grasps", "attempts\nper s", "grasps\nper h"]
-    heads += [f"{stage}\n[s]" for stage in stages]
-    heads += ["MuJoCo\ngrasps/h", "ratio"] if with_mujoco else []
-    table = _table("Attempts on one core", "object", *heads)
+    heads = ["object", "faces", "attempts", "grasps", "attempts\nper s", "grasps\nper h"]
+    heads += [f"{stage}\n[s]" for stage in stages] + ["MuJoCo\ngrasps/h", "ratio"] * with_mujoco
 
-    def row(name: str, rates: Mapping[str, Any]) -> None:
+    def row(name: str, rates: Mapping[str, Any]) -> list[str]:
         mujoco = rates.get("peer", {})
         ratio = mujoco.get("ratio", mujoco.get("median_ratio"))
         cells = [
-            f"{rates['faces']:,}" if "faces" in rates else "",
-            f"{rates['attempts']:,}",
-            f"{rates['outcomes'].get(Outcome.SUCCESS.label, 0):,}",
+            _count(rates["faces"]) if "faces" in rates else "",
+            _count(rates["attempts"]),
+            _count(rates["outcomes"].get(Outcome.SUCCESS.label, 0)),
             f"{rates['resolved_per_core_second']:.1f}",
             f"{rates['grasps_per_core_hour']:,.0f}",
             *(f"{rates['seconds'][stage]:.1f}" for stage in stages),
         ]
         if with_mujoco:
             cells += [f"{mujoco['grasps_per_core_hour']:,.0f}", f"{ratio:.2f}" if ratio else "-"]
-        table.add_row(_safe(name), *cells)
+        return [name, *cells]
 
-    for rates in report["objects"]:
-        row(rates["name"], rates)
-    table.add_section()
-    row("all (ratio: median)" if with_mujoco else "all", report["all"])
-    return table
+    rows = (row(rates["name"], rates) for rates in report["objects"])
+    total = row("all (ratio: median)" if with_mujoco else "all", report["all"])
+    return make_table("Attempts on one core", heads, rows, [total])
 
 
 def bench_lines(report: Mapping[str, Any]) -> list[str]:
@@ -350,11 +393,10 @@ def bench_lines(report: Mapping[str, Any]) -> list[str]:
     funnel = ", ".join(
         f"{outcomes[o.label]:,} {o.label}" for o in _OUTCOME_HEADS if outcomes[o.label]
     )
-    versions = ", ".join(f"{name} {version}" for name, version in report["versions"].items())
     return [
         f"outcomes: {funnel}",
         f"peak memory: {report['peak_memory'] / 1e6:,.0f} MB",
-        f"on {report['cpu']}; {versions}",
+        f"on {report['cpu']}; {_versions(report)}",
     ]
 
 
@@ -371,17 +413,18 @@ def fidelity_table(counts_by_variant: Mapping[str, Mapping[str, Any]]) -> Table:
         "successes": "grasps",
         "successes_other": "variant's\ngrasps",
     }
-    table = _table("The same attempts, simulated in other ways", "variant", *columns.values())
-    for name, counts in counts_by_variant.items():
-        cells = (f"{counts[key]:{'.1%' if 'share' in key else ','}}" for key in columns)
-        table.add_row(name.replace("_", " "), *cells)
+    rows = (
+        [name.replace("_", " "), *(f"{n[k]:{'.1%' if 'share' in k else ','}}" for k in columns)]
+        for name, n in counts_by_variant.items()
+    )
 
     # Without the screen, the variant's grasps show what the screen loses.
     off = counts_by_variant["screen_off"]
     lost, successes = off["successes_lost_by_screen"], off["successes_other"]
     counted = f"{lost:,} of {successes:,}" if successes else "unknown, as there are no grasps"
-    table.caption = f"grasps that the screen removed: {counted}"
-    return table
+    caption = f"grasps that the screen removed: {counted}"
+    title = "The same attempts, simulated in other ways"
+    return make_table(title, ("variant", *columns.values()), rows, caption=caption)
 
 
 def drive_line(counts: Mapping[str, Any]) -> str:
@@ -399,20 +442,22 @@ _GROUP_HEADS = {"sample": "samples", "removed": "held, no samples", "lost": "los
 
 def cross_check_table(groups: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return how many stored lifts hold in MuJoCo, of all and of those lifted there, by group."""
-    shares = ("share", "95 %\nconfidence"), ("share\nof these", "95 %\nconfidence")
-    heads = ("lifts", "hold\nthere", *shares[0], "lifted\nthere", *shares[1])
-    table = _table("Stored lifts, tried again in MuJoCo", "in the dataset", *heads)
-    for group, counts in groups.items():
-        cells = [f"{counts[key]:,}" for key in ("drawn", "held")]
-        cells += [*_share_cells(counts["of_all"]), f"{counts['lifted']:,}"]
-        table.add_row(_GROUP_HEADS[group], *cells, *_share_cells(counts["of_lifted"]))
-    return table
 
+    def shares(share: Mapping[str, float] | None) -> list[str]:
+        if share is None:
+            return ["-", "-"]
+        return [f"{share['share']:.1%}", f"{share['low']:.1%} to {share['high']:.1%}"]
 
-def _share_cells(share: Mapping[str, float] | None) -> list[str]:
-    if share is None:
-        return ["-", "-"]
-    return [f"{share['share']:.1%}", f"{share['low']:.1%} to {share['high']:.1%}"]
+    lifts = ("lifts", "hold\nthere", "share", "95 %\nconfidence")
+    heads = ("in the dataset", *lifts, "lifted\nthere", "share\nof these", "95 %\nconfidence")
+    rows = (
+        [
+            *(_GROUP_HEADS[group], _count(n["drawn"]), _count(n["held"]), *shares(n["of_all"])),
+            *(_count(n["lifted"]), *shares(n["of_lifted"])),
+        ]
+        for group, n in groups.items()
+    )
+    return make_table("Stored lifts, tried again in MuJoCo", heads, rows)
 
 
 def cross_check_lines(report: Mapping[str, Any]) -> list[str]:
@@ -423,8 +468,11 @@ def cross_check_lines(report: Mapping[str, Any]) -> list[str]:
             found = Counter(counts["not_lifted"]).most_common()
             reasons = ", ".join(f"{n:,} {label}" for label, n in found)
             lines.append(f"{_GROUP_HEADS[group]} not lifted there: {reasons}")
-    versions = ", ".join(f"{name} {version}" for name, version in report["versions"].items())
-    return [*lines, f"with {versions}"]
+    return [*lines, f"with {_versions(report)}"]
+
+
+def _versions(report: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} {version}" for name, version in report["versions"].items())
 
 
 def score_table(card: Mapping[str, Any], seconds: Mapping[str, float]) -> Table:
@@ -433,36 +481,17 @@ def score_table(card: Mapping[str, Any], seconds: Mapping[str, float]) -> Table:
     protocol = card["settings"].get("protocol")
     counts = "Sample" if protocol is None else f"By {protocol['protocol']}"
     title = f"{counts}, success@1, first wrist pose, mean over {card['objects']} objects [%]"
-    timed = ("s per\nverdict",) if protocol is None else ()
-    table = _table(title, "set", "headline", "95 %\ninterval", *names, *timed)
-    for name, each in card["sets"].items():
-        values = each["measures"]
-        head = values["headline"]
-        cells = [
-            f"{100 * head['value']:.1f}",
-            f"{100 * head['low']:.0f} to {100 * head['high']:.0f}",
-        ]
+    timed = ["s per\nverdict"] * (protocol is None)
+
+    def row(name: str, values: Mapping[str, Mapping[str, float]]) -> list[str]:
+        value, low, high = (100 * values["headline"][key] for key in ("value", "low", "high"))
+        cells = [name, f"{value:.1f}", f"{low:.0f} to {high:.0f}"]
         cells += [f"{100 * values[measure]['value']:.0f}" for measure in names]
-        cells += [f"{seconds[name]:.2f}" for _ in timed]
-        table.add_row(_safe(name), *cells)
-    return table
+        return cells + [f"{seconds[name]:.2f}" for _ in timed]
 
-
-def _table(title: str, first: str, *numbers: str) -> Table:
-    """Return an empty table: a column of names and columns of numbers, by their heads."""
-    table = Table(
-        title=title,
-        title_justify="left",
-        caption_justify="left",
-        box=SIMPLE,
-        pad_edge=False,
-        collapse_padding=True,
-        padding=(0, 1, 0, 0),
-    )
-    table.add_column(first, no_wrap=True, overflow="ellipsis", max_width=24)
-    for head in numbers:
-        table.add_column(escape(head), justify="right", no_wrap=True)
-    return table
+    heads = ("set", "headline", "95 %\ninterval", *names, *timed)
+    rows = (row(name, each["measures"]) for name, each in card["sets"].items())
+    return make_table(title, heads, rows)
 
 
 def make_console(*, stderr: bool = False) -> Console:
@@ -474,3 +503,35 @@ def make_console(*, stderr: bool = False) -> Console:
 def print_table(table: Table) -> None:
     """Print a table to standard output."""
     make_console().print(table)
+
+
+def print_stats(out: Path) -> None:
+    """Print the tables of a dataset: outcomes, how well the hand holds, samples by split."""
+    console, unfinished = make_console(), count_unfinished(out)
+    funnel = count_funnel(out) if unfinished is None else unfinished.funnel
+    table = funnel_table(funnel)
+    # Rich would cut numbers in a narrow terminal; the compact table has fewer columns.
+    natural = Measurement.get(console, console.options.update(max_width=WIDTH), table).maximum
+    if natural > console.width:
+        table = funnel_table(funnel, compact=True)
+    console.print(table)
+    console.print(hold_table(funnel))
+    config = read_manifest(out).config
+    if preshapes := preshapes_of(funnel, config):
+        console.print(preshape_table(preshapes))
+    console.print()
+    if unfinished is None:
+        splits = count_splits(out)
+        console.print(split_table(splits))
+        rule = split_rule_of(out / DATA_FILES["oto"])
+        say(split_line(rule, funnel, splits))
+        for line in barren_lines(funnel, config):
+            say(line)
+        if (holding := holding_of(Trials(out))) is not None:
+            for line in holding_lines(holding):
+                say(line)
+        of_benchmark = (out / BUILTIN_FOLDER / BENCHMARK_FILE).is_file()
+        if not of_benchmark and (line := split_shortfall(splits, rule, config.split)):
+            say(line)
+    else:
+        say(f"{out}: {unfinished_line(unfinished)}")

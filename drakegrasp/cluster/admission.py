@@ -16,49 +16,14 @@ from typing import Any
 
 from distributed import Client, Scheduler, Worker, WorkerPlugin
 
+from drakegrasp.cluster.connect import SATURATION, SILENCE_SECONDS, WORKER_ENVIRONMENT
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import REQUIRED_VERSIONS, installed_versions
 from drakegrasp.errors import MachineError, printable
-from drakegrasp.generation.prepare import PREPARE_SECONDS
-from drakegrasp.runtime.journal import wall_limit
 from drakegrasp.vision.probe_image import probe_image
 
-#: Tasks that the scheduler gives to a worker, per thread: a task that waits behind another would
-#: be blamed, too, when that one kills the worker.
-SATURATION = 1.0
-#: Time without a sign of life after which the scheduler gives a worker up [s]: longer than the
-#: limits of every step (see `runtime.journal`). A step that holds the interpreter gives none, and
-#: its journal tells more than the scheduler knows. A lost connection is noticed at once.
-SILENCE_SECONDS = 2.0 * wall_limit(PREPARE_SECONDS)
-#: The variable that chooses a kernel of OpenBLAS, read when the library is loaded.
-BLAS_KERNEL = "OPENBLAS_CORETYPE"
 #: Topic of the messages from workers that join later.
 _TOPIC = "drakegrasp-admission"
-
-
-def worker_environment() -> dict[str, str]:
-    """Return the environment variables that every worker gets, on this machine and on others.
-
-    Software OpenGL and BLAS would start threads beside the one process per core, and nothing that
-    a worker does needs the network.
-    """
-    return {
-        "LP_NUM_THREADS": "0",
-        "DRAKE_ALLOW_NETWORK": "none",
-        "OMP_NUM_THREADS": "1",
-        "MKL_NUM_THREADS": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-    }
-
-
-def start_environment() -> dict[str, str]:
-    """Return the environment variables of workers that we start.
-
-    Which kernel OpenBLAS runs is left to each machine, unless the caller's environment says it: the
-    last bits of a lift depend on it (`docs/explanation/determinism.md`).
-    """
-    kernel = {name: os.environ[name] for name in (BLAS_KERNEL,) if name in os.environ}
-    return {**worker_environment(), **kernel}
 
 
 class Admission(WorkerPlugin):  # type: ignore[misc]
@@ -78,7 +43,7 @@ class Admission(WorkerPlugin):  # type: ignore[misc]
 
     def setup(self, worker: Worker) -> None:
         """Check and set up the worker; Dask calls this before it gives it any task."""
-        os.environ.update(worker_environment())  # for a worker that was started by hand
+        os.environ.update(WORKER_ENVIRONMENT)  # for a worker that was started by hand
         fault = unfitness(worker.state.nthreads, installed_versions(self._config), self._versions)
         if fault is None and _host() not in self._hosts:
             fault = _image_fault()

@@ -1,32 +1,84 @@
-"""Connecting to Dask: a running scheduler, or a cluster on this machine."""
+"""Connecting to Dask: a running scheduler, or workers on this machine that nobody else can use.
+
+Every user of a machine reaches the ports of its loopback address, and whoever connects to a Dask
+process can run any program in it. So all connections need a certificate, which this process makes
+and hands to its workers through a pipe. HTTP servers ask for none, so they are not started.
+"""
 
 from __future__ import annotations
 
 import importlib.util
 import json
+import logging
+import multiprocessing
+import os
+import signal
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from multiprocessing import resource_tracker
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Any
+from typing import Any, TypedDict
 
 import dask
-from distributed import Client, SpecCluster
+from distributed import Client, Nanny, Scheduler, SpecCluster, Worker
 from distributed.security import Security
+from distributed.utils import LoopRunner
+from tornado.ioloop import IOLoop
 
-from drakegrasp.cluster.admission import SATURATION, SILENCE_SECONDS, start_environment
-from drakegrasp.cluster.local import PrivateCluster, undisturbed_loop
+from drakegrasp.cluster.certificates import chosen_security
 from drakegrasp.errors import ConfigError, MachineError
+from drakegrasp.generation.prepare import PREPARE_SECONDS
 from drakegrasp.runtime.allocator import PRELOAD, SETTINGS, kept_variables
-from drakegrasp.runtime.environment import available_cores
-from drakegrasp.runtime.executor import refuse_to_start_workers
+from drakegrasp.runtime.executor import count_workers, refuse_to_start_workers
+from drakegrasp.runtime.journal import wall_limit
 
-#: How long to wait for a scheduler to answer [s].
-CONNECT_SECONDS = 10
-#: How long a scheduler may take to write its file [s].
-WRITE_SECONDS = 2
+#: Address that only this machine can reach.
+LOOPBACK = "127.0.0.1"
+#: How long to wait for a scheduler to answer, and how long it may take to write its file [s].
+CONNECT_SECONDS, WRITE_SECONDS = 10, 2
 #: Module that a nanny loads before it starts its worker: it chooses the worker's allocator.
 NANNY_PRELOAD = "drakegrasp.runtime.allocator"
+#: Tasks that the scheduler gives to a worker, per thread: a task that waits behind another would
+#: be blamed, too, when that one kills the worker.
+SATURATION = 1.0
+#: Time without a sign of life after which the scheduler gives a worker up [s]: longer than the
+#: limits of every step (see `runtime.journal`). A step that holds the interpreter gives none, and
+#: its journal tells more than the scheduler knows. A lost connection is noticed at once.
+SILENCE_SECONDS = 2.0 * wall_limit(PREPARE_SECONDS)
+#: The variable that chooses a kernel of OpenBLAS, read when the library is loaded.
+BLAS_KERNEL = "OPENBLAS_CORETYPE"
+#: The environment variables that every worker gets, on this machine and on others. Software OpenGL
+#: and BLAS would start threads beside the one process per core, and nothing that a worker does
+#: needs the network.
+WORKER_ENVIRONMENT = {
+    "LP_NUM_THREADS": "0",
+    "DRAKE_ALLOW_NETWORK": "none",
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+}
+
+
+class Workers(TypedDict, total=False):
+    """Where a public call has its work done if it is given no client; see `connect`."""
+
+    workers: int | None
+    scheduler: str | None
+    scheduler_file: str | Path | None
+    tls: bool
+    tls_files: tuple[Path, Path, Path] | None
+
+
+def start_environment() -> dict[str, str]:
+    """Return the environment variables of workers that we start.
+
+    Which kernel OpenBLAS runs is left to each machine, unless the caller's environment says it: the
+    last bits of a lift depend on it (`docs/explanation/determinism.md`).
+    """
+    kernel = {name: os.environ[name] for name in (BLAS_KERNEL,) if name in os.environ}
+    return {**WORKER_ENVIRONMENT, **kernel}
 
 
 def dask_settings() -> dict[str, Any]:
@@ -65,46 +117,77 @@ def has_dashboard() -> bool:
     return importlib.util.find_spec("bokeh") is not None
 
 
-@contextmanager
 def connect(
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
     *,
-    security: Security | None = None,
     tls: bool = True,
+    tls_files: tuple[Path, Path, Path] | None = None,
     memory: str | None = None,
-) -> Iterator[Client]:
-    """Connect to a running scheduler, or start a cluster on this machine, while the block runs.
+) -> AbstractContextManager[Client]:
+    """Return what gives a Dask client while a block runs, for any number of calls.
+
+    >>> with connect(workers=8) as client:                                  # doctest: +SKIP
+    ...     verdicts = verify_grasps(grasps, on=data, client=client)
 
     Args:
-        workers: Processes of a cluster on this machine; one per core if None.
-        scheduler: Address of a running scheduler.
+        workers: Processes on this machine, which are started; one per core if None.
+        scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
-        security: Certificates; without them a cluster on this machine makes its own, and a
-            running scheduler gets those of Dask's settings (`distributed.comm.tls`).
-        tls: Whether a running scheduler must want a certificate.
+        tls: Whether the scheduler must want a certificate.
+        tls_files: Certificate authority, certificate and private key (PEM). Without them workers
+            on this machine get some of their own, and a running scheduler gets those of Dask's
+            settings (`distributed.comm.tls`).
         memory: Limit per process on this machine, e.g. "2GB"; an equal share of it if None.
 
     Raises:
-        ConfigError: If the scheduler wants no certificate, and should.
+        ConfigError: If the number of workers is below one or given with a scheduler, the address
+            is empty, the choice of TLS contradicts itself, or the scheduler wants no certificate
+            although `tls` says so.
         MachineError: If there is no scheduler at the address.
     """
-    # Dask sets variables here for the workers that it starts here.
-    with kept_variables(PRELOAD, SETTINGS), dask.config.set(dask_settings()):
-        if scheduler or scheduler_file:
-            cluster = _connect_remote(scheduler, scheduler_file, security, tls)
-        else:
-            cluster = _start_local(workers, security, memory)
-        with cluster as client:
-            yield client
+    # Python imports a script into each process that it starts: a call that is not under
+    # `if __name__ == "__main__"` would begin there, too.
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        sys.exit(1)
+    elsewhere = bool(scheduler or scheduler_file)
+    if scheduler is not None and not scheduler.strip():
+        raise ConfigError(f"scheduler must be an address like tls://host:8786, got {scheduler!r}")
+    if workers is not None and elsewhere:
+        raise ConfigError("workers must not be given with a scheduler, which has its own")
+    count = count_workers(workers)
+    security = chosen_security(tls, tls_files, elsewhere=elsewhere)
+
+    @contextmanager
+    def connected() -> Iterator[Client]:
+        # Dask sets variables here for the workers that it starts here.
+        with kept_variables(PRELOAD, SETTINGS), dask.config.set(dask_settings()):
+            if elsewhere:
+                cluster = _connect_remote(scheduler, scheduler_file, security, tls)
+            else:
+                cluster = _start_local(count, security, memory or "auto")
+            with cluster as client:
+                yield client
+
+    return connected()
+
+
+def joined(client: Client | None, workers: Workers) -> AbstractContextManager[Client]:
+    """Return the caller's client, or what connects to the workers that a public call asks for.
+
+    Raises:
+        ConfigError: If both are given; as `connect`.
+    """
+    if client is None:
+        return connect(**workers)
+    if workers:
+        raise ConfigError(f"{next(iter(workers))} must not be given with a client, got both")
+    return nullcontext(client)
 
 
 def _connect_remote(
-    scheduler: str | None,
-    scheduler_file: str | Path | None,
-    security: Security | None,
-    tls: bool,
+    scheduler: str | None, scheduler_file: str | Path | None, security: Security | None, tls: bool
 ) -> Client:
     address, file = scheduler, None if scheduler_file is None else str(scheduler_file)
     # Dask waits for a missing file for ever.
@@ -150,25 +233,6 @@ def _address_of(file: Path) -> str | None:
             return address if isinstance(address, str) else None
 
 
-@contextmanager
-def _start_local(
-    workers: int | None, security: Security | None, memory: str | None
-) -> Iterator[Client]:
-    refuse_to_start_workers()
-    with undisturbed_loop() as loop:
-        try:
-            cluster = PrivateCluster(
-                workers or available_cores(), loop=loop, security=security, memory=memory or "auto"
-            )
-        except RuntimeError as error:
-            raise MachineError(
-                f"worker processes must start, got: {error}; in a script, the call must be under "
-                'if __name__ == "__main__":'
-            ) from None
-        with closing_cluster(cluster), Client(cluster) as client:
-            yield client
-
-
 class _RemoteClient(Client):
     """A client that closes at once if it cannot start.
 
@@ -194,3 +258,106 @@ def closing_cluster(cluster: SpecCluster) -> Iterator[None]:
         # On a busy machine a worker may not end within Dask's limit: it ends with this process.
         with suppress(TimeoutError):
             cluster.close()
+
+
+@contextmanager
+def _start_local(workers: int, security: Security | None, memory: str) -> Iterator[Client]:
+    refuse_to_start_workers()
+    with _undisturbed_loop() as loop:
+        try:
+            cluster = PrivateCluster(workers, loop=loop, security=security, memory=memory)
+        except RuntimeError as error:
+            raise MachineError(
+                f"worker processes must start, got: {error}; in a script, the call must be under "
+                'if __name__ == "__main__":'
+            ) from None
+        with closing_cluster(cluster), Client(cluster) as client:
+            yield client
+
+
+class _QuietScheduler(Scheduler):
+    """A scheduler without an HTTP server; no option of Dask leaves it out (distributed 2026.8)."""
+
+    def start_http_server(self, *_: Any, **__: Any) -> None:
+        """Open no port."""
+
+
+class _QuietWorker(Worker):
+    """A worker without an HTTP server."""
+
+    def start_http_server(self, *_: Any, **__: Any) -> None:
+        """Open no port."""
+
+
+class PrivateCluster(SpecCluster):
+    """A scheduler in this process, and workers of one thread, each under a nanny.
+
+    Its start may be interrupted. Dask cannot close a cluster that has not started, and at the end
+    of the program a traceback would say so (distributed 2026.8). Its processes end with this one
+    all the same.
+    """
+
+    def __init__(
+        self, workers: int, *, loop: IOLoop, security: Security | None = None, memory: str
+    ) -> None:
+        """Start the cluster.
+
+        Args:
+            workers: Number of processes.
+            loop: Event loop in which the scheduler and the nannies run.
+            security: Certificates; made for this cluster, and in memory only, if None.
+            memory: Limit per process, e.g. "2GB"; "auto" for an equal share.
+        """
+        security = security or Security.temporary()
+        server = {"host": LOOPBACK, "protocol": "tls://", "security": security}
+        nanny = {
+            "cls": Nanny,
+            "options": {
+                **server,
+                "worker_class": _QuietWorker,
+                "nthreads": 1,
+                "memory_limit": memory,
+                "silence_logs": logging.CRITICAL,
+            },
+        }
+        scheduler = {
+            "cls": _QuietScheduler,
+            "options": {**server, "port": 0, "dashboard": False},
+        }
+        try:
+            super().__init__(
+                dict.fromkeys(range(workers), nanny),
+                scheduler,
+                nanny,
+                loop=loop,
+                security=security,
+                silence_logs=logging.CRITICAL,
+            )
+        except BaseException:
+            self._instances.discard(self)
+            # A nanny whose worker did not start would tell this loop's log, which nobody reads.
+            loop.asyncio_loop.set_exception_handler(lambda *_: None)  # type: ignore[attr-defined]
+            raise
+
+
+@contextmanager
+def _undisturbed_loop() -> Iterator[IOLoop]:
+    """Run an event loop in a thread that no Ctrl-C reaches, nor the processes that it starts.
+
+    At a terminal Ctrl-C goes to every process. The client stops then, and its workers with it; one
+    that has just begun to start would print a traceback instead.
+    """
+    # The first process that a thread starts also starts this one, and clears the thread's mask.
+    resource_tracker.ensure_running()
+    runner = LoopRunner()
+    runner.start()
+    try:
+        runner.run_sync(_block_interrupts)
+        yield runner.loop
+    finally:
+        runner.stop()
+
+
+async def _block_interrupts() -> None:
+    # Threads and processes that this thread starts inherit the mask.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

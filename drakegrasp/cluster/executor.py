@@ -28,7 +28,7 @@ from distributed import Client, Future, KilledWorker
 from distributed.core import Status
 from distributed.deploy import Cluster
 
-from drakegrasp.cluster.local import PrivateCluster
+from drakegrasp.cluster.connect import PrivateCluster
 from drakegrasp.errors import BlankImageError, MachineError
 from drakegrasp.runtime.executor import WorkerPool
 

@@ -12,7 +12,7 @@ from drakegrasp.config import FilterConfig
 from drakegrasp.errors import ConfigError
 from drakegrasp.filters import Flags, first_removal, is_outlier
 from drakegrasp.outcomes import Removal
-from drakegrasp.runtime.user_code import own_class, run_own
+from drakegrasp.registry import own_class, run_own
 from drakegrasp.table import Table
 
 #: The setting that names filters of the user's own.

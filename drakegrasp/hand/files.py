@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
+from drakegrasp import registry
 from drakegrasp.config import CarriedHand, HandSource
 from drakegrasp.errors import HandError
 
@@ -14,8 +15,9 @@ MODELS = Path(__file__).resolve().parent.parent / "models"
 
 
 def hand_names() -> list[str]:
-    """Return the names of the hands that come with the package."""
-    return sorted(path.name.removesuffix("_hand.yaml") for path in MODELS.glob("*_hand.yaml"))
+    """Return the names of the hands that come with the package, and of those of others."""
+    ours = (path.name.removesuffix("_hand.yaml") for path in MODELS.glob("*_hand.yaml"))
+    return sorted({*ours, *registry.names("hands")})
 
 
 def hand_file(source: HandSource) -> Path:
@@ -27,9 +29,11 @@ def hand_file(source: HandSource) -> Path:
     if isinstance(source, CarriedHand):
         refuse_outside(source.path, source.path.parent)
         return source.path
-    if source in hand_names():
-        return MODELS / f"{source}_hand.yaml"
-    path = Path(source)
+    path = MODELS / f"{source}_hand.yaml"
+    if source in hand_names() and not path.exists():
+        path = Path(registry.find("hands", str(source)))
+    elif source not in hand_names():
+        path = Path(source)
     if not path.is_file():
         names = ", ".join(hand_names())
         raise HandError(f"hand must be one of {names} or a YAML file, got {str(source)!r}")

@@ -23,7 +23,7 @@ from drakegrasp.config import (
 from drakegrasp.errors import ConfigError
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file, hand_names
-from drakegrasp.runtime.user_code import read_class
+from drakegrasp.registry import read_class
 
 #: Keys of `candidates` that are the hand's own where they are not given, or null.
 HAND_KEYS = ("standoffs", "spreads_deg")

@@ -21,9 +21,9 @@ from drakegrasp import __version__
 from drakegrasp.errors import ConfigError, DataError, MeshError
 from drakegrasp.protocols.files import inner_path, one_motion, read_grasp_file, read_object_folder
 from drakegrasp.protocols.protocol import MujocoProtocol, PostureVerdict, Protocol, find_protocol
+from drakegrasp.registry import read_class, run_own
 from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.executor import Executor, in_order, run_here
-from drakegrasp.runtime.user_code import read_class, run_own
 
 if TYPE_CHECKING:
     from drakegrasp.protocols.scene import ProtocolScene

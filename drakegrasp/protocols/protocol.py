@@ -18,7 +18,7 @@ import numpy as np
 from drakegrasp import registry
 from drakegrasp.errors import ConfigError, listed
 from drakegrasp.frames import Array
-from drakegrasp.runtime.user_code import own_class, read_class, run_own
+from drakegrasp.registry import own_class, read_class, run_own
 
 if TYPE_CHECKING:
     from drakegrasp.protocols.scene import ProtocolScene

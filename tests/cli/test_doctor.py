@@ -7,6 +7,7 @@ import sys
 from collections import namedtuple
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import pytest
 from helpers.machine import needs_egl
@@ -43,74 +44,51 @@ def test_current_directory_is_the_default(tmp_path: Path, monkeypatch: pytest.Mo
     assert writing == Finding(name="writing", ok=True, what=str(tmp_path))
 
 
-def test_old_python_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "version_info", (3, 10, 12, "final", 0))
-    finding = doctor.check_python()
-    assert not finding.ok
-    assert "3.11 or newer" in finding.remedy
+EGL, DRAKE = "apt-get install libegl1 libgl1-mesa-dri", "pip install 'drake>=1.51.1,!=1.52.0'"
+CONTAINER = "use a system or container with glibc 2.34 or newer, such as Ubuntu 22.04"
+#: What a machine may have: the check, what is there, whether it will do, what is said, the remedy.
+MACHINES = [
+    ("python", (3, 10, 12, "final", 0), False, "", "install Python 3.11 or newer"),
+    ("glibc", ("glibc", "2.34"), True, "glibc 2.34", ""),
+    ("glibc", ("glibc", "2.4"), False, "glibc 2.4", CONTAINER),
+    ("glibc", ("glibc", "2.31"), False, "glibc 2.31", CONTAINER),
+    ("glibc", ("glibc", "3.0"), True, "glibc 3.0", ""),
+    ("glibc", ("musl", "1.2.5"), False, "musl 1.2.5", CONTAINER),
+    ("glibc", ("", ""), False, "another C library", CONTAINER),
+    ("drake", "1.51.1", True, "1.51.1: works; attempts take up to a tenth longer", ""),
+    ("drake", "1.52.0", False, "1.52.0", DRAKE),
+    ("drake", "1.52.0.post1", False, "1.52.0.post1", DRAKE),
+    ("drake", "1.52.1", True, "1.52.1: works; attempts take up to a tenth longer", ""),
+    ("drake", "1.58.0", True, "1.58.0", ""),
+    ("drake", "1.51.0", False, "1.51.0", DRAKE),
+    ("drake", "0.0.20260101", False, "0.0.20260101", DRAKE),
+    ("drake", "2.0", True, "2.0", ""),
+    ("drake", None, False, "not installed", DRAKE),
+    ("egl", "libEGL-none.so.1", False, "libEGL-none.so.1", EGL),
+]
 
 
-@pytest.mark.parametrize(
-    ("libc", "ok", "what"),
-    [
-        (("glibc", "2.34"), True, "glibc 2.34"),
-        (("glibc", "2.4"), False, "glibc 2.4"),
-        (("glibc", "2.31"), False, "glibc 2.31"),
-        (("glibc", "3.0"), True, "glibc 3.0"),
-        (("musl", "1.2.5"), False, "musl 1.2.5"),
-        (("", ""), False, "another C library"),
-    ],
-)
-def test_old_or_other_c_library_is_told(
-    monkeypatch: pytest.MonkeyPatch, libc: tuple[str, str], ok: bool, what: str
+@pytest.mark.skipif(sys.platform != "linux", reason="EGL and glibc are Linux's")
+@pytest.mark.parametrize(("check", "there", "ok", "what", "remedy"), MACHINES)
+def test_what_is_missing_is_told_with_what_mends_it(
+    monkeypatch: pytest.MonkeyPatch, check: str, there: Any, ok: bool, what: str, remedy: str
 ) -> None:
-    monkeypatch.setattr(sys, "platform", "linux")
-    monkeypatch.setattr(doctor.platform, "libc_ver", lambda: libc)
-    finding = doctor.check_glibc()
-    assert (finding.ok, finding.what) == (ok, what)
-    assert ("container" in finding.remedy) is not ok
+    def version(package: str) -> Any:
+        if there is None:
+            raise metadata.PackageNotFoundError(package)
+        return there
 
-
-@pytest.mark.parametrize(
-    ("version", "ok"),
-    [
-        ("1.51.1", True),
-        ("1.52.0", False),
-        ("1.52.0.post1", False),
-        ("1.52.1", True),
-        ("1.58.0", True),
-        ("1.51.0", False),
-        ("0.0.20260101", False),
-        ("2.0", True),
-    ],
-)
-def test_drake_that_crashes_or_is_too_old_is_told(
-    monkeypatch: pytest.MonkeyPatch, version: str, ok: bool
-) -> None:
-    monkeypatch.setattr(doctor.metadata, "version", lambda package: version)
-    mend = "" if ok else "pip install 'drake>=1.51.1,!=1.52.0'"
-    finding = doctor.check_drake()
-    assert (finding.ok, finding.what.partition(":")[0], finding.remedy) == (ok, version, mend)
-    assert ("a tenth longer" in finding.what) == (version in ("1.51.1", "1.52.1"))
-
-
-def test_missing_drake_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(package: str) -> str:
-        raise metadata.PackageNotFoundError(package)
-
-    monkeypatch.setattr(doctor.metadata, "version", missing)
-    finding = doctor.check_drake()
-    assert (finding.ok, finding.what) == (False, "not installed")
-    assert finding.remedy.startswith("pip install 'drake")
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="EGL is Linux's")
-def test_missing_egl_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "EGL_LIBRARY", "libEGL-none.so.1")
-    finding = doctor.check_egl()
-    assert not finding.ok
-    assert "libEGL-none.so.1" in finding.what
-    assert finding.remedy == "apt-get install libegl1 libgl1-mesa-dri"
+    place, name, value = {
+        "python": (sys, "version_info", there),
+        "glibc": (doctor.platform, "libc_ver", lambda: there),
+        "drake": (doctor.metadata, "version", version),
+        "egl": (doctor, "EGL_LIBRARY", there),
+    }[check]
+    monkeypatch.setattr(place, name, value)
+    finding = getattr(doctor, f"check_{check}")()
+    assert (finding.ok, finding.remedy) == (ok, remedy)
+    assert finding.what.startswith(what)
+    assert ("a tenth longer" in finding.what) == ("a tenth longer" in what)
 
 
 @pytest.mark.parametrize(
@@ -133,7 +111,7 @@ def test_image_that_fails_is_told_and_kills_nobody(
     monkeypatch.setattr(probe_image, "IMAGE_SECONDS", 1.0 if "sleep" in child else 60.0)
     finding = doctor.check_image()
     assert (finding.ok, finding.what) == (False, what)
-    assert finding.remedy == "apt-get install libegl1 libgl1-mesa-dri"
+    assert finding.remedy == EGL
 
 
 def test_image_that_lacks_a_library_is_mended_by_installing_it(
@@ -162,20 +140,16 @@ def test_child_does_not_import_what_lies_in_the_current_directory(
 
 @pytest.mark.usefixtures("no_image")
 def test_directory_that_cannot_be_written_is_told(tmp_path: Path) -> None:
-    """A file is in the way: that stops even root."""
+    """A file in the way stops even root; one that does not exist yet is no lack, and not made."""
     (tmp_path / "file").write_text("")
-    (writing,) = (f for f in diagnose(tmp_path / "file" / "out") if f.name == "writing")
-    assert not writing.ok
-    assert writing.what == f"{tmp_path / 'file'}: Not a directory"
-    assert "--out" in writing.remedy
-
-
-@pytest.mark.usefixtures("no_image")
-def test_directory_that_does_not_exist_yet_is_no_lack(tmp_path: Path) -> None:
-    """`build` makes it; the doctor does not."""
-    writing = {f.name: f for f in diagnose(tmp_path / "new" / "out")}["writing"]
-    assert (writing.ok, writing.what) == (True, str(tmp_path))
-    assert list(tmp_path.iterdir()) == []
+    for folder, ok, what in (
+        (tmp_path / "file" / "out", False, f"{tmp_path / 'file'}: Not a directory"),
+        (tmp_path / "new" / "out", True, str(tmp_path)),
+    ):
+        writing = {finding.name: finding for finding in diagnose(folder)}["writing"]
+        assert (writing.ok, writing.what) == (ok, what)
+        assert ("--out" in writing.remedy) is not ok
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

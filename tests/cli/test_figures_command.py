@@ -37,11 +37,3 @@ def test_figures_are_written_beside_the_dataset(
         {path.name for path in folder.iterdir()} for folder in (out / "figures", tmp_path / "other")
     ]
     assert names[0] == names[1]
-
-
-def test_mistakes_are_one_line_and_leave_nothing(tmp_path: Path) -> None:
-    result = run("figures", tmp_path, "--quiet")
-    assert result.exit_code == 1
-    assert result.stderr.startswith(f"error: {tmp_path}/trials.hdf5: must be the trials")
-    assert result.stderr.count("\n") == 1
-    assert not list(tmp_path.iterdir())

@@ -22,7 +22,7 @@ except BaseException:
 COMMAND = """
 import sys, time
 import click
-from drakegrasp.cli.errors import OneCommand
+from drakegrasp.cli.console import OneCommand
 
 @click.command(cls=OneCommand)
 def command():

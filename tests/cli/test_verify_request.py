@@ -11,7 +11,7 @@ from helpers.commands import run
 from helpers.datasets import OTO, make_dataset
 from helpers.hands import write_with_optional_fingers
 
-from drakegrasp.cli.verify.request import VerifyRequest, place_requested, requested_rows
+from drakegrasp.cli.placing import VerifyRequest, place_requested, requested_rows
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError, HandError

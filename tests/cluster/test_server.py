@@ -20,10 +20,9 @@ from server.processes import wait_until
 from server.slurm import PARTITION, queued_jobs, running_slurm
 from server.ssh import running_sshd
 
-from drakegrasp.cluster import launch
-from drakegrasp.cluster.admission import worker_environment
-from drakegrasp.cluster.launch import start_cluster
-from drakegrasp.cluster.request import ClusterRequest
+from drakegrasp.cluster import slurm as jobs
+from drakegrasp.cluster.connect import WORKER_ENVIRONMENT
+from drakegrasp.cluster.kinds import ClusterRequest, cluster_of
 from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
@@ -95,7 +94,7 @@ def submit(env: dict[str, str], meshes: Path, out: Path, *arguments: str) -> Non
 
 def settings(client: Client) -> dict[str, dict[str, Any]]:
     """Return what matters of each worker, as it is there."""
-    names = list(worker_environment())
+    names = list(WORKER_ENVIRONMENT)
 
     # Workers cannot import this module, so what they run is defined here.
     def look(dask_worker: Any) -> dict[str, Any]:
@@ -121,7 +120,7 @@ def check_settings(client: Client, count: int, scheme: str) -> None:
     found = settings(client)
     assert len(found) == count
     for worker in found.values():
-        assert worker["environment"] == worker_environment()
+        assert worker["environment"] == WORKER_ENVIRONMENT
         assert (worker["start"], worker["profile"], worker["threads"]) == ("spawn", False, 1)
         assert worker["address"].startswith(f"{scheme}://127.0.0.1:")
 
@@ -157,12 +156,12 @@ def test_slurm_workers_have_their_settings_and_are_replaced(
 
     for name in ("SLURM_CONF", "SBATCH_EXPORT"):
         monkeypatch.setenv(name, slurm[name])
-    monkeypatch.setattr(launch, "REFILL_SECONDS", 2.0)
+    monkeypatch.setattr(jobs, "REFILL_SECONDS", 2.0)
     request = ClusterRequest(kind="slurm", workers=3, cores=1, walltime="00:20:00", tls=False)
     # Over the defaults of dask-jobqueue, which another test's import may have read already.
     yaml = dask.config.collect(paths=[slurm["DASK_CONFIG"]], env={})
     settings_of_site = dask.config.merge(dask.config.config, yaml)
-    with dask.config.set(settings_of_site), start_cluster(request, tmp_path) as client:
+    with dask.config.set(settings_of_site), cluster_of(request).connected(tmp_path) as client:
         client.wait_for_workers(3, timeout=PATIENCE)
         check_settings(client, 3, "tcp")
         for worker in settings(client).values():
@@ -230,10 +229,10 @@ def test_ssh_workers_have_their_settings(
     ssh: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", ssh["HOME"])
-    for name in worker_environment():
+    for name in WORKER_ENVIRONMENT:
         monkeypatch.delenv(name, raising=False)
     request = ClusterRequest(kind="ssh", where=("127.0.0.1", "127.0.0.1"), workers=2)
-    with start_cluster(request, tmp_path) as client:
+    with cluster_of(request).connected(tmp_path) as client:
         client.wait_for_workers(2, timeout=PATIENCE)
         check_settings(client, 2, "tls")
     wait_until(lambda: not remote_processes(), "the end of the workers", tmp_path / "none")

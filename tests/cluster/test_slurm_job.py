@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from drakegrasp.cluster import launch
 from drakegrasp.cluster.certificates import security_of
 from drakegrasp.cluster.connect import dask_settings
-from drakegrasp.cluster.request import ClusterRequest
+from drakegrasp.cluster.kinds import ClusterRequest
 from drakegrasp.errors import MachineError
 
 pytest.importorskip("dask_jobqueue")
 
-from drakegrasp.cluster.slurm_job import QuotedJob
+from drakegrasp.cluster import slurm
+from drakegrasp.cluster.slurm import QuotedJob, Slurm
 
 
 def test_paths_in_a_job_script_are_words_and_nothing_of_them_runs(tmp_path: Path) -> None:
@@ -58,10 +58,10 @@ def test_job_has_the_memory_of_all_its_workers(monkeypatch: pytest.MonkeyPatch) 
         scripts.append(script)
         raise MachineError("no SLURM here")
 
-    monkeypatch.setattr(launch, "_refuse_bad_job", refuse)
+    monkeypatch.setattr(slurm, "_refuse_bad_job", refuse)
     request = ClusterRequest(kind="slurm", workers=6, cores=3, memory="2GB", host="127.0.0.1")
     with pytest.raises(MachineError, match="no SLURM here"):
-        launch._slurm(request, None)
+        Slurm(request).start(None)
     (script,) = scripts
     lines = [line.removeprefix("#SBATCH ").split("=") for line in script.splitlines()]
     said = {line[0]: line[1] for line in lines if len(line) == 2}

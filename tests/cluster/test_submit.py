@@ -25,13 +25,13 @@ from helpers.meshes import write_fixed
 from helpers.scripts import PIPELINES, load_script
 
 import drakegrasp
+from drakegrasp import registry
 from drakegrasp.cluster import connect as connecting
-from drakegrasp.cluster import launch
-from drakegrasp.cluster.admission import admitted_workers, worker_environment
+from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.certificates import make_certificates, private_directory
-from drakegrasp.cluster.connect import connect, dask_settings
-from drakegrasp.cluster.launch import _exports, start_cluster
-from drakegrasp.cluster.request import ClusterRequest, walltime_seconds
+from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect, dask_settings
+from drakegrasp.cluster.kinds import ClusterRequest, cluster_of
+from drakegrasp.cluster.slurm import _exports, walltime_seconds
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.settings import load_config
@@ -102,7 +102,7 @@ def test_workers_elsewhere_need_a_certificate_unless_told_otherwise(
 ) -> None:
     own = make_certificates(tmp_path) if choice == "own" else None
 
-    def start(_: ClusterRequest, security: Security | None) -> None:
+    def start(_: object, security: Security | None) -> None:
         if choice == "none":
             assert security is None
         else:
@@ -112,12 +112,13 @@ def test_workers_elsewhere_need_a_certificate_unless_told_otherwise(
             assert security.tls_ca_file == str(kept)
         raise MachineError("started")
 
-    monkeypatch.setattr(launch, f"_{kind}", start)
+    monkeypatch.setattr(registry.find("clusters", kind), "start", start)
     where = ("node",) if kind == "ssh" else ()
     request = ClusterRequest(
         kind=kind, where=where, workers=1, host="10.0.0.1", tls=choice != "none", tls_files=own
     )
-    with pytest.raises(MachineError, match="started"), start_cluster(request, tmp_path / "out"):
+    cluster = cluster_of(request)
+    with pytest.raises(MachineError, match="started"), cluster.connected(tmp_path / "out"):
         pass
     assert not list(tmp_path.glob("out/.tls-*"))
 
@@ -346,14 +347,14 @@ def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
     def saturation(dask_scheduler: Any) -> float:
         return float(dask_scheduler.WORKER_SATURATION)
 
-    names = list(worker_environment())
+    names = list(WORKER_ENVIRONMENT)
 
     def environment() -> dict[str, str | None]:
         return {name: os.environ.get(name) for name in names}
 
     command = [sys.executable, "-m"]
     file = tmp_path / "scheduler.json"
-    plain = {k: v for k, v in os.environ.items() if k not in worker_environment()}
+    plain = {k: v for k, v in os.environ.items() if k not in WORKER_ENVIRONMENT}
     flags = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
     (tmp_path / "keys").mkdir()
     files = make_certificates(tmp_path / "keys")
@@ -374,12 +375,12 @@ def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
         while not file.exists():
             scheduler.poll()
             assert scheduler.returncode is None
-        with start_cluster(request, tmp_path) as client:
+        with cluster_of(request).connected(tmp_path) as client:
             client.wait_for_workers(1, timeout=60)
             with admitted_workers(client, load_config()):
                 assert client.run_on_scheduler(saturation) == 1.0
                 ((address, found),) = client.run(environment).items()
-                assert found == worker_environment()
+                assert found == WORKER_ENVIRONMENT
                 late = [*join, "--nthreads", "2"]
                 refused = subprocess.run(late, env=plain, stderr=subprocess.PIPE, timeout=120)
                 assert b"drakegrasp-unfit" in refused.stderr

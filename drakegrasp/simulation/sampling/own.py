@@ -18,7 +18,7 @@ from drakegrasp.config import CandidateConfig
 from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.frames import Array, read_pose
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.runtime.user_code import own_class, run_own
+from drakegrasp.registry import own_class, run_own
 from drakegrasp.seeding import Stream
 
 

@@ -1,13 +1,15 @@
-"""The commands that show a dataset: in a browser, as figures."""
+"""The commands that show a dataset in a browser, as figures, and in the formats of other tools."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import fill
 
 import click
 
-from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import PATH, dataset_argument, shared
+from drakegrasp import registry
+from drakegrasp.cli.console import Command, progress_bar, say
+from drakegrasp.cli.options import PATH, Named, dataset_argument, option, shared
 from drakegrasp.errors import counted
 
 #: Port without --port; the same every time, so that a tunnel to another machine can stay.
@@ -16,30 +18,28 @@ PORT = 8321
 
 @click.command("inspect")
 @dataset_argument()
-@click.option(
-    "--predictions",
-    "results",
-    type=PATH,
-    metavar="RESULTS",
-    help="Show predictions beside the rows that they are for: the results that "
+@option(
+    "--predictions results",
+    "RESULTS",
+    "Show predictions beside the rows that they are for: the results that "
     "verify --dataset FILE --out NAME wrote.",
+    type=PATH,
 )
-@click.option(
+@option(
     "--port",
+    "N",
+    "Port on this machine; 0 takes any that is free.",
     type=click.IntRange(0, 65535),
     default=PORT,
     show_default=True,
-    metavar="N",
-    help="Port on this machine; 0 takes any that is free.",
 )
-@click.option(
-    "--static",
-    "folder",
+@option(
+    "--static folder",
+    "DIR",
+    "Write the pages to DIR as files that open without a server, and end.",
     type=PATH,
-    metavar="DIR",
-    help="Write the pages to DIR as files that open without a server, and end.",
 )
-@click.option("--no-browser", is_flag=True, help="Only print the address.")
+@option("--no-browser", None, "Only print the address.", is_flag=True)
 def inspect_(
     out: Path, results: Path | None, port: int, folder: Path | None, no_browser: bool
 ) -> None:
@@ -66,7 +66,6 @@ def inspect_(
     if folder is None:
         serve(out, results=results, port=port, browser=not no_browser, announce=say)
         return
-    from drakegrasp.runtime.progress import progress_bar
 
     with progress_bar("inspect", "grasps") as progress:
         site = write_site(out, folder, results=results, progress=progress)
@@ -76,17 +75,13 @@ def inspect_(
 
 @click.command()
 @dataset_argument()
-@click.option(
-    "--out", "folder", type=PATH, metavar="DIR", help="Where to write.  [default: OUT/figures]"
-)
-@click.option(
-    "--trial", type=int, metavar="ID", help="The grasp whose phases are drawn: row of trials.hdf5."
-)
-@click.option(
+@option("--out folder", "DIR", "Where to write.  [default: OUT/figures]", type=PATH)
+@option("--trial", "ID", "The grasp whose phases are drawn: row of trials.hdf5.", type=int)
+@option(
     "--compare",
+    "OTHER",
+    "A dataset of the same objects by the other method of palm poses (candidates.method).",
     type=PATH,
-    metavar="OTHER",
-    help="A dataset of the same objects by the other method of palm poses (candidates.method).",
 )
 @shared("--quiet")
 def figures(
@@ -108,7 +103,6 @@ def figures(
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.foreign_files import refuse_link
     from drakegrasp.pictures.figures.write import write_figures
-    from drakegrasp.runtime.progress import progress_bar
 
     if folder is None:
         folder = out / "figures"
@@ -124,3 +118,65 @@ def figures(
     for name, why in written.left_out.items():
         say(f"{name} is left out: {why}")
     say(f"{counted(len(written.names), 'figure')} in {written.folder}")
+
+
+class _Export(Command):
+    """The command, whose help lists the exporters."""
+
+    def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the text, and a paragraph of the formats; called by click."""
+        super().format_help_text(ctx, formatter)
+        formatter.write_paragraph()
+        for name in registry.names("exporters"):
+            row = f"  {name:<15}{registry.summary('exporters', name)}"
+            formatter.write(f"{fill(row, 79, subsequent_indent=' ' * 17)}\n")
+
+
+@click.command(cls=_Export)
+@dataset_argument()
+@click.argument("directory", type=PATH, required=False)
+@option("--to form", None, "The format.", type=Named("exporters"), required=True)
+@click.option(
+    "--licence",
+    "--license",
+    metavar="ID",
+    help="Licence that the card of format hf names, e.g. cc-by-4.0.",
+)
+@option(
+    "--about",
+    "YAML",
+    "For format hf: name, version, url, creators, published, licence, citation.",
+    type=PATH,
+)
+@shared("--quiet")
+def export(
+    out: Path,
+    directory: Path | None,
+    form: str,
+    licence: str | None,
+    about: Path | None,
+    quiet: bool,
+) -> None:
+    """Write the samples of a dataset in another format.
+
+    DIRECTORY must be new or empty.  [default: OUT/export_FORMAT]
+    """
+    from drakegrasp.exchange.croissant import Publication, not_said, read_publication
+    from drakegrasp.exchange.export import export_dataset
+    from drakegrasp.foreign_files import refuse_link
+
+    # What is said of the publishers; the option is stronger than the file.
+    if form != "hf" and about:
+        raise click.UsageError(f"--about is for --to hf, got --to {form}")
+    publication = Publication() if about is None else read_publication(about)
+    if licence:
+        publication = publication.model_copy(update={"licence": licence})
+
+    if directory is None:
+        directory = out / f"export_{form}"
+        refuse_link(directory)
+    with progress_bar("export", "sample", show=not quiet) as progress:
+        count = export_dataset(out, directory, form, publication=publication, progress=progress)
+    say(f"{counted(count, 'sample')} in {directory}")
+    if form == "hf" and (missing := not_said(publication)):
+        say(f"before it is published, --about should say: {', '.join(missing)}")

@@ -1,8 +1,8 @@
-"""How commands speak and end: every error is one line on standard error and an exit code.
+"""How commands speak and end, and their help.
 
-What they print has no control characters, whatever names are in it.
-
-0 done, 1 the work failed, 2 wrong usage, 130 Ctrl-C, 143 SIGTERM.
+Every error is one line on standard error and an exit code: 0 done, 1 the work failed, 2 wrong
+usage, 130 Ctrl-C, 143 SIGTERM. What is printed has no control characters, whatever names are in it.
+In a help the options of everyday come first, and rare ones under a heading of their own.
 """
 
 from __future__ import annotations
@@ -10,15 +10,16 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from drakegrasp.cli.help import Command
+from drakegrasp import registry
 from drakegrasp.errors import (
     ConfigError,
     DrakegraspError,
@@ -28,7 +29,12 @@ from drakegrasp.errors import (
     first_line,
     printable,
 )
+from drakegrasp.runtime.allocator import restart
 
+if TYPE_CHECKING:
+    from drakegrasp.runtime.progress import Report
+
+_UTF8, _STREAMS = "PYTHONUTF8", "PYTHONIOENCODING"
 #: A signal that comes while a module is imported is sent again after this time [s].
 AGAIN_SECONDS = 0.05
 #: Commands that go on where they were stopped.
@@ -56,6 +62,51 @@ def say(text: str, *, err: bool = False) -> None:
 def say_json(document: Mapping[str, Any]) -> None:
     """Print a document of strict JSON on one line."""
     click.echo(json.dumps(document, allow_nan=False))
+
+
+def progress_bar(title: str, unit: str, *, show: bool = True) -> AbstractContextManager[Report]:
+    """Return the progress bar of `runtime.progress`; what it needs is loaded now."""
+    from drakegrasp.runtime import progress
+
+    return progress.progress_bar(title, unit, show=show)
+
+
+class Option(click.Option):
+    """An option that the help lists under a heading, and that may name what the registry has."""
+
+    def __init__(
+        self,
+        *args: Any,
+        heading: str = "Options",
+        names: registry.Kind | None = None,
+        **attributes: Any,
+    ) -> None:
+        super().__init__(*args, **attributes)
+        self.heading, self.names = heading, names
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Return the words of the option and its help; called by click."""
+        if self.names is not None:
+            known = ", ".join(registry.names(self.names))
+            self.help = (self.help or "").replace("{names}", known)
+        return super().get_help_record(ctx)
+
+
+class Command(click.Command):
+    """A command whose help has a section for each heading of its options."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options; called by click."""
+        sections: dict[str, list[tuple[str, str]]] = {"Options": []}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is not None and not isinstance(parameter, click.Argument):
+                heading = getattr(parameter, "heading", "Options")
+                sections.setdefault(heading, []).append(record)
+        for heading, records in sections.items():
+            if records:
+                with formatter.section(heading):
+                    formatter.write_dl(records)
 
 
 class OneCommand(Command):
@@ -155,3 +206,15 @@ def _is_importing(frame: FrameType | None) -> bool:
             return True
         frame = frame.f_back
     return False
+
+
+def restart_with_utf8() -> None:
+    """Start this program again in Python's UTF-8 mode, where the locale has another encoding.
+
+    Under such a locale Drake cannot be imported, and the files of an object cannot be opened whose
+    name it cannot encode. The streams keep the encoding of the terminal.
+    """
+    if sys.getfilesystemencoding() == "utf-8" or os.environ.get(_UTF8) == "1":
+        return
+    terminal = getattr(sys.stdout, "encoding", None) or "utf-8"
+    restart({_STREAMS: f"{terminal}:replace", **os.environ, _UTF8: "1"})

@@ -1,28 +1,32 @@
-"""`drakegrasp build`, `assemble`, `merge`, `scenes` and `stats`, and what they print."""
+"""The commands that make datasets and count what is in them: `build`, `stats`, `check` and more."""
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from drakegrasp.cli.errors import say, say_json
-from drakegrasp.cli.help import Command
+from drakegrasp.cli.console import Command, progress_bar, say, say_json
 from drakegrasp.cli.options import (
+    BUILD,
+    CONNECTION,
     FILE,
     PATH,
-    build_options,
+    SET_ASSEMBLED,
+    SET_SCENES,
     chosen_workers,
-    connection_options,
     dataset_argument,
+    option,
     parse_request,
-    postprocessing_options,
-    scenes_options,
     shared,
 )
-from drakegrasp.errors import counted
+from drakegrasp.errors import counted, printable
+from drakegrasp.runtime.executor import processes
 
 if TYPE_CHECKING:
     from drakegrasp.generation.pipeline import BuildReport
@@ -31,11 +35,9 @@ if TYPE_CHECKING:
 
 
 @click.command(cls=Command)
-@build_options
-@connection_options
-@click.option(
-    "--plan", is_flag=True, help="Only print the hours and bytes that the build would take."
-)
+@shared(*BUILD)
+@shared(*CONNECTION)
+@option("--plan", None, "Only print the hours and bytes that the build would take.", is_flag=True)
 @shared("--times")
 def build(plan: bool, times: Path | None, **options: Any) -> None:
     """Build a dataset from a directory of meshes.
@@ -66,16 +68,46 @@ def build(plan: bool, times: Path | None, **options: Any) -> None:
     print_report(report)
 
 
+@click.command("bench-set", cls=Command)
+@click.argument("out", type=PATH, metavar="OUT")
+@shared("--only", "--set")
+@shared(*CONNECTION)
+@shared("--quiet")
+def bench_set(
+    out: Path,
+    only: tuple[str, ...],
+    overrides: tuple[str, ...],
+    quiet: bool,
+    **options: Any,
+) -> None:
+    """Make the frozen benchmark drakegrasp-bench-1 in OUT.
+
+    256 built-in objects with masses and frictions of their own, all for testing. Their meshes are
+    compared with the published hashes. With --only or --set it is a part of the benchmark or
+    another one, and each card says so. The same command continues an interrupted build.
+    """
+    from drakegrasp.api.building import make_benchmark
+
+    report = make_benchmark(
+        out,
+        only=only,
+        overrides=overrides,
+        **chosen_workers(options),
+        show=not quiet,
+    )
+    print_report(report)
+
+
 @click.command()
 @dataset_argument()
-@click.option(
+@option(
     "--reject",
-    type=FILE,
-    metavar="FILE",
-    help="Trials that must not become samples: the reject.json of an inspection, or a text file "
+    "FILE",
+    "Trials that must not become samples: the reject.json of an inspection, or a text file "
     "with an id per line; # starts a comment.",
+    type=FILE,
 )
-@postprocessing_options
+@shared("--set", text=SET_ASSEMBLED)
 @shared("--workers")
 def assemble(
     out: Path, reject: Path | None, overrides: tuple[str, ...], workers: int | None
@@ -85,12 +117,11 @@ def assemble(
     The command writes trials.hdf5 and both data files again from the shards in OUT.
     Entries of reject.json that are not successes are skipped and listed.
     """
+    from drakegrasp.cli import tables
     from drakegrasp.dataset.assemble import assemble as assemble_files
     from drakegrasp.dataset.checks.object_files import carried_hand_as_built
     from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.dataset.rejections import read_rejected, unused_rejections
-    from drakegrasp.runtime.executor import processes
-    from drakegrasp.runtime.progress import progress_bar
 
     rejected = () if reject is None else read_rejected(reject)
     with processes(workers) as execute, progress_bar("assemble", "tasks") as progress:
@@ -100,7 +131,7 @@ def assemble(
         manifest = read_manifest(out)
     if manifest.config.scenes.when == "assembled":
         write_scenes(out, workers=workers)
-    print_stats(out)
+    tables.print_stats(out)
     for sentence in unused_rejections(out, rejected, manifest.rejected):
         say(sentence)
     for changed in carried_hand_as_built(manifest):
@@ -109,7 +140,7 @@ def assemble(
 
 @click.command()
 @dataset_argument()
-@scenes_options
+@shared("--set", text=SET_SCENES)
 @shared("--workers", "--quiet")
 def scenes(out: Path, overrides: tuple[str, ...], workers: int | None, quiet: bool) -> None:
     """Render scenes whose cameras know no grasp, to train on.
@@ -132,8 +163,6 @@ def write_scenes(
 ) -> Scenes:
     """Write scenes.hdf5 in processes of this machine."""
     from drakegrasp.generation.scenes.make import make_scenes
-    from drakegrasp.runtime.executor import processes
-    from drakegrasp.runtime.progress import progress_bar
 
     with (
         processes(workers) as execute,
@@ -145,7 +174,7 @@ def write_scenes(
 @click.command()
 @click.argument("into", type=PATH, metavar="INTO")
 @click.argument("outs", type=PATH, metavar="OUTS...", nargs=-1, required=True)
-@postprocessing_options
+@shared("--set", text=SET_ASSEMBLED)
 @shared("--workers")
 def merge(
     into: Path, outs: tuple[Path, ...], overrides: tuple[str, ...], workers: int | None
@@ -155,13 +184,12 @@ def merge(
     Their objects or their seeds may differ, and nothing else but what --set says for all. INTO
     must be new or empty, and appears when it is complete; OUTS stay as they are.
     """
+    from drakegrasp.cli import tables
     from drakegrasp.generation.merge import merge as merge_datasets
-    from drakegrasp.runtime.executor import processes
-    from drakegrasp.runtime.progress import progress_bar
 
     with processes(workers) as execute, progress_bar("merge", "tasks") as progress:
         merge_datasets(into, outs, overrides=overrides, execute=execute, progress=progress)
-    print_stats(into)
+    tables.print_stats(into)
 
 
 @click.command()
@@ -172,70 +200,66 @@ def stats(out: Path, as_json: bool) -> None:
 
     While a build runs, or after it was stopped, the command counts what is done so far.
     """
+    from drakegrasp.cli import tables
     from drakegrasp.dataset.statistics import counts_as_dict
 
     if as_json:
         say_json(counts_as_dict(out))
     else:
-        print_stats(out)
+        tables.print_stats(out)
 
 
-def print_stats(out: Path) -> None:
-    """Print the tables of a dataset: outcomes, how well the hand holds, samples by split."""
-    from rich.measure import Measurement
+@click.command()
+@dataset_argument("path", "OUT|FILE")
+@shared("--workers", "--json")
+def check(path: Path, workers: int | None, as_json: bool) -> None:
+    """Check every invariant of a dataset.
 
-    from drakegrasp.cli.tables import (
-        WIDTH,
-        barren_lines,
-        funnel_table,
-        hold_table,
-        make_console,
-        preshape_table,
-        split_line,
-        split_table,
-        unfinished_line,
-    )
-    from drakegrasp.dataset.card.holding import holding_lines, holding_of
-    from drakegrasp.dataset.card.shortfall import split_shortfall
-    from drakegrasp.dataset.manifest import read_manifest
-    from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, DATA_FILES
-    from drakegrasp.dataset.statistics import (
-        count_funnel,
-        count_splits,
-        count_unfinished,
-        preshapes_of,
-        split_rule_of,
-    )
-    from drakegrasp.dataset.trials import Trials
+    OUT is a dataset's directory; FILE is one of its three main files. Exit code 1 if an
+    invariant is broken.
+    """
+    from drakegrasp.dataset.checks.run import check_dataset
 
-    console, unfinished = make_console(), count_unfinished(out)
-    funnel = count_funnel(out) if unfinished is None else unfinished.funnel
-    table = funnel_table(funnel)
-    # Rich would cut numbers in a narrow terminal; the compact table has fewer columns.
-    natural = Measurement.get(console, console.options.update(max_width=WIDTH), table).maximum
-    if natural > console.width:
-        table = funnel_table(funnel, compact=True)
-    console.print(table)
-    console.print(hold_table(funnel))
-    config = read_manifest(out).config
-    if preshapes := preshapes_of(funnel, config):
-        console.print(preshape_table(preshapes))
-    console.print()
-    if unfinished is None:
-        splits = count_splits(out)
-        console.print(split_table(splits))
-        rule = split_rule_of(out / DATA_FILES["oto"])
-        say(split_line(rule, funnel, splits))
-        for line in barren_lines(funnel, config):
-            say(line)
-        if (holding := holding_of(Trials(out))) is not None:
-            for line in holding_lines(holding):
-                say(line)
-        of_benchmark = (out / BUILTIN_FOLDER / BENCHMARK_FILE).is_file()
-        if not of_benchmark and (line := split_shortfall(splits, rule, config.split)):
-            say(line)
+    with processes(workers) as execute, progress_bar("check", "steps") as progress:
+        violations = check_dataset(path, execute=execute, progress=progress)
+    if as_json:
+        say_json({"path": str(path), "broken": [asdict(violation) for violation in violations]})
     else:
-        say(f"{out}: {unfinished_line(unfinished)}")
+        for violation in violations:
+            say(str(violation))
+        found = counted(len(violations), "broken invariant")
+        say(f"{path}: {found if violations else 'no broken invariants'}")
+    if violations:
+        sys.exit(1)
+
+
+@click.command()
+@dataset_argument()
+@option("--trial", "ID", "Row of trials.hdf5.", required=True, type=int)
+@option("--html", "FILE", "Write a recording of the trial that plays in a browser.", type=PATH)
+def replay(out: Path, trial: int, html: Path | None) -> None:
+    """Run a trial again and compare every value.
+
+    Exit code 1 if any value differs from the stored one.
+    """
+    from drakegrasp.generation.replay import record_trial, replay_trial
+
+    # Whatever differs is printed: values first, then versions, which may explain them.
+    again = replay_trial(out, trial)
+    say(f"trial {trial} of {again.object_name}: was {again.recorded.label}, is {again.found.label}")
+    for other, links in again.meetings.items():
+        say(f"  where it starts, {', '.join(map(printable, links))} of the hand meet the {other}")
+    for name, difference in again.differences.items():
+        how = "is missing in one" if math.isnan(difference) else f"by up to {difference:.3g}"
+        say(f"  {name} differs: {how}")
+    for package, change in again.versions.items():
+        say(f"  {package}: {change}")
+
+    if html is not None:
+        record_trial(out, trial, html)
+        say(str(html))
+    if not again.same:
+        sys.exit(1)
 
 
 def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -> None:
@@ -255,7 +279,9 @@ def print_report(report: BuildReport) -> None:
         click.exceptions.Exit: With code 1 if the machine must have spoiled labels; a line on
             standard error has said so.
     """
-    print_stats(report.out)
+    from drakegrasp.cli import tables
+
+    tables.print_stats(report.out)
     if report.simulated:
         reused = f" ({report.reused} had been done before)" if report.reused else ""
         say(f"{counted(report.simulated, 'work unit')} simulated{reused}")

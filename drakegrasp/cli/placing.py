@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.cli.errors import say
+from drakegrasp.cli.console import say
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.predicted_rows import PredictedRows
@@ -166,9 +166,9 @@ def _rows_of(request: VerifyRequest, known: npt.NDArray[np.int64] | None) -> lis
     if text is None:
         return None if known is None else [int(row) for row in np.ravel(known)]
     if known is not None:
-        raise GraspError(f"--rows must be left out with a file that has rows, got {text}")
+        _refuse_given("left out with a file that has rows", rows=text)
     if request.dataset is None:
-        raise GraspError(f"--rows must be given with --dataset only, got {text}")
+        _refuse_given("given with --dataset only", rows=text)
     if text.endswith(".npy"):
         rows = read_numbers(Path(text)).ravel()
         if not (np.isfinite(rows).all() and (rows == np.floor(rows)).all()):
@@ -190,19 +190,19 @@ def _rows_of(request: VerifyRequest, known: npt.NDArray[np.int64] | None) -> lis
 def _place_postures(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
     """Return the postures of a file on their objects, and the configuration."""
     # They say their frame themselves, and need no fit.
-    idle: dict[str, object] = {"--frame": request.frame, "--camera": request.camera}
-    idle["--method"] = None if request.method == "hand" else request.method
-    idle["--snap-points"] = request.snap_points or None
-    idle["--rows"] = request.rows
-    for name, value in idle.items():
-        if value is not None:
-            raise GraspError(f"{name} must be left out with postures, got {value}")
+    _refuse_given(
+        "left out with postures",
+        frame=request.frame,
+        camera=request.camera,
+        method=None if request.method == "hand" else request.method,
+        snap_points=request.snap_points or None,
+        rows=request.rows,
+    )
     if (request.mesh is None) == (request.dataset is None):
         raise GraspError("--object MESH or --dataset FILE must be given with postures, one of them")
     if request.dataset is not None:
         return _postures_on(request.dataset, request)
-    if request.split is not None:
-        raise GraspError(f"--split must be given with --dataset only, got {request.split}")
+    _refuse_given("given with --dataset only", split=request.split)
     config = load_config(request.config, request.overrides)
     config = config if request.hand is None else override_config(config, [], hand=request.hand)
 
@@ -220,18 +220,15 @@ def _place_postures(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
 
 def _postures_on(dataset: Path, request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
     """Return postures on the rows of a dataset, or without `row` on the objects that they name."""
-    given = {"--units": request.units, "--hand": request.hand, "--config": request.config}
-    for name, value in given.items():
-        if value is not None:
-            raise GraspError(f"{name} must be left out with postures and --dataset, got {value}")
+    given = {"units": request.units, "hand": request.hand, "config": request.config}
+    _refuse_given("left out with postures and --dataset", **given)
     if has_rows(request.grasps):
         data = GraspDataset(dataset, split=request.split or DEFAULT_SPLIT, fewer_fingers=True)
         hand = load_hand(dataset_config(data).hand_source)
         table = read_attempts(request.grasps, hand, of=data)
         placed = place_on_rows(table, data, table.of_row, overrides=request.overrides)
         return placed, dataset_config(data, overrides=request.overrides)
-    if request.split is not None:
-        raise GraspError(f"--split must be given with `row` in the postures, got {request.split}")
+    _refuse_given("given with `row` in the postures", split=request.split)
     out = dataset.parent if dataset.is_file() else dataset
     config = override_config(read_manifest(out).config, request.overrides)
     table = read_attempts(request.grasps, load_hand(config.hand_source))
@@ -265,18 +262,18 @@ def _dataset_path(request: VerifyRequest) -> Path | None:
 
 def _refuse_idle(request: VerifyRequest, dataset: Path | None) -> None:
     """Refuse options without effect, and a missing camera."""
-    if dataset is not None and request.units is not None:
-        raise GraspError(f"--units must be given with --object only, got {request.units}")
-    grouped = request.grasps.suffix.lower() in HDF5_SUFFIXES
-    if request.split is not None and dataset is None and not grouped:
-        raise GraspError(
-            "--split must be given with --dataset or grasps in an HDF5 file only, "
-            f"got {request.split}"
-        )
-    needed = dataset is None and request.frame == "camera"
-    if needed and request.camera is None:
+    if dataset is not None:
+        _refuse_given("given with --object only", units=request.units)
+    elif request.grasps.suffix.lower() not in HDF5_SUFFIXES:
+        _refuse_given("given with --dataset or grasps in an HDF5 file only", split=request.split)
+    if dataset is not None or request.frame != "camera":
+        _refuse_given("given with --object and --frame camera only", camera=request.camera)
+    elif request.camera is None:
         raise GraspError("--camera FILE must be given with --object and --frame camera, got none")
-    if not needed and request.camera is not None:
-        raise GraspError(
-            f"--camera must be given with --object and --frame camera only, got {request.camera}"
-        )
+
+
+def _refuse_given(how: str, **options: object) -> None:
+    """Refuse options that are given, and must be otherwise."""
+    for name, value in options.items():
+        if value is not None:
+            raise GraspError(f"--{name.replace('_', '-')} must be {how}, got {value}")

@@ -1,0 +1,292 @@
+"""The commands of what is simulated: `audit` and `objects` of meshes, `hand` of hands."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from drakegrasp.cli.console import progress_bar, say, say_finding
+from drakegrasp.cli.options import FILE, NEW_FILE, PATH, chosen_settings, option, shared
+from drakegrasp.errors import counted
+
+if TYPE_CHECKING:
+    from drakegrasp.commissioning.finding import Finding
+
+
+@click.command()
+@click.argument("mesh_dir", type=PATH)
+@shared("--units", "--manifest")
+@option("--hand", "HAND", "Hand whose opening the sizes are compared with (default: barrett).")
+@option("--json json_file", "FILE", "Write all findings as JSON too.", type=PATH)
+@option("--sheet", "FILE", "Write a picture of every object with its status (.png).", type=PATH)
+def audit(
+    mesh_dir: Path,
+    units: str,
+    manifest: Path | None,
+    hand: str | None,
+    json_file: Path | None,
+    sheet: Path | None,
+) -> None:
+    """Check which meshes are fit, repaired or refused.
+
+    Meshes are prepared as in a build with the default configuration. A build also drops each
+    object on the table, and refuses one that does not come to rest.
+    Exit code 1 if every mesh is refused.
+    """
+    from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console, memory_line
+    from drakegrasp.hand.description import load_hand
+    from drakegrasp.hand.kinematics import opening
+    from drakegrasp.hand.settings import load_config
+    from drakegrasp.objects.audit import audit as audit_meshes
+    from drakegrasp.runtime.files import atomic_path, write_atomic
+
+    config = load_config(overrides=[f"hand={hand}"] if hand else [])
+    wide = opening(load_hand(config.hand_source))
+    with progress_bar("audit", "meshes") as progress:
+        rows = audit_meshes(
+            mesh_dir, units=units, manifest=manifest, opening=wide, progress=progress
+        )
+    console = make_console()
+    console.print(audit_table(rows, compact=console.width < ROOMY))
+    say(audit_line(rows))
+    if line := memory_line(rows):
+        say(line)
+
+    if json_file is not None:
+        text = json.dumps([row.to_json() for row in rows], indent=1, ensure_ascii=False)
+        write_atomic(json_file, f"{text}\n".encode())
+    if sheet is not None:
+        from drakegrasp.pictures.object_sheet import object_sheet
+
+        with progress_bar("draw", "objects") as progress, atomic_path(sheet) as png:
+            object_sheet(rows, png, progress=progress)
+    if all(row.status == "refused" for row in rows):
+        sys.exit(1)
+
+
+@click.group()
+def objects() -> None:
+    """List or export the built-in objects, or make morphs of meshes."""
+
+
+@objects.command("list")
+def list_objects() -> None:
+    """Print every built-in class, with the parameters that are drawn."""
+    from drakegrasp.shapes.catalog import CLASSES
+
+    for item in CLASSES:
+        sizes = ", ".join(f"{name} {span}" for name, span in item.parameters.items())
+        say(f"{item.number:>2} {item.name:<15} {sizes}")
+
+
+@objects.command("export")
+@click.argument("directory", type=PATH)
+@shared("--per-class", "--objects-seed")
+def export_objects(directory: Path, **options: Any) -> None:
+    """Write the built-in objects' meshes (.obj, metres) to DIRECTORY.
+
+    Equal options write equal bytes on every machine.
+    """
+    from drakegrasp.generation.request import BUILTIN
+    from drakegrasp.hand.settings import load_config
+    from drakegrasp.shapes.catalog import export_builtin
+
+    config = load_config(overrides=chosen_settings({"objects": BUILTIN, **options}))
+    with progress_bar("objects", "meshes") as progress:
+        paths = export_builtin(directory, config=config.builtin, progress=progress)
+    say(f"{counted(len(paths), 'mesh', 'meshes')} in {directory}")
+
+
+@objects.command("morph")
+@click.argument("mesh_dir", type=PATH)
+@option("--per-mesh", "N", "Morphs of each mesh.", required=True, type=click.IntRange(min=1))
+@shared("--seed", type=click.IntRange(min=0), default=0, text="Seed of the draws.  [default: 0]")
+@shared("--out", text="Directory of the morphs; new or empty.")
+@shared("--units", "--manifest")
+def morph(
+    mesh_dir: Path, per_mesh: int, seed: int, out: Path, units: str, manifest: Path | None
+) -> None:
+    """Make objects of other proportions from meshes.
+
+    Each mesh of MESH_DIR is widened, bent in and stretched along an axis at random. The morphs
+    (.obj, metres, +z up) stand on the table as the mesh does, and an objects.yaml beside them
+    keeps their class. The same seed gives the same files.
+    """
+    from drakegrasp.objects.morph import morph_meshes
+
+    with progress_bar("morph", "morphs") as progress:
+        report = morph_meshes(
+            mesh_dir,
+            out,
+            per_mesh=per_mesh,
+            seed=seed,
+            units=units,
+            manifest=manifest,
+            progress=progress,
+        )
+    for reason in report.refused:
+        say(f"no morphs of {reason}", err=True)
+    for name, count in report.crossing.items():
+        faces = counted(count, "face")
+        say(f"{name} passes through itself in {faces}, and so do its morphs", err=True)
+    share = report.first_draws / report.morphs
+    say(f"{counted(report.morphs, 'morph')} in {out}; {share:.0%} by the first draw")
+
+
+@click.group()
+def hand() -> None:
+    """List the hands, draft a hand file, or check a hand."""
+
+
+@hand.command("list")
+def list_hands() -> None:
+    """Print the names of the hands that come with the package."""
+    from drakegrasp.hand.files import hand_names
+
+    for name in hand_names():
+        say(name)
+
+
+@hand.command("new")
+@click.argument("model", type=FILE, metavar="MODEL")
+@option("--out", "FOLDER", "A new folder for the hand's files.", type=PATH, required=True)
+@option("--palm", "LINK", "The link that carries the fingers.")
+@option("--approach", "X,Y,Z", "Where the palm faces: +Gz, in the axes of the palm link.")
+@option("--fingers", "LINK,LINK", "The fingertip links that grasp.")
+@option(
+    "--joint joints",
+    "NAME=POSITION",
+    "The position of a joint that does not close [rad or m], as in the vendor's model.",
+    multiple=True,
+)
+@option("--reverse", "JOINT", "A joint whose positive position opens.", multiple=True)
+@option(
+    "--effort",
+    "E",
+    "What each motor gives at its joint [N m, or N].",
+    type=click.FloatRange(min=0.0, min_open=True),
+)
+@option(
+    "--set settings",
+    "KEY=VALUE",
+    "A key of the hand file, as in --set drive=torque.",
+    multiple=True,
+)
+@option("--package packages", "NAME=FOLDER", "Where package://NAME/ is.", multiple=True)
+@option(
+    "--root roots",
+    "FOLDER",
+    "A folder outside of the model's whose meshes it may use.",
+    type=PATH,
+    multiple=True,
+)
+def new_hand(
+    model: Path,
+    out: Path,
+    approach: str | None,
+    fingers: str | None,
+    joints: Sequence[str],
+    packages: Sequence[str],
+    roots: Sequence[Path],
+    **said: Any,
+) -> None:
+    """Draft a hand file from a model, and draw it.
+
+    MODEL is a URDF, SDFormat or MJCF file as its vendor ships it. FOLDER gets the hand file, in
+    which each guess has a comment, the model, its meshes and a picture. Options override guesses.
+    Exit code 1 if a check of the drafted hand fails.
+    """
+    import numpy as np
+
+    from drakegrasp.commissioning.draft.answers import Answers
+    from drakegrasp.commissioning.draft.run import draft_hand
+
+    # What a person says.
+    answers = Answers(
+        approach=None if approach is None else np.array(_numbers(approach)),
+        fingers=tuple(fingers.split(",")) if fingers else (),
+        joints={name: _number(text) for name, text in _pairs("--joint", joints)},
+        **said,
+    )
+    folders = {name: Path(text) for name, text in _pairs("--package", packages)}
+    drafted = draft_hand(model, out, answers=answers, packages=folders, roots=roots)
+
+    # What was made of it.
+    for note in drafted.notes:
+        say(f"note  {note}")
+    for finding in drafted.findings:
+        _print(finding)
+    picture = drafted.path.with_suffix(".png")
+    if drafted.findings[0].name != "files":
+        _draw(drafted.path, picture)
+        say(f"Look at {picture}: pads must face each other, and Gz (blue) leave the palm.")
+    say(f"Then: drakegrasp hand check {drafted.path}")
+    if not all(finding.ok for finding in drafted.findings):
+        sys.exit(1)
+
+
+def _pairs(option: str, texts: Sequence[str]) -> list[tuple[str, str]]:
+    """Return name and value of each NAME=VALUE."""
+    for text in texts:
+        if not all(text.partition("=")):
+            raise click.BadParameter(f"{option} must be NAME=VALUE, got {text!r}")
+    return [(name, value) for name, _, value in (text.partition("=") for text in texts)]
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise click.BadParameter(f"must be a number, got {text!r}") from None
+
+
+def _numbers(text: str) -> list[float]:
+    numbers = [_number(part) for part in text.split(",")]
+    if len(numbers) != 3 or not any(numbers):
+        raise click.BadParameter(f"--approach must be X,Y,Z, not all zero, got {text!r}")
+    return numbers
+
+
+@hand.command("check")
+@click.argument("hand_file", metavar="NAME|YAML")
+@option(
+    "--picture",
+    "PNG",
+    "Write a picture of the hand, open and closed, with pads and palm frame.",
+    type=NEW_FILE,
+)
+def check_hand_file(hand_file: str, picture: Path | None) -> None:
+    """Check a hand before it is used, with trial grasps.
+
+    Files, motion, strength and trial grasps in simulation are checked. NAME is a hand that comes
+    with the package, YAML a hand file. Exit code 1 if anything is wrong.
+    """
+    from drakegrasp.commissioning.run import check_hand
+
+    findings = check_hand(hand_file, report=_print)
+
+    # A hand whose files can be read can be drawn.
+    if picture is not None and findings[0].ok:
+        _draw(hand_file, picture)
+        say(str(picture))
+    if not all(finding.ok for finding in findings):
+        sys.exit(1)
+
+
+def _draw(hand_file: str | Path, picture: Path) -> None:
+    """Draw a hand."""
+    from drakegrasp.commissioning.pinch import across_angle
+    from drakegrasp.hand.description import load_hand
+    from drakegrasp.pictures.hand_picture import picture_hand
+
+    loaded = load_hand(hand_file)
+    picture_hand(loaded, picture, across=across_angle(loaded))
+
+
+def _print(finding: Finding) -> None:
+    say_finding(finding.ok, "FAIL", f"{finding.name:<20} {finding.text}")

@@ -1,0 +1,480 @@
+"""`drakegrasp verify`: a line of JSON per predicted grasp. `score`: a card with reference rows."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import click
+
+from drakegrasp.cli.console import Command, progress_bar, say
+from drakegrasp.cli.options import CONNECTION, PATH, PathType, chosen_workers, option, shared
+from drakegrasp.runtime.executor import processes
+
+if TYPE_CHECKING:
+    from drakegrasp.cli.placing import VerifyRequest
+    from drakegrasp.runtime.executor import Executor
+    from drakegrasp.runtime.progress import Report
+    from drakegrasp.verification.result import Verification
+
+EXISTING = PathType(path_type=Path, exists=True)
+SPLITS = click.Choice(["train", "valid", "test"])
+#: Options that say what the grasps are and where; a protocol of MuJoCo answers all others.
+PLACES = ("grasps", "mesh", "units", "dataset", "split", "frame", "camera", "hand")
+#: What those others are if they are not given, and how the command line calls them.
+_USUAL = {"method": "hand", "overrides": (), "snap_points": False, "tls": True}
+_CALLED = {"mesh": "object", "overrides": "set", "tls": "no-tls", "tls_files": "tls-ca-file"}
+#: Options of `score` that change no verdict.
+_IDLE = {"out", "as_json", "quiet", "tls", *(n[2:].replace("-", "_") for n in CONNECTION)}
+
+
+class _Frame(click.Choice[str]):
+    """The frames of grasps; `workspace` is an earlier name of `table`."""
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Return the frame of a word."""
+        return super().convert("table" if value == "workspace" else value, param, ctx)
+
+
+@click.command(cls=Command)
+@click.argument("grasps", type=PATH, metavar="GRASPS")
+@option("--object mesh", "MESH", "The object: a .obj, .stl, .ply or .glb file.", type=PATH)
+@option("--units", "m|cm|mm", "Unit of length of the mesh.  [default: m]")
+@option(
+    "--dataset",
+    "FILE",
+    "Instead of --object: the data file OUT/grasping_oto.hdf5 or _otm. Each row gives the "
+    "object, its pose and the camera's pose.",
+    type=PATH,
+)
+@option(
+    "--split",
+    None,
+    "Rows of the dataset, and group in an HDF5 file of grasps.  [default: test]",
+    type=SPLITS,
+)
+@option(
+    "--rows",
+    "0,4,7-9|FILE.npy",
+    "With --dataset: the row of the split that each grasp is for, where the file does not "
+    "say.  [default: all rows]",
+)
+@option(
+    "--frame",
+    None,
+    "Frame of the grasps.  [default: object; with --dataset camera]",
+    type=_Frame(["object", "camera", "table"]),
+)
+@option(
+    "--camera",
+    "FILE",
+    "With --object and --frame camera: .npy file with the camera's pose in the table-top "
+    "frame X_TC, as (4, 4), or per grasp as (n, 4, 4) or (n, 12).",
+    type=PATH,
+)
+@option(
+    "--method",
+    None,
+    "hand: close a simulated hand on the contacts and lift. forces: ask "
+    "whether forces at the contacts that they select on the surface can lift the object.",
+    type=click.Choice(["hand", "forces"]),
+    default="hand",
+    show_default=True,
+)
+@option(
+    "--snap-points",
+    None,
+    "Move the points, not the normals, to the surface of the object first.",
+    is_flag=True,
+)
+@option(
+    "--protocol",
+    "NAME|FILE.py:NAME",
+    "The rule of the verdict: {names}, or a class of your own. All but lift run in MuJoCo.",
+    names="protocols",
+    default="lift",
+    show_default=True,
+)
+@option(
+    "--simulator",
+    None,
+    "Where the protocol must run.  [default: where it is at home]",
+    type=click.Choice(["drake", "mujoco"]),
+)
+@option(
+    "--assets",
+    "DIR",
+    "With files of DexGraspBench: the folder in which they name their objects.  [default: .]",
+    type=PATH,
+)
+@option("--hand", "NAME|YAML|XML", "The hand.  [default: that of the configuration]")
+@option(
+    "--config",
+    "YAML|PRESET",
+    "Configuration: a file, or the preset paper, fast, randomized or released.  [default: "
+    "that of the dataset, else the defaults]",
+)
+@shared("--set")
+@option(
+    "--out", "NAME", "Write NAME.jsonl and NAME.h5 instead of printing lines of JSON.", type=PATH
+)
+@shared(*CONNECTION)
+@shared("--quiet", text="Show neither progress nor the table.")
+@shared("--json", text="Print the lines of JSON also with --out, and nothing else.")
+def verify(
+    quiet: bool,
+    as_json: bool,
+    protocol: str,
+    simulator: str | None,
+    assets: Path | None,
+    **options: Any,
+) -> None:
+    """Try predicted grasps in the simulator.
+
+    The command says whether each grasp holds its object, and if not, why.
+
+    GRASPS is a .npy array with a row per grasp, a .csv file with a line per grasp, or an HDF5
+    file with an array `grasps` at its root or in a group. An array `rows` beside it names the
+    rows of the dataset. A grasp has 6 numbers per finger (18 for the Barrett Hand): the contact
+    points in metres, then the unit normals out of the object, in the order of the hand's
+    fingers.
+
+    GRASPS may also be a file or a folder of postures as `build --postures` reads it, on --object
+    or on the objects of --dataset that it names, or that its `row` says.
+
+    With another protocol than lift, the first wrist pose that fits contacts is tried. There GRASPS
+    may be a .npy file of DexGraspBench or a folder of such files, and --hand an MJCF, whose world
+    is the hand's root.
+
+    If GRASPS is a data file of a dataset, and neither --object nor --dataset is given, the
+    command tries the grasps of that dataset.
+
+    One line of JSON per grasp goes to standard output or NAME.jsonl, a table of the outcomes to
+    standard error. A row that is no grasp has the outcome `invalid`. Exit code: 0 if every grasp
+    has a verdict, whatever it is; 2 for input that cannot be used.
+    """
+    from drakegrasp.cli.placing import VerifyRequest
+    from drakegrasp.protocols.protocol import find_protocol
+
+    workers = chosen_workers(options)
+    rule, stored = find_protocol(protocol)
+    if simulator not in (None, rule.simulator):
+        raise click.UsageError(
+            f"--simulator of protocol {stored} must be {rule.simulator}, got {simulator}"
+        )
+    if rule.simulator != "drake":
+        request = VerifyRequest(**{name: options.pop(name) for name in PLACES})
+        out, count = options.pop("out"), workers.pop("workers")
+        _refuse_options(protocol, **workers, **options)
+        _verify_by_protocol(request, protocol, assets, out, count, as_json=as_json, quiet=quiet)
+    elif assets is not None:
+        raise click.UsageError("--assets must be used with another --protocol than lift")
+    else:
+        _verify_by_lift(VerifyRequest(**options), workers, as_json, quiet or as_json)
+
+
+def _refuse_options(protocol: str, **options: Any) -> None:
+    """Refuse options that the protocol answers by itself.
+
+    Raises:
+        click.UsageError: If one is given.
+    """
+    for name, value in options.items():
+        if value is not None and value != _USUAL.get(name):
+            said = _CALLED.get(name, name.replace("_", "-"))
+            raise click.UsageError(f"--{said} must not be used with protocol {protocol}")
+
+
+def _verify_by_lift(
+    request: VerifyRequest, workers: dict[str, Any], as_json: bool, quiet: bool
+) -> None:
+    from drakegrasp.api.verifying import run_verification
+    from drakegrasp.cli.placing import place_requested, requested_rows
+    from drakegrasp.cli.tables import make_console, verdict_table
+    from drakegrasp.verification.hints import count_hints
+    from drakegrasp.verification.result_files import (
+        json_lines,
+        part_path,
+        result_paths,
+        write_json_line,
+        write_results,
+    )
+
+    # All input is read and checked before anything is simulated.
+    out = request.out
+    grasps, config = place_requested(request)
+    rows = None if out is None else requested_rows(request, len(grasps))
+
+    def print_line(index: int, result: Verification) -> None:
+        write_json_line(index, result, sys.stdout)
+
+    def deliver(index: int, result: Verification) -> None:
+        write(index, result)
+        if as_json and out is not None:
+            print_line(index, result)
+
+    # Lines are written as verdicts arrive, so an interrupted run leaves those that are done.
+    try:
+        with nullcontext(print_line) if out is None else json_lines(out) as write:
+            results = run_verification(grasps, **workers, on_result=deliver, show=not quiet)
+            if out is not None:
+                write_results(results, result_paths(out)[1], config, rows)
+    except BaseException:
+        if out is not None and part_path(out).exists():
+            say(f"{part_path(out)}: the verdicts so far", err=True)
+        raise
+
+    for path in () if out is None or as_json else result_paths(out):
+        say(str(path))
+    if not quiet:
+        make_console(stderr=True).print(verdict_table(results))
+        for hint, count in count_hints(result.hints for result in results):
+            say(f"{count} of {len(results)} grasps would fit much better: {hint}", err=True)
+        if lost := sum(result.misplaced and not result.hints for result in results):
+            say(
+                f"{lost} of {len(results)} grasps are off the object, in every frame and unit that "
+                "is known here",
+                err=True,
+            )
+
+
+def _verify_by_protocol(
+    request: VerifyRequest,
+    protocol: str,
+    assets: Path | None,
+    out: Path | None,
+    workers: int | None,
+    *,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Write the verdicts, and how many hold."""
+    from drakegrasp.protocols.postures import json_line, prepare_trials, verify_postures
+    from drakegrasp.verification.result_files import refuse_unwritable, result_paths, text_lines
+
+    def print_line(line: str) -> None:
+        sys.stdout.write(line + "\n")
+        sys.stdout.flush()
+
+    if out is not None:
+        refuse_unwritable(out)
+    held, show, read = 0, not (quiet or as_json), request.grasps
+    with TemporaryDirectory() as scratch, processes(workers) as execute:
+        with progress_bar("cut", "objects", show=show) as report:
+            if _is_foreign(request, assets):
+                hand, folder, files = _foreign_files(request, protocol, assets)
+            else:
+                hand, folder, files = _own_files(request, Path(scratch), execute, report)
+        trials = prepare_trials(protocol, hand, folder)
+
+        # A line per verdict as it comes.
+        with (
+            nullcontext(print_line) if out is None else text_lines(out) as write,
+            progress_bar("verify", "grasps", show=show) as report,
+        ):
+            for index, result in enumerate(verify_postures(files, trials, execute)):
+                name = read if folder == Path(scratch) else files[index]
+                line = json_line(index, replace(result, file=Path(name)), trials)
+                write(line)
+                if as_json and out is not None:
+                    print_line(line)
+                held += result.verdict.success
+                report(index + 1, len(files), holding=held)
+    if out is not None and not as_json:
+        say(str(result_paths(out)[0]))
+    if show:
+        say(f"{held:,} of {len(files):,} grasps hold by {trials.protocol}", err=True)
+
+
+def _is_foreign(request: VerifyRequest, assets: Path | None) -> bool:
+    """Return whether the grasps are files of DexGraspBench."""
+    import numpy as np
+
+    path = request.grasps
+    if Path(request.hand or "").suffix == ".xml" or assets is not None:
+        return True
+    if path.is_dir():
+        return any(path.rglob("*.npy"))
+    try:
+        return path.suffix == ".npy" and np.load(path, mmap_mode="r") is None
+    except ValueError:  # an array of Python objects
+        return True
+    except OSError:
+        return False
+
+
+#: The MJCF of the hand, the folder of objects, and the file of each grasp, or why it has none.
+_Files: TypeAlias = tuple[Path, Path, list[Path | str]]
+
+
+def _foreign_files(request: VerifyRequest, protocol: str, assets: Path | None) -> _Files:
+    """Return files of DexGraspBench as they are."""
+    from drakegrasp.errors import DataError, HandError
+
+    given = {name: getattr(request, name) for name in PLACES if name not in ("grasps", "hand")}
+    _refuse_options(f"{protocol} and files of DexGraspBench", **given)
+    hand, path = Path(request.hand or ""), request.grasps
+    if hand.suffix != ".xml":
+        raise HandError(
+            f"--hand must be an MJCF (.xml) with files of DexGraspBench, got {request.hand}"
+        )
+    files: list[Path | str] = [path] if path.is_file() else [*sorted(path.rglob("*.npy"))]
+    if not files:
+        raise DataError(f"{path}: must be a .npy file or a folder of them, got none")
+    return hand, assets or Path(), files
+
+
+def _own_files(request: VerifyRequest, folder: Path, execute: Executor, report: Report) -> _Files:
+    """Write postures or contacts as files of DexGraspBench, in their order."""
+    from drakegrasp.cli.placing import place_requested
+    from drakegrasp.exchange.dexgraspbench import fitted_postures, write_grasps
+    from drakegrasp.hand.description import load_hand
+    from drakegrasp.runtime.environment import require_mujoco
+
+    require_mujoco("mujoco", "coacd")
+    placed, config = place_requested(request)
+    placed.sort(key=lambda grasp: grasp.index)
+    hand, postures = load_hand(config.hand_source), fitted_postures(placed, execute)
+    path, files = write_grasps(postures, hand, folder, execute=execute, report=report)
+    return path, folder, files
+
+
+@click.command(cls=Command)
+@click.argument("predictions", type=EXISTING, metavar="[PREDICTIONS]...", nargs=-1)
+@option(
+    "--dataset",
+    "FILE",
+    "The data file OUT/grasping_oto.hdf5 or _otm, or OUT/scenes.hdf5, whose rows or views the "
+    "predictions are for.",
+    type=PATH,
+    required=True,
+)
+@option("--split", None, "Rows of the dataset.", type=SPLITS, default="test", show_default=True)
+@option(
+    "--against",
+    "FILE",
+    "Predictions of another method for the same rows: the card says by how much the headline "
+    "is above its. May be given several times, for a method that was trained several times.",
+    type=EXISTING,
+    multiple=True,
+)
+@option(
+    "--train",
+    "FILE",
+    "Data file whose training rows give the reference rows.  [default: --dataset]",
+    type=PATH,
+)
+@option(
+    "--reference references",
+    "NAME",
+    "Score these reference rows only; may be given several times: own, nearest image, "
+    "constant, random, top-down, palm normals, surface.  [default: all]",
+    multiple=True,
+)
+@option("--per-object", "N", "Rows of each object, at most.", type=click.IntRange(1))
+@shared("--set")
+@option(
+    "--protocol",
+    "NAME|FILE.py:NAME",
+    "The rule of a verdict, see `drakegrasp verify`. All but lift try the first wrist pose of "
+    "a prediction in MuJoCo.",
+    default="lift",
+    show_default=True,
+)
+@option(
+    "--out",
+    "DIR",
+    "Folder of the card and of the verdicts; the same command goes on from there.",
+    type=PATH,
+    default=Path("score"),
+    show_default=True,
+)
+@option("--json as_json", None, "Print the card as JSON.", is_flag=True)
+@shared(*CONNECTION)
+@shared("--quiet", text="Show neither progress nor the table.")
+@click.pass_context
+def score(
+    context: click.Context,
+    /,
+    predictions: tuple[Path, ...],
+    dataset: Path,
+    split: str,
+    against: tuple[Path, ...],
+    train: Path | None,
+    references: tuple[str, ...],
+    as_json: bool,
+    quiet: bool,
+    **options: Any,
+) -> None:
+    """Score predicted grasps beside reference rows, and write a card.
+
+    Each of PREDICTIONS is a .npy, HDF5 or Parquet file: (n, 6k) numbers, one grasp per row of the
+    split, or (n, m, 6k), m per row, in the camera's frame; or a file of postures with the `row`
+    that each is for; or a file or a folder of samples that were exported. Several files are of one
+    method that was trained several times. Without any, the reference rows are scored alone.
+
+    DIR gets card.json, card.md, card.png, and the verdicts, so that an interrupted score goes on.
+    """
+    from drakegrasp.api.scoring import score as score_predictions
+    from drakegrasp.cli.tables import make_console, score_table
+    from drakegrasp.dataset.manifest import read_manifest
+    from drakegrasp.dataset.scenes.rows import open_rows
+    from drakegrasp.errors import DataError, GraspError
+    from drakegrasp.exchange.attempts import holds_postures
+    from drakegrasp.scoring.references import REFERENCES
+
+    # A bad dataset is wrong usage, as for `verify`.
+    workers = chosen_workers(options)
+    try:
+        read_manifest(dataset.parent)
+        bare = not references and bool(predictions) and all(map(holds_postures, predictions))
+        data = open_rows(dataset, split=split, fewer_fingers=bare)
+        trained = None if train is None else open_rows(train, split="train")
+    except DataError as error:
+        raise GraspError(str(error)) from None
+    references = references or tuple(REFERENCES)
+    if data.has_fewer_fingers:
+        say("no reference rows: some samples leave fingers out", err=True)
+        references = ()
+    scored = score_predictions(
+        predictions,
+        data,
+        against=against or None,
+        train=trained,
+        references=references,
+        again=_command(context),
+        **options,
+        **workers,
+        show=not quiet,
+    )
+
+    if as_json:
+        click.echo(json.dumps(scored.card, indent=1, allow_nan=False))
+    else:
+        for name, value in scored.card["headline"].items():
+            low, high = 100.0 * value["low"], 100.0 * value["high"]
+            say(f"{name}: {100.0 * value['value']:.1f} % ({low:.1f} to {high:.1f})")
+        say(str(options["out"] / "card.md"))
+    if not quiet:
+        make_console(stderr=True).print(score_table(scored.card, scored.seconds))
+        for warning in scored.card["warnings"]:
+            say(f"warning: {warning}", err=True)
+
+
+def _command(context: click.Context) -> str:
+    """Return the command that makes the card again, without what changes no verdict."""
+    words = ["drakegrasp", "score"]
+    for parameter in context.command.params:
+        value = context.params[str(parameter.name)]
+        if parameter.name in _IDLE or value == parameter.get_default(context):
+            continue
+        option = () if isinstance(parameter, click.Argument) else parameter.opts[:1]
+        for each in value if isinstance(value, tuple) else (value,):
+            words += [*option, str(each)]
+    return shlex.join(words)

@@ -1,1 +1,0 @@
-"""`drakegrasp verify`."""

@@ -1,0 +1,266 @@
+"""Kinds of clusters by name, as `pipelines/submit_build.py --cluster` takes them.
+
+In: a `ClusterRequest`. Out: lines for the user, and a Dask client while a block runs. A kind is a
+class in a module of its own and a line in pyproject.toml; those of this machine and of a running
+scheduler are here. Workers on other machines inherit nothing, so each kind sends them
+`dask_settings`; nothing listens beyond this machine unless `host` or `interface` says so.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import dask
+from dask.utils import parse_bytes
+from distributed import Client, SpecCluster
+from distributed.security import Security
+
+from drakegrasp import registry
+from drakegrasp.cluster.certificates import (
+    chosen_security,
+    make_certificates,
+    private_directory,
+    security_of,
+)
+from drakegrasp.cluster.connect import LOOPBACK, closing_cluster, connect, dask_settings
+from drakegrasp.errors import ConfigError, MachineError
+
+#: Options of a cluster on other machines.
+REMOTE = ("workers", "cores", "memory", "host", "interface")
+#: More memory than a worker has [B].
+MOST_MEMORY = 10**15
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClusterRequest:
+    """The requested workers, as on the command line of `pipelines/submit_build.py`.
+
+    Attributes:
+        kind: A name of the registry.
+        where: Hosts, the address of a scheduler, or its file.
+        workers: Number of processes in all.
+        cores: Number of cores of each host or job, with a worker on each.
+        memory: Memory of each worker, e.g. "2GB".
+        walltime: Time limit of each SLURM job, as SLURM writes it: [D-]HH:MM:SS.
+        host: Address on which the scheduler listens.
+        interface: Name of the network interface on which scheduler and workers listen.
+        tls: Whether connections need a certificate.
+        tls_files: Files in PEM format that every machine sees: authority, certificate and
+            private key. Without them, workers that are started get some that are made for this run.
+    """
+
+    kind: str
+    where: tuple[str, ...] = ()
+    workers: int | None = None
+    cores: int | None = None
+    memory: str | None = None
+    walltime: str | None = None
+    host: str | None = None
+    interface: str | None = None
+    tls: bool = True
+    tls_files: tuple[Path, Path, Path] | None = None
+
+
+class Local:
+    """Workers on this machine; the base of all kinds.
+
+    Attributes:
+        follow: Least and largest number of words that follow the kind, and what they are.
+        options: The options that it has.
+        request: What is asked for.
+    """
+
+    follow: tuple[int, float, str] = (0, 0, "nothing")
+    options: tuple[str, ...] = ("workers", "memory")
+
+    def __init__(self, request: ClusterRequest) -> None:
+        """Refuse what a cluster of this kind cannot be.
+
+        Raises:
+            ConfigError: If the request contradicts itself, or lacks something.
+            MachineError: If a package is missing.
+        """
+        self.request = request
+        least, most, what = self.follow
+        if not least <= len(request.where) <= most:
+            got = " ".join(request.where) or "nothing"
+            raise ConfigError(f"--cluster {request.kind} must be followed by {what}, got {got}")
+        for name in (*REMOTE, "walltime"):
+            value = getattr(request, name)
+            if value is not None and name not in self.options:
+                raise ConfigError(f"--{name} must not be given with --cluster {request.kind}")
+            if name in ("workers", "cores") and value is not None and value < 1:
+                raise ConfigError(f"{name} must be at least 1, got {value}")
+        chosen_security(request.tls, request.tls_files, elsewhere=type(self) is not Local)
+        if request.memory is not None:
+            memory_bytes(request.memory)
+
+    def count(self) -> int | None:
+        """Return how many workers there will be; None if that is known only when they start."""
+        return self.request.workers
+
+    def line(self) -> str:
+        """Return what will be started, in words."""
+        return "workers on this machine"
+
+    def is_open(self) -> bool:
+        """Return whether other machines reach the scheduler that is started."""
+        return False
+
+    def connected(self, out: Path) -> AbstractContextManager[Client]:
+        """Return what starts the workers when it is entered.
+
+        Args:
+            out: Directory that all machines see; certificates for this run are written there.
+        """
+        asked = self.request
+        return connect(asked.workers, tls_files=asked.tls_files, memory=asked.memory)
+
+
+class Running(Local):
+    """The workers of a scheduler that runs, by its address."""
+
+    follow, options = (1, 1, "its address"), ()
+
+    def line(self) -> str:
+        """Return what will be used, in words."""
+        return f"the workers of {' '.join(self.request.where)}"
+
+    def count(self) -> int | None:
+        """Return how many workers the scheduler has."""
+        with self.connected(Path()) as client:
+            return max(1, len(client.nthreads()))
+
+    def connected(self, out: Path) -> AbstractContextManager[Client]:
+        """Return what connects to the scheduler when it is entered."""
+        asked = self.request
+        return connect(None, asked.where[0], tls=asked.tls, tls_files=asked.tls_files)
+
+
+class RunningFile(Running):
+    """The workers of a scheduler that runs, by the file that it wrote."""
+
+    follow = (1, 1, "its path")
+
+    def connected(self, out: Path) -> AbstractContextManager[Client]:
+        """Return what connects to the scheduler when it is entered."""
+        asked = self.request
+        return connect(None, None, asked.where[0], tls=asked.tls, tls_files=asked.tls_files)
+
+
+class Remote(Local):
+    """Workers that are started on other machines; a kind says how in `start`."""
+
+    options: tuple[str, ...] = REMOTE
+
+    def start(self, security: Security | None) -> SpecCluster:
+        """Start scheduler and workers."""
+        raise NotImplementedError
+
+    def listens(self) -> bool:
+        """Return whether settings of the user's say where the scheduler listens."""
+        return False
+
+    def listening(self) -> dict[str, str]:
+        """Return the options that say where a scheduler listens; none if the user's settings do.
+
+        Raises:
+            ConfigError: If it is not said where to listen.
+        """
+        for name in ("host", "interface"):
+            if (value := getattr(self.request, name)) is not None:
+                return {name: value}
+        if self.request.where and all(map(is_loopback, self.request.where)):
+            return {"host": LOOPBACK}
+        if self.listens():
+            return {}
+        raise ConfigError(
+            "--interface NAME or --host ADDRESS must be given for workers on other machines: "
+            "without, the scheduler listens to this machine only"
+        )
+
+    def workers_listening(self) -> dict[str, str]:
+        """Return the options that say where workers listen."""
+        listening = self.listening()
+        # Without options a worker chooses an address by which other machines reach it.
+        here = "interface" in listening or is_loopback(listening.get("host", ""))
+        return listening if here else {}
+
+    def is_open(self) -> bool:
+        """Return whether other machines reach the scheduler that is started."""
+        listening = self.listening()
+        return not is_loopback(listening.get("host", "")) and listening.get("interface") != "lo"
+
+    @contextmanager
+    def connected(self, out: Path) -> Iterator[Client]:
+        """Run the cluster while the block runs; its certificates go with it."""
+        with self._security(out) as security, dask.config.set(dask_settings()):
+            try:
+                cluster = self.start(security)
+            except (ConfigError, MachineError):
+                raise
+            # Each kind of cluster fails in its own ways; to the user they are all the machine's.
+            except Exception as error:
+                reason = str(error) or type(error).__name__
+                raise MachineError(f"the workers did not start: {reason}") from None
+            with closing_cluster(cluster), Client(cluster) as client:
+                yield client
+
+    @contextmanager
+    def _security(self, out: Path) -> Iterator[Security | None]:
+        asked = self.request
+        if asked.tls and asked.tls_files is None:
+            with private_directory(out) as folder:
+                yield security_of(make_certificates(folder))
+        else:
+            yield chosen_security(asked.tls, asked.tls_files, elsewhere=True)
+
+
+def cluster_of(request: ClusterRequest) -> Local:
+    """Return the cluster that is asked for; nothing is started.
+
+    Raises:
+        ConfigError: If the request contradicts itself, or lacks something.
+        MachineError: If a package is missing.
+    """
+    found: Local = registry.find("clusters", request.kind)(request)
+    return found
+
+
+def describe(cluster: Local) -> list[str]:
+    """Return what will be started, in lines for the user, with a warning of an open port."""
+    tls = cluster.request.tls
+    lines = [cluster.line(), f"connections: {'TLS' if tls else 'not encrypted'}"]
+    if not tls and cluster.is_open():
+        lines.append(
+            "warning: anybody who reaches the scheduler's port can run programs as you; leave out "
+            "--no-tls"
+        )
+    return lines
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this machine reaches an address."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def memory_bytes(text: str) -> int:
+    """Return a size of memory such as "2GB" in bytes.
+
+    Raises:
+        ConfigError: If the text is no such size.
+    """
+    try:
+        size = int(parse_bytes(text)) if text.strip() and text.isascii() else 0
+    except (ValueError, OverflowError):
+        size = 0
+    if not 0 < size <= MOST_MEMORY:
+        raise ConfigError(f"memory must be a size such as 2GB, got {text[:40]!r}")
+    return size

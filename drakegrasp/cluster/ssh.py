@@ -1,0 +1,95 @@
+"""Workers on hosts that are reached over SSH; the first host also runs the scheduler."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+from distributed import SpecCluster, SSHCluster
+from distributed.security import Security
+
+from drakegrasp.cluster.certificates import server_options
+from drakegrasp.cluster.connect import LOOPBACK, start_environment
+from drakegrasp.cluster.kinds import ClusterRequest, Remote
+from drakegrasp.errors import ConfigError
+
+#: A scheduler on another machine ends by itself after this time without work: its client was
+#: killed.
+IDLE_TIME = "1 hour"
+
+
+class Ssh(Remote):
+    """Hosts by name; one that is named twice has the workers twice."""
+
+    follow = (1, math.inf, "the names of the hosts")
+
+    def __init__(self, request: ClusterRequest) -> None:
+        """Refuse hosts with a user's name, and numbers of workers that do not fit."""
+        super().__init__(request)
+        for host in request.where:
+            if "@" in host:
+                raise ConfigError(
+                    f"a host must be a name or address, got {host!r}: the user and "
+                    "the key for it go into ~/.ssh/config"
+                )
+
+        # Each host has as many workers as the others.
+        hosts, workers, cores = len(request.where), request.workers, request.cores
+        if cores is not None and workers not in (None, hosts * cores):
+            raise ConfigError(
+                f"--workers must be --cores times the number of hosts, {hosts * cores}, or "
+                f"not be given, got {workers}"
+            )
+        if cores is None:
+            if workers is None:
+                raise ConfigError("--workers or --cores must be given for workers over ssh")
+            if workers % hosts:
+                raise ConfigError(
+                    f"--workers must be a multiple of the number of hosts, {hosts}, got {workers}; "
+                    "a host may be named more than once"
+                )
+            cores = workers // hosts
+        self.per_host = cores
+        self.listening()
+
+    def count(self) -> int:
+        """Return how many workers there will be."""
+        return len(self.request.where) * self.per_host
+
+    def line(self) -> str:
+        """Return what will be started, in words."""
+        hosts = dict.fromkeys(self.request.where)
+        on = f"{' '.join(hosts)}, scheduler on {self.request.where[0]}"
+        return f"{self.count()} workers over ssh on {on}"
+
+    def start(self, security: Security | None) -> SpecCluster:
+        """Start scheduler and workers.
+
+        SSHCluster sends Dask's settings with every command that it runs on another machine.
+
+        Raises:
+            ConfigError: If a path of a certificate has a quotation mark: Dask puts its commands
+                between two of them.
+        """
+        server = server_options(security)
+        for path in server.get("security", {}).values():
+            if "'" in str(path):
+                raise ConfigError(f"certificates (in --out) must have paths without ', got {path}")
+
+        # A worker on each core; the first host also runs the scheduler.
+        worker = {
+            "n_workers": self.per_host,
+            "nthreads": 1,
+            "memory_limit": self.request.memory or "auto",
+            "env": start_environment(),
+            **self.workers_listening(),
+            **server,
+        }
+        scheduler = {"port": 0, "dashboard_address": f"{LOOPBACK}:0", "idle_timeout": IDLE_TIME}
+        return SSHCluster(
+            [self.request.where[0], *self.request.where],
+            worker_options=worker,
+            scheduler_options={**scheduler, **self.listening(), **server},
+            security=security,
+            silence_logs=logging.ERROR,
+        )
