@@ -19,7 +19,7 @@ import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.card.holding import wilson_interval
-from drakegrasp.dataset.manifest import installed_versions, read_manifest, refuse_older
+from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
@@ -80,7 +80,6 @@ def draw_lifts(out: Path, count: int) -> list[StoredLift]:
         DataError: If there is no dataset, or no lift in it.
     """
     manifest = read_manifest(out)
-    refuse_older(manifest, out)
     seed = manifest.config.seed
     lifts = _read_lifts(out)
     if not lifts:

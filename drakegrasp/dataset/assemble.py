@@ -37,7 +37,6 @@ from drakegrasp.dataset.manifest import (
     Manifest,
     manifest_text,
     read_manifest,
-    refuse_older,
     with_postprocessing,
 )
 from drakegrasp.dataset.opening import open_samples, open_trials, read_codes
@@ -103,7 +102,6 @@ def assemble(
         read_manifest(out)
     with build_lock(out):
         manifest = read_manifest(out)
-        refuse_older(manifest, out)
         manifest = with_postprocessing(manifest, overrides)
         return assemble_locked(out, manifest, rejected=rejected, execute=execute, progress=progress)
 

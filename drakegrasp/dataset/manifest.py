@@ -42,7 +42,6 @@ from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.rejections import AttemptKey, key_to_json
 from drakegrasp.dataset.schema import (
     CONVENTIONS,
-    OTHER_SCHEMA,
     SCHEMA_VERSION,
     refuse_other_schema,
 )
@@ -370,7 +369,7 @@ def read_manifest(out: Path) -> Manifest:
 
     # The version first: another schema may have other keys.
     refuse_other_schema(path, tree.get("schema_version"))
-    stored = validated(path, _updated(tree, content), _Stored)
+    stored = validated(path, content, _Stored)
     try:
         config = parse_stored(stored.config)
     except ConfigError as error:
@@ -391,32 +390,6 @@ def read_manifest(out: Path) -> Manifest:
             f"was edited (without the key {DIGEST} it is taken as it is)"
         )
     return manifest
-
-
-def refuse_older(manifest: Manifest, out: Path) -> None:
-    """Refuse a dataset of an older schema: its files are read, but nothing is simulated by them.
-
-    Raises:
-        DataError: If it is.
-    """
-    if manifest.schema_version < SCHEMA_VERSION:
-        raise DataError(
-            f"{out}: schema must be {SCHEMA_VERSION} for anything but reading, "
-            f"got {manifest.schema_version}; {OTHER_SCHEMA}"
-        )
-
-
-def _updated(tree: dict[str, Any], content: bytes) -> bytes:
-    """Return the text of a manifest with the keys of this schema; `tree` is what it says."""
-    if tree["schema_version"] == SCHEMA_VERSION:
-        return content
-    # Version 3 knew one resting pose.
-    objects = tree.get("objects")
-    for entry in objects if isinstance(objects, list) else []:
-        if isinstance(entry, dict) and {"X_TO", "rolled"} <= set(entry):
-            pose = {key: entry.pop(key) for key in ("X_TO", "rolled")}
-            entry["resting"] = [{**pose, "probability": 1.0}]
-    return json.dumps(tree).encode()
 
 
 class _Stored(BaseModel):
@@ -443,9 +416,7 @@ def _contradictions(stored: _Stored, manifest: Manifest) -> Iterator[str]:
         ("config_hash", stored.config_hash, config.simulation_hash()),
         ("seed", stored.seed, config.seed),
     ):
-        # Other keys decided the hash of an older schema.
-        old = stored.schema_version < SCHEMA_VERSION and key == "config_hash"
-        if said != must and not old:
+        if said != must:
             yield f"{key} must be {must}, that of its config, got {said}"
     if stored.split_by not in (None, manifest.split_rule):
         yield f"split_by must be {manifest.split_rule} with its objects, got {stored.split_by}"
@@ -493,7 +464,6 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
 
     # With a manifest it must continue the same dataset.
     manifest = read_manifest(out)
-    refuse_older(manifest, out)
     installed = installed_versions(config)
     same_hand = is_hand(config.hand_source, manifest.versions.get("hand"))
     if same_hand:  # wherever its files are

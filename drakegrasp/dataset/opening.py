@@ -27,14 +27,12 @@ from drakegrasp.dataset.schema import (
     SCENE_FIELDS,
     SCENE_GRASP_FIELDS,
     SCENE_OBJECT_FIELDS,
-    SCHEMA_VERSION,
     SPLITS,
     SUCCESS_FIELDS,
     TRIAL_FIELDS,
     VIEW_FIELDS,
     VISIBLE_FIELDS,
     Field,
-    is_readable,
     refuse_other_schema,
 )
 from drakegrasp.errors import DataError, first_line, printable
@@ -304,13 +302,6 @@ def differences(
         thorough: Whether to report harmless differences as well: additional fields, and other
             attributes of fields.
     """
-    # Older files have fewer fields.
-    version = file.attrs.get("schema_version")
-    version = version if is_readable(version) and not thorough else SCHEMA_VERSION
-    tables = {
-        name: tuple(f for f in fields if f.since <= version) for name, fields in tables.items()
-    }
-
     # The headers of all datasets, each looked at once.
     headers = {name: _datasets(file, name, fields) for name, fields in tables.items()}
     lengths = _lengths(tables, headers)

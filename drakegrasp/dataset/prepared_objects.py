@@ -18,10 +18,9 @@ import numpy.typing as npt
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray
-from drakegrasp.dataset.manifest import ObjectEntry, RestingEntry, read_manifest, refuse_older
+from drakegrasp.dataset.manifest import ObjectEntry, RestingEntry
 from drakegrasp.dataset.opening import PLAN_TABLES, POSTURE_FIELDS, POSTURE_TEXTS, opened
 from drakegrasp.dataset.paths import (
-    FILE_NAME,
     model_file_sha256,
     model_path,
     plan_path,
@@ -135,18 +134,13 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
     """
     path = plan_path(out, name)
 
-    # Both files must be as they were written, and of this configuration. Plans have no version.
-    try:
-        refuse_changed_model(out, name, recorded_model(out, name))
-        with opened(path, "the plan of an object") as file:
-            attributes = dict(file.attrs)
-            arrays = {field.name: file[field.name][:] for field in chain(*PLAN_TABLES)}
-            names = [field.name for field in (*POSTURE_FIELDS, *POSTURE_TEXTS)]
-            given = {name: file[name][:] for name in names if name in file}
-    except DataError:
-        if (out / FILE_NAME).exists():
-            refuse_older(read_manifest(out), out)
-        raise
+    # Both files must be as they were written, and of this configuration.
+    refuse_changed_model(out, name, recorded_model(out, name))
+    with opened(path, "the plan of an object") as file:
+        attributes = dict(file.attrs)
+        arrays = {field.name: file[field.name][:] for field in chain(*PLAN_TABLES)}
+        names = [field.name for field in (*POSTURE_FIELDS, *POSTURE_TEXTS)]
+        given = {name: file[name][:] for name in names if name in file}
     if attributes["config_hash"] != config.simulation_hash():
         raise DataError(
             f"{path}: must be of configuration {config.simulation_hash()}, "

@@ -239,7 +239,7 @@ class GraspDataset:
         _refuse_other_fields([name])
         dataset = self._open()[self.split].get(name)
         if dataset is None:
-            return FIELDS[name].empty(self._length, {})[start:stop]
+            return self._missing(name)[start:stop]
         try:
             if FIELDS[name].dtype == "str":
                 return np.asarray(dataset.asstr()[start:stop])
@@ -276,10 +276,14 @@ class GraspDataset:
         if name not in self._fields:
             field = file[self.split].get(name)
             if field is None:
-                # A file of an older schema; all that it may lack is scalar.
-                field = FIELDS[name].empty(self._length, {})
+                field = self._missing(name)
             self._fields[name] = ImageRows(field) if FIELDS[name].sample else field
         return self._fields[name]
+
+    def _missing(self, name: str) -> npt.NDArray[Any]:
+        """Return the rows of a field that a file made before it lacks: they have no value."""
+        grasps = self._open()[self.split]["grasps"]
+        return FIELDS[name].empty(self._length, {"k": grasps.shape[1] // 6})
 
     def _open(self) -> h5py.File:
         """Return the file, as this process opened it."""

@@ -6,8 +6,9 @@ that is not here is in no file. Imports NumPy only, so that a reader can load it
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,6 @@ from drakegrasp.outcomes import Outcome, Removal, Stage
 
 #: Goes up with every change of the table that an older reader cannot read.
 SCHEMA_VERSION = 4
-#: Versions that can be read; fields that a version lacks read as without a value.
-READABLE = (3, 4)
 #: What to do with a file of another version: its labels mean something else.
 OTHER_SCHEMA = "build the dataset again with this version of drakegrasp, in another directory"
 
@@ -110,8 +109,10 @@ class Field:
         per_finger: Whether NaN stands for a finger that does not touch.
         sample: Whether it is an image, stored in one chunk per row.
         some: Whether rows that reached the stage may lack a value.
-        since: First version of the schema that has it.
-        optional: Whether files of this version may lack it: then it reads as without a value.
+        optional: Whether files may lack it: then it reads as without a value, or is derived.
+        derive: Of a field of `/trials` that follows from others: given a table of rows with the
+            columns of `needs`, its values (n, ...). No shard stores it.
+        needs: Names of these columns.
         of: Where its value is measured, as a path of attributes: from the row of `build.columns`
             for a trial, from a `Verification` for a verdict. For a number of a sample, the column
             of its trial that it copies. Empty if it is computed otherwise.
@@ -128,8 +129,9 @@ class Field:
     per_finger: bool = False
     sample: bool = False
     some: bool = False
-    since: int = 3
     optional: bool = False
+    derive: Callable[[Mapping[str, npt.NDArray[Any]]], npt.NDArray[Any]] | None = None
+    needs: tuple[str, ...] = ()
     of: str = ""
     shown: Shown | None = None
 
@@ -163,7 +165,7 @@ class Field:
 def is_readable(version: object) -> bool:
     """Return whether an attribute or key `schema_version` is that of a schema that can be read."""
     whole = isinstance(version, int | np.integer) and not isinstance(version, bool)
-    return whole and version in READABLE
+    return whole and version == SCHEMA_VERSION
 
 
 def refuse_other_schema(path: Path, version: object) -> None:
@@ -178,13 +180,29 @@ def refuse_other_schema(path: Path, version: object) -> None:
     """
     if not is_readable(version):
         got = "none" if version is None else printable(str(version)[:40])
-        must = " or ".join(map(str, READABLE))
-        raise DataError(f"{path}: schema must be {must}, got {got}; {OTHER_SCHEMA}")
+        raise DataError(f"{path}: schema must be {SCHEMA_VERSION}, got {got}; {OTHER_SCHEMA}")
 
 
 def sizes(*, fingers: int, joints: int, image: int) -> dict[str, int]:
     """Return the lengths of the letters in the shapes."""
     return {"k": fingers, "6k": 6 * fingers, "j": joints, "S": image}
+
+
+def with_derived(
+    columns: Mapping[str, npt.NDArray[Any]],
+) -> dict[str, npt.NDArray[Any]]:
+    """Return columns of `/trials` with those that follow from them."""
+    found = dict(columns)
+    for field in TRIAL_FIELDS:
+        if field.derive is not None and all(name in columns for name in field.needs):
+            found[field.name] = field.derive(columns).astype(field.dtype)
+    return found
+
+
+def sources_of(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the columns of a shard from which columns of `/trials` are read or derived."""
+    needs = {field.name: field.needs for field in TRIAL_FIELDS if field.derive is not None}
+    return tuple(dict.fromkeys(chain.from_iterable(needs.get(name, (name,)) for name in names)))
 
 
 def stored_fields(fields: Sequence[Field], *, certified: bool) -> tuple[Field, ...]:
@@ -196,11 +214,6 @@ def stored_fields(fields: Sequence[Field], *, certified: bool) -> tuple[Field, .
 def _since(stage: Stage, *fields: Field) -> tuple[Field, ...]:
     """Return fields that have a value from a stage on."""
     return tuple(replace(field, stage=stage) for field in fields)
-
-
-def _new(*fields: Field) -> tuple[Field, ...]:
-    """Return fields that the schema has since version 4."""
-    return tuple(replace(field, since=4) for field in fields)
 
 
 def _contacts(prefix: str, of: str, when: str) -> tuple[Field, ...]:
@@ -276,7 +289,7 @@ _CLOSED = tuple(field for field in _contacts("closed", "trial.closed", "when clo
 _LIFTED = _contacts("lifted", "trial.lift", "after the lift")
 
 # Where a palm pose comes from; an attempt's identity is object, candidate, stand-off and child.
-_LINEAGE = _new(
+_LINEAGE = (
     Field("resting", "", "uint8", "-", "-", "index of the object's resting pose"),
     Field("source", "", "uint8", "-", "-",
           "sampler of the palm pose: 0 rotations, 1 normals, 2 refine, 3 own; 4 a posture that "
@@ -296,7 +309,7 @@ _LINEAGE = _new(
 #: What `preshape` says of a posture that is of none: all fingers of a hand with preshapes close.
 NO_PRESHAPE = 255
 # Fields of several tables.
-_PRESHAPE = _new(
+_PRESHAPE = (
     Field("preshape", "", "uint8", "-", "-",
           "index of the hand file's preshape, 255 of a posture of none; 0 if the file has none",
           optional=True),
@@ -318,7 +331,7 @@ _TIME_LIFT = Field(
 _CLEARANCE = {
     when: Field(f"clearance_{when}", "", "float64", "m", "T",
                 f"least height of the hand above the table's top {during}, negative below it; NaN "
-                "in datasets that do not measure it", some=True, since=4, optional=True,
+                "in datasets that do not measure it", some=True, optional=True,
                 of=f"trial.{of}.clearance", shown=Shown(f"least height {during}", "mm"))
     for when, of, during in (("close", "closed", "from the start of closing to its end"),
                              ("lift", "lift", "during the lift"))
@@ -380,7 +393,7 @@ CONDITION_FIELDS: tuple[Field, ...] = (
 #: How much a lifted attempt bears; see `drakegrasp.simulation.robustness`. Files of builds that do
 #: not certify lack these, see `stored_fields`.
 HOLD_FIELDS: tuple[Field, ...] = tuple(
-    replace(field, stage=Stage.LIFTED, some=True, since=4, optional=True)
+    replace(field, stage=Stage.LIFTED, some=True, optional=True)
     for field in (
         Field("p_hold_samples", "", "int32", "-", "-",
               "k: disturbed repeats (section `certify`) that would be samples by the default "
@@ -409,9 +422,9 @@ DATA_FIELDS: tuple[Field, ...] = (
           "the same where the fingertips hold the object after the lift, on the resting object"),
     Field("trial_id", "", "int64", "-", "-", "row of trials.hdf5"),
     *_copied("grasp_props", *_WORDS, *_LINEAGE, *_PRESHAPE),
-    *_new(Field("grasp_props/weight", "", "float32", "-", "-",
-                "1 / number of samples, itself included, of the same object and resting pose whose "
-                "palm is within 10 mm and 15 deg")),
+    Field("grasp_props/weight", "", "float32", "-", "-",
+          "1 / number of samples, itself included, of the same object and resting pose whose "
+          "palm is within 10 mm and 15 deg"),
     *_copied("grasp_props", *_SLIP, *_RELEASED),
     Field("grasp_props/other_links_held", "", "uint8", "-", "-",
           "number of other links of the hand that touch the object after the lift",
@@ -467,10 +480,10 @@ TRIAL_FIELDS: tuple[Field, ...] = (
         *_LINEAGE,
         Field("posture_row", "", "float64", "-", "-",
               "row of the posture in its file; NaN for a palm pose of a sampler", some=True,
-              since=4, optional=True),
+              optional=True),
         Field("own_motors", "", "bool", "-", "-",
               "whether each joint had a motor of its own, because the posture does not follow the "
-              "couplings of the hand file", since=4, optional=True),
+              "couplings of the hand file", optional=True),
         *_PRESHAPE,
         _SPREAD,
         Field("seed", "", "uint64", "-", "-",
@@ -485,19 +498,17 @@ TRIAL_FIELDS: tuple[Field, ...] = (
               "pose of the palm at the start; the candidate's where the palm ray misses"),
     ),
     *CONDITION_FIELDS,
-    *_new(
-        Field("audited", "", "bool", "-", "-",
-              "whether a closed hand that may lift is lifted in any case, as one in ten is",
-              of="attempt.audited"),
-    ),
+    Field("audited", "", "bool", "-", "-",
+          "whether a closed hand that may lift is lifted in any case, as one in ten is",
+          of="attempt.audited"),
     *_since(
         Stage.CLOSED,
         _TIME_CLOSE,
         _CLEARANCE["close"],
         *_CLOSED,
-        *_new(Field("chance", "", "float64", "-", "-",
-                    "chance of a sample, of a closed hand that may lift; NaN for hands without "
-                    "weights of it", some=True, of="trial.chance")),
+        Field("chance", "", "float64", "-", "-",
+              "chance of a sample, of a closed hand that may lift; NaN for hands without "
+              "weights of it", some=True, of="trial.chance"),
     ),
     *_since(
         Stage.LIFTED,

@@ -103,7 +103,7 @@ class Shard:
 
 def trial_columns() -> tuple[Field, ...]:
     """Return the fields of `/trials` that a shard has."""
-    return tuple(f for f in TRIAL_FIELDS if f.name not in ASSEMBLED_FIELDS)
+    return tuple(f for f in TRIAL_FIELDS if f.name not in ASSEMBLED_FIELDS and f.derive is None)
 
 
 def read_field(trials: h5py.Group, field: Field) -> AnyArray:

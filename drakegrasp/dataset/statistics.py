@@ -21,10 +21,10 @@ from drakegrasp.dataset.assembly.survey import shards_sha256
 from drakegrasp.dataset.assembly.weights import effective_number
 from drakegrasp.dataset.card.holding import holding_of
 from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_names
-from drakegrasp.dataset.manifest import read_manifest, refuse_older
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.opening import open_samples, open_trials
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
-from drakegrasp.dataset.schema import NO_PRESHAPE, SCHEMA_VERSION, SPLITS
+from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
 from drakegrasp.dataset.trial_files import NONE, shard_part
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError, HandError, counted
@@ -146,10 +146,8 @@ def is_assembled(out: Path, *, verify_shards: bool = False, execute: Executor = 
     Raises:
         DataError: If a file has values that lie elsewhere, or a shard is missing.
     """
-    # The signature of an older schema was of other keys.
     manifest = read_manifest(out)
-    older = manifest.schema_version < SCHEMA_VERSION
-    expected = {} if older else {"signature": manifest.signature()}
+    expected = {"signature": manifest.signature()}
     if verify_shards:
         expected["shards"] = shards_sha256(out, manifest, execute)
     try:
@@ -190,7 +188,6 @@ def count_unfinished(out: Path) -> Unfinished | None:
 
     # Count the attempts of the shards that are whole.
     manifest = read_manifest(out)
-    refuse_older(manifest, out)
     entries = manifest.objects
     numbers = {entry.name: number for number, entry in enumerate(entries)}
     parts = []

@@ -27,7 +27,7 @@ from drakegrasp.dataset.opening import (
     refuse_other_codes,
 )
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
-from drakegrasp.dataset.schema import CAMERAS, OBJECT_FIELDS, READABLE, SPLITS, TRIAL_FIELDS
+from drakegrasp.dataset.schema import CAMERAS, OBJECT_FIELDS, SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.shards import ASSEMBLED_FIELDS, ShardHeader, open_shard, trial_columns
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome, Removal
@@ -192,8 +192,10 @@ def _stored(
     """
     field, near = FIELDS[name], slice(int(rows[0]), int(rows[-1]) + 1)
     if name not in trials:
-        if field.since == min(READABLE) and not field.optional:
+        if not field.optional:
             raise DataError(f"{part.path}: /trials/{name} must be there, got none")
+        if field.derive is not None:
+            return field.derive({name: _stored(name, trials, part, rows) for name in field.needs})
         return field.empty(len(rows), {})
     values = trials[name][near]
     if codes is not None:

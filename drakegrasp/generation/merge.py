@@ -25,7 +25,6 @@ from drakegrasp.dataset.manifest import (
     ObjectEntry,
     differences,
     read_manifest,
-    refuse_older,
     with_postprocessing,
     write_manifest,
 )
@@ -106,7 +105,6 @@ def merge(
 def _read_complete(out: Path, execute: Executor) -> Manifest:
     """Return the manifest of a dataset that no build has to go on with."""
     manifest = read_manifest(out)
-    refuse_older(manifest, out)
     if not is_assembled(out, verify_shards=True, execute=execute):
         raise DataError(
             f"{out}: must be a complete dataset, got one whose files are not of all its shards; "

@@ -33,7 +33,6 @@ from drakegrasp.dataset.paths import (
     model_path,
 )
 from drakegrasp.dataset.rejections import AttemptKey
-from drakegrasp.dataset.schema import SCHEMA_VERSION
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.suspicion import COLUMNS, PARTS, suspicion
 from drakegrasp.dataset.trial_files import Stamp, TrialPart, sample_ids, shard_part, stamp
@@ -516,9 +515,7 @@ def _other_manifest(out: Path, signature: str) -> Manifest | None:
         manifest = read_manifest(out)
     except DataError:
         return None  # the files are all that there is
-    # No build goes on with an older schema.
-    same = manifest.schema_version < SCHEMA_VERSION or manifest.signature() == signature
-    return None if same else manifest
+    return None if manifest.signature() == signature else manifest
 
 
 def _count_newer(state: Snapshot, manifest: Manifest) -> int:

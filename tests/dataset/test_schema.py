@@ -163,6 +163,6 @@ def test_dataset_of_another_version_gets_one_line(
     with pytest.raises(DataError) as error:
         opens(old / name if alone else old)
     assert str(error.value) == (
-        f"{old / name}: schema must be 3 or {SCHEMA_VERSION}, got 1; build the dataset again "
+        f"{old / name}: schema must be {SCHEMA_VERSION}, got 1; build the dataset again "
         "with this version of drakegrasp, in another directory"
     )

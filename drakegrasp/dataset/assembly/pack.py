@@ -26,8 +26,9 @@ from drakegrasp.dataset.schema import (
     SPLITS,
     TRIAL_FIELDS,
     stored_fields,
+    with_derived,
 )
-from drakegrasp.dataset.shards import ASSEMBLED_FIELDS, ShardHeader, open_shard, read_field
+from drakegrasp.dataset.shards import ShardHeader, open_shard, read_field, trial_columns
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.runtime.files import disk_full_named, temporary_name
@@ -160,8 +161,8 @@ def read_rows(task: PackTask) -> tuple[dict[str, AnyArray], dict[str, SplitSampl
     for piece in task.slices:
         path = piece.header.path(Path(task.out))
         with open_shard(path, piece.header, verify_seal=False, again=True) as (file, _):
-            own = [field for field in fields if field.name not in ASSEMBLED_FIELDS]
-            trials = {field.name: read_field(file["trials"], field) for field in own}
+            own = (field for field in trial_columns() if field.name in columns)
+            trials = with_derived({f.name: read_field(file["trials"], f) for f in own})
             _fill_rows(columns, trials, piece, task)
             _add_samples(samples, trials, file["looks"], piece, task, load)
     return columns, samples

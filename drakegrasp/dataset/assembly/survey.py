@@ -17,7 +17,7 @@ from drakegrasp.config import CameraConfig, Config
 from drakegrasp.dataset.filtering import judge_successes
 from drakegrasp.dataset.hdf5 import read_column
 from drakegrasp.dataset.manifest import Manifest
-from drakegrasp.dataset.schema import CAMERAS, CERTIFICATE_FIELDS, sizes
+from drakegrasp.dataset.schema import CAMERAS, CERTIFICATE_FIELDS, sizes, sources_of, with_derived
 from drakegrasp.dataset.shards import ShardHeader, open_shard, read_trials
 from drakegrasp.dataset.suspicion import COLUMNS, suspicion
 from drakegrasp.filters import NEEDED
@@ -313,12 +313,10 @@ LOOK_COLUMNS = (
     *(field.name for field in CERTIFICATE_FIELDS),
 )
 #: Columns of `/trials` from which those of successes follow.
-TRIAL_COLUMNS = tuple(
-    dict.fromkeys(
-        name
-        for name in (*_COPIED, *(name for each in _DERIVED for name in each.needs))
-        if name not in (*LOOK_COLUMNS, "depth_otm")
-    )
+TRIAL_COLUMNS = sources_of(
+    name
+    for name in (*_COPIED, *(name for each in _DERIVED for name in each.needs))
+    if name not in (*LOOK_COLUMNS, "depth_otm")
 )
 
 
@@ -338,6 +336,7 @@ def successes_of(rows: Table, camera: CameraConfig, *, object: int = 0) -> Table
         "trial_id": np.arange(rows.count, dtype=np.int64),
         "object": np.full(rows.count, object, dtype=np.int32),
     }
+    rows = Table(with_derived(rows))
     certificates = (field.name for field in CERTIFICATE_FIELDS)
     found |= rows.only(*_COPIED, *certificates)
     for each in _DERIVED:

@@ -25,7 +25,7 @@ from drakegrasp.dataset.checks.rows import Check, CheckedFile
 from drakegrasp.dataset.checks.scenes import other_state, scene_tasks, tables
 from drakegrasp.dataset.checks.trials_file import successes, trials_tasks
 from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.dataset.manifest import read_manifest, refuse_older
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, SCENES_FILE, TRIALS_FILE
 from drakegrasp.dataset.schema import CAMERAS, refuse_other_schema
 from drakegrasp.errors import DataError, first_line
@@ -95,7 +95,6 @@ def _check_file(path: Path, check: Check) -> None:
 def _check_directory(out: Path, check: Check) -> None:
     """Check the files of a dataset, each with its objects, its shards and the other files."""
     manifest = read_manifest(out)
-    refuse_older(manifest, out)
     files = _look_at_files(out, check.findings)
     check.total = _rows(files) + sum(entry.candidates for entry in manifest.objects)
 

@@ -19,7 +19,7 @@ from drakegrasp.dataset.assembly.split import may_train, rank_in_split
 from drakegrasp.dataset.card.text import write_card
 from drakegrasp.dataset.hdf5 import create_field, write_field
 from drakegrasp.dataset.lock import build_lock
-from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manifest, refuse_older
+from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manifest
 from drakegrasp.dataset.opening import SCENE_TABLES, open_samples
 from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.scenes.reader import count_scenes
@@ -96,7 +96,6 @@ def make_scenes_locked(
 ) -> Scenes:
     """Write scenes.hdf5 and the card, see `make_scenes`; the caller holds the lock."""
     manifest = read_manifest(out)
-    refuse_older(manifest, out)
     config = _with_scenes(manifest.config, overrides)
     hand = load_hand(config.hand_source)
     joints = manifest.joints or position_order(hand.model, hand.palm_link)
