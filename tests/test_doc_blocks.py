@@ -21,7 +21,7 @@ from helpers.meshes import write_fixed
 from drakegrasp.cli.main import main
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import Decisions, write_decisions
-from drakegrasp.exchange.croissant import not_said, read_publication
+from drakegrasp.exchange.export import not_said, read_publication
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 

@@ -161,8 +161,7 @@ def export(
 
     DIRECTORY must be new or empty.  [default: OUT/export_FORMAT]
     """
-    from drakegrasp.exchange.croissant import Publication, not_said, read_publication
-    from drakegrasp.exchange.export import export_dataset
+    from drakegrasp.exchange.export import Publication, export_dataset, not_said, read_publication
     from drakegrasp.foreign_files import refuse_link
 
     # What is said of the publishers; the option is stronger than the file.

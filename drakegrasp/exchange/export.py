@@ -6,27 +6,84 @@ is a module with one function that writes a directory; `FORMATS` names them.
 
 from __future__ import annotations
 
+import datetime
 import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import Field as Key
 
 from drakegrasp import registry
+from drakegrasp.config import describe_mistake
 from drakegrasp.dataset.opening import refuse_other_codes
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
 from drakegrasp.dataset.trial_files import sample_ids
 from drakegrasp.dataset.trials import Trials
-from drakegrasp.errors import DataError
-from drakegrasp.exchange.croissant import Publication
+from drakegrasp.errors import DataError, one_line
+from drakegrasp.foreign_files import read_text
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.runtime.files import atomic_folder
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.simulation.attempts import CONDITIONS
+from drakegrasp.yaml_text import parse_yaml
+
+
+class Publication(BaseModel):
+    """Attributes are the keys of the file, all optional.
+
+    Attributes:
+        name: Of the dataset, e.g. "Mugs and bowls, Allegro Hand".
+        version: Semantic version of the dataset, e.g. 1.0.0.
+        url: Address of its page.
+        creators: Names of people or groups.
+        published: Day on which it was published.
+        licence: Identifier, e.g. cc-by-4.0.
+        citation: How to cite it, as BibTeX.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str | None = Key(default=None, min_length=1)
+    version: str | None = Key(default=None, pattern=r"^\d+\.\d+\.\d+([-+].+)?$")
+    url: str | None = Key(default=None, pattern=r"^https?://\S+$")
+    creators: tuple[str, ...] = ()
+    published: datetime.date | None = None
+    licence: str | None = Key(default=None, min_length=1)
+    citation: str | None = Key(default=None, min_length=1)
+
+
+#: What Croissant 1.1 demands and no program knows.
+REQUIRED = ("name", "url", "creators", "published", "licence")
+
+
+def read_publication(path: Path) -> Publication:
+    """Return the content of a file.
+
+    Raises:
+        DataError: If it is not readable YAML, has an unknown key, or a value of another form.
+    """
+    try:
+        content = parse_yaml(read_text(path))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise DataError(f"{path}: must be a readable YAML file, got: {one_line(error)}") from error
+    try:
+        return Publication.model_validate({} if content is None else content)
+    except ValidationError as error:
+        keys = ", ".join(Publication.model_fields)
+        line = describe_mistake(error.errors()[0], whole="the file", legal=f"a known key ({keys})")
+        raise DataError(f"{path}: {line}") from error
+
+
+def not_said(publication: Publication) -> list[str]:
+    """Return the keys that a published dataset must have and this one lacks."""
+    return [key for key in REQUIRED if not getattr(publication, key)]
 
 
 def export_dataset(

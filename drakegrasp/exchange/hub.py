@@ -1,7 +1,8 @@
 """A folder for the Hugging Face Hub: Parquet files, a dataset card and Croissant metadata.
 
 In: a dataset. Out: `<camera>/<split>-00000-of-00001.parquet` for both cameras and all splits that
-have samples, `README.md` (whose head in YAML the Hub and `datasets` read) and `croissant.json`.
+have samples, `README.md` (whose head in YAML the Hub and `datasets` read) and `croissant.json`
+(mlcommons.org/croissant, version 1.1, with the fields of its RAI vocabulary 1.0).
 `datasets.load_dataset(folder, "oto")` reads it. With a scenes.hdf5 there is a configuration of
 views, and one of the grasps in them. Their columns are those of the schema, with what /scenes and
 /objects say of a row's scene in place of the numbers of their rows; a scene has the same number in
@@ -14,6 +15,7 @@ file, by their last names. Needs the extra `[hub]`.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import os
@@ -46,11 +48,157 @@ from drakegrasp.dataset.schema import (
 )
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import MachineError
-from drakegrasp.exchange.croissant import Publication, croissant
+from drakegrasp.exchange.export import Publication
 from drakegrasp.runtime.progress import Report
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+#: Types of Croissant by NumPy's letter of a kind.
+_CROISSANT_TYPES = {"f": "sc:Float", "i": "sc:Integer", "u": "sc:Integer", "b": "sc:Boolean"}
+#: Terms of Croissant that mean what its vocabulary says.
+_TERMS = (
+    *("arrayShape", "citeAs", "column", "containedIn", "equivalentProperty", "extract", "field"),
+    *("fileProperty", "fileObject", "fileSet", "format", "includes", "isArray", "isLiveDataset"),
+    *("jsonPath", "key", "md5", "parentField", "path", "recordSet", "references", "regex"),
+    *("repeated", "replace", "samplingRate", "separator", "source", "subField", "transform"),
+)
+#: The context that the specification prescribes.
+_CONTEXT: dict[str, Any] = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "cr": "http://mlcommons.org/croissant/",
+    "dct": "http://purl.org/dc/terms/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "sc": "https://schema.org/",
+    "conformsTo": "dct:conformsTo",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "description": {"@container": "@language"},
+    "name": {"@container": "@language"},
+    **{term: f"cr:{term}" for term in _TERMS},
+}
+
+
+def croissant(
+    folder: Path,
+    files: Sequence[tuple[HubTable, str]],
+    card: Mapping[str, Any],
+    publication: Publication,
+) -> dict[str, Any]:
+    """Return the content of `croissant.json`.
+
+    Args:
+        folder: With the files.
+        files: Table and path of each file that was written.
+        card: Content of the data card (`card_content`).
+        publication: What the publishers say; keys that they do not say are left out.
+    """
+    # Each file with its hash, so that a damaged download shows.
+    distribution = [
+        {
+            "@type": "cr:FileObject",
+            "@id": path,
+            "name": path,
+            "contentUrl": path,
+            "encodingFormat": "application/x-parquet",
+            "sha256": hashlib.sha256((folder / path).read_bytes()).hexdigest(),
+        }
+        for _, path in files
+    ]
+
+    # The dataset, with the columns of each file.
+    said = {
+        "license": publication.licence,
+        "version": publication.version,
+        "url": publication.url,
+        "creator": [{"@type": "sc:Organization", "name": name} for name in publication.creators],
+        "datePublished": publication.published and publication.published.isoformat(),
+        "citeAs": publication.citation,
+    }
+    return {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "name": publication.name or card["title"],
+        "description": "Simulated multi-finger grasps, each with the images of its camera.",
+        "conformsTo": [
+            "http://mlcommons.org/croissant/1.1",
+            "http://mlcommons.org/croissant/RAI/1.0",
+        ],
+        **{key: value for key, value in said.items() if value},
+        **_responsibility(card),
+        "distribution": distribution,
+        "recordSet": [_record_set(table, path) for table, path in files],
+    }
+
+
+def _responsibility(card: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of Croissant's RAI vocabulary, all from the data card."""
+    # How many, of what, by which programs.
+    counts = card["counts"]
+    everything, removals = counts["all"], counts["removed"]
+    samples = [row["samples"] for row in counts["classes"].values()]
+    versions = ", ".join(f"{name} {card['versions'][name]}" for name in ("drakegrasp", "drake"))
+    reasons = ", ".join(f"{count} {reason}" for reason, count in removals.items()) or "none"
+
+    # Only what is known of every dataset that drakegrasp makes.
+    return {
+        "rai:dataCollection": (
+            f"Simulated with {versions}, hand {card['hand']}: {everything['attempts']} attempts to "
+            f"grasp, of which {everything['held']} hold. No people and no robot took part."
+        ),
+        "rai:dataCollectionType": "Software Collection",
+        "rai:dataPreprocessingProtocol": (
+            f"Filters removed {sum(removals.values())} held grasps: {reasons}."
+        ),
+        "rai:dataAnnotationProtocol": (
+            "Each label is the outcome of a simulated lift; no network made or corrected one."
+        ),
+        "rai:dataBiases": [
+            f"{len(counts['objects'])} objects of {len(counts['classes'])} classes, with "
+            f"{min(samples)} to {max(samples)} samples each."
+        ],
+        "rai:dataLimitations": [entry["limit"] for entry in card["limits"]],
+        "rai:dataUseCases": ["Training and testing of networks that predict grasps from images."],
+        "rai:personalSensitiveInformation": ["None."],
+    }
+
+
+def _record_set(table: HubTable, path: str) -> dict[str, Any]:
+    columns, name = table.columns, path.removesuffix(".parquet")
+    return {
+        "@type": "cr:RecordSet",
+        "@id": name,
+        "name": name,
+        "description": table.what,
+        "field": [_croissant_field(name, path, column, field) for column, field in columns.items()],
+    }
+
+
+def _croissant_field(
+    record_set: str, path: str, column: str, field: Field | None
+) -> dict[str, Any]:
+    source: dict[str, Any] = {"fileObject": {"@id": path}, "extract": {"column": column}}
+    if field is None or field.sample:  # an image: the bytes of a PNG file
+        source["transform"] = {"jsonPath": "bytes"}
+        kind, repeated = "sc:ImageObject", False
+    else:
+        kind = "sc:Text" if field.dtype == "str" else _CROISSANT_TYPES[np.dtype(field.dtype).kind]
+        repeated = bool(field.axes)
+    meaning = f"PNG file of the {column}."
+    if field is not None:
+        meaning = f"{field.meaning}{'' if field.unit == '-' else f' [{field.unit}]'}"
+    return {
+        "@type": "cr:Field",
+        "@id": f"{record_set}/{column}",
+        "name": column,
+        "description": meaning,
+        "dataType": kind,
+        "repeated": repeated,
+        "source": source,
+    }
+
 
 #: Fields by the names of columns. An image is None, or a field that is an image.
 Columns = Mapping[str, Field | None]
@@ -78,8 +226,8 @@ class HubTable:
     columns: Columns
     read: Callable[[int, int], Mapping[str, Sequence[Any]]]
 
-    def write(self, folder: Path, wrote: Callable[[int], None]) -> Iterator[ParquetFile]:
-        """Write the files of the table below a folder, and yield them.
+    def write(self, folder: Path, wrote: Callable[[int], None]) -> Iterator[tuple[HubTable, str]]:
+        """Write the files of the table below a folder, and yield it with the path of each.
 
         Args:
             folder: Of all configurations.
@@ -96,7 +244,7 @@ class HubTable:
                 for group in self._groups(rows, schema):
                     writer.write_table(group, row_group_size=GROUP_ROWS)
                     wrote(len(group))
-            yield ParquetFile(table=self, path=path, rows=len(rows))
+            yield self, path
 
     def _groups(self, rows: range, schema: pa.Schema) -> Iterator[pa.Table]:
         """Yield the rows as tables of `GROUP_ROWS`."""
@@ -105,21 +253,6 @@ class HubTable:
         for start in range(rows.start, rows.stop, GROUP_ROWS):
             content = self.read(start, min(start + GROUP_ROWS, rows.stop))
             yield pa.Table.from_pydict(dict(content), schema=schema)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ParquetFile:
-    """A file of a hub folder.
-
-    Attributes:
-        table: Whose rows it holds.
-        path: Below the folder.
-        rows: Number of rows.
-    """
-
-    table: HubTable
-    path: str
-    rows: int
 
 
 def png_cell(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> dict[str, Any]:

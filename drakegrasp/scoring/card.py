@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 from drakegrasp.errors import NAMED
@@ -59,11 +59,26 @@ MEANINGS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Origin:
-    """Where a score comes from.
+def card_of(
+    sets: Sequence[Judged],
+    grouping: Grouping,
+    own: Mapping[int, Array],
+    *,
+    dataset: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    limit: float,
+    oracle: bool,
+    known_objects: int,
+    new_classes: bool,
+    benchmark: Mapping[str, Any] | None,
+    again: str,
+) -> dict[str, Any]:
+    """Return the card.
 
-    Attributes:
+    Args:
+        sets: The predictions if there are any, then the reference rows.
+        grouping: Of the scored rows.
+        own: By row (3k,), contact points of its own grasp in {O} [m].
         dataset: What was scored on: file, split, hashes, rows.
         settings: All that decides a verdict, with the versions.
         limit: d, the largest distance between asked and reached contacts [m].
@@ -73,60 +88,38 @@ class Origin:
         benchmark: What the frozen benchmark says of itself; None for another dataset.
         again: The command that makes the card again.
     """
-
-    dataset: Mapping[str, Any]
-    settings: Mapping[str, Any]
-    limit: float
-    oracle: bool
-    known_objects: int
-    new_classes: bool
-    benchmark: Mapping[str, Any] | None
-    again: str
-
-
-def card_of(
-    sets: Sequence[Judged], grouping: Grouping, own: Mapping[int, Array], origin: Origin
-) -> dict[str, Any]:
-    """Return the card.
-
-    Args:
-        sets: The predictions if there are any, then the reference rows.
-        grouping: Of the scored rows.
-        own: By row (3k,), contact points of its own grasp in {O} [m].
-        origin: Where the score comes from.
-    """
     # What is drawn, and each set; all sets share the draws.
-    clusters = grouping.classes if origin.new_classes else grouping.names
+    clusters = grouping.classes if new_classes else grouping.names
     draws = resample(clusters)
-    described = {each.name: _set_of(each, grouping, own, draws, origin.oracle) for each in sets}
+    described = {each.name: _set_of(each, grouping, own, draws, oracle) for each in sets}
     tested = [each for each in sets if each.name not in REFERENCES]
-    by_protocol = "protocol" in origin.settings
-    measures = {k: v for k, v in MEANINGS.items() if k != "held_any" or origin.oracle}
+    by_protocol = "protocol" in settings
+    measures = {k: v for k, v in MEANINGS.items() if k != "held_any" or oracle}
 
     card: dict[str, Any] = {
         "form": FORM,
         "headline": {each.name: described[each.name]["measures"]["headline"] for each in tested},
         "measures": BY_PROTOCOL if by_protocol else measures,
-        "limit_mm": round(1e3 * origin.limit, 3),
+        "limit_mm": round(1e3 * limit, 3),
         "rows": len(grouping.rows),
         "objects": len(grouping.names),
         "classes": len(set(grouping.classes)),
         "intervals": {
             "level": LEVEL,
             "resamples": RESAMPLES,
-            "drawn": "classes" if origin.new_classes else "objects",
+            "drawn": "classes" if new_classes else "objects",
             "training_seeds": max((len(each.ranked) for each in tested), default=0),
         },
-        "warnings": _warnings(grouping, origin, sets),
+        "warnings": _warnings(grouping, sets, dataset["split_rows"], known_objects),
         "sets": described,
         "above": _above(sets, tested, grouping, draws),
         "by_class": {each.name: by_class(each, grouping) for each in sets},
         "by_object": {each.name: by_object(each, grouping) for each in sets},
-        "dataset": dict(origin.dataset),
-        "settings": dict(origin.settings),
-        "again": origin.again,
+        "dataset": dict(dataset),
+        "settings": dict(settings),
+        "again": again,
     }
-    return card if origin.benchmark is None else card | {"benchmark": dict(origin.benchmark)}
+    return card if benchmark is None else card | {"benchmark": dict(benchmark)}
 
 
 def _above(
@@ -173,7 +166,9 @@ def _set_of(
     }
 
 
-def _warnings(grouping: Grouping, origin: Origin, sets: Sequence[Judged]) -> list[str]:
+def _warnings(
+    grouping: Grouping, sets: Sequence[Judged], total: int, known_objects: int
+) -> list[str]:
     """Return what a reader must know before comparing."""
     found = []
     if len(grouping.names) < FEW_OBJECTS:
@@ -181,11 +176,10 @@ def _warnings(grouping: Grouping, origin: Origin, sets: Sequence[Judged]) -> lis
             f"only {len(grouping.names)} test objects: intervals of fewer than {FEW_OBJECTS} are "
             "too narrow, and an order of methods may not last"
         )
-    total = origin.dataset["split_rows"]
     if len(grouping.rows) < total:
         found.append(f"{len(grouping.rows)} of the {total} rows of the split were scored")
-    if origin.known_objects:
-        found.append(f"{origin.known_objects} test objects are training objects, by their names")
+    if known_objects:
+        found.append(f"{known_objects} test objects are training objects, by their names")
     if not any(REFERENCES[each.name].trained for each in sets if each.name in REFERENCES):
         found.append("no blind row stands beside the score, so it says little (--train)")
 

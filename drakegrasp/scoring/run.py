@@ -23,7 +23,7 @@ from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
 from drakegrasp.grasp import unpack_grasp
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.scoring.benchmark import read_benchmark, rows_digest
-from drakegrasp.scoring.card import Origin, card_of, card_text
+from drakegrasp.scoring.card import card_of, card_text
 from drakegrasp.scoring.measures import Grouping, Judged, seconds
 from drakegrasp.scoring.references import REFERENCES, Scene
 from drakegrasp.scoring.verdict import Ranked, Verdict, VerdictFile, rank, verdict_key
@@ -146,7 +146,11 @@ def score(request: Request, verify: Verify, folder: Path | None) -> Score:
         judged.append(Judged(name=name, ranked=ranked, verdicts=tuple(found)))
         start += len(ranked)
 
-    origin = Origin(
+    own = dict(zip(rows, own_contacts(request.data, rows), strict=True))
+    card = card_of(
+        judged,
+        grouping,
+        own,
         dataset=_described(request.data, rows),
         settings=settings,
         limit=request.config.verify.max_contact_error,
@@ -156,8 +160,6 @@ def score(request: Request, verify: Verify, folder: Path | None) -> Score:
         benchmark=read_benchmark(request.data.path.parent, request.config, versions),
         again=request.again,
     )
-    own = dict(zip(rows, own_contacts(request.data, rows), strict=True))
-    card = card_of(judged, grouping, own, origin)
     times = {each.name: seconds(each) for each in judged}
     return Score(card=card, seconds=times, sets=tuple(judged))
 

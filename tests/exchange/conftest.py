@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 from helpers.datasets import make_dataset
 
-from drakegrasp.exchange.croissant import Publication
-from drakegrasp.exchange.export import ClosedGrasp, export_dataset, read_closed_grasps
+from drakegrasp.exchange.export import ClosedGrasp, Publication, export_dataset, read_closed_grasps
 
 #: What the publishers of the exported dataset say.
 PUBLICATION = Publication(

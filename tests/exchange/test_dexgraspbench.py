@@ -23,11 +23,6 @@ from drakegrasp.hand.description import load_hand  # noqa: E402
 from drakegrasp.hand.kinematics import fingertip_poses  # noqa: E402
 from drakegrasp.mjcf.hand_model import make_hand_model  # noqa: E402
 from drakegrasp.pictures.still_scene import StillScene  # noqa: E402
-from drakegrasp.protocols.files import (  # noqa: E402
-    one_motion,
-    read_grasp_file,
-    read_object_folder,
-)
 
 
 def pose_of(vector: Array) -> Array:
@@ -51,20 +46,6 @@ def content_of(folder: Path, grasp: ClosedGrasp) -> dict[str, Any]:
     data = folder / "output/export_drakegrasp_barrett/graspdata"
     path = data / grasp.object_name / f"{grasp.trial_id}.npy"
     return np.load(path, allow_pickle=True).item()
-
-
-def test_poses_and_joints_come_back(folder: Path, grasps: list[ClosedGrasp]) -> None:
-    hand = load_hand()
-    assert len(list(folder.rglob("*.npy"))) == len(grasps)
-    for grasp in grasps:
-        content = content_of(folder, grasp)
-        assert pose_of(content["obj_pose"]) == pytest.approx(grasp.X_TO, abs=1e-9)
-        for key in ("pregrasp_qpos", "grasp_qpos", "squeeze_qpos"):
-            X_TG = pose_of(content[key][:7]) @ hand.X_BG
-            assert pytest.approx(grasp.X_TG, abs=1e-9) == X_TG
-        q = dict(zip(content["joint_names"], content["grasp_qpos"][7:], strict=True))
-        assert q == dict(zip(StillScene(hand).joints, grasp.q, strict=True))
-        assert set(content["joint_units"]) == {"rad"}
 
 
 def test_fingers_open_and_press_by_equal_steps(folder: Path, grasps: list[ClosedGrasp]) -> None:
@@ -141,12 +122,3 @@ def test_objects_have_their_volume(folder: Path, grasps: list[ClosedGrasp]) -> N
         # The boxes of the dataset lie on the table with their centre as origin.
         lowest = min((part.vertices @ grasp.X_TO[2, :3]).min() for part in parts)
         assert lowest == pytest.approx(-grasp.X_TO[2, 3], abs=1e-3)
-
-
-def test_own_reader_reads_what_is_exported(folder: Path, grasps: list[ClosedGrasp]) -> None:
-    data = folder / "output/export_drakegrasp_barrett/graspdata"
-    path = data / grasps[0].object_name / f"{grasps[0].trial_id}.npy"
-    stored = read_grasp_file(path)
-    exported = content_of(folder, grasps[0])["grasp_qpos"]
-    np.testing.assert_allclose(one_motion(stored).grasp, exported, rtol=0, atol=1e-15)
-    assert read_object_folder(folder / stored.object_path, 1.0).volume > 1e-5

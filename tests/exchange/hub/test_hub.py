@@ -19,8 +19,7 @@ from drakegrasp.dataset.schema import DEPTH_UNIT
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.exchange import hub as hub
 from drakegrasp.exchange import hub as table
-from drakegrasp.exchange.croissant import read_publication
-from drakegrasp.exchange.export import export_dataset
+from drakegrasp.exchange.export import export_dataset, read_publication
 
 pytest.importorskip("pyarrow")
 

@@ -171,10 +171,6 @@ def test_wrench_that_is_not_finite_cannot_be_given():
     assert not program.smallest(CARRY * np.nan).feasible
 
 
-def test_pinch_without_friction_cannot_carry():
-    assert not smallest_forces(*PINCH, ORIGIN, CARRY, 0.0).feasible
-
-
 @pytest.mark.parametrize("limit", [5.0, 20.0])
 def test_smallest_friction_of_a_ring_is_its_share_of_the_weight(limit):
     p, n = ring(3)
@@ -193,13 +189,6 @@ def test_smallest_friction_is_where_the_force_limit_is_met(seed):
         ForceProgram(GraspContacts(p, n, p_OOcm), friction - 2e-4), loads
     ).largest_normal
     assert at <= 20.0 < below
-
-
-def test_smallest_friction_is_nothing_for_a_finger_below():
-    friction = smallest_friction(
-        GraspContacts([[0.0, 0.0, -0.03]], [[0.0, 0.0, -1.0]], ORIGIN, 20.0), [CARRY]
-    )
-    assert friction <= FRICTION_TOLERANCE
 
 
 def test_smallest_friction_is_infinite_where_the_limit_is_too_low():

@@ -154,12 +154,6 @@ def test_nearest_point_is_trimeshs_own(pads: Pads, hulls: list[trimesh.Trimesh],
         assert abs(hull_distance(hull, found)) < 1e-9
 
 
-def test_nearest_point_has_no_rounding() -> None:
-    box = whole_pads([trimesh.creation.box(2.0 * HALF).vertices])
-    corner = nearest_on_pads(box, np.array([HALF + 0.01]))
-    np.testing.assert_allclose(corner[0], HALF, atol=1e-12)
-
-
 # The pad region
 
 
