@@ -98,20 +98,14 @@ def read_floats(words: Iterable[bytes]) -> list[float]:
     Raises:
         ValueError: If one is no number; it gives the word.
     """
-    words = list(words)
-    try:
-        return [float(word) for word in words]
-    except ValueError:
-        bad = next(word for word in words if not _is_number(word))
-        raise ValueError(f"{bad[:40].decode(errors='replace')!r} in place of a number") from None
-
-
-def _is_number(word: bytes) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+    numbers = []
+    for word in words:
+        try:
+            numbers.append(float(word))
+        except ValueError:
+            said = repr(word[:40].decode(errors="replace"))
+            raise ValueError(f"{said} in place of a number") from None
+    return numbers
 
 
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

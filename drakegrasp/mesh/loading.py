@@ -96,7 +96,7 @@ def parse_mesh(name: str, content: bytes) -> tuple[Array, Faces]:
 
 
 def _read_by_trimesh(kind: str, content: bytes) -> tuple[Array, Faces]:
-    """Return the vertices and faces that trimesh finds in a file."""
+    """Return the vertices and faces that trimesh finds in a file; if none, raise `IndexError`."""
     with np.errstate(all="ignore"):
         scene = trimesh.load_scene(
             io.BytesIO(content), file_type=kind, process=False, skip_materials=True
@@ -107,8 +107,11 @@ def _read_by_trimesh(kind: str, content: bytes) -> tuple[Array, Faces]:
         part = scene.geometry[key]
         if isinstance(part, trimesh.Trimesh) and len(part.faces):
             part = trimesh.Trimesh(part.vertices, part.faces, process=False)
-            parts.append(part.apply_transform(X_SN))
-    return _concatenate(parts)
+            part.apply_transform(X_SN)
+            parts.append((part.vertices.view(np.ndarray), part.faces.view(np.ndarray)))
+    surface = stack(parts) if len(parts) > 1 else None
+    vertices, faces = (surface.vertices, surface.faces) if surface else parts[0]
+    return vertices.astype(np.float64, copy=False), faces.astype(np.int64, copy=False)
 
 
 def _are_same(vertices: Array, faces: Faces, declared: Declared) -> bool:
@@ -161,15 +164,3 @@ def clean_triangles(vertices: Array, faces: Faces, name: str) -> trimesh.Trimesh
     if not len(faces):
         raise MeshError(f"{name}: must hold triangles, got only degenerate faces")
     return trimesh.Trimesh(vertices, faces, process=False)
-
-
-def _concatenate(parts: list[trimesh.Trimesh]) -> tuple[Array, Faces]:
-    """Return the vertices and faces of several meshes as one; of none, empty arrays."""
-    if not parts:
-        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
-    arrays = [(part.vertices.view(np.ndarray), part.faces.view(np.ndarray)) for part in parts]
-    if len(arrays) > 1:
-        solid = stack(arrays)
-        arrays = [(solid.vertices, solid.faces)]
-    ((vertices, faces),) = arrays  # no copies of one that may be large
-    return vertices.astype(np.float64, copy=False), faces.astype(np.int64, copy=False)

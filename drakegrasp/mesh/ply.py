@@ -57,7 +57,8 @@ def declared_ply(content: bytes) -> Declared:
             if element.count:
                 vertices = np.stack([columns[axis][0] for axis in "xyz"], axis=1, dtype=np.float64)
         elif element.name in ("face", "tristrips") and element.count:
-            corners, counts = _join(corners, counts, *_polygons(element, columns))
+            more, their = _polygons(element, columns)
+            corners, counts = np.concatenate((corners, more)), np.concatenate((counts, their))
     source.finish()
     return triangulate(vertices, corners, counts)
 
@@ -230,7 +231,7 @@ def _polygons(element: _Element, columns: _Columns) -> tuple[Faces, Faces]:
     lengths = columns[name][1] if name else None
     if name is None or lengths is None:
         raise ValueError(f"{element.name!r} without vertex_indices")
-    corners = columns[name][0].astype(np.int64)
+    corners, lengths = columns[name][0].astype(np.int64), lengths.astype(np.int64)
     return (corners, lengths) if element.name == "face" else _unroll(corners, lengths)
 
 
@@ -251,7 +252,3 @@ def strip_faces(strip: Faces) -> Faces:
         return np.zeros((0, 3), dtype=np.int64)
     faces[1::2] = faces[1::2, [1, 0, 2]]
     return faces
-
-
-def _join(corners: Faces, counts: Faces, more: Faces, their: Faces) -> tuple[Faces, Faces]:
-    return np.concatenate((corners, more)), np.concatenate((counts, their.astype(np.int64)))

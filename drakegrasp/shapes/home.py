@@ -17,7 +17,7 @@ from drakegrasp.shapes.curves import (
     BROAD, COARSE, EDGE, LARGE, arch, between, ellipse, foot_and_wall, joined, resample,
     rounded_polygon, scaled, smooth, spaced, spread_evenly)
 from drakegrasp.shapes.parts import (
-    ball, block, hoop, lathe, moved, pillar, post, prism, rod, rotated, tube)
+    ball, block, hoop, lathe, moved, pillar, post, prism, rod, tube)
 from drakegrasp.shapes.solids import bar, capped, cut, flat_base, fuse, revolve, skin, solid, sweep
 
 #: Edge length of a hat [m].
@@ -291,14 +291,14 @@ def _bell_on_stalk(radius: float, z: float, side: float) -> Trimesh:
         z: Of its middle [m].
         side: 1 for the bell at +x, -1 for that at -x.
     """
-    s, c = (float(value) for value in sin_cos_deg(60.0))
+    s, c = map(float, sin_cos_deg(60.0))
     dome = cut(
         ball((0.0, 0.0, 0.0), (0.42 * radius, 0.42 * radius, 0.36 * radius)),
         block((radius, radius, radius), (0.0, 0.0, -0.5 * radius)))
-    leaning = rotated(dome, "y", 30.0 * side)
     stalk = rod((0.9 * radius * c * side, 0.0, z + 0.9 * radius * s),
         (1.3 * radius * c * side, 0.0, z + 1.3 * radius * s), 0.0045)
-    return fuse(moved(leaning, (1.18 * radius * c * side, 0.0, z + 1.18 * radius * s)), stalk)
+    place = (1.18 * radius * c * side, 0.0, z + 1.18 * radius * s)
+    return fuse(moved(dome, place, y=30.0 * side), stalk)
 
 
 def hat(*, brim: float, crown: float, height: float) -> Trimesh:

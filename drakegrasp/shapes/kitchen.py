@@ -185,12 +185,11 @@ def coffeemaker(*, width: float, depth: float, height: float) -> Trimesh:
     top = 0.52 * height
     side = smooth(scaled([(0.8, 0.0), (1.0, 0.3), (0.9, 0.65), (0.62, 0.9), (0.68, 1.0)], jug,
         top - floor), LARGE)
-    parts.append(moved(lathe(side, edge=LARGE), (x, 0.0, floor - 0.002)))
+    body = moved(lathe(side, edge=LARGE), (x, 0.0, floor - 0.002))
     handle = loop_handle(x=x + 0.6 * jug, top=0.92 * top, bottom=floor + 0.22 * (top - floor),
         reach=0.78 * jug, radius=0.0045, edge=LARGE)
-    parts.append(handle)
     lamp = ball((0.5 * depth, 0.25 * width, height - 0.5 * head), 0.006, edge=0.6 * EDGE)
-    return fuse(*parts, lamp)
+    return fuse(*parts, body, handle, lamp)
 
 
 def teapot(*, radius: float, height: float, spout: float) -> Trimesh:
@@ -301,14 +300,12 @@ def carton(*, width: float, height: float, roof: float) -> Trimesh:
         (height + roof + fin, width, 0.008),
     ], corner=0.003, edge=LARGE)
     # The gable's ends are folded inwards.
-    folds = []
-    for side in (-1.0, 1.0):
-        fold = pillar([(height + 0.004, 0.0105, 0.86 * width),
-            (height + 0.86 * roof, 0.024, 0.005)])
-        folds.append(moved(fold, (0.5 * side * width, 0.0, 0.0)))
+    fold = pillar([(height + 0.004, 0.0105, 0.86 * width), (height + 0.86 * roof, 0.024, 0.005)])
+    folds = [moved(fold, (0.5 * side * width, 0.0, 0.0)) for side in (-1.0, 1.0)]
     slope = np.degrees(np.arctan2(roof, 0.5 * width - 0.004))
-    cap = rotated(post(-0.006, 0.011, 0.15 * width + 0.003), "x", slope)
-    return fuse(cut(shell, *folds), moved(cap, (0.0, -0.27 * width, height + 0.48 * roof)))
+    cap = post(-0.006, 0.011, 0.15 * width + 0.003)
+    place = (0.0, -0.27 * width, height + 0.48 * roof)
+    return fuse(cut(shell, *folds), moved(cap, place, x=slope))
 
 
 def spray_bottle(*, width: float, depth: float, height: float, edge: float = 0.007) -> Trimesh:

@@ -217,9 +217,9 @@ def bunny(*, body: float, head: float, ear: float) -> Trimesh:
     for side in (-1.0, 1.0):
         upright = ball((0.0, 0.0, 0.5 * ear), (0.3 * head, 0.36 * head, 0.62 * ear),
             edge=0.8 * COAT)
-        leaning = rotated(rotated(upright, "x", -10.0 * side), "y", -12.0)
+        place = (0.28 * body, 0.38 * side * head, chin + 0.55 * head)
         parts += [
-            moved(leaning, (0.28 * body, 0.38 * side * head, chin + 0.55 * head)),
+            moved(upright, place, x=-10.0 * side, y=-12.0),
             ball((0.55 * body, 0.62 * side * body, 0.24 * body),
                 (0.62 * body, 0.3 * body, 0.3 * body), edge=COAT),
             ball((0.8 * body, 0.3 * side * body, 0.95 * body),
@@ -252,9 +252,8 @@ def toy_dog(*, length: float, height: float, girth: float) -> Trimesh:
             parts.append(ball((x + 0.4 * leg, y, 0.45 * leg), (1.4 * leg, 1.1 * leg, 0.8 * leg),
                 edge=COAT))
         ear = ball((0.0, 0.0, -0.45 * girth), (0.36 * girth, 0.17 * girth, 0.68 * girth), edge=COAT)
-        leaning = rotated(ear, "x", 14.0 * side)
-        parts.append(moved(leaning,
-            (nose[0] - 0.3 * girth, 0.8 * side * girth, nose[2] + 0.42 * girth)))
+        place = (nose[0] - 0.3 * girth, 0.8 * side * girth, nose[2] + 0.42 * girth)
+        parts.append(moved(ear, place, x=14.0 * side))
     return flat_base(fuse(*parts))
 
 

@@ -220,10 +220,6 @@ def test_union_volume_is_inclusion_exclusion(tmp_path_factory, seed, shift):
     assert model.volume == pytest.approx(a.prod() + b.prod() - common.prod(), rel=1e-4)
 
 
-# Real files
-
-
-@needs_g3db
 def test_surface_of_too_many_pieces_is_refused(tmp_path, monkeypatch):
     boxes = [box().apply_translation([0.3 * i, 0.0, 0.0]) for i in range(4)]
     path = write(tmp_path / "1_boxes.obj", *boxes)
