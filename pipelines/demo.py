@@ -16,7 +16,7 @@ from drakegrasp.cli.tables import make_console, print_stats
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.hand.settings import load_config
-from drakegrasp.pictures.contact_sheet import contact_sheet
+from drakegrasp.pictures.sheets import contact_sheet
 from drakegrasp.shapes.catalog import draw_builtin, export_builtin
 
 #: Classes that the hand often grasps, and objects of each: one trains and validates, one is tested.

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import drakegrasp as dg
-from drakegrasp.pictures.figures.write import write_figures
+from drakegrasp.pictures.figures import write_figures
 
 
 def main() -> None:

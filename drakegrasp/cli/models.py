@@ -61,7 +61,7 @@ def audit(
         text = json.dumps([row.to_json() for row in rows], indent=1, ensure_ascii=False)
         write_atomic(json_file, f"{text}\n".encode())
     if sheet is not None:
-        from drakegrasp.pictures.object_sheet import object_sheet
+        from drakegrasp.pictures.rendered import object_sheet
 
         with progress_bar("draw", "objects") as progress, atomic_path(sheet) as png:
             object_sheet(rows, png, progress=progress)
@@ -282,7 +282,7 @@ def _draw(hand_file: str | Path, picture: Path) -> None:
     """Draw a hand."""
     from drakegrasp.commissioning.pinch import across_angle
     from drakegrasp.hand.description import load_hand
-    from drakegrasp.pictures.hand_picture import picture_hand
+    from drakegrasp.pictures.rendered import picture_hand
 
     loaded = load_hand(hand_file)
     picture_hand(loaded, picture, across=across_angle(loaded))

@@ -102,7 +102,7 @@ def figures(
     views          views of scenes with a sample of each, if there are scenes
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.foreign_files import refuse_link
-    from drakegrasp.pictures.figures.write import write_figures
+    from drakegrasp.pictures.figures import write_figures
 
     if folder is None:
         folder = out / "figures"

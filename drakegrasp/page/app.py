@@ -34,14 +34,13 @@ from drakegrasp.dataset.paths import SCENES_FILE
 from drakegrasp.errors import DataError, DrakegraspError, printable
 from drakegrasp.foreign_files import parse_json
 from drakegrasp.outcomes import Outcome
+from drakegrasp.page.actions import DecisionFile, Recordings
 from drakegrasp.page.attempts import Attempts
 from drakegrasp.page.catalog import Catalog, Snapshot, Watched
-from drakegrasp.page.decisions import DecisionFile
 from drakegrasp.page.gallery import Gallery, Places, Query, Site, render
 from drakegrasp.page.looks import HandView, object_surface, read_look
 from drakegrasp.page.plots import PLOTS, plot_svg, plots_values
 from drakegrasp.page.predictions import Predictions, read_predictions, result_file
-from drakegrasp.page.recording import Recordings
 from drakegrasp.page.scenes import Scenes, read_scenes
 from drakegrasp.pictures.style import colour_png, strip_png
 

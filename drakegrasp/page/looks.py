@@ -247,8 +247,7 @@ class HandView:
             if self._scene is not None or self.problem:
                 return
             from drakegrasp.hand.description import load_hand
-            from drakegrasp.pictures.still_scene import StillScene
-            from drakegrasp.pictures.surfaces import link_surfaces
+            from drakegrasp.pictures.still_scene import StillScene, link_surfaces
 
             try:
                 scene = StillScene(load_hand(self._source))
@@ -263,7 +262,7 @@ class HandView:
         return tuple(self._surfaces)
 
     def surface(self, number: int) -> bytes:
-        """Return what is shown of a link, see `pictures.surfaces`.
+        """Return what is shown of a link, see `pictures.still_scene`.
 
         Raises:
             IndexError: If there is no link of that number.
@@ -367,7 +366,7 @@ def _columns(X: Array) -> list[float]:
 
 
 def object_surface(snapshot: Snapshot, number: int) -> bytes | None:
-    """Return what is shown of an object by its number, see `pictures.surfaces`.
+    """Return what is shown of an object by its number, see `pictures.still_scene`.
 
     It is None if there is no file of the object's meshes.
 
@@ -382,6 +381,6 @@ def object_surface(snapshot: Snapshot, number: int) -> bytes | None:
 def _read_surface(path: Path, modified: int) -> bytes:
     """Return what is shown of an object's file; one written at another time [ns] is read again."""
     from drakegrasp.objects.model import load_object
-    from drakegrasp.pictures.surfaces import object_json
+    from drakegrasp.pictures.still_scene import object_json
 
     return object_json(load_object(path))

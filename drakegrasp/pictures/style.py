@@ -1,4 +1,4 @@
-"""What all figures share: colours, axes, legends, and how to draw a sample.
+"""What all figures share: colours, axes, legends, samples, and what is drawn over pictures.
 
 A contact is drawn where the camera matrix projects it: a dot in its finger's colour and a
 short arrow along the outward normal. The dot is hollow if the object hides the contact.
@@ -7,9 +7,11 @@ short arrow along the outward normal. The dot is hollow if the object hides the 
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import cycle, islice
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -23,9 +25,9 @@ from matplotlib.patheffects import withStroke
 
 from drakegrasp.dataset.opening import open_samples
 from drakegrasp.dataset.reader import Sample
-from drakegrasp.frames import Array
+from drakegrasp.frames import Array, invert_pose, transform_points
 from drakegrasp.grasp import unpack_grasp
-from drakegrasp.vision.camera import project
+from drakegrasp.vision.camera import Picture, project
 
 #: Colours of contacts: predicted, after closing, after the lift, those of the dataset's own grasp
 #: (Okabe and Ito: safe for the colour-blind).
@@ -39,6 +41,10 @@ ARROW = 0.03
 HIDDEN = 0.006
 #: Colour of text and lines.
 INK = "#333333"
+#: Colours of the x, y and z axes of a frame.
+AXIS_COLOURS = ("#D62728", "#2CA02C", "#1F4FD8")
+#: Distance of a label from its point [points].
+LABEL_REACH = 13.0
 #: Colours of depths; on thumbnails of pixels without depth, of the mask's background and object.
 #: What is nothing is transparent, and the object neither dark nor light: it is seen on any page.
 DEPTHS = "viridis_r"
@@ -68,7 +74,6 @@ def draw_sample(
     mask.imshow(sample.mask, cmap="gray", vmin=-0.25, vmax=1.1, interpolation="nearest")
     for panel in axes:
         draw_contacts(panel, sample, K, scale=scale)
-        hide_ticks(panel)
 
 
 def draw_contacts(axes: Axes, sample: Sample, K: Array, *, scale: float = 1.0) -> None:
@@ -96,8 +101,7 @@ def draw_contacts(axes: Axes, sample: Sample, K: Array, *, scale: float = 1.0) -
         mark_contact(axes, i, dot, end, hidden=bool(hidden), scale=scale)
 
     # Contacts outside the image must not change what the axes show.
-    axes.set_xlim(-0.5, size[0] - 0.5)
-    axes.set_ylim(size[1] - 0.5, -0.5)
+    frame_image(axes, *sample.mask.shape)
 
 
 def mark_contact(
@@ -171,11 +175,29 @@ def draw_finger_legend(
         for i, c in enumerate(islice(cycle(FINGER_COLOURS), fingers))
     ]
     marks.append(mark(INK, "white", INK, "hidden by the object"))
+    draw_legend(figure, marks, corner, size)
+
+
+def draw_legend(
+    figure: Figure, marks: Sequence[Line2D], corner: tuple[float, float], size: float
+) -> None:
+    """Draw a legend in one line, from its upper left corner, with text of a size [points]."""
     figure.legend(
-        handles=marks, loc="upper left", bbox_to_anchor=corner, ncols=len(marks), fontsize=size,
-        frameon=False, handletextpad=0.1, columnspacing=1.2, borderaxespad=0.0, borderpad=0.0,
-        labelcolor=INK,
+        handles=list(marks), loc="upper left", bbox_to_anchor=corner, ncols=len(marks),
+        fontsize=size, frameon=False, handletextpad=0.1, columnspacing=1.2, borderaxespad=0.0,
+        borderpad=0.0, labelcolor=INK,
     )  # fmt: skip
+
+
+def new_page(width: float, height: float) -> Figure:
+    """Return an empty white page of a size [inch]."""
+    return Figure(figsize=(width, height), facecolor="white")
+
+
+def write_beside(axes: Axes, x: float, y: float, text: str, size: float, **more: Any) -> None:
+    """Write a text as it is, at shares of the width and the height of axes."""
+    look = {"color": INK, "parse_math": False, **more}
+    axes.text(x, y, text, transform=axes.transAxes, fontsize=size, **look)
 
 
 def add_axes(figure: Figure, left: float, top: float, wide: float, high: float) -> Axes:
@@ -191,6 +213,13 @@ def hide_ticks(axes: Axes) -> None:
     axes.set_yticks([])
     for spine in axes.spines.values():
         spine.set_visible(False)
+
+
+def frame_image(axes: Axes, height: int, width: int) -> None:
+    """Show an image's pixels and nothing else; pixel centres have whole coordinates."""
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    hide_ticks(axes)
 
 
 def shortened(name: str, most: int) -> str:
@@ -255,3 +284,118 @@ def colour_png(colours: npt.NDArray[np.uint8]) -> bytes:
     buffer = io.BytesIO()
     imsave(buffer, colours, format="png")
     return buffer.getvalue()
+
+
+class Triad(NamedTuple):
+    """A frame {A} to draw over a picture.
+
+    Attributes:
+        label: Its letter.
+        X_WA: (4, 4), its pose.
+        length: Of its axes [m].
+    """
+
+    label: str
+    X_WA: Array
+    length: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Panel:
+    """A picture, and what to draw over it.
+
+    Attributes:
+        title: Text above the picture.
+        picture: The picture.
+        triads: Frames.
+        lines: Dashed polylines, each (n, 3) in {W} [m].
+        strokes: By colour, polylines (n, 3) in {W} [m], drawn as they are.
+        points: By name, points (3,) in {W} [m].
+        arrows: By name, tail (3,) and tip (3,) in {W} [m], drawn in the colours of the fingers.
+    """
+
+    title: str
+    picture: Picture
+    triads: Sequence[Triad] = ()
+    lines: Sequence[Array] = ()
+    strokes: Mapping[str, Sequence[Array]] = field(default_factory=dict)
+    points: Mapping[str, Array] = field(default_factory=dict)
+    arrows: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+
+
+def draw_panel(axes: Axes, panel: Panel) -> None:
+    """Draw lines, frames, points and arrows of a panel over its picture."""
+    picture, halo = panel.picture, [withStroke(linewidth=3.0, foreground="white")]
+
+    # Lines and frames.
+    for line in panel.lines:
+        axes.plot(*picture.pixels(line).T, color=INK, linewidth=0.9, linestyle=(0, (5, 3)))
+    for colour, strokes in panel.strokes.items():
+        for line in strokes:
+            axes.plot(*picture.pixels(line).T, color=colour, linewidth=1.4, path_effects=halo,
+                      solid_capstyle="round")  # fmt: skip
+    for triad in panel.triads:
+        tips = triad.X_WA[:3, 3] + triad.length * triad.X_WA[:3, :3].T
+        # Draw the farthest axis first, so that nearer ones cover it.
+        depths = transform_points(invert_pose(picture.X_WC), tips)[:, 2]
+        for k in np.argsort(-depths):
+            ends = picture.pixels(np.vstack([triad.X_WA[:3, 3], tips[k]]))
+            axes.plot(*ends.T, color=AXIS_COLOURS[k], linewidth=2.2, solid_capstyle="round",
+                      path_effects=halo, zorder=5)  # fmt: skip
+
+    # Contacts and other points.
+    for i, (start, end) in enumerate(panel.arrows.values()):
+        colour = FINGER_COLOURS[i % len(FINGER_COLOURS)]
+        tail, tip = picture.pixels(np.vstack([start, end]))
+        axes.annotate("", tip, tail, zorder=6, arrowprops={
+            "arrowstyle": "-|>", "color": colour, "linewidth": 2.0, "shrinkA": 0.0, "shrinkB": 0.0,
+            "path_effects": halo, "mutation_scale": 11.0})  # fmt: skip
+        axes.plot(*tail, "o", color=colour, markersize=6.5, markeredgecolor="white", zorder=7)
+    for point in panel.points.values():
+        axes.plot(*picture.pixels(point[None])[0], "o", color=INK, markersize=6.0,
+                  markeredgecolor="white", zorder=7)  # fmt: skip
+
+    # Labels, placed where they cover none of the above.
+    labels = {triad.label: triad.X_WA[:3, 3] for triad in panel.triads}
+    labels |= dict(panel.points) | {name: start for name, (start, _) in panel.arrows.items()}
+    drawn = [
+        t.X_WA[:3, 3] + f * t.length * t.X_WA[:3, :3].T for t in panel.triads for f in (0.5, 1)
+    ]
+    drawn += [np.linspace(start, end, 4) for start, end in panel.arrows.values()]
+    anchors = {name: picture.pixels(p[None])[0] for name, p in labels.items()}
+    _draw_labels(axes, anchors, picture.pixels(np.vstack([np.zeros((0, 3)), *drawn])))
+
+
+def show_image(axes: Axes, image: npt.NDArray[np.uint8]) -> None:
+    """Show an image whose pixel centres have whole coordinates."""
+    axes.imshow(image, interpolation="antialiased")
+    frame_image(axes, *image.shape[:2])
+    axes.set_autoscale_on(False)
+
+
+def _draw_labels(axes: Axes, pixels: Mapping[str, Array], obstacles: Array) -> None:
+    """Write names beside points, each on the side with the most room.
+
+    Args:
+        axes: That show the image.
+        pixels: By name, (2,), the point that is labelled [px].
+        obstacles: (n, 2), what labels should not cover [px].
+    """
+    # Distance of a label from its point, from points of the paper to pixels of the image.
+    window = axes.get_window_extent()
+    reach = LABEL_REACH * axes.figure.dpi / 72.0 * abs(np.ptp(axes.get_xlim())) / window.width
+    angles = np.deg2rad(np.arange(0.0, 360.0, 30.0))
+    directions = np.column_stack([np.cos(angles), np.sin(angles)])
+    taken = np.vstack([obstacles, *pixels.values()])
+
+    for name, pixel in pixels.items():
+        places = pixel + reach * directions * [1.0 + 0.25 * len(name), 1.0]
+        distances = np.linalg.norm(places[:, None] - taken[None], axis=2)
+        # The nearest obstacle counts most, the next two count as well.
+        nearest = np.sort(distances, axis=1)[:, :3]
+        place = places[np.argmax(nearest @ [4.0, 2.0, 1.0][: nearest.shape[1]])]
+        taken = np.vstack([taken, place])
+        axes.text(
+            place[0], place[1], name, ha="center", va="center", fontsize=10.5, weight="bold",
+            color="black", zorder=9, path_effects=[withStroke(linewidth=3.0, foreground="white")],
+        )  # fmt: skip

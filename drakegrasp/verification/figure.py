@@ -25,7 +25,6 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.mesh.crossings import first_hits
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
-from drakegrasp.pictures.figures.panels import show_image
 from drakegrasp.pictures.recording import (
     draw_predicted,
     record_attempt,
@@ -40,7 +39,16 @@ from drakegrasp.pictures.still_scene import (
     box_corners,
     camera_pose,
 )
-from drakegrasp.pictures.style import ARROW, HIDDEN, INK, LIFTED, PREDICTED, REACHED, add_axes
+from drakegrasp.pictures.style import (
+    ARROW,
+    HIDDEN,
+    INK,
+    LIFTED,
+    PREDICTED,
+    REACHED,
+    add_axes,
+    show_image,
+)
 from drakegrasp.simulation.construction import build_object_scene
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.vision.camera import Picture

@@ -18,15 +18,17 @@ from drakegrasp.dataset.reader import GraspDataset, Sample
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
-from drakegrasp.pictures.figures.panels import Panel, draw_panel, show_image
 from drakegrasp.pictures.style import (
     INK,
+    Panel,
     add_axes,
     draw_colour_bar,
     draw_finger_legend,
+    draw_panel,
     draw_sample,
     read_far,
     save_figure,
+    show_image,
 )
 from drakegrasp.vision.camera import Picture
 

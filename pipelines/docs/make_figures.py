@@ -19,8 +19,8 @@ from drakegrasp.dataset.prepared_objects import PreparedObject
 from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
-from drakegrasp.pictures.figures.palm_poses import palm_poses_figure
-from drakegrasp.pictures.figures.samplers import METHODS, palm_rays
+from drakegrasp.pictures.approaches import palm_poses_figure
+from drakegrasp.pictures.samplers import METHODS, palm_rays
 from drakegrasp.pictures.style import save_figure
 from drakegrasp.shapes.catalog import export_builtin
 from drakegrasp.simulation.candidates import sample_candidates

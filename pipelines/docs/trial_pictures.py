@@ -14,9 +14,9 @@ from doc_figures import find_sample
 
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.frames import X_WT, make_pose, transform_points, unpack_pose
-from drakegrasp.pictures.figures.panels import Panel, Triad
-from drakegrasp.pictures.figures.trial_stages import frustum, load_trial
+from drakegrasp.pictures.rendered import frustum, load_trial
 from drakegrasp.pictures.still_scene import NO_SHADOWS, StillScene, camera_pose
+from drakegrasp.pictures.style import Panel, Triad
 from drakegrasp.vision.camera import Picture
 
 #: Edge of the table where the world's origin below it must be seen [m].

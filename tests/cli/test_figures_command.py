@@ -8,22 +8,18 @@ import pytest
 from helpers.commands import run
 
 from drakegrasp.errors import DataError
-from drakegrasp.pictures.figures import write
+from drakegrasp.pictures import figures
 
 
 def test_figures_are_written_beside_the_dataset(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(data: object, trial_id: int | None) -> None:
+    def refuse(*_: object) -> None:
         raise DataError("not in this test")
 
-    def touch(figure: object, path: Path) -> None:
-        path.parent.mkdir(exist_ok=True)
-        for suffix in (".png", ".svg"):
-            path.with_suffix(suffix).touch()
-
-    monkeypatch.setattr(write, "_phases", refuse)
-    monkeypatch.setattr(write, "_write", touch)
+    monkeypatch.setattr(figures, "_phases", refuse)
+    for name in ("png_bytes", "svg_bytes"):
+        monkeypatch.setattr(figures, name, lambda figure, *, dpi: b"")
     result = run("figures", out, "--quiet")
     assert result.exit_code == 0, result.output
     assert result.stdout.splitlines() == [

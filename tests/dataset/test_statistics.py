@@ -29,7 +29,7 @@ from drakegrasp.dataset.trial_files import NONE
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.page.catalog import Catalog
-from drakegrasp.pictures.figures.write import NUMBERS_FILE, write_figures
+from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
 
 
 def test_words_are_counted_by_object(out: Path) -> None:

@@ -23,8 +23,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
-from drakegrasp.pictures.still_scene import StillScene
-from drakegrasp.pictures.surfaces import link_surfaces
+from drakegrasp.pictures.still_scene import StillScene, link_surfaces
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.shapes.catalog import builtin_sources
 

@@ -42,7 +42,8 @@ from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.page.attempts import Attempts
 from drakegrasp.page.catalog import Catalog
-from drakegrasp.pictures.figures.held_grasps import read_approaches, read_held
+from drakegrasp.pictures.approaches import read_approaches
+from drakegrasp.pictures.figures import read_held
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.verification.placing import place_on_rows
 

@@ -10,8 +10,7 @@ from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import fingertip_poses
 from drakegrasp.hand.shapes import link_shapes
-from drakegrasp.pictures.still_scene import Poses, StillScene
-from drakegrasp.pictures.surfaces import link_surfaces
+from drakegrasp.pictures.still_scene import Poses, StillScene, link_surfaces
 
 HAND = load_hand()
 

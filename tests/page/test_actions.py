@@ -1,17 +1,18 @@
-"""Decisions of several pages and servers in one file."""
+"""Decisions of several pages and servers in one file, and attempts that are run again."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from drakegrasp.dataset.rejections import AttemptKey, read_decisions
 from drakegrasp.errors import DataError
-from drakegrasp.page import decisions as decisions_module
-from drakegrasp.page.decisions import LOCK_NAME, DecisionFile, Undo
+from drakegrasp.page import actions
+from drakegrasp.page.actions import LOCK_NAME, DecisionFile, Recordings, Rerun, Undo
 
 A, B = AttemptKey("1_box_a", 0, 0), AttemptKey("3_brick", 1, 0)
 #: Many decisions of one process.
@@ -19,7 +20,7 @@ DECIDE = """
 import sys
 from pathlib import Path
 from drakegrasp.dataset.rejections import AttemptKey
-from drakegrasp.page.decisions import DecisionFile
+from drakegrasp.page.actions import DecisionFile
 out, name = Path(sys.argv[1]), sys.argv[2]
 file = DecisionFile(out)
 for i in range(60):
@@ -66,7 +67,7 @@ def test_each_page_undoes_its_own(tmp_path: Path) -> None:
 
 
 def test_few_pages_are_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decisions_module, "KEPT_PAGES", 2)
+    monkeypatch.setattr(actions, "KEPT_PAGES", 2)
     file = DecisionFile(tmp_path)
     for page in ("first", "second", "third"):
         file.decide(A, "rejected" if page == "second" else "kept", page)
@@ -74,9 +75,9 @@ def test_few_pages_are_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_lock_that_stays_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decisions_module, "PATIENCE", 0.1)
+    monkeypatch.setattr(actions, "PATIENCE", 0.1)
     file = DecisionFile(tmp_path)
-    held = decisions_module._held(tmp_path / LOCK_NAME)
+    held = actions._held(tmp_path / LOCK_NAME)
     with held, pytest.raises(DataError, match="must be held for a moment only"):
         file.decide(A, "rejected")
     file.decide(A, "rejected")
@@ -86,3 +87,66 @@ def test_a_lock_file_that_a_dead_server_left_is_taken(tmp_path: Path) -> None:
     (tmp_path / LOCK_NAME).touch()
     DecisionFile(tmp_path).decide(A, "rejected")
     assert not (tmp_path / LOCK_NAME).exists()
+
+
+LABEL = "0123456789ab-0-0"
+
+
+def test_a_replay_that_differs_is_told(out: Path) -> None:
+    """The rows of the boxes were never simulated: the program finds others."""
+    recordings = Recordings(out)
+    try:
+        found = recordings.make(LABEL, 0)
+        assert not found.same
+        assert found.text.startswith("trial 0 of 1_box_a: was success, is ")
+        assert "time_close differs: " in found.text
+        assert ".html" not in found.text
+        content = recordings.read(LABEL)
+        assert content is not None
+        assert b"<html" in content[:1000].lower()
+        assert recordings.make(LABEL, 0) is found
+    finally:
+        recordings.close()
+
+
+@pytest.fixture
+def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """The commands that are run; each writes a recording and says that all is equal."""
+    commands: list[list[str]] = []
+
+    def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
+        commands.append(command)
+        path = command[command.index("--html") + 1]
+        Path(path).write_text("<html>")
+        text = f"trial 7 of a: was success, is success\n{path}\n"
+        return subprocess.CompletedProcess(command, 0, text, "")
+
+    monkeypatch.setattr(actions.subprocess, "run", run)
+    return commands
+
+
+def test_a_replay_that_is_equal_is_told(tmp_path: Path, commands: list[list[str]]) -> None:
+    recordings = Recordings(tmp_path)
+    found = recordings.make(LABEL, 7)
+    recordings.close()
+    assert found == Rerun(same=True, text="trial 7 of a: was success, is success")
+
+
+def test_the_current_folder_gives_no_modules(tmp_path: Path, commands: list[list[str]]) -> None:
+    recordings = Recordings(Path("-out"))
+    recordings.make(LABEL, 7)
+    recordings.close()
+    (command,) = commands
+    assert "-P" in command[: command.index("-c")]
+    # Nor is the name of the directory taken for an option.
+    assert command[-2:] == ["--", "-out"]
+
+
+def test_what_cannot_run_is_one_line(tmp_path: Path) -> None:
+    recordings = Recordings(tmp_path)
+    try:
+        with pytest.raises(DataError, match=r"trial 7 cannot be run again: error: .*must be"):
+            recordings.make(LABEL, 7)
+        assert recordings.read(LABEL) is None
+    finally:
+        recordings.close()

@@ -7,16 +7,20 @@ import shutil
 from pathlib import Path
 from xml.etree import ElementTree
 
+import h5py
 import matplotlib as mpl
 import numpy as np
 import pytest
 from helpers import datasets
-from helpers.datasets import OTO, TRIALS, edit_file, make_dataset
+from helpers.datasets import OTO, SLIP, TRIALS, edit_file, make_dataset
 from helpers.machine import needs_egl
 
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import DataError, MachineError
-from drakegrasp.pictures.figures import write
-from drakegrasp.pictures.figures.write import NUMBERS_FILE, write_figures
+from drakegrasp.frames import unpack_pose
+from drakegrasp.pictures import figures
+from drakegrasp.pictures.approaches import read_approaches
+from drakegrasp.pictures.figures import NUMBERS_FILE, read_held, write_figures
 
 ALL = {
     *("palm_poses", "phases", "classes_1", "outcomes", "hold", "objects"),
@@ -32,10 +36,10 @@ def contents(folder: Path) -> dict[str, bytes]:
 def no_render(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the only figure that needs a renderer."""
 
-    def refuse(data: object, trial_id: int | None) -> None:
+    def refuse(*_: object) -> None:
         raise DataError("not in this test")
 
-    monkeypatch.setattr(write, "_phases", refuse)
+    monkeypatch.setattr(figures, "_phases", refuse)
 
 
 @pytest.mark.sim
@@ -97,7 +101,7 @@ def test_names_are_drawn_as_they_are_also_without_opengl(
     def fail(*_: object) -> None:
         raise MachineError("no EGL")
 
-    monkeypatch.setattr(write, "phases_figure", fail)
+    monkeypatch.setattr(figures, "phases_figure", fail)
     name = "1_$^$ <script>&\"' 碗 x" + 30 * "y"
     monkeypatch.setattr(datasets, "BOXES", {name: ((0.06, 0.05, 0.10), "a $^$ class")})
     out = make_dataset(tmp_path / "out", tmp_path)
@@ -118,3 +122,44 @@ def test_what_was_asked_for_must_be_drawn(sound: Path, tmp_path: Path) -> None:
         write_figures(sound, tmp_path, trial_id=36)
     with pytest.raises(DataError, match="must have been lifted, got below_table"):
         write_figures(sound, tmp_path, trial_id=2)
+
+
+def test_every_success_is_read_once(sound: Path) -> None:
+    held = read_held(sound)
+    assert held.trial_ids.tolist() == [0, 3, 11, 12, 15, 23, 24, 27, 35]
+    assert [int(group.sum()) for group in held.groups.values()] == [9, 9, 9]
+    np.testing.assert_allclose(held.quantities["slip in the hand [mm]"], 1e3 * SLIP)
+    np.testing.assert_allclose(held.quantities["turn in the hand [°]"], 1.0)
+    np.testing.assert_allclose(held.quantities["largest fingertip force after the lift [N]"], 12.5)
+    np.testing.assert_allclose(held.quantities["largest penetration after the lift [mm]"], 0.125)
+
+
+def test_a_file_without_successes_has_none(sound: Path, tmp_path: Path) -> None:
+    shutil.copy(sound / TRIALS, tmp_path)
+    edit_file(tmp_path / TRIALS, lambda f: f["trials/outcome"].write_direct(np.full(36, 9, "u1")))
+    held = read_held(tmp_path)
+    assert len(held.trial_ids) == 0
+    assert all(len(values) == 0 for values in held.quantities.values())
+
+
+def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"trials\.hdf5: must be the trials"):
+        read_held(tmp_path)
+
+
+def test_approaches_are_of_one_object(sound: Path, tmp_path: Path) -> None:
+    config = read_manifest(sound).config
+    found = read_approaches(sound, "2_box_b", config)
+    assert found.attempts == 12
+    assert found.groups.tolist() == [2, 2, 2]  # stable
+    # All palms are tilted by 0.25 rad; the one attempt whose ray misses, row 7, approached nothing.
+    np.testing.assert_allclose(found.successes[:, 2], np.cos(0.25), atol=1e-9)
+    with h5py.File(sound / TRIALS, "r") as file:
+        rows = [1, 2, 4, 5, 6, 8, 9, 10]
+        X_TO, X_OG = (unpack_pose(file[f"trials/{name}"][12:24][rows]) for name in ("X_TO", "X_OG"))
+    np.testing.assert_allclose(found.directions, -(X_TO @ X_OG)[:, :3, 2], atol=1e-9)
+    with h5py.File(sound / TRIALS, "r") as file:
+        standoffs = np.array(config.candidates.standoffs)
+        rows = file["trials/standoff_index"][12:24][[0, 3, 11]]
+    lengths = np.linalg.norm(found.rays[:, 1] - found.rays[:, 0], axis=1)
+    np.testing.assert_allclose(lengths, standoffs[rows])

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 from doc_figures import find_sample, frames_figure, hero_figure
-from helpers.datasets import MISSING
+from helpers.datasets import MISSING, OTO
 from helpers.machine import needs_egl
 from helpers.scripts import PIPELINES
 from matplotlib.figure import Figure
@@ -20,11 +20,20 @@ from matplotlib.image import imread
 from drakegrasp.config import CameraConfig
 from drakegrasp.dataset.hdf5 import create_field
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.scenes.reader import SceneDataset
 from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS, sizes
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, make_pose, pack_pose
+from drakegrasp.generation.scenes.make import make_scenes
 from drakegrasp.grasp import pack_grasp
-from drakegrasp.pictures.contact_sheet import contact_sheet, draw_sheet, spread_over_objects
+from drakegrasp.pictures import sheets
+from drakegrasp.pictures.sheets import (
+    class_sheets,
+    contact_sheet,
+    draw_sheet,
+    scene_views,
+    spread_over_objects,
+)
 from drakegrasp.pictures.style import draw_contacts
 from drakegrasp.vision.camera import intrinsics, project
 
@@ -193,7 +202,7 @@ def test_figure_of_the_frames_has_them_all(sound: Path, tmp_path: Path) -> None:
 def test_chosen_view_sees_every_fingertip(sound: Path) -> None:
     from drakegrasp.frames import X_WT
     from drakegrasp.hand.description import load_hand
-    from drakegrasp.pictures.figures.trial_stages import load_trial
+    from drakegrasp.pictures.rendered import load_trial
     from drakegrasp.simulation.construction import build_scene
     from drakegrasp.simulation.scene import hand_joint_names
 
@@ -218,7 +227,7 @@ def test_chosen_view_sees_every_fingertip(sound: Path) -> None:
 
 @pytest.mark.sim
 def test_only_lifted_trials_can_be_shown(sound: Path) -> None:
-    from drakegrasp.pictures.figures.trial_stages import load_trial
+    from drakegrasp.pictures.rendered import load_trial
 
     with pytest.raises(DataError, match="missing_fingertip"):
         load_trial(sound, MISSING)
@@ -230,7 +239,7 @@ def test_figures_import_no_drake() -> None:
     import subprocess
 
     code = (
-        "import sys, doc_figures, drakegrasp.pictures.contact_sheet; "
+        "import sys, doc_figures, drakegrasp.pictures.sheets; "
         "print({'pydrake', 'dask', 'trimesh'} & set(sys.modules))"
     )
     found = subprocess.run(
@@ -256,3 +265,54 @@ def test_a_finger_that_a_grasp_leaves_out_is_not_drawn() -> None:
     draw_contacts(axes, sample, np.diag([20.0, 20.0, 1.0]))
     assert {line.get_gid() for line in axes.lines} - {None} >= {"contact 0", "contact 2"}
     assert "contact 1" not in {line.get_gid() for line in axes.lines}
+
+
+def titles(pages: list) -> list[str]:
+    return [text.get_text() for page in pages for axes in page.axes for text in axes.texts]
+
+
+def test_each_class_has_its_first_sample(sound: Path) -> None:
+    pages, trials = class_sheets(sound / OTO)
+    first: dict[str, int] = {}
+    with h5py.File(sound / OTO, "r") as file:
+        for split in SPLITS:
+            group = file[split]
+            names = group["object_props/class_name"].asstr()[:]
+            for name, trial in zip(names, group["trial_id"][:], strict=True):
+                first[name] = min(int(trial), first.get(name, 10**6))
+    assert trials == first
+    assert list(trials) == ["box", "brick"]
+    assert titles(pages) == ["box", f"trial {first['box']}", "brick", f"trial {first['brick']}"]
+
+
+def test_many_classes_fill_pages(sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sheets, "PER_PAGE", 1)
+    pages, _ = class_sheets(sound / OTO)
+    assert len(pages) == 2
+
+
+def test_a_file_without_samples_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="must be a data file"):
+        class_sheets(tmp_path / OTO)
+
+
+@pytest.mark.sim
+def test_each_view_shows_the_contacts_of_a_sample_of_its_scene(out: Path) -> None:
+    path = make_scenes(out, overrides=["scenes.views=3"]).path
+    figure, drawn = scene_views(path)
+    # Three drawn views of the object to train on, four of each to test.
+    assert len(drawn) == len(figure.axes) == 3 + 4 + 4
+    data = SceneDataset(path, points=None, split="train")
+    for axes, told in zip(figure.axes, drawn, strict=True):
+        grasps = data.grasps_in(told["view"])
+        row = int(np.argmax(grasps["trial_id"] == told["trial_id"]))
+        assert grasps["sample"][row]
+        dots = {line.get_gid(): line for line in axes.lines if line.get_gid()}
+        hollow = [dots[f"contact {i}"].get_markerfacecolor() == "white" for i in range(3)]
+        assert hollow == (~grasps["visible"][row]).tolist()
+    assert any(not data.grasps_in(told["view"])["visible"].all() for told in drawn)
+
+
+def test_a_file_that_is_missing_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"scenes\.hdf5: must be the scenes of a dataset"):
+        scene_views(tmp_path / "scenes.hdf5")

@@ -1,17 +1,19 @@
 """The two samplers of palm poses compared: which approaches they try, and what they find.
 
-In: a dataset, and perhaps another of the same objects by the other sampler. Out: palm poses of one
-object by both, and numbers. Without the other dataset the other sampler draws palm poses of that
-one object, which nobody has tried.
+In: a dataset, and perhaps another of the same objects by the other sampler. Out: the paper's Figure
+2, palm poses of one object by both, and numbers. Without the other dataset the other sampler draws
+palm poses of that one object, which nobody has tried.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from drakegrasp.config import POSTPROCESSING_KEYS, Config
 from drakegrasp.dataset.manifest import read_manifest
@@ -20,19 +22,48 @@ from drakegrasp.dataset.statistics import Funnel, count_funnel
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
 from drakegrasp.outcomes import Outcome
-from drakegrasp.pictures.figures.approach_sphere import (
+from drakegrasp.pictures.approaches import (
     NEAR_DEG,
     approach_directions,
     coverage,
+    palm_poses_figure,
 )
 from drakegrasp.simulation.candidates import Candidates, sample_candidates
 
 #: Names of the samplers in the configuration, in the order of the paper's figure, and in words.
 METHODS = {"normals": "along surface normals", "rotations": "global and local rotations"}
+#: Palm rays of a sampler in the figure.
+RAYS = 220
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SamplerComparison:
+def samplers_figure(out: Path, other: Path | None = None) -> tuple[Figure, dict[str, Any]]:
+    """Return the palm poses of both samplers on one object, and their numbers.
+
+    Args:
+        out: As in `compare_samplers`.
+        other: As in `compare_samplers`.
+
+    Raises:
+        DataError: As in `compare_samplers`.
+    """
+    found = compare_samplers(out, other)
+    model, numbers, rays, captions = found.shown.model, found.numbers, {}, {}
+    for method, title in METHODS.items():
+        rays[title] = palm_rays(found.candidates[method], found.standoff, RAYS)
+        of_all = numbers["of_objects"].get(method)
+        captions[title] = caption(numbers["of_object"][method], of_all, numbers["objects"])
+    figure = palm_poses_figure(
+        model.visual_vertices,
+        model.visual_faces,
+        rays,
+        R_TO=found.shown.X_TO[:3, :3],
+        captions=captions,
+        name=model.name,
+    )
+    return figure, numbers
+
+
+class SamplerComparison(NamedTuple):
     """Both samplers on one object, and their numbers.
 
     Attributes:
@@ -226,3 +257,32 @@ def _common_objects(datasets: dict[str, Path], funnels: dict[str, Funnel]) -> li
         paths = " and ".join(str(path) for path in datasets.values())
         raise DataError(f"{paths}: must have objects of the same meshes, got none")
     return names
+
+
+def caption(of_object: Mapping[str, Any], of_all: Mapping[str, Any] | None, objects: int) -> str:
+    """Return what stands below a panel.
+
+    Args:
+        of_object: Numbers of the sampler on the object that is drawn, see `samplers`.
+        of_all: On all objects; None if it was only drawn.
+        objects: Their number.
+    """
+    lines = [
+        f"{of_object['palm_rays']:,} of {of_object['palm_poses']:,} palm rays meet the object",
+        f"{_percent(of_object)} of the directions from above lie within {NEAR_DEG:g}° of one",
+        _rate(of_object, "successes per 1,000 attempts"),
+    ]
+    if of_all is not None and objects > 1:
+        lines.append(f"all {objects:,} objects: {_percent(of_all)}; {_rate(of_all, 'per 1,000')}")
+    return "\n".join(lines)
+
+
+def _percent(numbers: Mapping[str, Any]) -> str:
+    return f"{100.0 * numbers['coverage']:.0f} %"
+
+
+def _rate(numbers: Mapping[str, Any], unit: str) -> str:
+    rate = numbers["successes_per_1000_attempts"]
+    if rate is None:
+        return "not tried in this dataset"
+    return f"{rate:.1f} {unit} ({numbers['successes']:,} of {numbers['attempts']:,})"

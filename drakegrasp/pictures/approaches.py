@@ -1,0 +1,387 @@
+"""From where palms approach objects: directions, what they cover, rays over objects, and maps.
+
+Objects on the table are seen in parallel projection, in a view {V} whose axes point right, up and
+towards the reader. In: attempts of some objects. Out: figures. Needs matplotlib, not Drake.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+from scipy.spatial import KDTree
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.frames import Array, unpack_pose
+from drakegrasp.outcomes import Outcome
+from drakegrasp.pictures.charts import GROUPS
+from drakegrasp.pictures.style import (
+    INK,
+    add_axes,
+    draw_legend,
+    hide_ticks,
+    new_page,
+    shortened,
+    write_beside,
+)
+
+#: A direction is covered if an approach is at most this far from it [deg].
+NEAR_DEG = 10.0
+#: Directions of the half sphere that are looked at.
+PROBES = 2000
+#: From where the reader looks: about the vertical from +x, and above the horizontal [rad].
+AZIMUTH, ELEVATION = np.deg2rad(-55.0), np.deg2rad(20.0)
+#: Direction of the light in the view: from the upper left and from the front.
+LIGHT = np.array([-0.48, 0.6, 0.64])
+OBJECT_COLOUR = np.array([0.70, 0.77, 0.86])
+#: Colours of a palm's approach, as in the paper, and of attempts that failed.
+APPROACH, FAILED = "#7B2FA8", "#B8BDC4"
+#: Rays and dots of a panel, at most.
+MAX_RAYS, MAX_DOTS = 300, 3000
+#: Heights above the table that have a circle on a map [deg].
+CIRCLES_DEG = (60.0, 30.0, 0.0)
+#: Half the edge of a map: what comes from a little below the horizon is still on it.
+EXTENT = 1.24
+#: Edge of a picture or a map, spaces, caption and head [inch]; objects in a row.
+EDGE, GAP, BETWEEN, CAPTION, HEAD, ACROSS = 2.5, 0.05, 0.3, 0.28, 0.24, 2
+#: Width of a panel of rays, space beside it, height of its title and of a line of text [inch].
+PANEL, MARGIN, TITLE, LINE = 3.9, 0.12, 0.34, 0.2
+
+
+def approach_directions(X_TO: Array, X_OG: Array) -> Array:
+    """Return the unit directions (n, 3) in {T} from which palms (n, 4, 4) come: -Gz."""
+    return np.asarray(-X_OG[:, :3, 2] @ X_TO[:3, :3].T)
+
+
+def coverage(directions: Array) -> float:
+    """Return which share of the half sphere over the table lies near an approach.
+
+    Near is NEAR_DEG or less. The directions that are looked at lie on a spiral that gives each the
+    same area (Fibonacci lattice; Gonzalez 2010, Mathematical Geosciences 42).
+
+    Args:
+        directions: (n, 3), unit, in {T}.
+    """
+    if not len(directions):
+        return 0.0
+    i = np.arange(PROBES)
+    height, turn = (i + 0.5) / PROBES, i * np.pi * (3.0 - np.sqrt(5.0))
+    radius = np.sqrt(1.0 - height**2)
+    probes = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), height])
+
+    # The chord of the angle; a direction on the limit may not depend on rounding.
+    chord = 2.0 * np.sin(np.deg2rad(NEAR_DEG) / 2.0) + 1e-9
+    distance, _ = KDTree(directions).query(probes)
+    return float(np.count_nonzero(distance <= chord)) / PROBES
+
+
+def map_directions(directions: Array) -> Array:
+    """Return the places (n, 2) of directions on Lambert's equal-area map about +Tz.
+
+    Straight up is the origin, the horizon the unit circle, and what comes from below is outside of
+    it.
+
+    Args:
+        directions: (n, 3), unit, in {T}.
+    """
+    # Of the angle from +Tz: r = sqrt(2) sin(angle / 2) is 1 at the horizon.
+    across = np.hypot(directions[:, 0], directions[:, 1])
+    r = np.sqrt(np.maximum(1.0 - directions[:, 2], 0.0))
+    scale = np.divide(r, across, out=np.zeros_like(r), where=across > 1e-12)
+    return np.asarray(directions[:, :2] * scale[:, None])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectApproaches:
+    """An object, and from where it was approached.
+
+    Attributes:
+        name: Of the object.
+        vertices, faces: (n, 3) in {O} [m] and (m, 3).
+        R_TO: (3, 3), how it rests.
+        attempts: Their number.
+        directions: (a, 3) in {T}, from which palms came that found no grasp; without those whose
+            palm ray misses.
+        rays: (s, 2, 3) in {O}, of the successes: from the palm's origin to the surface [m].
+        successes: (s, 3) in {T}, directions of the successes.
+        groups: (s,), how each success holds: index into GROUPS.
+    """
+
+    name: str
+    vertices: Array
+    faces: npt.NDArray[np.int32]
+    R_TO: Array
+    attempts: int
+    directions: Array
+    rays: Array
+    successes: Array
+    groups: npt.NDArray[np.int64]
+
+
+def read_approaches(out: Path, name: str, config: Config) -> ObjectApproaches:
+    """Return from where an object was approached first, in the resting pose that held most.
+
+    Args:
+        out: Directory of the dataset.
+        name: Of the object.
+        config: Of the object, see `Manifest.config_of`.
+
+    Raises:
+        DataError: If a file is missing or damaged.
+    """
+    # The attempts of the object at the pose in which most are held: a picture shows one pose.
+    prepared = load_prepared(out, name, config)
+    first = Trials(out).where(object_name=name, refined=False)
+    resting, held = first["resting"], first["outcome"] == Outcome.SUCCESS
+    pose = int(np.bincount(resting[held], minlength=1).argmax())
+    own = first[resting == pose].columns(
+        ("outcome", "X_OG", "standoff_index", "precision", "stable")
+    )
+    outcome, packed, standoff, precision, stable = own.values()
+    X_OG = unpack_pose(packed)
+
+    # Attempts whose palm ray misses do not approach the object.
+    won, approached = outcome == Outcome.SUCCESS, outcome != Outcome.RAY_MISS
+    X_TO = prepared.resting_poses[pose]
+    directions = approach_directions(X_TO, X_OG)
+    reach = np.array(config.candidates.standoffs)[standoff[won]]
+    p_OG, z_O = X_OG[won, :3, 3], X_OG[won, :3, 2]
+    return ObjectApproaches(
+        name=name,
+        vertices=prepared.model.visual_vertices,
+        faces=prepared.model.visual_faces,
+        R_TO=X_TO[:3, :3],
+        attempts=len(outcome),
+        directions=directions[approached & ~won],
+        rays=np.stack([p_OG, p_OG + reach[:, None] * z_O], axis=1),
+        successes=directions[won],
+        groups=(precision[won].astype(np.int64) + stable[won]),
+    )
+
+
+def approaches_figure(objects: Sequence[ObjectApproaches], *, left_out: int) -> Figure:
+    """Return a picture and a map per object.
+
+    Args:
+        objects: What to draw, at least one.
+        left_out: Number of objects with successes that are not drawn.
+    """
+    # The page: blocks of a picture and a map, below a head with the legend.
+    across = min(ACROSS, len(objects))
+    lines = -(-len(objects) // across)
+    block = 2 * EDGE + GAP
+    width = max(across * block + (across - 1) * BETWEEN + 0.3, 7.0)
+    height = HEAD + lines * (CAPTION + EDGE) + 0.1
+    figure = new_page(width, height)
+
+    for i, item in enumerate(objects):
+        line, column = divmod(i, across)
+        left, top = 0.15 + column * (block + BETWEEN), HEAD + line * (CAPTION + EDGE) + CAPTION
+        picture = add_axes(figure, left, top, EDGE, EDGE)
+        _draw_picture(picture, item)
+        _draw_map(add_axes(figure, left + EDGE + GAP, top, EDGE, EDGE), item)
+        counts = f"{len(item.successes):,} of {item.attempts:,} attempts"
+        write_beside(picture, 0.0, 1.02, f"{shortened(item.name, 30)}: {counts}", 9.5)
+
+    # The head.
+    colours = {**GROUPS, "attempt that failed": FAILED}
+    marks = [
+        Line2D([], [], color=colour, label=name, markersize=6 if name in GROUPS else 4, marker="o",
+               linestyle="none", markeredgewidth=0.0) for name, colour in colours.items()
+    ]  # fmt: skip
+    draw_legend(figure, marks, (0.15 / width, 1.0 - 0.08 / height), 9)
+    if left_out:
+        text = f"{left_out:,} objects with fewer successes are left out"
+        figure.text(1.0 - 0.15 / width, 1.0 - 0.1 / height, text, fontsize=9, color=INK,
+                    ha="right", va="top")  # fmt: skip
+    return figure
+
+
+def spread(count: int, most: int) -> npt.NDArray[np.int64]:
+    """Return which of `count` things to draw: evenly spaced ones, `most` at most."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
+
+
+def _draw_picture(axes: Axes, item: ObjectApproaches) -> None:
+    """Draw the object with the palm rays of its successes."""
+    R_VO = view_rotation() @ item.R_TO
+    triangles = triangles_in_view(item.vertices, item.faces, item.R_TO)
+    shown = spread(len(item.rays), MAX_RAYS)
+    rays, groups = item.rays[shown] @ R_VO.T, item.groups[shown]
+    for number, colour in enumerate(GROUPS.values()):
+        draw_rays(axes, rays[groups == number], colour, width=0.8, opacity=0.85)
+    draw_object(axes, triangles)
+
+    # A square about all of it.
+    low, high = frame_of([triangles, rays])
+    middle, half = (low + high) / 2.0, (high - low).max() / 2.0
+    finish_view(axes, middle - half, middle + half)
+
+
+def _draw_map(axes: Axes, item: ObjectApproaches) -> None:
+    """Draw the map of directions: straight above in the middle, the horizon as a circle."""
+    for height in CIRCLES_DEG:
+        radius = np.sqrt(1.0 - np.sin(np.deg2rad(height)))
+        horizon = height == CIRCLES_DEG[-1]
+        axes.add_patch(Circle((0.0, 0.0), radius, facecolor="none", edgecolor="#8A9099",
+                              linewidth=1.0 if horizon else 0.5, zorder=2))  # fmt: skip
+        axes.text(0.0, -radius, f"{height:.0f}°", fontsize=7, color="#6A7078", ha="center",
+                  va="center", zorder=5,
+                  bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6})  # fmt: skip
+    for place, text in (((EXTENT - 0.06, 0.0), "+Tx"), ((0.0, EXTENT - 0.06), "+Ty")):
+        axes.text(*place, text, fontsize=7.5, color="#6A7078", ha="center", va="center", zorder=5)
+
+    # Failures are a ground of dots; successes stand on it.
+    failed = map_directions(item.directions[spread(len(item.directions), MAX_DOTS)])
+    axes.plot(*failed.T, "o", color=FAILED, markersize=1.7, markeredgewidth=0.0, zorder=1,
+              rasterized=len(failed) > 500)  # fmt: skip
+    places = map_directions(item.successes)
+    for number, colour in enumerate(GROUPS.values()):
+        axes.plot(*places[item.groups == number].T, "o", color=colour, markersize=4.2,
+                  markeredgecolor="white", markeredgewidth=0.4, zorder=4)  # fmt: skip
+    axes.set(xlim=(-EXTENT, EXTENT), ylim=(-EXTENT, EXTENT), aspect="equal")
+    hide_ticks(axes)
+
+
+def palm_poses_figure(
+    vertices: Array,
+    faces: npt.NDArray[np.int32],
+    rays: Mapping[str, Array],
+    *,
+    R_TO: npt.ArrayLike | None = None,
+    captions: Mapping[str, str] | None = None,
+    name: str = "",
+) -> Figure:
+    """Return the approach rays of palm poses to a mesh, a panel per method.
+
+    Args:
+        vertices: Of the mesh, (n, 3) in {O} [m].
+        faces: Of the mesh, (m, 3).
+        rays: By title, (r, 2, 3): from the palm's origin to the surface, in {O} [m].
+        R_TO: (3, 3), how the object rests; as in its file if None.
+        captions: By the same titles, the text below a panel.
+        name: Of the object, for the last line.
+    """
+    # One scale for all panels, which shows every ray.
+    R_TO = np.eye(3) if R_TO is None else np.asarray(R_TO)
+    triangles = triangles_in_view(vertices, faces, R_TO)
+    seen = {title: ends @ (view_rotation() @ R_TO).T for title, ends in rays.items()}
+    low, high = frame_of([triangles, *seen.values()])
+
+    # The page: panels side by side over their captions.
+    captions = captions or {}
+    lines = max((text.count("\n") + 1 for text in captions.values()), default=0)
+    foot = LINE if name else 0.0
+    tall = float(PANEL * (high[1] - low[1]) / (high[0] - low[0]))
+    width = len(rays) * (PANEL + MARGIN) + MARGIN
+    height = TITLE + tall + LINE * lines + foot + MARGIN
+    figure = new_page(width, height)
+
+    for k, (title, ends) in enumerate(seen.items()):
+        axes = add_axes(figure, MARGIN + k * (PANEL + MARGIN), TITLE, PANEL, tall)
+        # The object is translucent, as in the paper: rays behind it shine through.
+        draw_rays(axes, ends, APPROACH, width=0.6, opacity=0.6, through=0.25)
+        draw_object(axes, triangles)
+        finish_view(axes, low, high)
+        axes.set_title(title, fontsize=11, color=INK, pad=6)
+        below = {"ha": "center", "va": "top", "linespacing": 1.5}
+        write_beside(axes, 0.5, 0.0, captions.get(title, ""), 9, **below)
+    if name:
+        text = f"{shortened(name, 40)}; rays: from the largest stand-off to the surface"
+        figure.text(MARGIN / width, 0.06 / height, text, fontsize=8, color=INK, va="bottom",
+                    parse_math=False)  # fmt: skip
+    return figure
+
+
+# An object on the table with rays around it, in parallel projection.
+
+
+def view_rotation() -> Array:
+    """Return R_VT (3, 3) of the view {V}: its axes point right, up, and towards the reader."""
+    out = np.array([np.cos(AZIMUTH), np.sin(AZIMUTH), 0.0])
+    right, towards = np.cross([0.0, 0.0, 1.0], out), np.cos(ELEVATION) * out
+    towards[2] = np.sin(ELEVATION)
+    return np.vstack([right, np.cross(towards, right), towards])
+
+
+def frame_of(shapes: Sequence[Array], *, border: float = 0.03) -> tuple[Array, Array]:
+    """Return the lower left and the upper right corner (2,) of points seen in the view [m].
+
+    Args:
+        shapes: Arrays (..., 3) of points in {V}.
+        border: Of the picture, as a share of its size.
+    """
+    points = np.concatenate([shape.reshape(-1, 3)[:, :2] for shape in shapes])
+    low, high = points.min(axis=0), points.max(axis=0)
+    edge = border * (high - low).max()
+    return low - edge, high + edge
+
+
+def draw_object(axes: Axes, triangles: Array) -> None:
+    """Draw triangles (m, 3, 3) in {V}, shaded by one light; those that face away are left out."""
+    # The farthest first, so that nearer ones cover them.
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    front = np.flatnonzero(normals[:, 2] > 0.0)
+    front = front[np.argsort(triangles[front, :, 2].mean(axis=1), kind="stable")]
+
+    # Thousands of triangles are pixels in an SVG, too: else no program could open it. Edges close
+    # the seams.
+    shade = 0.55 + 0.45 * np.clip(normals[front] @ LIGHT, 0.0, 1.0)
+    colours = np.outer(shade, OBJECT_COLOUR)
+    axes.add_collection(
+        PolyCollection(list(triangles[front, :, :2]), facecolors=colours, edgecolors="face",
+                       linewidths=0.4, zorder=2, rasterized=True)
+    )  # fmt: skip
+
+
+def draw_rays(
+    axes: Axes, rays: Array, colour: str, *, width: float, opacity: float, through: float = 0.0
+) -> None:
+    """Draw rays (n, 2, 3) in {V}: those behind the object's middle stand behind it.
+
+    Args:
+        axes: Where to draw.
+        rays: The rays [m].
+        colour: Of the rays.
+        width: Of a ray [points].
+        opacity: Of a ray, 0 to 1.
+        through: That of what shines through the object.
+    """
+    behind = rays[:, :, 2].mean(axis=1) < 0.0
+    for part, order, alpha in (
+        (rays[behind], 1.0, opacity),
+        (rays[behind], 2.5, through),
+        (rays[~behind], 3.0, opacity),
+    ):
+        if len(part) and alpha > 0.0:
+            lines = LineCollection(list(part[..., :2]), colors=colour, linewidths=width)
+            lines.set(alpha=alpha, zorder=order)
+            axes.add_collection(lines)
+
+
+def finish_view(axes: Axes, low: Array, high: Array) -> None:
+    """Set what axes show, in equal scales [m]."""
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    hide_ticks(axes)
+
+
+def triangles_in_view(vertices: Array, faces: npt.NDArray[np.int32], R_TO: Array) -> Array:
+    """Return the triangles (m, 3, 3) of a mesh in {V}, about the origin of {O} [m].
+
+    Args:
+        vertices: (n, 3) in {O} [m].
+        faces: (m, 3).
+        R_TO: (3, 3), how the object rests.
+    """
+    return np.asarray((vertices @ (view_rotation() @ R_TO).T)[faces])

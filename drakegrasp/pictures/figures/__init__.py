@@ -1,1 +1,0 @@
-"""The pictures of `drakegrasp figures`, and what the figures of the docs share with them."""

@@ -1,0 +1,255 @@
+"""Sheets of samples: of a data file, of each class, and of scenes to train on.
+
+In: a data file or scenes.hdf5. Out: figures. Needs matplotlib, not Drake.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from drakegrasp.dataset.reader import GraspDataset, Sample
+from drakegrasp.dataset.scenes.reader import SceneDataset
+from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.errors import DataError
+from drakegrasp.frames import Array
+from drakegrasp.pictures.style import (
+    ARROW,
+    INK,
+    add_axes,
+    draw_colour_bar,
+    draw_finger_legend,
+    draw_sample,
+    frame_image,
+    mark_contact,
+    new_page,
+    read_far,
+    save_figure,
+    shortened,
+    write_beside,
+)
+from drakegrasp.vision.camera import project
+
+#: Samples per line of a contact sheet, and the edge of each of its images [inch].
+ACROSS, EDGE = 3, 1.12
+#: Classes on a page.
+PER_PAGE = 24
+#: Of the sheet of scenes: scenes of a split, views of a scene, and the width of a view [inch].
+SCENES = {"train": 4, "valid": 1, "test": 2}
+VIEWS, WIDE = 4, 1.9
+#: Length of the line along +Gz from the palm's origin [m].
+PALM = 0.06
+
+
+def contact_sheet(path: Path, png: Path, *, rows: int = 8, split: str | None = None) -> int:
+    """Draw samples of a data file: colour, depth and mask of each, with its contacts.
+
+    The sheet shows as many different objects as it can. The same file gives the same sheet.
+
+    Args:
+        path: `grasping_oto.hdf5` or `grasping_otm.hdf5`.
+        png: The file to write.
+        rows: Most lines of samples.
+        split: The split to draw from; all of them if None.
+
+    Returns:
+        The number of samples drawn.
+
+    Raises:
+        DataError: If the file is not a data file or holds no sample.
+    """
+    # All samples of the file.
+    splits = SPLITS if split is None else (split,)
+    parts = [GraspDataset(path, split=each, fewer_fingers=True) for each in splits]
+    places = [(part, row) for part in parts for row in range(len(part))]
+    if not places:
+        raise DataError(f"{path}: must hold at least one sample to draw, got none")
+
+    # Choose some of them, and draw.
+    names = [str(name) for part in parts for name in part.column("object_props/object_name")]
+    chosen = spread_over_objects(names, rows * ACROSS)
+    samples = [places[i][0][places[i][1]] for i in chosen]
+    figure = draw_sheet(samples, parts[0].K, far=read_far(path))
+    save_figure(figure, png, dpi=130)
+    return len(samples)
+
+
+def spread_over_objects(names: Sequence[str], count: int) -> list[int]:
+    """Return the indices of at most `count` samples, spread over as many objects as possible.
+
+    Objects are in the order of their numbers. If there are more objects than places, evenly
+    spaced ones are taken. Of each object the first samples are taken.
+
+    Args:
+        names: Name of the object of each sample.
+        count: Most samples to choose.
+    """
+    # Turn t holds the t-th sample of every object that has so many.
+    order = sorted(range(len(names)), key=lambda i: (_natural(names[i]), i))
+    turns: list[list[int]] = []
+    for _, group in groupby(order, key=lambda i: names[i]):
+        for turn, i in enumerate(group):
+            if turn == len(turns):
+                turns.append([])
+            turns[turn].append(i)
+
+    # Fill the places turn by turn.
+    chosen: list[int] = []
+    for turn_indices in turns:
+        room = min(count - len(chosen), len(turn_indices))
+        picks = np.linspace(0, len(turn_indices) - 1, room).round().astype(int)
+        chosen += [turn_indices[k] for k in picks]
+
+    # Samples of an object stand side by side.
+    place = {i: k for k, i in enumerate(order)}
+    return sorted(chosen, key=place.__getitem__)
+
+
+def draw_sheet(
+    samples: Sequence[Sample], K: Array, *, far: float, titles: Sequence[str] | None = None
+) -> Figure:
+    """Return the contact sheet of samples as a figure.
+
+    Its axes are colour, depth and mask of each sample in turn, then the colour bar.
+
+    Args:
+        samples: What to draw, at least one.
+        K: (3, 3), camera matrix [px].
+        far: Far plane of the camera [m].
+        titles: Text above each sample; the name of its object if None.
+    """
+    # The page: blocks of three images, below a head with legend and colour bar.
+    across = min(ACROSS, len(samples))
+    lines = -(-len(samples) // across)
+    gap, between, caption, margin = 0.035, 0.22, 0.21, 0.16
+    # A single sample is too narrow for legend and colour bar side by side.
+    head = 0.42 if across > 1 else 0.62
+    block = 3 * EDGE + 2 * gap
+    width = across * block + (across - 1) * between + 2 * margin
+    height = lines * (EDGE + caption) + head + margin
+    figure = new_page(width, height)
+
+    # The samples, all with the same scale of depths.
+    nearest = min(float(sample.image[3].min()) for sample in samples)
+    for i, sample in enumerate(samples):
+        line, column = divmod(i, across)
+        left = margin + column * (block + between)
+        top = head + line * (EDGE + caption) + caption
+        axes = [add_axes(figure, left + k * (EDGE + gap), top, EDGE, EDGE) for k in range(3)]
+        draw_sample(axes, sample, K, near=nearest, far=far, scale=0.75)
+        title = str(sample.props["object_name"]) if titles is None else titles[i]
+        write_beside(axes[0], 0.0, 1.05, title.replace("_", " "), 7.0)
+        trial = f"trial {sample.trial_id}"
+        write_beside(axes[2], 1.0, 1.05, trial, 6.0, color="#888888", ha="right")
+
+    # The head.
+    bar_width = min(1.6, block / 2.2)
+    bar = add_axes(figure, width - margin - bar_width, head - 0.29, bar_width, 0.09)
+    draw_colour_bar(figure, bar, nearest, far, size=6.5)
+    draw_finger_legend(
+        figure, len(samples[0].grasp) // 6, (margin / width, 1.0 - 0.10 / height), 7.0
+    )
+    return figure
+
+
+def _natural(name: str) -> tuple[int, str]:
+    """Return the sorting key of a name: its leading number, then the rest."""
+    number, _, rest = name.partition("_")
+    return (int(number), rest) if number.isdecimal() else (10**9, name)
+
+
+def class_sheets(path: Path) -> tuple[list[Figure], dict[str, int]]:
+    """Return pages with a sample of each class, and the trial of each class's sample.
+
+    Of each class the sample of the lowest trial is taken, as it is; classes are in the order of
+    their names.
+
+    Args:
+        path: A data file.
+
+    Raises:
+        DataError: If the file is no data file or holds no sample.
+    """
+    # The first sample of each class.
+    first: dict[str, tuple[int, GraspDataset, int]] = {}
+    for split in SPLITS:
+        data = GraspDataset(path, split=split, fewer_fingers=True)
+        ids, classes = data.column("trial_id"), data.column("object_props/class_name")
+        for row, (trial, name) in enumerate(zip(ids.tolist(), classes.tolist(), strict=True)):
+            if name not in first or trial < first[name][0]:
+                first[name] = trial, data, row
+    if not first:
+        raise DataError(f"{path}: must hold at least one sample to draw, got none")
+
+    # Pages of as many classes as fit.
+    names, far, pages = sorted(first), read_far(path), []
+    for start in range(0, len(names), PER_PAGE):
+        shown = names[start : start + PER_PAGE]
+        samples: list[Sample] = [first[name][1][first[name][2]] for name in shown]
+        pages.append(draw_sheet(samples, first[shown[0]][1].K, far=far, titles=shown))
+    return pages, {name: first[name][0] for name in names}
+
+
+def scene_views(path: Path) -> tuple[Figure, list[dict[str, int]]]:
+    """Return the sheet, and of each of its views the row of /views and the trial of the sample.
+
+    Scenes are of different objects, evenly over their names. The sample is the first of its scene.
+
+    Raises:
+        DataError: If the file is missing or damaged, or has no scene with a sample.
+    """
+    lines = []
+    for split in SPLITS:
+        data = SceneDataset(path, points=None, split=split, negatives="none", grasps=1)
+        if not len(data):
+            continue
+        scenes = data.tables["views"]["scene"][data.views]
+        objects = data.tables["scenes"]["object"][scenes, 0]
+        _, first = np.unique(objects, return_index=True)
+        picked = np.linspace(0, len(first) - 1, min(SCENES[split], len(first))).round().astype(int)
+        lines += [(data, data.views[scenes == scenes[i]][:VIEWS]) for i in first[picked]]
+    if not lines:
+        raise DataError(f"{path}: must have a scene with a sample, got none")
+
+    # The page.
+    high, caption, head, margin, gap = 0.75 * WIDE, 0.2, 0.3, 0.12, 0.04
+    width = VIEWS * (WIDE + gap) + 2 * margin
+    height = len(lines) * (high + caption) + head + margin
+    figure, drawn = new_page(width, height), []
+    for line, (data, views) in enumerate(lines):
+        top = head + line * (high + caption) + caption
+        for column, view in enumerate(views.tolist()):
+            axes = add_axes(figure, margin + column * (WIDE + gap), top, WIDE, high)
+            trial, name = _draw_view(axes, data, view)
+            drawn.append({"view": view, "trial_id": trial})
+            if column == 0:
+                text = f"{shortened(name, 30).replace('_', ' ')}, {data.split}, trial {trial}"
+                write_beside(axes, 0.0, 1.03, text, 7.0)
+    fingers = lines[0][0].tables["grasps"]["p_TQ"].shape[1]
+    draw_finger_legend(figure, fingers, (margin / width, 1.0 - 0.08 / height), 7.0)
+    return figure, drawn
+
+
+def _draw_view(axes: Axes, data: SceneDataset, view: int) -> tuple[int, str]:
+    """Draw a view with the first sample of its scene; return the trial and the object's name."""
+    images, grasps = data.images(view), data.grasps_in(view, frame="camera")
+    row = int(np.argmax(grasps["sample"]))
+    axes.imshow(images["rgb"], interpolation="nearest")
+    K, X_CG = images["K"].astype(float), grasps["X_AG"][row].astype(float)
+    palm = project(K, np.array([X_CG[:3, 3], X_CG[:3, 3] + PALM * X_CG[:3, 2]]))
+    axes.plot(*palm.T, color=INK, linewidth=1.6)
+    axes.plot(*palm[0], marker="s", markersize=4.0, color=INK)
+
+    # The contacts, hollow where the file says that the camera does not see them.
+    p_CQ, nhat = grasps["p_AQ"][row].astype(float), grasps["nhat_Q_A"][row].astype(float)
+    for i in np.flatnonzero(np.isfinite(p_CQ).all(axis=1)).tolist():
+        dot, end = project(K, np.array([p_CQ[i], p_CQ[i] + ARROW * nhat[i]]))
+        mark_contact(axes, i, dot, end, hidden=not grasps["visible"][row, i], scale=0.8)
+    frame_image(axes, *images["mask"].shape)
+    number = int(data.tables["scenes"]["object"][data.tables["views"]["scene"][view], 0])
+    return int(grasps["trial_id"][row]), data.names[number]
