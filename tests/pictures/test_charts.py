@@ -14,9 +14,8 @@ from drakegrasp.pictures.charts import (
     draw_counts,
     draw_distributions,
     draw_objects,
-    svg_bytes,
 )
-from drakegrasp.pictures.style import MASK, NO_DEPTH, strip_png
+from drakegrasp.pictures.style import MASK, NO_DEPTH, strip_png, svg_bytes
 
 
 def test_bars_are_as_long_as_their_counts() -> None:
