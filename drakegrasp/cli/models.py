@@ -21,7 +21,11 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("mesh_dir", type=PATH)
 @shared("--units", "--manifest")
-@option("--hand", "HAND", "Hand whose opening the sizes are compared with (default: barrett).")
+@option(
+    "--hand",
+    "HAND",
+    "Hand with whose opening and stand-offs sizes are compared (default: barrett).",
+)
 @option("--json json_file", "FILE", "Write all findings as JSON too.", type=PATH)
 @option("--sheet", "FILE", "Write a picture of every object with its status (.png).", type=PATH)
 def audit(
@@ -40,17 +44,16 @@ def audit(
     """
     from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console, memory_line
     from drakegrasp.hand.description import load_hand
-    from drakegrasp.hand.kinematics import opening
+    from drakegrasp.hand.kinematics import flat_limits, opening
     from drakegrasp.hand.settings import load_config
     from drakegrasp.objects.audit import audit as audit_meshes
     from drakegrasp.runtime.files import atomic_path, write_atomic
 
     config = load_config(overrides=[f"hand={hand}"] if hand else [])
-    wide = opening(load_hand(config.hand_source))
+    own = load_hand(config.hand_source)
+    limits: Any = {"opening": opening(own), "flat": flat_limits(own)}
     with progress_bar("audit", "meshes") as progress:
-        rows = audit_meshes(
-            mesh_dir, units=units, manifest=manifest, opening=wide, progress=progress
-        )
+        rows = audit_meshes(mesh_dir, units=units, manifest=manifest, **limits, progress=progress)
     console = make_console()
     console.print(audit_table(rows, compact=console.width < ROOMY))
     say(audit_line(rows))

@@ -18,10 +18,12 @@ from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.frames import rotation_about, transform_points
 from drakegrasp.hand.chains import Chain
 from drakegrasp.hand.description import Hand
-from drakegrasp.hand.shapes import pad_surfaces
+from drakegrasp.hand.shapes import link_shapes, pad_surfaces
 
 #: Positions of each coordinate at which the opening of a hand is measured.
 OPENING_STEPS = 9
+#: Positions of each finger at which the reach of a hand is measured.
+REACH_STEPS = 41
 
 
 def coordinate_limits(hand: Hand) -> Array:
@@ -160,6 +162,44 @@ def opening(hand: Hand) -> float:
         for p, q in combinations([p for p in points if len(p)], 2):
             largest = max(largest, float(cdist(p, q).max()))
     return largest
+
+
+def flat_limits(hand: Hand) -> tuple[float, float]:
+    """Return the height [m] that flat objects need for a hand that faces the table, to what width.
+
+    While they close the fingertips come ahead of the palm by its reach: at a smaller stand-off
+    below the object's top by the difference, where the table may not be yet. At a larger one they
+    close above the object. An object wider than the width [m] is met before they are there.
+
+    Raises:
+        HandError: See `hand.shapes.link_shapes`.
+    """
+    ahead, spread, closing = _reach(hand)
+    height = min((ahead - s for s in hand.standoffs if s < ahead), default=0.0)
+    tips = fingertip_poses(hand, spread=spread, closing=closing)
+    pads = [pad.reshape(-1, 3) for pad in pad_surfaces(hand)]
+    points = [transform_points(X, pad) for X, pad in zip(tips, pads, strict=True) if len(pad)]
+    return height, max((float(cdist(p, q).min()) for p, q in combinations(points, 2)), default=0.0)
+
+
+def _reach(hand: Hand) -> tuple[float, float, Array]:
+    """Return how far ahead of the palm a hand comes while it closes [m], and where it is then.
+
+    The postures are `REACH_STEPS` of all fingers together, at the ends of the spread.
+
+    Returns:
+        The distance along +Gz, the spread [rad] and the closing positions (k,) [rad or m].
+    """
+    closing = np.linspace(0.0, closed_positions(hand), REACH_STEPS)
+    corners = {link: parts for link, parts in link_shapes(hand).items() if parts}
+    farthest, at = 0.0, (0.0, closing[0])
+    for spread in coordinate_limits(hand)[0].tolist():
+        for link in corners.keys() & hand.link_chains.keys():
+            X_GL = link_poses(hand, link, spread=spread, closing=closing)
+            ahead = (X_GL[:, 2, :3] @ np.concatenate(corners[link]).T + X_GL[:, 2, 3:]).max(axis=1)
+            if ahead.max() > farthest:
+                farthest, at = float(ahead.max()), (spread, closing[ahead.argmax()])
+    return farthest, *at
 
 
 def joint_frames(hand: Hand, finger: int, *, spread: float, closing: npt.ArrayLike) -> Array:

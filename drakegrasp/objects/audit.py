@@ -54,6 +54,9 @@ MOST_CROSSED = 60_000
 SIDE_POINTS, SIDE_SLACK = 500, 1.1
 #: Sides of an object are opposed if the product of their outward normals is at most this.
 OPPOSED = -0.3
+#: Part of the height that a hand which faces the table needs below which objects get a warning: one
+#: that tilts comes a little lower. Measured, see docs/explanation/sampling.md.
+LOW_SHARE = 0.85
 #: Volume that a repair may change without a word, as a fraction.
 NOTED_CHANGE = 0.02
 #: Memory of scenes, distances and renderer [B]: of any object, and per face for contact and of the
@@ -127,6 +130,7 @@ def audit(
     units: str = "m",
     manifest: str | Path | None = None,
     opening: float = np.inf,
+    flat: tuple[float, float] = (0.0, 0.0),
     progress: Report = silent,
 ) -> list[AuditRow]:
     """Return, mesh by mesh, whether it is fit to be simulated, needs repair, or is refused.
@@ -139,6 +143,7 @@ def audit(
         manifest: Their YAML file, if it is not beside them.
         opening: Largest distance of the hand's fingertips [m], see `hand.shapes.opening`; objects
             that are wider everywhere get a warning.
+        flat: See `hand.kinematics.flat_limits` [m]; objects that stand lower get one, too.
         progress: Is told of each mesh.
 
     Raises:
@@ -146,12 +151,12 @@ def audit(
     """
     sources, rows = find_meshes(directory, units=units, manifest=manifest), list[AuditRow]()
     for source in sources:
-        rows.append(_audit_one(source, opening))
+        rows.append(_audit_one(source, opening, flat))
         progress(len(rows), len(sources))
     return rows
 
 
-def _audit_one(source: MeshSource, opening: float) -> AuditRow:
+def _audit_one(source: MeshSource, opening: float, flat: tuple[float, float]) -> AuditRow:
     """Return the row of a mesh: what the file holds, then what becomes of it."""
     known: dict[str, Any] = {"name": source.name, "class_name": source.class_name}
     try:
@@ -182,7 +187,7 @@ def _audit_one(source: MeshSource, opening: float) -> AuditRow:
     known["units_guess"] = guess_units(diagonal(model.visual_vertices), source.scale)
     status: Status = "repaired" if model.notes else "fit"
     row = AuditRow(**known, status=status, notes=model.notes, model=model)
-    return replace(row, warnings=(*_warnings(row), *_too_wide(row, opening)))
+    return replace(row, warnings=(*_warnings(row), *_too_wide(row, opening), *_too_low(row, *flat)))
 
 
 def guess_units(size: float, scale: float) -> str | None:
@@ -287,4 +292,15 @@ def _too_wide(row: AuditRow, opening: float) -> Iterator[str]:
         yield (
             f"its opposed sides are at least {row.width * 1e3:.0f} mm apart, and the hand opens "
             f"{opening * 1e3:.0f} mm: another unit, or a larger hand"
+        )
+
+
+def _too_low(row: AuditRow, height: float, width: float) -> Iterator[str]:
+    """Yield that fingers cannot come beside an object above the table, if so."""
+    least = LOW_SHARE * height
+    if row.extents is not None and row.extents[2] < least and min(row.extents[:2]) < width:
+        yield (
+            f"its height must be {least * 1e3:.0f} mm for a hand that faces the table, got "
+            f"{row.extents[2] * 1e3:.0f} mm: another resting pose, other stand-offs "
+            "(candidates.standoffs), or another hand"
         )

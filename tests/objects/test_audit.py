@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
 import trimesh
 from helpers.meshes import G3DB, box, flipped, needs_g3db, open_box, write
 
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.kinematics import opening
+from drakegrasp.hand.kinematics import flat_limits, opening
 from drakegrasp.objects.audit import audit, guess_units
 from drakegrasp.objects.model import forecast_memory, needed_limit, prepare_object
 from drakegrasp.objects.sources import find_meshes
@@ -137,3 +138,39 @@ def test_objects_that_are_too_wide_for_the_hand_get_a_warning(tmp_path):
     assert "at least 56" in said[0]
     assert "the hand opens 385 mm" in said[0]
     assert not any("apart" in w for r in audit(tmp_path) for w in r.warnings)
+
+
+def test_objects_that_are_too_low_for_a_hand_that_faces_the_table_get_a_warning(tmp_path):
+    """The Barrett Hand comes 113 mm ahead: 23 mm below the top at its stand-off of 90 mm.
+
+    Its fingertips are 101 mm apart there: wide objects are met before.
+    """
+    sizes = ((0.08, 0.18, 0.012), (0.08, 0.18, 0.023), (0.15, 0.15, 0.012))
+    for number, size in enumerate(sizes):
+        trimesh.creation.box(size).export(tmp_path / f"{number}_book.stl")
+    flat = flat_limits(load_hand())
+    assert flat == pytest.approx((0.023, 0.101), abs=1e-3)
+    said = [
+        [w for w in row.warnings if "faces the table" in w] for row in audit(tmp_path, flat=flat)
+    ]
+    assert list(map(len, said)) == [1, 0, 0]
+    assert said[0][0].startswith("its height must be 20 mm") and "got 12 mm" in said[0][0]
+    assert not any("faces the table" in w for row in audit(tmp_path) for w in row.warnings)
+
+
+@needs_g3db
+def test_low_objects_that_a_hand_closes_on_get_no_warning(tmp_path):
+    """Pen and fork gave no simulated attempt of 900; the book of 23 mm gives grasps."""
+    for name in ("3_book", "107_pen", "2_fork"):
+        (tmp_path / f"{name}_final.obj").symlink_to(G3DB / f"{name}_final.obj")
+    rows = audit(tmp_path, units="cm", flat=flat_limits(load_hand()))
+    low = {row.class_name for row in rows if any("faces the table" in w for w in row.warnings)}
+    assert low == {"pen", "fork"}
+
+
+def test_the_best_stand_off_decides_how_flat_an_object_may_be():
+    """The best counts of those at which the fingertips come below the object's top."""
+    hand = load_hand()
+    for standoffs, height in (((0.2,), 0.0), ((0.06, 0.2), 0.053), ((0.06, 0.1), 0.013)):
+        own = replace(hand, standoffs=standoffs)
+        assert flat_limits(own)[0] == pytest.approx(height, abs=1e-3)
