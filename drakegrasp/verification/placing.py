@@ -324,52 +324,22 @@ def as_drawn(
         rows: (n,), the row of each grasp, by its index.
         overrides: What the caller sets, e.g. "physics.friction_hand=0.5".
     """
-    rules = read_manifest(dataset.path.parent).config.randomize
-    overridden = overridden_keys(overrides)
+    rules, told = (
+        read_manifest(dataset.path.parent).config.randomize,
+        np.full((len(rows), 3), np.nan),
+    )
 
-    # Use each row's drawn friction and mass; what the caller sets wins. Where one coefficient was
-    # drawn, both are taken from the row.
-    drawn_friction = rules.friction_hand is not None or rules.friction_table is not None
-    frictions = {
-        name: dataset.column(f"conditions/{name}")[rows].astype(float)
-        for name in ("friction_hand", "friction_table")
-        if drawn_friction and f"physics.{name}" not in overridden
-    }
-    masses = dataset.column("object_props/work2mass")[rows, 0].astype(float)
-
-    tried = []
+    # What the caller sets wins. Where one coefficient was drawn, both are taken from the row.
+    if rules.friction_hand is not None or rules.friction_table is not None:
+        for k, name in enumerate(("friction_hand", "friction_table")):
+            told[:, k] = dataset.column(f"conditions/{name}")[rows]
+    if rules.mass is not None:
+        told[:, 2] = dataset.column("object_props/work2mass")[rows, 0]
+    stands, overridden, tried = _Stands([]), overridden_keys(overrides), []
     for grasp in grasps:
-        i, placed, config = grasp.index, grasp.placed, grasp.config
-        if drawn_friction:
-            used = {name: float(values[i]) for name, values in frictions.items()}
-            placed, config = with_friction(placed, config, used)
-        if rules.mass is not None:
-            placed = with_mass(placed, float(masses[i]))
+        placed, config = stands.under(grasp.placed, grasp.config, told[grasp.index], overridden)
         tried.append(replace(grasp, placed=placed, config=config))
     return tried
-
-
-def with_friction(
-    placed: PlacedObject, config: Config, used: Mapping[str, float]
-) -> tuple[PlacedObject, Config]:
-    """Return an object and a configuration with other coefficients of friction.
-
-    Args:
-        placed: The object, whose own friction gives way.
-        config: How it is tried.
-        used: Coefficients by `friction_hand` and `friction_table`; what lacks keeps its value.
-    """
-    physics = config.physics.model_copy(update=dict(used))
-    config = config.model_copy(update={"physics": physics})
-    # They come from the object's own, which would win otherwise.
-    return replace(placed, model=replace(placed.model, friction=None)), config
-
-
-def with_mass(placed: PlacedObject, mass: float) -> PlacedObject:
-    """Return an object with another mass [kg], and its inertia in proportion."""
-    known = placed.model
-    inertia = mass / known.mass * known.I_OOcm_O
-    return replace(placed, model=replace(known, mass=mass, I_OOcm_O=inertia))
 
 
 def choose_rows(
@@ -534,16 +504,21 @@ class _Stands:
         key = (id(thing), conditions.tobytes())
         if key not in self._known:
             told = dict(zip(CONDITIONS, conditions.tolist(), strict=True))
-            mass, placed, own = told.pop("mass"), thing, thing.model.friction
+            mass, model = told.pop("mass"), thing.model
             if np.isfinite(list(told.values())).any():
-                frictions = {n: v if np.isfinite(v) else own for n, v in told.items()}
+                frictions = {n: v if np.isfinite(v) else model.friction for n, v in told.items()}
                 used = {
                     name: value
                     for name, value in frictions.items()
                     if value is not None and f"physics.{name}" not in overridden
                 }
-                placed, config = with_friction(placed, config, used)
-            if np.isfinite(mass) and "objects.mass" not in overridden and mass != thing.model.mass:
-                placed = with_mass(placed, mass)
-            self._known[key] = placed, config
+                # They come before the object's own, which would win otherwise.
+                physics = config.physics.model_copy(update=used)
+                config = config.model_copy(update={"physics": physics})
+                model = replace(model, friction=None)
+            if np.isfinite(mass) and "objects.mass" not in overridden and mass != model.mass:
+                # The inertia grows in proportion.
+                model = replace(model, mass=mass, I_OOcm_O=mass / model.mass * model.I_OOcm_O)
+            same = model is thing.model
+            self._known[key] = thing if same else replace(thing, model=model), config
         return self._known[key]
