@@ -15,7 +15,7 @@ import pytest
 import trimesh
 from distributed import Client
 
-from drakegrasp.api.building import build_on
+from drakegrasp.api.building import build_dataset, build_on
 from drakegrasp.api.verifying import (
     PlacedObject,
     place_object,
@@ -93,15 +93,6 @@ def test_results_come_in_the_order_of_the_grasps(cube: PlacedObject) -> None:
         Outcome.INVALID if g is off else Outcome.SUCCESS for g in order
     ]
     np.testing.assert_array_equal([v.p_OQ[0, 0] for v in results], [g[0, 0] for g in order])
-
-
-def test_every_grasp_is_placed_once(cube: PlacedObject) -> None:
-    grasps = np.tile(GRASP.ravel(), (9, 1))
-    grasps[:, 2] = 1e-3 * np.arange(9)
-    placed = place(grasps, cube)
-    assert [grasp.index for grasp in placed] == list(range(9))
-    assert all(grasp.p_OQ.shape == grasp.nhat_Q_O.shape == (3, 3) for grasp in placed)
-    assert [grasp.p_OQ[0, 2] for grasp in placed] == grasps[:, 2].tolist()
 
 
 def test_grasps_of_one_object_stand_together(test_split: GraspDataset) -> None:
@@ -335,6 +326,12 @@ def test_unknown_object_is_refused_before_anything_starts(
     sources = find_meshes(small_meshes) if objects else None
     with pytest.raises(MeshError, match=r"only must be names of objects \(.*\), got '9_cup'"):
         build_on(_never(), sources, tmp_path / "out", load_config(), only=["9_cup"])
+    assert not (tmp_path / "out").exists()
+
+
+def test_work_is_for_a_client_or_for_workers(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="workers must not be given with a client, got both"):
+        build_dataset("builtin", tmp_path / "out", client=object(), workers=2)
     assert not (tmp_path / "out").exists()
 
 

@@ -20,7 +20,6 @@ from drakegrasp.runtime.files import (
     LIST_NAME,
     atomic_folder,
     atomic_hdf5,
-    atomic_path,
     probe_folder,
     replaced_together,
     sweep_temporary,
@@ -82,16 +81,6 @@ def test_bytes_replace_an_older_file(tmp_path: Path) -> None:
     for content in (b"one", b"two\r\n"):
         write_atomic(path, content)
         assert path.read_bytes() == content
-    assert everything_in(tmp_path) == [path]
-
-
-def test_block_that_fails_keeps_the_older_file(tmp_path: Path) -> None:
-    path = tmp_path / "file.txt"
-    write_atomic(path, b"old")
-    with pytest.raises(ValueError, match="half"), atomic_path(path) as temporary:
-        temporary.write_bytes(b"ne")
-        raise ValueError("half")
-    assert path.read_bytes() == b"old"
     assert everything_in(tmp_path) == [path]
 
 

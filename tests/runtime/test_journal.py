@@ -213,26 +213,20 @@ def test_unit_that_dies_for_nothing_is_given_up() -> None:
 
 
 @pytest.mark.parametrize(
-    ("step", "deaths"), [("prepare", PREPARE_DEATHS), ("build", SILENT_DEATHS)]
-)
-def test_vanishing_counts_in_every_step(step: str, deaths: int) -> None:
-    """As when there is not the memory to prepare a mesh, or to build its scene."""
-    history = _History()
-    for _ in range(deaths):
-        assert history.verdict(step) is None
-        history.add(step, 0, b"")
-    assert history.verdict(step) is Verdict.VANISHED
-
-
-@pytest.mark.parametrize(
-    ("marks", "verdict", "deaths"),
-    [(b"Timeout (0:00:01)!", Verdict.HUNG, 2), (b"Fatal Python error", Verdict.CRASHED, 2)],
+    ("step", "marks", "verdict", "deaths"),
+    [
+        ("try 4", b"Timeout (0:00:01)!", Verdict.HUNG, 2),
+        ("try 4", b"Fatal Python error", Verdict.CRASHED, 2),
+        # As when there is not the memory to prepare a mesh, or to build its scene.
+        ("prepare", b"", Verdict.VANISHED, PREPARE_DEATHS),
+        ("build", b"", Verdict.VANISHED, SILENT_DEATHS),
+    ],
 )
 def test_each_way_to_die_has_its_number_of_deaths(
-    marks: bytes, verdict: Verdict, deaths: int
+    step: str, marks: bytes, verdict: Verdict, deaths: int
 ) -> None:
     history = _History()
     for _ in range(deaths):
-        assert history.verdict("try 4") is None
-        history.add("try 4", 0, marks)
-    assert history.verdict("try 4") is verdict
+        assert history.verdict(step) is None
+        history.add(step, 0, marks)
+    assert history.verdict(step) is verdict
