@@ -30,8 +30,8 @@ from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.conditions import Materials, usual_conditions
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.randomization.conditions import Materials, usual_conditions
 
 T = TypeVar("T")
 #: What a lift is in the dataset: a sample, held but removed by the filters, or lost.

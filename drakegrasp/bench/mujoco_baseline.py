@@ -24,10 +24,10 @@ from drakegrasp.mjcf.scene import IMMOVABLE, build_mujoco_scene
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.conditions import Materials, usual_materials
 from drakegrasp.simulation.contacts import MAX_BESIDE
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.randomization.conditions import Materials, usual_materials
-from drakegrasp.simulation.trajectory import lift_path
+from drakegrasp.simulation.lift import lift_path
 from drakegrasp.simulation.verdict import judge_closed, judge_lifted
 
 #: Time steps between two checks while closing, and while lifting.

@@ -359,7 +359,7 @@ _WORDS = (
           "whether it is a precision grasp with slip below 5 mm and turn below 5 deg"),
 )
 
-#: The conditions of an attempt, drawn or not: what `simulation.randomization` may change.
+#: The conditions of an attempt, drawn or not: what `simulation.conditions` may change.
 CONDITION_FIELDS: tuple[Field, ...] = (
     *_measured(
         "conditions.materials",

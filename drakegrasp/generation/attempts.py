@@ -29,12 +29,10 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.simulation.attempts import posture_attempts
 from drakegrasp.simulation.candidates import Attempt, children, family_member, make_attempts
-from drakegrasp.simulation.randomization.conditions import usual_conditions
-from drakegrasp.simulation.randomization.draws import draw_conditions
-from drakegrasp.simulation.sampling.centring import centred
+from drakegrasp.simulation.conditions import draw_conditions, usual_conditions
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes
-from drakegrasp.simulation.screen import Prediction, predict
+from drakegrasp.simulation.screen import Prediction, centred, predict
 from drakegrasp.simulation.trial import TrialRecord, lift_on, run_attempt
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
 from drakegrasp.vision.depth_sensor import spoil_depth

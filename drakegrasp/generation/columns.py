@@ -24,7 +24,7 @@ from drakegrasp.grasp import unused_fingers
 from drakegrasp.objects.model import ContactFit, ObjectModel, fit_contacts
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.simulation.candidates import Attempt
-from drakegrasp.simulation.randomization.conditions import Conditions, usual_conditions
+from drakegrasp.simulation.conditions import Conditions, usual_conditions
 from drakegrasp.simulation.scene import hand_joint_names
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.table import AnyArray, Table

@@ -53,7 +53,7 @@ from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
 from drakegrasp.simulation.attempts import Attempts, misfits
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.sampling.own import own_sampler
+from drakegrasp.simulation.samplers import own_sampler
 
 #: By how much a rank may be off the border of a split that depends on which objects have samples.
 NEAR_BORDER = 0.05

@@ -36,9 +36,8 @@ from drakegrasp.mesh.crossings import first_hits
 from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.simulation.randomization.conditions import Conditions
-from drakegrasp.simulation.sampling.own import OwnPoses
-from drakegrasp.simulation.sampling.rotations import above_table, make_poses, rotation_candidates
+from drakegrasp.simulation.conditions import Conditions
+from drakegrasp.simulation.samplers import OwnPoses, above_table, make_poses, rotation_candidates
 
 #: Surface points that `normals` draws together; another number is another draw.
 BLOCK = 1000

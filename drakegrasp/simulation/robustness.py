@@ -22,10 +22,9 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt, palm_motion
-from drakegrasp.simulation.randomization.conditions import Conditions, usual_conditions
-from drakegrasp.simulation.sampling.centring import centred
+from drakegrasp.simulation.conditions import Conditions, usual_conditions
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
-from drakegrasp.simulation.screen import Prediction, predict
+from drakegrasp.simulation.screen import Prediction, centred, predict
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
 #: Finer time step over the trial's, throughout the lift: a grasp that is an artefact of the step

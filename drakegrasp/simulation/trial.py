@@ -21,28 +21,30 @@ from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import JointPath, Pregrasp
-from drakegrasp.simulation.clearance import Way
+from drakegrasp.simulation.conditions import Materials, usual_materials
 from drakegrasp.simulation.contacts import (
     Contacts,
+    Way,
     open_hand_collides,
     open_hand_meets,
     read_contacts,
 )
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.lift import Lift, lift
-from drakegrasp.simulation.randomization.conditions import Materials, usual_materials
-from drakegrasp.simulation.randomization.materials import set_materials
+from drakegrasp.simulation.materials import set_materials
 from drakegrasp.simulation.scene import (
     Scene,
+    TrialLimits,
+    TrialTimeout,
     closing_angles,
     command_joints,
     finger_speed,
     hand_joint_names,
     hand_positions,
     reset_attempt,
+    start_limits,
 )
 from drakegrasp.simulation.screen import Prediction, predict
-from drakegrasp.simulation.stepping import TrialLimits, TrialTimeout, start_limits
 from drakegrasp.simulation.verdict import (
     is_precision,
     is_stable,

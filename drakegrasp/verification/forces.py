@@ -39,7 +39,7 @@ from drakegrasp.hand.strength import fingertip_forces, within_load
 from drakegrasp.mesh.surfaces import winding_numbers
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.trajectory import lift_path
+from drakegrasp.simulation.lift import lift_path
 
 #: Forces count as applying a wrench if their error is below this share of it.
 MAX_ERROR = 1e-7

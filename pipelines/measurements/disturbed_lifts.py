@@ -41,7 +41,7 @@ from drakegrasp.generation.columns import judge_sample
 from drakegrasp.outcomes import Removal
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt
-from drakegrasp.simulation.randomization.conditions import usual_conditions
+from drakegrasp.simulation.conditions import usual_conditions
 from drakegrasp.simulation.scene_cache import cached_scene
 from drakegrasp.simulation.trial import run_attempt
 

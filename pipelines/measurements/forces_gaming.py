@@ -29,8 +29,8 @@ from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.hand.settings import override_config
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.lift import lift_path
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.trajectory import lift_path
 from drakegrasp.verification.forces import (
     MAX_DISTANCE,
     ForceProgram,

@@ -36,9 +36,9 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.still_scene import NO_SHADOWS, Poses, StillScene
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation import lift as lifting
+from drakegrasp.simulation.conditions import usual_conditions
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.contacts import read_contacts
-from drakegrasp.simulation.randomization.conditions import usual_conditions
 from drakegrasp.simulation.scene import Scene, hand_positions, palm_pose
 from drakegrasp.simulation.trial import run_attempt
 

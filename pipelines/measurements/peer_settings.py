@@ -32,7 +32,7 @@ from drakegrasp.mjcf import links, scene
 from drakegrasp.mjcf.convex_parts import convex_parts
 from drakegrasp.outcomes import Outcome
 from drakegrasp.seeding import Stream
-from drakegrasp.simulation.randomization.conditions import usual_conditions
+from drakegrasp.simulation.conditions import usual_conditions
 
 GROUPS: tuple[Group, ...] = ("sample", "lost")
 #: Last number of the place of the stream that draws objects.

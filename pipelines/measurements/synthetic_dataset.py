@@ -25,7 +25,7 @@ from drakegrasp.dataset.shards import Shard, ShardHeader, read_shard, write_shar
 from drakegrasp.hand.settings import override_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.progress import progress_bar
-from drakegrasp.simulation.randomization.draws import draw_conditions
+from drakegrasp.simulation.conditions import draw_conditions
 
 #: Columns of attempts, and of looks at successes.
 Rows = tuple[dict[str, AnyArray], dict[str, AnyArray]]

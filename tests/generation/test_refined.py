@@ -365,7 +365,7 @@ def test_palm_poses_about_one_that_only_scrapes_the_table_are_tried(tmp_path: Pa
     (tmp_path / "above.py").write_text(
         "import numpy as np\n"
         "from drakegrasp.frames import make_pose\n"
-        "from drakegrasp.simulation.sampling.rotations import R_OG0\n"
+        "from drakegrasp.simulation.samplers import R_OG0\n"
         "class Above:\n"
         "  def __init__(self, model, X_TO, stream):\n"
         "    self.height = float(model.half_extents[2]) + 0.042\n"

@@ -32,9 +32,9 @@ from drakegrasp.simulation.candidates import (
     normal_candidates,
     palm_motion,
 )
-from drakegrasp.simulation.randomization.draws import draw_conditions
+from drakegrasp.simulation.conditions import draw_conditions
 from drakegrasp.simulation.robustness import _noise_factor
-from drakegrasp.simulation.sampling.rotations import rotation_candidates
+from drakegrasp.simulation.samplers import rotation_candidates
 from drakegrasp.simulation.screen import predict
 from drakegrasp.vision.depth_sensor import DepthSensor, spoil_depth
 

@@ -18,7 +18,7 @@ from drakegrasp.simulation.candidates import (
     make_attempts,
     sample_candidates,
 )
-from drakegrasp.simulation.sampling.rotations import R_OG0
+from drakegrasp.simulation.samplers import R_OG0
 
 #: Edge of the cube that the hand can grasp from above [m].
 CUBE = 0.07

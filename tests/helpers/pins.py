@@ -50,7 +50,7 @@ LARGE = 10_000
 #: Simulated numbers of other machines are as near as this: metres, radians, newtons, shares.
 NEAR = 1e-4
 #: Leaves of JSON that say when, where and with what, or how long.
-MACHINE = ("seconds", "version", "time", "path", "file", "sha256", "hash")
+MACHINE = ("seconds", "version", "time", "path", "file", "sha256", "hash", "again")
 
 
 def command(*arguments: object) -> None:

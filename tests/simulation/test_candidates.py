@@ -33,7 +33,7 @@ from drakegrasp.simulation.candidates import (
     palm_ray_distance,
     sample_candidates,
 )
-from drakegrasp.simulation.sampling.rotations import ray_meets_box, rotation_candidates
+from drakegrasp.simulation.samplers import ray_meets_box, rotation_candidates
 
 #: Full extents of three of the paper's meshes [m]; their files are in centimetres. Counts
 #: of valid and of distinct poses.

@@ -31,14 +31,15 @@ from drakegrasp.simulation.drive import (
 )
 from drakegrasp.simulation.scene import (
     Scene,
+    TrialTimeout,
     advance,
     closing_angles,
     move_wrist,
     release,
     reset_attempt,
+    start_limits,
     transfer_state,
 )
-from drakegrasp.simulation.stepping import TrialTimeout, start_limits
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
 #: Rounding and the compliance of Drake's joint limits [rad].

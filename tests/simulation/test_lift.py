@@ -15,10 +15,10 @@ from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import lift as lifting
-from drakegrasp.simulation import stepping
+from drakegrasp.simulation import scene as stepping
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.contacts import read_contacts
-from drakegrasp.simulation.lift import lift
+from drakegrasp.simulation.lift import lift, lift_duration
 from drakegrasp.simulation.scene import (
     Scene,
     advance,
@@ -27,10 +27,9 @@ from drakegrasp.simulation.scene import (
     palm_pose,
     release,
     reset_attempt,
+    start_limits,
     transfer_state,
 )
-from drakegrasp.simulation.stepping import start_limits
-from drakegrasp.simulation.trajectory import lift_duration
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
 pytestmark = pytest.mark.sim

@@ -18,11 +18,10 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel, make_object
 from drakegrasp.simulation import drive as drive_module
+from drakegrasp.simulation import screen as centring
 from drakegrasp.simulation.candidates import Attempt, Pregrasp, Source
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.drive import disengage, drive_of, engage, opening_torques
-from drakegrasp.simulation.sampling import centring
-from drakegrasp.simulation.sampling.centring import centred
 from drakegrasp.simulation.scene import (
     Scene,
     advance,
@@ -31,6 +30,7 @@ from drakegrasp.simulation.scene import (
     release,
     reset_attempt,
 )
+from drakegrasp.simulation.screen import centred
 
 pytestmark = pytest.mark.sim
 #: Each jaw presses with so much [N].

@@ -26,7 +26,7 @@ from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome, Stage
-from drakegrasp.simulation import stepping
+from drakegrasp.simulation import scene as stepping
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import (
     build_object_scene,
@@ -35,6 +35,7 @@ from drakegrasp.simulation.construction import (
     partner_friction,
 )
 from drakegrasp.simulation.contacts import is_inside, read_contacts
+from drakegrasp.simulation.lift import lift_duration
 from drakegrasp.simulation.scene import (
     advance,
     move_wrist,
@@ -45,7 +46,6 @@ from drakegrasp.simulation.scene import (
 )
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.settle import settle
-from drakegrasp.simulation.trajectory import lift_duration
 from drakegrasp.simulation.trial import TrialRecord, run_attempt, start_meetings
 from drakegrasp.vision.camera import camera_pose_oto
 

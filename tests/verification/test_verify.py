@@ -21,7 +21,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.sampling.rotations import R_OG0
+from drakegrasp.simulation.samplers import R_OG0
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification import verify as verifying
 from drakegrasp.verification.verify import PlacedGrasp, verify_placed

@@ -25,7 +25,7 @@ from drakegrasp.hand.folder import is_hand
 from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp, LiftChance, read_lift_chance
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.randomization.draws import draw_conditions
+from drakegrasp.simulation.conditions import draw_conditions
 from drakegrasp.simulation.verdict import judge_closed, scrapes
 
 #: Objects whose meshes, with their search trees, stay in memory during a task; samples are ordered

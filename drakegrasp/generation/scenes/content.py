@@ -38,8 +38,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.candidates import Source
-from drakegrasp.simulation.randomization.conditions import Conditions, usual_materials
-from drakegrasp.simulation.randomization.draws import conditions_from
+from drakegrasp.simulation.conditions import Conditions, conditions_from, usual_materials
 from drakegrasp.simulation.scene_cache import cached_renderer
 from drakegrasp.vision.camera import Lens
 from drakegrasp.vision.rendering import Renderer, capture, paint

@@ -15,7 +15,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.trajectory import PEAK_ACCELERATION, lift_duration
+from drakegrasp.simulation.lift import PEAK_ACCELERATION, lift_duration
 from drakegrasp.verification.forces import (
     TORSION_RADIUS,
     ForceVerdict,

@@ -12,8 +12,7 @@ from drakegrasp.config import Config
 from drakegrasp.frames import rotation_angle
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.randomization.conditions import Conditions, usual_conditions
-from drakegrasp.simulation.randomization.draws import WORDS, draw_conditions
+from drakegrasp.simulation.conditions import WORDS, Conditions, draw_conditions, usual_conditions
 
 COUNT = 400
 #: The preset that draws everything.

@@ -1,20 +1,31 @@
-"""The paper's palm poses: products of global and local rotations of a first palm pose.
+"""Palm poses of the paper's rotations, and of a sampler of the user's own.
 
-In: the half extents of an object's box, its resting pose, and the angles. Out: the distinct valid
-poses X_OG, in a stated order. Relative to the size of the box they are the same for all objects, so
-without jitter the hundreds of thousands of combinations are compared once per process.
+The paper's are products of global and local rotations of a first palm pose: the distinct valid
+poses X_OG in a stated order, from the half extents of an object's box, its resting pose, and the
+angles. Relative to the size of the box they are the same for all objects, so without jitter the
+hundreds of thousands of combinations are compared once per process.
+
+A class that the user gives as `file.py:Name` yields poses of its own, which are checked;
+docs/explanation/sampling.md has an example.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
+from itertools import islice
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
+from drakegrasp.arithmetic import dot, multiply, norm, sin_cos_deg
 from drakegrasp.config import CandidateConfig
+from drakegrasp.errors import ConfigError, GraspError
+from drakegrasp.frames import Array, read_pose
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.registry import own_class, run_own
 from drakegrasp.seeding import Stream
 
 #: The first palm's axes in {O}: +Gz looks down onto the object, Gx = Ox.
@@ -212,3 +223,67 @@ def _rotation_xyz(angles_deg: Array) -> Array:
         [sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy],
     ]
     return np.moveaxis(np.array(rows), -1, 0)
+
+
+def own_sampler(stored: str, code: Mapping[str, str]) -> type[Any]:
+    """Return the class of a sampler of the user's own.
+
+    Raises:
+        ConfigError: If it cannot be imported, or is of another signature.
+    """
+    key, arguments = "candidates.method", ("model", "X_TO", "stream")
+    return own_class(stored, code, key=key, arguments=arguments, method="poses")
+
+
+class OwnPoses:
+    """The poses that a sampler of the user's own yields, one after the other.
+
+    Attributes:
+        log_density: The class's own; 0 if it has none.
+        limit: Number of poses that it has, up to `candidates.max`.
+    """
+
+    def __init__(
+        self, stored: str, model: ObjectModel, X_TO: Array, config: CandidateConfig, stream: Stream
+    ) -> None:
+        """Draw the poses.
+
+        Args:
+            stored: Its name in the configuration.
+            model: The object.
+            X_TO: Its resting pose, (4, 4).
+            config: Number of poses, and the text of the class.
+            stream: Its random numbers.
+
+        Raises:
+            ConfigError: If it cannot be run, or yields something other than poses.
+        """
+        found, name = own_sampler(stored, config.code), stored.partition("@")[0]
+        sampler = run_own(stored, found, model, X_TO, stream)
+        made = run_own(stored, lambda: list(islice(sampler.poses(), config.max)))
+        self._poses = np.array([_pose(f"{name}: pose {i}", X) for i, X in enumerate(made)]).reshape(
+            -1, 4, 4
+        )
+        self.limit: int | None = len(self._poses)
+        self.log_density = getattr(sampler, "log_density", 0.0)
+        if not isinstance(self.log_density, float) or not math.isfinite(self.log_density):
+            raise ConfigError(f"{name}: log_density must be a finite float, got {self.log_density}")
+
+    def poses(self, count: int) -> Array:
+        """Return the first poses (count, 4, 4)."""
+        return self._poses[:count]
+
+    def counts(self, count: int) -> tuple[int, int, int]:
+        """Return the number of poses three times: nothing is known of what was not yielded."""
+        return count, count, count
+
+
+def _pose(name: str, X_OG: npt.ArrayLike) -> Array:
+    """Return what a sampler yielded as a pose (4, 4) with an exact rotation."""
+    try:
+        X = read_pose(X_OG, name)
+    except GraspError as error:
+        raise ConfigError(str(error)) from None
+    if X.shape != (4, 4):
+        raise ConfigError(f"{name} must be one pose, 4 x 4 numbers, got {len(X)} of them")
+    return X

@@ -12,12 +12,12 @@ from pydrake.geometry import GeometryId, ProximityProperties, RoleAssign
 from pydrake.multibody.plant import CoulombFriction
 from pydrake.multibody.tree import RigidBody
 
+from drakegrasp.simulation.conditions import Materials
 from drakegrasp.simulation.construction import (
     object_friction,
     object_inertia,
     partner_friction,
 )
-from drakegrasp.simulation.randomization.conditions import Materials
 from drakegrasp.simulation.scene import Scene
 
 #: Group and name of a shape's coefficient of friction.

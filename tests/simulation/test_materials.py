@@ -13,8 +13,8 @@ from drakegrasp.hand.description import Hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.conditions import Materials, usual_conditions
 from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.randomization.conditions import Materials, usual_conditions
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 

@@ -1,1 +1,0 @@
-"""Samplers of palm poses that are more than a function."""
