@@ -11,7 +11,6 @@ import csv
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, TextIO
@@ -117,11 +116,11 @@ def _raw(path: Path, hand: Hand, *, nameless: bool = False) -> dict[str, Any]:
 
 def _named(raw: dict[str, Any], of: str | None) -> dict[str, Any]:
     """Return rows whose objects have names; `of` is that of those without."""
-    if of is not None:
-        return {**raw, "objects": [name or of for name in raw["objects"]]}
-    if raw.get("of_row") is not None and not any(raw["objects"]):
+    objects = [name or of or "" for name in raw["objects"]]
+    if raw.get("of_row") is not None and not any(objects):
         raise GraspError("postures must name an object in each row, got rows of a dataset alone")
-    return raw
+    # What a file says for a score is not asked.
+    return {**raw, "objects": objects, "of_row": None, "confidence": None}
 
 
 def _made(hand: Hand, raw: dict[str, Any]) -> Attempts:
@@ -138,18 +137,19 @@ def _made(hand: Hand, raw: dict[str, Any]) -> Attempts:
 
 def _for_rows(path: Path, hand: Hand, data: GraspDataset) -> Attempts:
     """Return the postures that are for rows of a split, see `read_attempts`."""
-    tables, files = list[Attempts | str](), files_in(path) if path.is_dir() else [path]
+    tables, files = list[Attempts](), files_in(path) if path.is_dir() else [path]
     for each in files:
         with named(each):
             raw = _of_split(_raw(each, hand, nameless=True), data)
             if len(raw["objects"]):
-                tables.append(_on_rows(raw, data, hand))
+                # Between files confidence is not compared.
+                known = raw if len(files) == 1 else {**raw, "confidence": None}
+                tables.append(_on_rows(known, data, hand))
     if not tables:
         raise GraspError(
             f"{path}: samples must be of {data.split} in {data.path.name} (--split), got none"
         )
-    joined = join_attempts(tables)
-    return joined if len(files) == 1 else replace(joined, confidence=None)
+    return join_attempts(tables) if len(tables) > 1 else tables[0]
 
 
 def _of_split(raw: dict[str, Any], data: GraspDataset) -> dict[str, Any]:

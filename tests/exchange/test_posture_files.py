@@ -591,3 +591,11 @@ def test_samples_that_were_exported_come_back(exported, grasps):
             )
         with pytest.raises(GraspError, match="hand must be barrett, as the file says"):
             read_attempts(next(exported(form).rglob(ONE_FILE[form])), HAND)
+
+
+def test_what_a_file_says_for_a_score_is_not_asked(tmp_path):
+    """Not even how many values there are: a table of postures can still be cut."""
+    np.savez(tmp_path / "p.npz", **arrays(), row=[0], confidence=0.5)
+    table = read_attempts(tmp_path / "p.npz", HAND)
+    assert (table.of_row, table.confidence) == (None, None)
+    assert len(table.at([0])) == 1
