@@ -12,6 +12,7 @@ import weakref
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -46,15 +47,14 @@ PAGES = ("/", "/?outcome=any&page=2", "/grasp/0-0-0", "/grasp/0-0-1", "/plots")
 
 
 def token(client: TestClient) -> str:
-    found = re.search(r'name="token" content="([^"]+)"', client.get("/").text)
-    assert found is not None
-    return found[1]
+    inspection: Inspection = client.app.state.inspection  # type: ignore[attr-defined]
+    return inspection.token
 
 
-def decide(client: TestClient, label: str, decision: str) -> int:
-    content = {"label": coded(state_of(client), label), "decision": decision}
-    answer = client.post("/decide", json=content, headers={TOKEN_HEADER: token(client)})
-    return answer.status_code
+def decide(client: TestClient, label: str, decision: str, **more: str) -> Any:
+    """Return the answer to a decision of a page on an attempt."""
+    content = {"label": coded(state_of(client), label), "decision": decision, **more}
+    return client.post("/decide", json=content, headers={TOKEN_HEADER: token(client)})
 
 
 def test_gallery_shows_what_is_selected_page_by_page(client: TestClient) -> None:
@@ -169,9 +169,9 @@ def test_plots_are_there(client: TestClient) -> None:
 def test_decisions_are_on_disk_at_once_and_undone_in_turn(client: TestClient, out: Path) -> None:
     path = out / "reject.json"
     assert not path.exists()
-    assert decide(client, "0-0-0", "rejected") == 200
-    assert decide(client, "1-1-0", "rejected") == 200
-    assert decide(client, "1-1-0", "kept") == 200
+    for label, decision in (("0-0-0", "rejected"), ("1-1-0", "rejected"), ("1-1-0", "kept")):
+        assert decide(client, label, decision).status_code == 200
+    assert f'name="token" content="{token(client)}"' in client.get("/").text
     a, b = AttemptKey("1_box_a", 0, 0), AttemptKey("2_box_b", 1, 0)
     assert (read_decisions(path).rejected, read_decisions(path).kept) == ({a}, {b})
     assert "card rejected" in client.get("/").text
@@ -204,20 +204,8 @@ def test_an_edited_file_is_not_overwritten(client: TestClient, out: Path) -> Non
     decide(client, "1-1-0", "rejected")
     assert read_decisions(out / "reject.json").rejected == {AttemptKey("2_box_b", 1, 0)}
     (out / "reject.json").write_text("mine")
-    content = {"label": coded(state_of(client), "0-0-0"), "decision": "kept"}
-    assert decide_raw(client, content, token_of(client)) == 400
+    assert decide(client, "0-0-0", "kept").status_code == 400
     assert (out / "reject.json").read_text() == "mine"
-
-
-def token_of(client: TestClient) -> str:
-    """The token when no page can be shown."""
-    inspection: Inspection = client.app.state.inspection  # type: ignore[attr-defined]
-    return inspection.token
-
-
-def decide_raw(client: TestClient, content: object, with_token: str | None) -> int:
-    headers = {} if with_token is None else {TOKEN_HEADER: with_token}
-    return client.post("/decide", json=content, headers=headers).status_code
 
 
 @pytest.mark.parametrize(
@@ -235,8 +223,8 @@ def decide_raw(client: TestClient, content: object, with_token: str | None) -> i
 def test_what_cannot_be_decided_is_refused(
     client: TestClient, out: Path, content: object, status: int
 ) -> None:
-    text = coded(state_of(client), json.dumps(content))
-    assert decide_raw(client, json.loads(text), token(client)) == status
+    text, headers = coded(state_of(client), json.dumps(content)), {TOKEN_HEADER: token(client)}
+    assert client.post("/decide", content=text, headers=headers).status_code == status
     assert not (out / "reject.json").exists()
 
 
@@ -333,8 +321,7 @@ def test_an_open_page_rejects_the_grasp_that_it_shows(client: TestClient, out: P
     assert "2_box_b" in client.get(f"/grasp/{label}").text
     write_manifest(whole, out)
     assemble(out)
-    content = {"label": label, "decision": "rejected"}
-    assert decide_raw(client, content, token(client)) == 200
+    assert decide(client, label, "rejected").status_code == 200
     assert read_decisions(out / "reject.json").rejected == {AttemptKey("2_box_b", 0, 0)}
     # A mesh of the page is that of its object, too.
     code = label.partition("-")[0]
@@ -356,8 +343,7 @@ def test_answers_say_what_is_decided_in_all(client: TestClient, out: Path) -> No
     headers = {TOKEN_HEADER: token(client)}
 
     def counts(label: str) -> object:
-        content = {"label": coded(state_of(client), label), "decision": "rejected"}
-        return client.post("/decide", json=content, headers=headers).json()["counts"]
+        return decide(client, label, "rejected").json()["counts"]
 
     assert counts("0-0-0") == {"rejected": 1, "kept": 0, "samples": 1}
     assert counts("1-1-0") == {"rejected": 2, "kept": 0, "samples": 2}
@@ -373,8 +359,7 @@ def test_answers_say_what_is_decided_in_all(client: TestClient, out: Path) -> No
 def test_undo_of_a_page_is_its_own(client: TestClient, out: Path) -> None:
     headers = {TOKEN_HEADER: token(client)}
     for label, page in (("0-0-0", "a"), ("1-1-0", "b")):
-        content = {"label": coded(state_of(client), label), "decision": "rejected", "page": page}
-        client.post("/decide", json=content, headers=headers)
+        decide(client, label, "rejected", page=page)
     undone = client.post("/undo", json={"page": "a"}, headers=headers).json()
     assert numbered(state_of(client), undone["label"]) == "0-0-0"
     assert read_decisions(out / "reject.json").rejected == {AttemptKey("2_box_b", 1, 0)}

@@ -281,32 +281,18 @@ def test_keyboard_moves_rejects_keeps_and_undoes(
     page.wait_for_selector("#cards")
 
 
-def test_keys_work_after_a_click_on_a_checkbox(
-    page: Page, address: str, state: Snapshot, out: Path
+@pytest.mark.parametrize("first", ["[data-layer=forces]", "[data-record]", ""])
+def test_keys_work_whatever_was_done_before(
+    page: Page, address: str, state: Snapshot, out: Path, first: str
 ) -> None:
-    page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
-    wait_for_view(page)
-    page.click("[data-layer=forces]")
-    page.keyboard.press("r")
-    page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
-    assert read_decisions(out / "reject.json").rejected == {AttemptKey("1_box_a", 0, 0)}
-
-
-def test_keys_work_with_caps_lock(page: Page, address: str, state: Snapshot, out: Path) -> None:
-    page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
-    page.keyboard.press("K")
-    page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
-    assert read_decisions(out / "reject.json").kept == {AttemptKey("1_box_a", 0, 0)}
-
-
-def test_keys_work_while_a_recording_is_made(
-    page: Page, address: str, state: Snapshot, out: Path
-) -> None:
+    """After a click on a checkbox, while a recording is made, and with Caps Lock."""
     page.route("**/record", lambda route: None)  # an answer that never comes
     page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
-    page.click("[data-record]")
-    page.wait_for_selector("[data-record]:disabled")
-    page.keyboard.press("k")
+    wait_for_view(page)
+    if first:
+        page.click(first)
+    page.keyboard.press("k" if first else "K")
+    page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
     wait_for_decision(out, AttemptKey("1_box_a", 0, 0), "kept")
     page.unroute("**/record")
 

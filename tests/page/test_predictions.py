@@ -21,7 +21,6 @@ from drakegrasp.dataset.predicted_rows import read_predicted_rows
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
 from drakegrasp.page.app import Inspection, make_app
-from drakegrasp.page.site import write_site
 
 
 @pytest.fixture
@@ -175,20 +174,6 @@ def test_results_are_read_again_when_they_change(
     with h5py.File(out / TRIALS, "r+") as file:
         file.attrs["shards"] = "other"
     assert client.get("/predictions").status_code == 400
-
-
-def test_files_hold_the_predictions_too(out: Path, results: Path, tmp_path: Path) -> None:
-    write_site(out, tmp_path / "site", results=results)
-    tags = Tags((tmp_path / "site" / "predictions.html").read_text(encoding="utf-8")).tags
-    cards = [a for tag, a in tags if tag == "li" and "data-label" in a]
-    assert [card["data-label"] for card in cards] == ["2", "3", "1", "0"]
-    assert [card["data-verdict"].split()[0] for card in cards] == ["fails", "fails", "held", "held"]
-    assert cards[2]["data-error"] == "12"
-    page = (tmp_path / "site" / "prediction" / "3.html").read_text(encoding="utf-8")
-    assert "2 of 4" in page
-    for _, attributes in Tags(page).tags:
-        address = attributes.get("src") or attributes.get("href") or ""
-        assert not address or (tmp_path / "site" / "prediction" / address).is_file(), address
 
 
 def test_results_say_which_rows_were_asked_for(out: Path, tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ from helpers.pages import numbered
 from drakegrasp.dataset.rejections import AttemptKey, Decisions
 from drakegrasp.dataset.trial_files import NONE
 from drakegrasp.errors import DataError
-from drakegrasp.page.attempts import QUANTITIES, Attempts
-from drakegrasp.page.catalog import FEATURES, Catalog, Snapshot
+from drakegrasp.page.attempts import Attempts
+from drakegrasp.page.catalog import Catalog, Snapshot
 
 NOTHING = Decisions()
 
@@ -134,10 +134,3 @@ def test_address_of_a_query_gives_the_query_again() -> None:
 def test_what_cannot_be_asked_for_is_refused(text: str, words: str) -> None:
     with pytest.raises(DataError, match=words):
         Attempts.query(dict(parse_qsl(text)))
-
-
-def test_every_feature_has_a_title_and_a_unit() -> None:
-    assert set(QUANTITIES) == set(FEATURES)
-    assert QUANTITIES["slip"].text(0.0123) == "12.3 mm"
-    assert QUANTITIES["turn"].text(np.pi / 2.0) == "90.0°"
-    assert QUANTITIES["force"].text(np.nan) == "–"
