@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.arithmetic import norm
 from drakegrasp.errors import DataError, printable
 from drakegrasp.outcomes import Outcome, Removal, Stage
 
@@ -256,6 +257,20 @@ def _labels(members: Sequence[Outcome] | Sequence[Removal]) -> str:
     return ", ".join(f"{member.value} {member.label}" for member in members)
 
 
+def _friction_use(t: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
+    """Return the share (n, k) of the friction cone that each fingertip uses after the lift.
+
+    |f_t| / (mu f_n), of the force's parts along the contact's mean normal and across it: 1 is the
+    border of the cone of one point; a patch that is bent may be beyond it.
+    """
+    f_Q_O, nhat_Q_O = t["lifted_f_Q_O"], t["lifted_nhat_Q_O"]
+    f_n = -(f_Q_O * nhat_Q_O).sum(axis=-1)  # the normal points out of the object
+    f_t = norm(f_Q_O + f_n[..., None] * nhat_Q_O)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        use = f_t / (t["friction_hand"][:, None] * f_n)
+    return np.where(t["lifted_touching"] & (f_n > 0.0), use, np.nan)
+
+
 # A row per field on at most two lines is what makes this a table.
 # fmt: off
 
@@ -343,6 +358,11 @@ _SLIP = _measured(
     Field("turn", "", "float64", "rad", "G",
           "angle that the object turned in the hand during the lift", shown=Shown("turn", "°")),
 )
+_SLIP_USE = Field("slip_use", "k", "float64", "-", "-",
+                  "share of the friction cone in use after the lift, 1 at its border",
+                  stage=Stage.LIFTED, per_finger=True, some=True, optional=True,
+                  derive=_friction_use, shown=Shown("friction in use", digits=2),
+                  needs=("lifted_touching", "lifted_f_Q_O", "lifted_nhat_Q_O", "friction_hand"))
 _RELEASED = _measured(
     "trial.lift",
     Field("slip_released", "", "float64", "m", "G",
@@ -425,7 +445,7 @@ DATA_FIELDS: tuple[Field, ...] = (
     Field("grasp_props/weight", "", "float32", "-", "-",
           "1 / number of samples, itself included, of the same object and resting pose whose "
           "palm is within 10 mm and 15 deg"),
-    *_copied("grasp_props", *_SLIP, *_RELEASED),
+    *_copied("grasp_props", *_SLIP, *_RELEASED, _SLIP_USE),
     Field("grasp_props/other_links_held", "", "uint8", "-", "-",
           "number of other links of the hand that touch the object after the lift",
           of="lifted_other_links"),
@@ -528,6 +548,7 @@ TRIAL_FIELDS: tuple[Field, ...] = (
               of="trial.lift.X_OG"),
         *_SLIP,
         *_RELEASED,
+        _SLIP_USE,
         *_measured("trial", *_WORDS),
     ),
     *HOLD_FIELDS,

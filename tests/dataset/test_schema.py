@@ -112,7 +112,7 @@ def _leads_to_something(root: type, path: str) -> bool:
         *(
             (TrialRow, f)
             for f in TRIAL_FIELDS
-            if f not in HOLD_FIELDS and f.name not in ASSEMBLED_FIELDS
+            if f not in HOLD_FIELDS and f.name not in ASSEMBLED_FIELDS and f.derive is None
         ),
         *((Verification, f) for f in VERIFICATION_FIELDS),
     ],
@@ -166,3 +166,19 @@ def test_dataset_of_another_version_gets_one_line(
         f"{old / name}: schema must be {SCHEMA_VERSION}, got 1; build the dataset again "
         "with this version of drakegrasp, in another directory"
     )
+
+
+def test_friction_in_use_is_a_share_of_the_cone() -> None:
+    """A force at half the angle's tangent of the cone, one on its border, and no contact."""
+    nhat = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [np.nan] * 3])
+    f = np.array([[0.3, 0.4, -2.0], [-4.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
+    (field,) = (field for field in TRIAL_FIELDS if field.name == "slip_use")
+    assert field.derive is not None
+    rows = {
+        "lifted_touching": np.array([[True, True, False]]),
+        "lifted_f_Q_O": f[None],
+        "lifted_nhat_Q_O": nhat[None],
+        "friction_hand": np.array([0.5]),
+    }
+    assert {*rows} == {*field.needs}
+    np.testing.assert_allclose(field.derive(rows), [[0.5, 1.0, np.nan]])
