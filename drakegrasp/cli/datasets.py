@@ -264,8 +264,7 @@ def replay(out: Path, trial: int, html: Path | None) -> None:
 
 def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -> None:
     """Print how long a requested build is expected to take, and its size."""
-    from drakegrasp.generation.estimate import plan_lines, plan_request
-    from drakegrasp.generation.stage_times import logged_times, read_times
+    from drakegrasp.generation.estimate import logged_times, plan_lines, plan_request, read_times
 
     logged = logged_times(request.out, request.config)
     measured = logged if times is None else read_times(times)

@@ -26,8 +26,7 @@ from drakegrasp.dataset.assembly.decisions import (
     pack_tasks,
     sample_texts,
 )
-from drakegrasp.dataset.assembly.pack import PackTask, Part, pack_rows, unpack_rows
-from drakegrasp.dataset.assembly.samples import SampleRows
+from drakegrasp.dataset.assembly.pack import PackTask, Part, SampleRows, pack_rows, unpack_rows
 from drakegrasp.dataset.assembly.survey import Survey, survey_object, survey_tasks
 from drakegrasp.dataset.card.content import content_of
 from drakegrasp.dataset.card.text import card_files

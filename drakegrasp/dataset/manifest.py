@@ -35,8 +35,7 @@ from drakegrasp.config import (
     parse_stored,
 )
 from drakegrasp.dataset import lock, log
-from drakegrasp.dataset.assembly.split import Rule, split_rule
-from drakegrasp.dataset.assembly.weights import number_poses
+from drakegrasp.dataset.assembly.split import Rule, number_poses, split_rule
 from drakegrasp.dataset.json_files import Name, read_mapping, validated
 from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.rejections import AttemptKey, key_to_json

@@ -17,16 +17,15 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config
+from drakegrasp.dataset.assembly.split import effective_number
 from drakegrasp.dataset.assembly.survey import shards_sha256
-from drakegrasp.dataset.assembly.weights import effective_number
 from drakegrasp.dataset.card.holding import holding_of
 from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_names
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.opening import open_samples, open_trials
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
-from drakegrasp.dataset.trial_files import NONE, shard_part
-from drakegrasp.dataset.trials import Trials
+from drakegrasp.dataset.trials import NONE, Trials, shard_part
 from drakegrasp.errors import DataError, HandError, counted
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file

@@ -23,8 +23,7 @@ from drakegrasp.dataset.opening import refuse_other_codes
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
-from drakegrasp.dataset.trial_files import sample_ids
-from drakegrasp.dataset.trials import Trials
+from drakegrasp.dataset.trials import Trials, sample_ids
 from drakegrasp.errors import DataError, one_line
 from drakegrasp.foreign_files import read_text
 from drakegrasp.frames import Array, unpack_pose

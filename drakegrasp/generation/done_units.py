@@ -18,7 +18,7 @@ from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import shards_folder
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import DataError
-from drakegrasp.generation.target import has_target
+from drakegrasp.generation.counts import has_target
 from drakegrasp.generation.work_unit import find_outcomes
 from drakegrasp.outcomes import Outcome
 

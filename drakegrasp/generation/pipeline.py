@@ -36,13 +36,11 @@ from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import ConfigError, DataError, DrakegraspError, GraspError, listed
 from drakegrasp.frames import unpack_pose
-from drakegrasp.generation.counts import Counts
+from drakegrasp.generation.counts import Counts, Target, refuse_two_ends, target_of
 from drakegrasp.generation.done_units import find_tasks, find_units
-from drakegrasp.generation.events import BuildEvents
+from drakegrasp.generation.events import BuildEvents, nothing_trains, too_heavy
 from drakegrasp.generation.prepare import PrepareTask, prepare_one
 from drakegrasp.generation.scenes.make import make_scenes_locked
-from drakegrasp.generation.target import Target, refuse_two_ends, target_of
-from drakegrasp.generation.warnings import nothing_trains, too_heavy
 from drakegrasp.generation.work_unit import WorkUnit, run_unit
 from drakegrasp.hand.carried import carry_hand
 from drakegrasp.hand.description import load_hand

@@ -37,7 +37,7 @@ from drakegrasp.generation.attempts import (
     try_attempt,
 )
 from drakegrasp.generation.columns import empty_looks, fill_look, judge_sample, trial_rows
-from drakegrasp.generation.target import has_target
+from drakegrasp.generation.counts import has_target
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.runtime.environment import one_thread, timed, trim_memory
 from drakegrasp.runtime.files import disk_full_named

@@ -15,7 +15,7 @@ from drakegrasp.dataset.filtering import own_setting
 from drakegrasp.dataset.rejections import FILE_NAME, Decisions
 from drakegrasp.dataset.schema import CAMERAS, SPLITS, TRIAL_FIELDS, Shown
 from drakegrasp.dataset.suspicion import PARTS, suspicion
-from drakegrasp.dataset.trial_files import NONE
+from drakegrasp.dataset.trials import NONE
 from drakegrasp.frames import unpack_pose
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.page.catalog import Snapshot

@@ -35,8 +35,7 @@ from drakegrasp.dataset.paths import (
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.suspicion import COLUMNS, PARTS, suspicion
-from drakegrasp.dataset.trial_files import Stamp, TrialPart, sample_ids, shard_part, stamp
-from drakegrasp.dataset.trials import Trials
+from drakegrasp.dataset.trials import Stamp, TrialPart, Trials, sample_ids, shard_part, stamp
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import is_name, parse_json
 from drakegrasp.hand.carried import carried_hand

@@ -23,7 +23,7 @@ from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.paths import DATA_FILES, shards_folder
 from drakegrasp.dataset.schema import CERTIFICATE_FIELDS, SPLITS
 from drakegrasp.dataset.shards import trial_columns
-from drakegrasp.dataset.trial_files import NONE
+from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.page.catalog import Snapshot, find_model

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from drakegrasp.dataset.statistics import count_splits
-from drakegrasp.dataset.trial_files import NONE
+from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.page.attempts import QUANTITIES

@@ -26,7 +26,7 @@ from drakegrasp.dataset.schema import (
     Shown,
     refuse_other_schema,
 )
-from drakegrasp.dataset.trial_files import Stamp, stamp
+from drakegrasp.dataset.trials import Stamp, stamp
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.outcomes import Outcome

@@ -15,7 +15,7 @@ from drakegrasp.dataset.opening import refuse_other_codes
 from drakegrasp.dataset.scenes.reader import SceneDataset
 from drakegrasp.dataset.scenes.rows import refuse_other_state
 from drakegrasp.dataset.schema import SPLITS, VIEW_KINDS, Shown
-from drakegrasp.dataset.trial_files import Stamp
+from drakegrasp.dataset.trials import Stamp
 from drakegrasp.errors import DataError
 from drakegrasp.frames import unpack_pose
 from drakegrasp.outcomes import Outcome

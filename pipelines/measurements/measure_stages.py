@@ -5,7 +5,7 @@
     drakegrasp build --objects MESH_DIR ... --plan --times times.json
 
 The script builds a small dataset in this process alone, so that no other worker disturbs the
-clock. The defaults of `drakegrasp.generation.stage_times` were measured with it.
+clock. The defaults of `drakegrasp.generation.estimate` were measured with it.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.statistics import count_splits
 from drakegrasp.errors import DataError
+from drakegrasp.generation.estimate import StageTimes
 from drakegrasp.generation.pipeline import build
 from drakegrasp.generation.prepare import prepare_one
-from drakegrasp.generation.stage_times import StageTimes
 from drakegrasp.generation.work_unit import UnitSummary
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes

@@ -25,7 +25,7 @@ from drakegrasp.dataset.statistics import (
     counts_as_dict,
     preshapes_of,
 )
-from drakegrasp.dataset.trial_files import NONE
+from drakegrasp.dataset.trials import NONE
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.page.catalog import Catalog

@@ -17,8 +17,7 @@ from drakegrasp.dataset import trial_files
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
-from drakegrasp.dataset.trial_files import NONE, shard_part
-from drakegrasp.dataset.trials import Trials
+from drakegrasp.dataset.trials import NONE, Trials, shard_part
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.frames import X_WT, invert_pose, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.outcomes import Outcome

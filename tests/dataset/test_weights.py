@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drakegrasp.dataset.assembly.weights import BLOCK, effective_number, weigh_samples
+from drakegrasp.dataset.assembly.split import BLOCK, effective_number, weigh_samples
 from drakegrasp.frames import make_pose, rotation_about
 
 

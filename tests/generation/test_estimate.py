@@ -15,8 +15,15 @@ from hypothesis import strategies as st
 from drakegrasp.dataset.log import BuildLog
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import ConfigError, DataError
-from drakegrasp.generation.estimate import CERTIFY_SECONDS, START_SECONDS, plan_build, plan_lines
-from drakegrasp.generation.stage_times import MEASURED, logged_times, read_times
+from drakegrasp.generation.estimate import (
+    CERTIFY_SECONDS,
+    MEASURED,
+    START_SECONDS,
+    logged_times,
+    plan_build,
+    plan_lines,
+    read_times,
+)
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.outcomes import Removal
 

@@ -8,7 +8,7 @@ import pytest
 
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import ConfigError
-from drakegrasp.generation.target import Target, refuse_two_ends
+from drakegrasp.generation.counts import Target, refuse_two_ends
 from drakegrasp.hand.settings import load_config
 
 

@@ -15,7 +15,7 @@ from helpers.pages import coded, numbered
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.manifest import Manifest, read_manifest, write_manifest
 from drakegrasp.dataset.rejections import Decisions
-from drakegrasp.dataset.trial_files import NONE
+from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.page import catalog as catalog_module

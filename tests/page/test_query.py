@@ -11,7 +11,7 @@ import pytest
 from helpers.pages import numbered
 
 from drakegrasp.dataset.rejections import AttemptKey, Decisions
-from drakegrasp.dataset.trial_files import NONE
+from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.page.attempts import Attempts
 from drakegrasp.page.catalog import Catalog, Snapshot

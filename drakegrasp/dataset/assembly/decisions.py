@@ -18,11 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import CameraConfig
-from drakegrasp.dataset.assembly.pack import TASK_ROWS, PackTask, ShardSlice
-from drakegrasp.dataset.assembly.samples import TEXTS
-from drakegrasp.dataset.assembly.split import split_samples
+from drakegrasp.dataset.assembly.pack import TASK_ROWS, TEXTS, PackTask, ShardSlice
+from drakegrasp.dataset.assembly.split import split_samples, weigh_samples
 from drakegrasp.dataset.assembly.survey import Survey, headers_by_object, join_seals
-from drakegrasp.dataset.assembly.weights import weigh_samples
 from drakegrasp.dataset.filtering import judge_successes
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.manifest import Manifest, origin_attributes

@@ -25,8 +25,7 @@ from drakegrasp.dataset.assembly.decisions import (
     number_rows,
     object_columns,
 )
-from drakegrasp.dataset.assembly.pack import SplitSamples
-from drakegrasp.dataset.assembly.samples import IMAGES
+from drakegrasp.dataset.assembly.pack import IMAGES, SplitSamples
 from drakegrasp.dataset.assembly.survey import Survey
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
 from drakegrasp.dataset.checks.rows import AnyArray, Batch, CheckedFile, Rule

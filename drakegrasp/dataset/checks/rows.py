@@ -223,7 +223,8 @@ class CheckedFile:
         # HDF5 reads a slice far faster than the same rows as a list.
         dense = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
         choice = slice(int(rows[0]), int(rows[-1]) + 1) if dense else rows
-        own, columns = file[group], {f.name: f.empty(len(rows), {}) for f in absent}
+        # A derived number of each finger is not missed in files made before it.
+        own, columns = file[group], {f.name: f.empty(len(rows), {}) for f in absent if not f.shape}
         for f in fields:
             if f in absent:
                 continue

@@ -22,7 +22,7 @@ from drakegrasp.arithmetic import Array
 from drakegrasp.dataset.hdf5 import AnyArray, ImageRows, read_texts
 from drakegrasp.dataset.opening import SCENE_TABLES, open_scenes, opened, refuse_other_codes
 from drakegrasp.dataset.schema import DEPTH_UNIT, SPLITS, Field
-from drakegrasp.dataset.trial_files import stamp
+from drakegrasp.dataset.trials import stamp
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import invert_pose, unpack_pose

@@ -23,7 +23,7 @@ from helpers.datasets import (
     turned,
 )
 
-from drakegrasp.dataset.assembly.samples import IMAGES
+from drakegrasp.dataset.assembly.pack import IMAGES
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.schema import DATA_FIELDS
 
