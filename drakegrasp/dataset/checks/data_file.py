@@ -106,7 +106,7 @@ def _copies_trial(batch: Batch, trials: CheckedFile) -> Iterator[Violation]:
     rows, position = np.unique(known["trial_id"], return_inverse=True)
     if not len(rows):
         return
-    copied = {field.name: field.of for field in DATA_FIELDS if field.of}
+    copied = {f.name: f.of for f in DATA_FIELDS if f.of and f.name in batch.columns}
     with trials.opened() as file:
         own = trials.read(file, "trials", rows, ["outcome", *copied.values()])
     failed = own["outcome"][position] != Outcome.SUCCESS

@@ -223,13 +223,16 @@ class CheckedFile:
         # HDF5 reads a slice far faster than the same rows as a list.
         dense = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
         choice = slice(int(rows[0]), int(rows[-1]) + 1) if dense else rows
-        # A derived number of each finger is not missed in files made before it.
         own, columns = file[group], {f.name: f.empty(len(rows), {}) for f in absent if not f.shape}
         for f in fields:
             if f in absent:
                 continue
             dataset = own[f.name]
             columns[f.name] = (dataset.asstr() if f.dtype == "str" else dataset)[choice]
+        # In files made before it a derived number of a trial is derived here.
+        for f in absent:
+            if f.derive is not None and {*f.needs} <= {*columns}:
+                columns[f.name] = f.derive(columns)
         return Batch(file=self.name, group=f"/{group}", rows=rows, columns=columns)
 
     def batches(

@@ -107,6 +107,10 @@ def stages(batch: Batch, close: CloseConfig | None) -> Iterator[Violation]:
     if close is not None:
         yield from _clearances(batch, stage, close.scrape_depth is not None)
     for f in TRIAL_FIELDS:
+        if f.derive is not None:
+            of = ", ".join(f.needs)
+            yield from batch.follows(f.name, f.derive(batch.columns), of)
+            continue
         values = batch[f.name]
         reached = stage >= f.stage
 
