@@ -24,7 +24,7 @@ from drakegrasp.shapes.curves import (
     rounded_rectangle,
     spread_evenly,
 )
-from drakegrasp.shapes.solids import cut, extrude, revolve, skin, solid, sweep
+from drakegrasp.shapes.solids import cut, extrude, fanned, revolve, skin, solid, sweep
 
 #: Rings of a flat end, as shares of its outline: the triangles at the centre stay plump.
 FLAT_END = (0.0, 0.5, 0.93)
@@ -126,10 +126,7 @@ def tube(path: npt.ArrayLike, radius: npt.ArrayLike, *, edge: float = EDGE) -> t
         other = np.cross(tangent, across)
         circle = np.outer(np.cos(angles), across) + np.outer(np.sin(angles), other)
         rings.append(point + size * circle if size > 0.0 else point[None])
-    for place in (0, -1):
-        if len(rings[place]) > 1:
-            rings.insert(0, points[:1]) if place == 0 else rings.append(points[-1:])
-    return skin(rings)
+    return skin(fanned(rings, points))
 
 
 def hoop(path: Array, radius: float, *, edge: float) -> list[trimesh.Trimesh]:

@@ -107,12 +107,7 @@ def sweep(
     for point, side, (a, b) in zip(points, across, factors, strict=True):
         ring = point + np.outer(a * outline[:, 0], side) + np.outer(b * outline[:, 1], binormal)
         rings.append(ring if a > 0.0 else point[None])
-    # A flat end is a fan round its centre.
-    if len(rings[0]) > 1:
-        rings.insert(0, points[:1])
-    if len(rings[-1]) > 1:
-        rings.append(points[-1:])
-    return skin(rings)
+    return skin(fanned(rings, points))
 
 
 def bar(
@@ -178,8 +173,14 @@ def grid_box(extents: npt.ArrayLike, *, centre: npt.ArrayLike, edge: float) -> t
 
 def capped(rings: list[Array]) -> trimesh.Trimesh:
     """Return the surface through rings (n_i, 3) of vertices [m], a fan at both ends."""
-    ends = [ring.mean(axis=0)[None] for ring in (rings[0], rings[-1])]
-    return skin([ends[0], *rings, ends[1]])
+    return skin(fanned(rings, np.array([ring.mean(axis=0) for ring in rings])))
+
+
+def fanned(rings: list[Array], centres: Array) -> list[Array]:
+    """Return rings (n_i, 3) with the centre (k, 3) [m] of each end that is no tip: a flat fan."""
+    first = [centres[:1]] if len(rings[0]) > 1 else []
+    last = [centres[-1:]] if len(rings[-1]) > 1 else []
+    return [*first, *rings, *last]
 
 
 def skin(rings: list[Array], *, closed: bool = False) -> trimesh.Trimesh:
