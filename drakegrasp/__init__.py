@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     )
     from drakegrasp.cluster.connect import connect
     from drakegrasp.config import Config
-    from drakegrasp.dataset.checks.findings import Violation
+    from drakegrasp.dataset.checks.rows import Violation
     from drakegrasp.dataset.checks.run import check_dataset
     from drakegrasp.dataset.reader import GraspDataset, Sample
-    from drakegrasp.dataset.scenes.reader import SceneDataset
+    from drakegrasp.dataset.scenes import SceneDataset
     from drakegrasp.dataset.trials import Trials
     from drakegrasp.errors import (
         BlankImageError,
@@ -70,11 +70,11 @@ _HOMES = {
     "Posture": "simulation.posture",
     "Replay": "generation.replay",
     "Sample": "dataset.reader",
-    "SceneDataset": "dataset.scenes.reader",
+    "SceneDataset": "dataset.scenes",
     "Score": "scoring.run",
     "Trials": "dataset.trials",
     "Verification": "verification.result",
-    "Violation": "dataset.checks.findings",
+    "Violation": "dataset.checks.rows",
     "build_dataset": "api.building",
     "check_dataset": "dataset.checks.run",
     "connect": "cluster.connect",

@@ -83,7 +83,7 @@ HEAVY = (
 )
 READERS = (
     *("grasp", "dataset.schema", "dataset.shards", "dataset.reader", "dataset.trials"),
-    "dataset.scenes.reader",
+    "dataset.scenes",
 )
 CHECKERS = ("dataset.checks.run", "dataset.assemble")
 

@@ -20,7 +20,7 @@ import pytest
 import yaml
 from helpers.commands import run
 
-from drakegrasp.dataset.scenes.reader import SceneDataset
+from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.hand.description import load_hand
 from drakegrasp.simulation.candidates import Source

@@ -38,9 +38,9 @@ NOT_RUN = {
     "python pipelines/make_certificates.py ": "a cluster; tests/cluster/test_submit.py",
     "tls=": "options of the lines below it",
     "python pipelines/baseline/": "trains with torch; tests/test_baseline.py",
-    "drakegrasp scenes ": "renders for minutes; tests/generation/scenes",
-    "drakegrasp scenes demo/dataset": "wants the demo; tests/generation/scenes",
-    "drakegrasp scenes TRIED": "wants a dataset; tests/generation/scenes",
+    "drakegrasp scenes ": "renders for minutes; tests/generation/test_make_scenes.py",
+    "drakegrasp scenes demo/dataset": "wants the demo; tests/generation/test_make_scenes.py",
+    "drakegrasp scenes TRIED": "wants a dataset; tests/generation/test_make_scenes.py",
     "python docs/examples/": "tests/test_examples.py runs it",
     "python pipelines/measurements/": "measures for minutes to hours",
     "drakegrasp build ": "simulates for minutes to hours; tests/build; with --plan it is run",
@@ -75,7 +75,7 @@ NO_CODE = {
 PY_NOT_RUN = {
     "dg.build_dataset(": "simulates for hours; tests/test_api.py",
     "datasets.load_dataset(": "tests/exchange/hub/test_hub.py reads a folder so",
-    "dg.SceneDataset(": "wants scenes and torch; tests/dataset/scenes",
+    "dg.SceneDataset(": "wants scenes and torch; tests/dataset/test_scene_reader.py",
     'dg.verify_grasp(grasp, "mug.obj"': "tests/test_api.py",
     'dg.place_object("mug.obj"': "tests/verification/test_verify.py",
 }

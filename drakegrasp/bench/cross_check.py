@@ -18,7 +18,7 @@ from typing import Any, Literal, TypeVar, get_args
 import numpy as np
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.card.holding import wilson_interval
+from drakegrasp.dataset.holding import wilson_interval
 from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.trials import Trials

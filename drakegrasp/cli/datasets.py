@@ -31,7 +31,6 @@ from drakegrasp.runtime.executor import processes
 if TYPE_CHECKING:
     from drakegrasp.generation.pipeline import BuildReport
     from drakegrasp.generation.request import BuildRequest
-    from drakegrasp.generation.scenes.make import Scenes
 
 
 @click.command(cls=Command)
@@ -119,7 +118,7 @@ def assemble(
     """
     from drakegrasp.cli import tables
     from drakegrasp.dataset.assemble import assemble as assemble_files
-    from drakegrasp.dataset.checks.object_files import carried_hand_as_built
+    from drakegrasp.dataset.checks.assembled import carried_hand_as_built
     from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.dataset.rejections import read_rejected, unused_rejections
 
@@ -148,10 +147,13 @@ def scenes(out: Path, overrides: tuple[str, ...], workers: int | None, quiet: bo
     The command writes OUT/scenes.hdf5: each object of OUT in each resting pose, seen by sixteen
     cameras (five fixed ones to test), with all hands that closed on it.
     """
+    from drakegrasp.dataset.paths import SCENES_FILE
+
     made = write_scenes(out, overrides=overrides, workers=workers, show=not quiet)
-    for split, count in made.scenes.items():
-        say(f"{split}: {counted(count, 'scene')}, {counted(made.views[split], 'view')}")
-    say(f"{counted(made.grasps, 'grasp')} in {made.path}")
+    for split, row in made.items():
+        say(f"{split}: {counted(row['scenes'], 'scene')}, {counted(row['views'], 'view')}")
+    grasps = sum(row["grasps"] for row in made.values())
+    say(f"{counted(grasps, 'grasp')} in {out / SCENES_FILE}")
 
 
 def write_scenes(
@@ -160,9 +162,9 @@ def write_scenes(
     overrides: Sequence[str] = (),
     workers: int | None = None,
     show: bool = True,
-) -> Scenes:
+) -> dict[str, dict[str, int]]:
     """Write scenes.hdf5 in processes of this machine."""
-    from drakegrasp.generation.scenes.make import make_scenes
+    from drakegrasp.generation.scenes import make_scenes
 
     with (
         processes(workers) as execute,

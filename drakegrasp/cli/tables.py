@@ -16,10 +16,10 @@ from rich.table import Table
 
 from drakegrasp.cli.console import say
 from drakegrasp.config import Config
-from drakegrasp.dataset.card.holding import holding_lines, holding_of
-from drakegrasp.dataset.card.shortfall import objects_without_samples, split_shortfall
+from drakegrasp.dataset.holding import holding_lines, holding_of
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, DATA_FILES
+from drakegrasp.dataset.shortfall import objects_without_samples, split_shortfall
 from drakegrasp.dataset.statistics import (
     NO_NAME,
     Funnel,

@@ -28,8 +28,7 @@ from drakegrasp.dataset.assembly.decisions import (
 )
 from drakegrasp.dataset.assembly.pack import PackTask, Part, SampleRows, pack_rows, unpack_rows
 from drakegrasp.dataset.assembly.survey import Survey, survey_object, survey_tasks
-from drakegrasp.dataset.card.content import content_of
-from drakegrasp.dataset.card.text import card_files
+from drakegrasp.dataset.card import card_files, content_of
 from drakegrasp.dataset.hdf5 import AnyArray, create_field, write_field
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (

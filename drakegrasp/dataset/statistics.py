@@ -19,8 +19,8 @@ import numpy.typing as npt
 from drakegrasp.config import Config
 from drakegrasp.dataset.assembly.split import effective_number
 from drakegrasp.dataset.assembly.survey import shards_sha256
-from drakegrasp.dataset.card.holding import holding_of
 from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_names
+from drakegrasp.dataset.holding import holding_of
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.opening import open_samples, open_trials
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE

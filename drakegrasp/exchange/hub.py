@@ -28,13 +28,12 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from drakegrasp.dataset.card.content import card_content
-from drakegrasp.dataset.card.text import card_text
+from drakegrasp.dataset.card import card_content, card_text
 from drakegrasp.dataset.opening import open_samples
 from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.scenes.reader import SceneDataset
-from drakegrasp.dataset.scenes.rows import refuse_other_state
+from drakegrasp.dataset.scene_rows import refuse_other_state
+from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.dataset.schema import (
     CAMERAS,
     DATA_FIELDS,

@@ -17,7 +17,7 @@ from drakegrasp.config import Config, continued, is_own_class
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.assembly.split import rank_in_split
 from drakegrasp.dataset.assembly.survey import headers_by_object
-from drakegrasp.dataset.card.text import write_card
+from drakegrasp.dataset.card import write_card
 from drakegrasp.dataset.filtering import own_filters
 from drakegrasp.dataset.lock import Holder, build_lock
 from drakegrasp.dataset.manifest import (
@@ -40,7 +40,7 @@ from drakegrasp.generation.counts import Counts, Target, refuse_two_ends, target
 from drakegrasp.generation.done_units import find_tasks, find_units
 from drakegrasp.generation.events import BuildEvents, nothing_trains, too_heavy
 from drakegrasp.generation.prepare import PrepareTask, prepare_one
-from drakegrasp.generation.scenes.make import make_scenes_locked
+from drakegrasp.generation.scenes import make_scenes_locked
 from drakegrasp.generation.work_unit import WorkUnit, run_unit
 from drakegrasp.hand.carried import carry_hand
 from drakegrasp.hand.description import load_hand

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.opening import refuse_other_codes
-from drakegrasp.dataset.scenes.reader import SceneDataset
-from drakegrasp.dataset.scenes.rows import refuse_other_state
+from drakegrasp.dataset.scene_rows import refuse_other_state
+from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.dataset.schema import SPLITS, VIEW_KINDS, Shown
 from drakegrasp.dataset.trials import Stamp
 from drakegrasp.errors import DataError

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from drakegrasp.dataset.reader import GraspDataset, Sample
-from drakegrasp.dataset.scenes.reader import SceneDataset
+from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array

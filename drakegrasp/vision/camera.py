@@ -1,9 +1,11 @@
-"""The poses of the two cameras and the projection of points to pixels; NumPy only.
+"""Cameras: their lenses and poses, what they see of contacts, and how a scene looks; NumPy only.
 
-Both cameras are 0.25 m behind the palm and look along +Gz (Veres et al., "Vision sensors"). `oto`
-(one-to-one) rolls with the palm; `otm` (one-to-many) keeps world up at the top of the image. Camera
-axes are those of Drake and OpenCV; pixel centres have integer coordinates, as in Drake's
-`CameraInfo`.
+Both cameras of a grasp are 0.25 m behind the palm and look along +Gz (Veres et al., "Vision
+sensors"). `oto` (one-to-one) rolls with the palm; `otm` (one-to-many) keeps world up at the top of
+the image. Cameras of a scene know no grasp: to train, viewpoints are drawn about the object; to
+test they are fixed, published poses in {T} that neither object nor seed moves, so that a grasp that
+is the same in the camera's frame is the same on the table, wherever the object lies. Camera axes
+are those of Drake and OpenCV; pixel centres have integer coordinates, as in Drake's `CameraInfo`.
 """
 
 from __future__ import annotations
@@ -13,12 +15,28 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
+from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos, sin_cos_deg
 from drakegrasp.config import CameraConfig, ScenesConfig
-from drakegrasp.frames import invert_pose, make_pose, transform_points
+from drakegrasp.frames import invert_pose, make_pose, rotation_about, transform_points
+from drakegrasp.objects.model import object_colour
+from drakegrasp.seeding import Stream
 
 #: Sine of the angle between view and vertical below which +Ty is up in the image (0.06 degrees).
 LOOKS_VERTICALLY = 1e-3
+#: What is nearer than a contact by more than this hides it [m].
+BEFORE = 3e-3
+#: What is farther from the object's pixels than this is not on it [px].
+BESIDE = 2.0
+#: Fixed viewpoints: azimuth and elevation [deg], distance [m] from the point `FIXED_AIM` in {T}.
+RING = tuple((azimuth, 45.0, 0.65) for azimuth in (0.0, 90.0, 180.0, 270.0))
+SINGLE = (45.0, 60.0, 0.7)
+FIXED_AIM = np.array([0.0, 0.0, 0.05])
+#: Colour of the table (models/table.sdf).
+TABLE_COLOUR = (0.55, 0.50, 0.44)
+#: Way and intensity of the light from above: at a slant, because a table is black where camera and
+#: light look along it.
+LIGHT_WAY = np.array([0.3, 0.4, -1.0])
+LIGHT_STRENGTH = 0.7
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -189,3 +207,134 @@ class Picture:
     def pixels(self, p_WA: npt.ArrayLike) -> Array:
         """Return the pixel coordinates (n, 2) [px] of points (n, 3) of the world [m]."""
         return project(self.K, transform_points(invert_pose(self.X_WC), p_WA))
+
+
+# What is seen of contacts, where cameras of scenes stand, how a scene looks
+
+
+def visible_contacts(
+    p_TQ: Array,
+    nhat_Q_T: Array,
+    X_TC: Array,
+    K: Array,
+    depth: npt.NDArray[np.floating],
+    mask: npt.NDArray[np.uint8],
+) -> npt.NDArray[np.bool_]:
+    """Return whether (...,) a camera sees contacts; those that are NaN it does not.
+
+    A contact is hidden if its normal points away from the camera, or if the ray from it to the
+    camera meets the object or the table first. It is the centre of a pressed patch, so it may lie a
+    little inside the object, and on a surface that is seen at a slant the depth changes by much
+    from one pixel to the next. So of the four pixels around it the farthest counts, and `BEFORE` is
+    allowed. The patch of a grasp that is no sample may span an edge: a centre that the camera sees
+    farther than `BESIDE` from the object is hidden, too, as no image shows it.
+
+    Args:
+        p_TQ: Contact points (..., 3) [m].
+        nhat_Q_T: Unit normals out of the object (..., 3).
+        X_TC: Pose of the camera (4, 4).
+        K: Camera matrix (3, 3) [px].
+        depth: Clean depth image (h, w) [m], 0 where there is nothing.
+        mask: Mask of the objects (h, w), 0 beside them.
+    """
+    p = p_TQ.reshape(-1, 3)
+    # A comparison with NaN is false.
+    rows = np.flatnonzero(dot(nhat_Q_T.reshape(-1, 3), X_TC[:3, 3] - p) > 0.0)
+    p_CQ = transform_points(invert_pose(X_TC), p[rows])
+    rows, p_CQ = rows[p_CQ[:, 2] > 0.0], p_CQ[p_CQ[:, 2] > 0.0]
+
+    # The four pixels around each that is in the image.
+    height, width = depth.shape
+    pixels = project(K, p_CQ)
+    u, v = np.floor(pixels).astype(np.int64).T
+    within = (u >= 0) & (v >= 0) & (u < width - 1) & (v < height - 1)
+    u, v, rows, z, pixels = u[within], v[within], rows[within], p_CQ[within, 2], pixels[within]
+    around = depth[np.array([v, v, v + 1, v + 1]), np.array([u, u + 1, u, u + 1])]
+    farthest = np.where(around == 0, np.inf, around).max(axis=0)
+
+    # Few are on no pixel of the object: those are measured.
+    beside = mask[v, u] == 0
+    own = np.argwhere(mask > 0)[:, ::-1]
+    apart = [np.linalg.norm(own - pixel, axis=1).min(initial=np.inf) for pixel in pixels[beside]]
+    beside[beside] = np.array(apart) > BESIDE
+
+    visible = np.zeros(len(p), dtype=np.bool_)
+    visible[rows] = (farthest >= z - BEFORE) & ~beside
+    return visible.reshape(p_TQ.shape[:-1])
+
+
+def look_at(p_TA: Array, distance: float, azimuth: float, sine: float, roll: float = 0.0) -> Array:
+    """Return X_TC (4, 4) of a camera that looks at a point from above the horizon.
+
+    Args:
+        p_TA: The point (3,) [m], in the middle of the image.
+        distance: Of the camera from it [m].
+        azimuth: Of the camera about the vertical, from +Tx [rad].
+        sine: Of the camera's elevation above the point.
+        roll: About the line of sight; without it the image's rows are horizontal [rad].
+    """
+    s, c = sin_cos(azimuth)
+    cosine = np.sqrt(1.0 - sine * sine)
+    z = -np.array([cosine * c, cosine * s, sine])
+    x = np.array([-s, c, 0.0])
+    R = np.column_stack([x, np.cross(z, x), z])
+    return make_pose(multiply(R, rotation_about([0.0, 0.0, 1.0], roll)), p_TA - distance * z)
+
+
+def fixed_viewpoints() -> Array:
+    """Return X_TC (5, 4, 4) of the cameras of scenes to test: the ring of four, then the single."""
+    return np.array(
+        [
+            look_at(FIXED_AIM, distance, np.deg2rad(azimuth), float(sin_cos_deg(elevation)[0]))
+            for azimuth, elevation, distance in (*RING, SINGLE)
+        ]
+    )
+
+
+def draw_viewpoint(stream: Stream, p_TO: Array, config: ScenesConfig) -> Array:
+    """Return X_TC (4, 4) of a camera that looks at an object from anywhere above the table.
+
+    Azimuth, distance, roll, the point that it looks at, and the sine of the elevation are uniform:
+    so are the camera's directions over the part of the sphere.
+
+    Args:
+        stream: Gives seven numbers.
+        p_TO: Where the object is, (3,) [m].
+        config: The ranges.
+    """
+    u = stream.uniform(7)
+    low, high = sin_cos_deg(config.elevation_deg)[0]
+    near, far = config.distance
+    return look_at(
+        p_TO + config.aim * (2.0 * u[4:] - 1.0),
+        near + (far - near) * float(u[0]),
+        2.0 * np.pi * float(u[2]),
+        float(low + (high - low) * u[1]),
+        np.deg2rad(config.roll_deg) * (2.0 * float(u[3]) - 1.0),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Appearance:
+    """How a scene looks.
+
+    Attributes:
+        object_colour, table_colour: (3,), red, green and blue in 0..1.
+        light_direction: (3,), unit vector in {W} along which the light from above shines.
+        light_strength: Its intensity; that of the light at the camera never changes.
+    """
+
+    object_colour: Array
+    table_colour: Array
+    light_direction: Array
+    light_strength: float
+
+
+def usual_appearance(name: str) -> Appearance:
+    """Return how the scene of an object looks, by the object's name, where nothing is drawn."""
+    return Appearance(
+        object_colour=np.array(object_colour(name)),
+        table_colour=np.array(TABLE_COLOUR),
+        light_direction=LIGHT_WAY / norm(LIGHT_WAY),
+        light_strength=LIGHT_STRENGTH,
+    )

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -46,8 +47,7 @@ from drakegrasp.hand.parsing import make_parser
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour
 from drakegrasp.runtime.environment import require_render_memory
-from drakegrasp.vision.appearance import Appearance, usual_appearance
-from drakegrasp.vision.camera import Lens, unproject
+from drakegrasp.vision.camera import Appearance, Lens, unproject, usual_appearance
 
 #: Colour of pixels beyond the table.
 BACKGROUND = np.array([0.86, 0.90, 0.94])
@@ -66,30 +66,27 @@ ENGINE = "vtk"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RenderedView:
-    """The images of one camera.
-
-    Attributes:
-        image: (4, S, S) float32, R, G, B in 0..1 and depth [m], `far` where nothing is nearer.
-        mask: (S, S) uint8, 1 where the object is seen.
-    """
-
-    image: npt.NDArray[np.float32]
-    mask: npt.NDArray[np.uint8]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Capture:
     """The images of one camera as the engine gives them.
 
     Attributes:
         rgb: (H, W, 3) uint8.
         depth: (H, W) float32 [m]; 0 where something is too near, inf where nothing is near enough.
         mask: (H, W) uint8, 1 where the object is seen.
+        lens: The camera.
     """
 
     rgb: npt.NDArray[np.uint8]
     depth: npt.NDArray[np.float32]
     mask: npt.NDArray[np.uint8]
+    lens: Lens
+
+    @cached_property
+    def image(self) -> npt.NDArray[np.float32]:
+        """What data files hold, (4, H, W): R, G, B in 0..1 and depth [m] within near..far."""
+        image = np.empty_like(self.rgb, shape=(4, *self.mask.shape), dtype=np.float32)
+        image[:3] = np.moveaxis(self.rgb, 2, 0) / np.float32(255.0)
+        image[3] = np.clip(self.depth, self.lens.near, self.lens.far)
+        return image
 
 
 @dataclass(kw_only=True, eq=False)
@@ -219,18 +216,12 @@ def render(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> Rend
     Raises:
         BlankImageError: If the image is blank, which means that OpenGL failed.
     """
-    config = renderer.config
-    seen = capture(renderer, Lens.of(config), X_TO, X_TC)
-
-    # Pack them as files hold them.
-    image = np.empty_like(seen.rgb, shape=(4, config.size, config.size), dtype=np.float32)
-    image[:3] = np.moveaxis(seen.rgb, 2, 0) / np.float32(255.0)
-    # Drake gives 0 for too near and infinity for too far.
-    image[3] = np.clip(seen.depth, config.near, config.far)
-    return RenderedView(image=image, mask=seen.mask)
+    return capture(renderer, Lens.of(renderer.config), X_TO, X_TC)
 
 
-def capture(renderer: Renderer, lens: Lens, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> Capture:
+def capture(
+    renderer: Renderer, lens: Lens, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike
+) -> RenderedView:
     """Return what a camera with a lens of its own sees; arguments and errors as for `render`."""
     # Place the object.
     plant = renderer.plant
@@ -260,7 +251,7 @@ def capture(renderer: Renderer, lens: Lens, X_TO: npt.ArrayLike, X_TC: npt.Array
     mask = (labels == int(renderer.object.index())).astype(np.uint8)
     X_OC = multiply(invert_pose(X_TO), X_TC)
     depth = depth_in_box(depth, mask, K, X_OC, renderer.half_extents)
-    return Capture(rgb=rgb, depth=depth, mask=mask)
+    return RenderedView(rgb=rgb, depth=depth, mask=mask, lens=lens)
 
 
 def depth_in_box(

@@ -25,7 +25,7 @@ import numpy as np
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config, with_whole_lifts
-from drakegrasp.dataset.card.holding import (
+from drakegrasp.dataset.holding import (
     COLUMNS,
     MUCH,
     area_under_roc,

@@ -29,9 +29,9 @@ OTHERS = ("hand", "mesh", "objects", "vision", "dataset", "generation", "scoring
 #: Modules and folders that draw a picture or tell a story: they decide nothing.
 _TELLING = {
     *(f"verification/{name}.py" for name in ("explanation", "figure", "recording", "views")),
-    *("dataset/card", "dataset/log.py", "hand/references.py", "scoring/card.py"),
+    *("dataset/card.py", "dataset/holding.py", "dataset/shortfall.py", "dataset/log.py"),
+    *("hand/references.py", "scoring/card.py"),
     *(
-        "vision/appearance.py",
         "vision/probe_image.py",
         "generation/events.py",
         "generation/warnings.py",

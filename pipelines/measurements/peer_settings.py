@@ -25,7 +25,7 @@ from unittest import mock
 from drakegrasp.bench import mujoco_baseline
 from drakegrasp.bench.cross_check import Group, StoredLift, draw_lifts
 from drakegrasp.bench.mujoco_baseline import MujocoBaseline
-from drakegrasp.dataset.card.holding import wilson_interval
+from drakegrasp.dataset.holding import wilson_interval
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.mjcf import links, scene

@@ -21,7 +21,7 @@ from typing import Any
 import click
 
 from drakegrasp.dataset.paths import SCENES_FILE
-from drakegrasp.dataset.scenes.reader import SceneDataset
+from drakegrasp.dataset.scenes import SceneDataset
 
 WORKERS = 2
 KINDS: dict[str, dict[str, Any]] = {"points": {}, "images": {"points": None}}

@@ -19,7 +19,7 @@ from helpers.datasets import (
 )
 
 from drakegrasp.bench.cross_check import GROUPS, agreement, draw_lifts
-from drakegrasp.dataset.card.holding import wilson_interval
+from drakegrasp.dataset.holding import wilson_interval
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome, Removal
 

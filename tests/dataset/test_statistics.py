@@ -13,7 +13,7 @@ from helpers.hands import write_with_preshapes
 
 from drakegrasp.cli.tables import funnel_table, hold_table
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.card.content import card_content
+from drakegrasp.dataset.card import card_content
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
 from drakegrasp.dataset.statistics import (

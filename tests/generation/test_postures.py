@@ -27,7 +27,7 @@ from drakegrasp.frames import make_pose, unpack_pose
 from drakegrasp.generation.pipeline import build, posture_config
 from drakegrasp.generation.prepare import prepare
 from drakegrasp.generation.replay import replay_trial
-from drakegrasp.generation.scenes.make import make_scenes
+from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config
@@ -288,7 +288,8 @@ def test_a_dataset_of_postures_of_preshapes_is_sound_and_replayed(of_preshapes):
 
 def test_scenes_have_the_hand_from_which_a_posture_of_a_preshape_closed(of_preshapes, tmp_path):
     out = Path(shutil.copytree(of_preshapes[0], tmp_path / "out"))
-    with h5py.File(make_scenes(out).path) as file:
+    make_scenes(out)
+    with h5py.File(out / "scenes.hdf5") as file:
         by_trial = np.argsort(file["grasps/trial_id"][:])
         q_open = file["grasps/q_open"][:][by_trial]
     pair = load_hand(read_manifest(out).config.hand_source).at(1)

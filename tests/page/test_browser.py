@@ -32,7 +32,7 @@ from drakegrasp.dataset.rejections import (
     read_rejected,
     write_decisions,
 )
-from drakegrasp.generation.scenes.make import make_scenes
+from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.outcomes import Removal
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.page.catalog import Catalog, Snapshot

@@ -16,7 +16,7 @@ from helpers.pages import Tags, missing_files, state_of
 from PIL import Image
 from starlette.testclient import TestClient
 
-from drakegrasp.generation.scenes.make import make_scenes
+from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.page import site as site_module
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.page.scenes import FAILS, HOLDS, UNKNOWN

@@ -20,11 +20,11 @@ from matplotlib.image import imread
 from drakegrasp.config import CameraConfig
 from drakegrasp.dataset.hdf5 import create_field
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.scenes.reader import SceneDataset
+from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS, sizes
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, make_pose, pack_pose
-from drakegrasp.generation.scenes.make import make_scenes
+from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.grasp import pack_grasp
 from drakegrasp.pictures import sheets
 from drakegrasp.pictures.sheets import (
@@ -298,7 +298,8 @@ def test_a_file_without_samples_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.sim
 def test_each_view_shows_the_contacts_of_a_sample_of_its_scene(out: Path) -> None:
-    path = make_scenes(out, overrides=["scenes.views=3"]).path
+    make_scenes(out, overrides=["scenes.views=3"])
+    path = out / "scenes.hdf5"
     figure, drawn = scene_views(path)
     # Three drawn views of the object to train on, four of each to test.
     assert len(drawn) == len(figure.axes) == 3 + 4 + 4

@@ -11,11 +11,11 @@ import pytest
 from helpers.datasets import OTO, make_dataset
 
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.scenes.rows import SceneRows, open_rows
+from drakegrasp.dataset.scene_rows import SceneRows, open_rows
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.frames import transform_points
-from drakegrasp.generation.scenes.make import make_scenes
+from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.scoring.references import REFERENCES, Scene
 from drakegrasp.scoring.run import own_contacts
 from drakegrasp.verification.placing import place_on_rows
@@ -27,7 +27,8 @@ pytestmark = pytest.mark.sim
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scenes")
     out = make_dataset(folder / "out", folder / "meshes", overrides=["split.by=class"])
-    return make_scenes(out, overrides=["scenes.views=3"]).path
+    make_scenes(out, overrides=["scenes.views=3"])
+    return out / "scenes.hdf5"
 
 
 def test_a_row_is_a_view_of_a_scene_with_a_sample(path: Path) -> None:

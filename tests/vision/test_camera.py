@@ -1,4 +1,4 @@
-"""The two cameras and the image frame, against Drake and by closed forms."""
+"""Cameras against Drake and by closed forms: poses, image frame, viewpoints, what is hidden."""
 
 from __future__ import annotations
 
@@ -10,15 +10,20 @@ from hypothesis.extra.numpy import arrays
 from pydrake.systems.sensors import CameraInfo
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.config import CameraConfig
+from drakegrasp.config import CameraConfig, ScenesConfig
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
+from drakegrasp.seeding import Stream
 from drakegrasp.vision.camera import (
+    FIXED_AIM,
     camera_pose_otm,
     camera_pose_oto,
+    draw_viewpoint,
+    fixed_viewpoints,
     image_frame,
     intrinsics,
     project,
     unproject,
+    visible_contacts,
 )
 
 CONFIG = CameraConfig()
@@ -174,3 +179,72 @@ def test_any_mask_gives_a_right_handed_frame_with_the_stated_signs(mask: Array) 
 def test_empty_mask_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one object pixel, got none"):
         image_frame(K, np.zeros((128, 128)), DEPTH)
+
+
+# Cameras that know no grasp: they look where they should, from within the ranges
+
+P_TO = np.array([0.1, -0.2, 0.07])
+
+
+def test_drawn_cameras_keep_to_the_ranges() -> None:
+    config = ScenesConfig(aim=0.0)
+    poses = np.array([draw_viewpoint(Stream(0, i), P_TO, config) for i in range(400)])
+    back = poses[:, :3, 3] - P_TO
+    distance = np.linalg.norm(back, axis=1)
+    elevation = np.rad2deg(np.arcsin(back[:, 2] / distance))
+    roll = np.rad2deg(np.arcsin(poses[:, 2, 0] / np.cos(np.deg2rad(elevation))))
+
+    assert 0.4 <= distance.min() < 0.41 and 0.89 < distance.max() <= 0.9
+    assert 20.0 <= elevation.min() < 21.0 and 80.0 < elevation.max() <= 85.0
+    assert 14.0 < np.abs(roll).max() <= 15.0 + 1e-9
+    # Image down has a component downwards, and what is aimed at is on the optical axis.
+    assert (poses[:, 2, 1] < 0.0).all()
+    p_CO = np.array([transform_points(invert_pose(X), P_TO[None])[0] for X in poses])
+    np.testing.assert_allclose(p_CO[:, :2], 0.0, atol=1e-12)
+    np.testing.assert_allclose(p_CO[:, 2], distance)
+
+
+def test_cameras_aim_beside_the_object_by_at_most_the_jitter() -> None:
+    poses = [draw_viewpoint(Stream(0, i), P_TO, ScenesConfig()) for i in range(400)]
+    # The distance of the optical axis from the object: below that of the corner of a cube.
+    off = [np.linalg.norm(transform_points(invert_pose(X), P_TO[None])[0, :2]) for X in poses]
+    assert 0.06 < max(off) <= 0.05 * np.sqrt(3.0)
+
+
+def test_fixed_cameras_are_the_published_ones() -> None:
+    back = fixed_viewpoints()[:, :3, 3] - FIXED_AIM
+    np.testing.assert_allclose(np.linalg.norm(back, axis=1), [0.65] * 4 + [0.7])
+    elevation = np.rad2deg(np.arcsin(back[:, 2] / np.linalg.norm(back, axis=1)))
+    np.testing.assert_allclose(elevation, [45.0] * 4 + [60.0])
+    azimuth = np.rad2deg(np.arctan2(back[:, 1], back[:, 0])) % 360.0
+    np.testing.assert_allclose(azimuth, [0.0, 90.0, 180.0, 270.0, 45.0], atol=1e-9)
+
+
+def test_what_is_before_a_contact_hides_it_and_so_does_its_normal() -> None:
+    # The camera looks down at a plane 0.5 m away, half of which is hidden by one at 0.4 m.
+    depth = np.full((48, 64), 0.5)
+    depth[:, :32] = 0.4
+    K = np.array([[100.0, 0.0, 31.5], [0.0, 100.0, 23.5], [0.0, 0.0, 1.0]])
+    X_TC = np.diag([1.0, -1.0, -1.0, 1.0])
+    X_TC[2, 3] = 0.5
+    up, down = [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]
+    p_TQ = [[0.1, 0, 0], [-0.1, 0, 0], [0.1, 0, 0], [0.1, 0, -0.002], [0.1, 0, -0.004], [1, 0, 0]]
+    nhat = [up, up, down, up, up, up]
+    picture = K, depth, np.ones(depth.shape, dtype=np.uint8)
+    seen = visible_contacts(np.array(p_TQ), np.array(nhat), X_TC, *picture)
+    assert seen.tolist() == [True, False, False, True, False, False]
+    assert not visible_contacts(np.full((1, 3), np.nan), np.array([up]), X_TC, *picture).any()
+
+
+def test_a_contact_that_is_no_place_on_the_object_is_hidden() -> None:
+    """The mask ends at column 40; the contacts are 5 mm, a pixel, apart."""
+    depth, mask = np.full((48, 64), 0.5), np.zeros((48, 64), dtype=np.uint8)
+    mask[:, :41] = 1
+    K = np.array([[100.0, 0.0, 32.0], [0.0, 100.0, 24.0], [0.0, 0.0, 1.0]])
+    X_TC = np.diag([1.0, -1.0, -1.0, 1.0])
+    X_TC[2, 3] = 0.5
+    p_TQ = np.array([[0.005 * (column - 32), 0, 0] for column in (39.5, 41.5, 42.1, 50)])
+    nhat = np.tile([0.0, 0.0, 1.0], (4, 1))
+    seen = visible_contacts(p_TQ, nhat, X_TC, K, depth, mask)
+    assert seen.tolist() == [True, True, False, False]
+    assert not visible_contacts(p_TQ, nhat, X_TC, K, depth, 0 * mask).any()

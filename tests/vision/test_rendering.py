@@ -17,8 +17,14 @@ from drakegrasp.config import CameraConfig
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
 from drakegrasp.hand.files import MODELS
 from drakegrasp.objects.model import ObjectModel, object_colour
-from drakegrasp.vision.appearance import TABLE_COLOUR, Appearance, usual_appearance
-from drakegrasp.vision.camera import intrinsics, project, unproject
+from drakegrasp.vision.camera import (
+    TABLE_COLOUR,
+    Appearance,
+    intrinsics,
+    project,
+    unproject,
+    usual_appearance,
+)
 from drakegrasp.vision.rendering import (
     RenderedView,
     Renderer,
@@ -148,7 +154,7 @@ def test_mask_and_depth_agree(renderer: Renderer) -> None:
     seen = render(renderer, X_TO, X_TC)
     assert 500 < seen.mask.sum() < 128 * 128 / 2
     assert np.abs(box_distance(object_points(seen, X_TC), HALF)).max() < 1e-6
-    inverted = RenderedView(image=seen.image, mask=1 - seen.mask)
+    inverted = replace(seen, mask=1 - seen.mask)
     # The table's pixels at the foot of the box come near to it.
     assert np.median(box_distance(object_points(inverted, X_TC), HALF)) > 0.02
     assert box_distance(object_points(inverted, X_TC), HALF).min() > -1e-6

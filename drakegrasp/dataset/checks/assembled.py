@@ -1,8 +1,9 @@
-"""The three files are what assembling gives: it is done again from the shards, and compared.
+"""The files are what assembling gives: it is done again from the shards, and compared.
 
-In: the surveys of all objects, which `object_files` makes, and the manifest. Out: a violation for
-each attribute, row of /objects and /successes, attempt and sample that differs. Samples are derived
-by the functions that write them; stored images are compared byte for byte.
+In: a dataset whose objects and shards are read and verified here, and its manifest. Out: a
+violation for each file that is not as it was written, and for each attribute, row of /objects and
+/successes, attempt and sample that differs from what assembling gives. Samples are derived by the
+functions that write them; stored images are compared byte for byte.
 """
 
 from __future__ import annotations
@@ -10,13 +11,15 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
+from typing import NamedTuple
 
 import h5py
 import numpy as np
 
+from drakegrasp.config import CarriedHand
 from drakegrasp.dataset.assembly.decisions import (
     Decisions,
     Shards,
@@ -24,97 +27,201 @@ from drakegrasp.dataset.assembly.decisions import (
     file_attributes,
     number_rows,
     object_columns,
+    pack_tasks,
+    sample_texts,
 )
-from drakegrasp.dataset.assembly.pack import IMAGES, SplitSamples
-from drakegrasp.dataset.assembly.survey import Survey
-from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
-from drakegrasp.dataset.checks.rows import AnyArray, Batch, CheckedFile, Rule
+from drakegrasp.dataset.assembly.pack import (
+    IMAGES,
+    TASK_ROWS,
+    PackTask,
+    SplitSamples,
+    read_rows,
+)
+from drakegrasp.dataset.assembly.survey import Survey, SurveyTask, survey_object, survey_tasks
+from drakegrasp.dataset.checks.rows import (
+    AnyArray,
+    Batch,
+    CheckedFile,
+    Findings,
+    Task,
+    Violation,
+    of_file,
+)
+from drakegrasp.dataset.checks.trials import Dataset, trial_rules
 from drakegrasp.dataset.hdf5 import unpacked_chunk
-from drakegrasp.dataset.manifest import Manifest
-from drakegrasp.dataset.paths import FILE_NAME
-from drakegrasp.outcomes import Removal
+from drakegrasp.dataset.manifest import Manifest, ObjectEntry
+from drakegrasp.dataset.paths import (
+    FILE_NAME,
+    model_path,
+    plan_path,
+    recorded_model,
+    refuse_changed_model,
+)
+from drakegrasp.dataset.schema import CAMERAS, SPLITS
+from drakegrasp.dataset.shards import read_trials
+from drakegrasp.errors import DataError, HandError, MeshError, first_line
+from drakegrasp.hand.carried import HAND_FOLDER
+from drakegrasp.hand.folder import hand_digest
+from drakegrasp.objects.model import load_object
+from drakegrasp.outcomes import Outcome, Removal
 
 #: Attributes that say of what a file was assembled, the cause of others first.
 ORIGIN = ("config", "split_by", "versions", "fingers", "joints", "shards", "signature")
+#: Trials in a batch: some 10 MB.
+TRIAL_ROWS = 8192
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Again:
-    """A dataset assembled again, but for its rows.
+# Files of objects
 
-    Attributes:
-        out: Directory of the dataset.
-        manifest: Its manifest.
-        shards: What the shards hold.
-        decisions: What becomes of the successes.
+#: An object of a dataset in a directory, and the survey of its shards; None if it has no palm pose.
+ObjectTask = tuple[Path, ObjectEntry, SurveyTask | None]
+
+
+def object_tasks(out: Path, manifest: Manifest) -> Iterator[ObjectTask]:
+    """Yield the task of each object."""
+    surveys = {task.object: task for task in survey_tasks(out, manifest)}
+    for i, entry in enumerate(manifest.objects):
+        yield out, entry, surveys.get(i)
+
+
+def check_object(task: ObjectTask) -> tuple[Findings, bool, Survey | None]:
+    """Verify the files of an object.
+
+    Returns:
+        The violations, whether its meshes can be read, and the survey of its shards; None where
+        one is missing or broken, or there is none.
     """
+    out, entry, shards = task
+    findings, survey = Findings(), None
+    findings.add(_meshes(out, entry))
+    readable = not findings
+    findings.add(_as_written(out, entry.name))
+    if shards is not None:
+        try:
+            survey = survey_object(shards)
+        except DataError:
+            findings.add(_broken_shards(shards))
+    return findings, readable, survey
 
-    out: Path
-    manifest: Manifest
+
+def carried_hand_as_built(manifest: Manifest) -> Iterator[Violation]:
+    """The hand that the dataset carries is the one that built it."""
+    source, what = manifest.config.hand_source, f"the hand must be that of {FILE_NAME}"
+    if not isinstance(source, CarriedHand):
+        return  # an older dataset carries none
+    try:
+        found = hand_digest(source)
+    except HandError as error:
+        yield of_file(HAND_FOLDER, what, first_line(error).rpartition(", got ")[2])
+        return
+    if found != source.digest:
+        yield of_file(HAND_FOLDER, f"{what}, {source.digest}", found)
+
+
+def _meshes(out: Path, entry: ObjectEntry) -> Iterator[Violation]:
+    """The meshes can be read, and are those of the manifest."""
+    path = model_path(out, entry.name)
+    name = str(path.relative_to(out))
+    try:
+        found = load_object(path).mesh_sha256
+    except MeshError as error:
+        yield of_file(name, "the object must be readable", error)
+        return
+    if found != entry.mesh_sha256:
+        yield of_file(name, f"mesh_sha256 must be that of {FILE_NAME}", found)
+
+
+def _as_written(out: Path, name: str) -> Iterator[Violation]:
+    """The meshes and the plan are as they were written: the plan vouches for both."""
+    path = plan_path(out, name)
+    try:
+        expected = recorded_model(out, name)
+        path = model_path(out, name)
+        refuse_changed_model(out, name, expected)
+    except (DataError, OSError) as error:
+        what = "an object's file must be as it was written"
+        got = first_line(error).removeprefix(f"{path}: ")
+        yield of_file(str(path.relative_to(out)), what, got)
+
+
+def _broken_shards(task: SurveyTask) -> Iterator[Violation]:
+    """The shards are there and whole, up to the last wanted grasp."""
+    out, left = Path(task.out), np.inf if task.wanted is None else task.wanted
+    for header in task.headers:
+        if left <= 0:
+            return
+        path = header.path(out)
+        try:
+            outcome = read_trials(path, header, ("outcome",), complete=True)["outcome"]
+        except DataError as error:
+            what = "the shard must be there, whole and of its work unit"
+            got = str(error).rpartition(", got ")[2] if path.exists() else "none"
+            yield of_file(str(path.relative_to(out)), what, got)
+            continue
+        left -= int((outcome == Outcome.SUCCESS).sum())
+
+
+# What is decided again
+
+
+class Again(NamedTuple):
+    """A dataset assembled again, but for its rows: what its shards hold, and what becomes of it."""
+
     shards: Shards
     decisions: Decisions
 
-    @classmethod
-    def of(
-        cls, out: Path, manifest: Manifest, surveys: Sequence[Survey], trials: CheckedFile | None
-    ) -> Again:
-        """Decide again which successes are samples, given the surveys of all objects.
 
-        Code of a dataset is never imported: what the user's own filters removed is read from
-        `trials`, if these can be read.
-        """
-        shards = number_rows(surveys, manifest)
-        removed = np.zeros(0, dtype=np.int64)
-        if manifest.config.filters.own and trials is not None and "successes" in trials.counts:
-            # Columns that cannot be read are a finding later.
-            with suppress(OSError), trials.opened() as file:
-                ids, reasons = (file["successes"][name][:] for name in ("trial_id", "removal"))
-            removed = ids[reasons == Removal.OWN]
-        own = np.isin(shards.successes.trial_id, removed)
-        decisions = decide(manifest, shards.successes, own)
-        return cls(out=out, manifest=manifest, shards=shards, decisions=decisions)
+def assemble_again(
+    manifest: Manifest, surveys: Sequence[Survey], trials: CheckedFile | None
+) -> Again:
+    """Decide again which successes are samples, given the surveys of all objects.
 
-    def counts(self, camera: str) -> dict[str, int]:
-        """Return how many rows each group of a file must have, see `file_attributes`."""
-        if camera:
-            return {split: len(ids) for split, ids in self.decisions.ids.items()}
-        return {
-            "objects": len(self.manifest.objects),
-            "trials": self.shards.count,
-            "successes": len(self.decisions.removal),
-        }
+    Code of a dataset is never imported: what the user's own filters removed is read from
+    `trials`, if these can be read.
+    """
+    shards, removed = number_rows(surveys, manifest), np.zeros(0, dtype=np.int64)
+    if manifest.config.filters.own and trials is not None and "successes" in trials.counts:
+        # Columns that cannot be read are a finding later.
+        with suppress(OSError), trials.opened() as file:
+            ids, reasons = (file["successes"][name][:] for name in ("trial_id", "removal"))
+        removed = ids[reasons == Removal.OWN]
+    own = np.isin(shards.successes["trial_id"], removed)
+    return Again(shards, decide(manifest, shards.successes, own))
 
 
-def origin(file: CheckedFile, manifest: Manifest, seals: str, camera: str) -> Iterator[Violation]:
-    """A file is of the manifest's configuration and of the shards that are there.
+def of_another_state(
+    file: CheckedFile, manifest: Manifest, again: Again | None, camera: str
+) -> Iterator[Violation]:
+    """A file is of the manifest's configuration and of the shards that are there, with their rows.
 
     Args:
         file: The file.
         manifest: Of the dataset.
-        seals: Hash of the seals of the shards; empty if they are not all known.
+        again: The dataset assembled again; None if its shards are not all known.
         camera: `oto` or `otm`; empty for the trials.
     """
-    due = file_attributes(manifest, seals, camera)
+    due = file_attributes(manifest, "" if again is None else again.shards.seals, camera)
     for key in ORIGIN:
-        if key not in due or key not in file.attributes or (key == "shards" and not seals):
+        if key not in due or key not in file.attributes or (key == "shards" and again is None):
             continue
         if _rows_depend_on(key, str(file.attributes[key])) != _rows_depend_on(key, due[key]):
             of = "the shards that are there" if key == "shards" else FILE_NAME
             got = "another" if key in ("config", "signature") else file.attributes[key]
-            yield of_file(
-                file.name,
-                f"attribute {key} must be that of {of}",
-                f"{got}; run `drakegrasp assemble` again",
-            )
+            got = f"{got}; run `drakegrasp assemble` again"
+            yield of_file(file.name, f"attribute {key} must be that of {of}", got)
             return  # others follow from it
 
-
-def row_counts(file: CheckedFile, again: Again, camera: str) -> Iterator[Violation]:
-    """Each group has the number of rows that assembling gives."""
-    for group, due in again.counts(camera).items():
-        count = file.counts.get(group, due)
-        if count != due:
-            yield of_file(file.name, f"number of rows must be {due}", count, f"/{group}")
+    # The number of rows of each group.
+    if again is None:
+        return
+    counts = {split: len(ids) for split, ids in again.decisions.ids.items()}
+    if not camera:
+        counts = {"trials": again.shards.count, "successes": len(again.decisions.removal)}
+        counts["objects"] = len(manifest.objects)
+    for group, number in counts.items():
+        count = file.counts.get(group, number)
+        if count != number:
+            yield of_file(file.name, f"number of rows must be {number}", count, f"/{group}")
 
 
 def objects_and_successes(
@@ -127,39 +234,98 @@ def objects_and_successes(
     with trials.opened() as file:
         for group, (columns, of) in tables.items():
             count = len(next(iter(columns.values())))
-            if trials.counts.get(group) != count:
-                continue  # a finding already, or no group
-            for batch in trials.batches(file, group, np.arange(count), max(count, 1), findings):
-                trials.judge(batch, findings, *_rules(columns, batch, of))
+            if trials.counts.get(group) == count:  # else a finding already, or no group
+                for batch in trials.batches(file, group, np.arange(count), count or 1, findings):
+                    findings.add(batch.follow(columns, of))
 
 
-def compare_trials(
-    file: h5py.File,
-    trials: CheckedFile,
-    columns: Mapping[str, AnyArray],
-    start: int,
-    findings: Findings,
-    size: int,
-) -> Iterator[Batch]:
-    """Yield rows of /trials that are those of their shards; others become findings.
+# Rows
+
+
+def trials_tasks(
+    files: Mapping[str, CheckedFile],
+    dataset: Dataset | None = None,
+    again: Again | None = None,
+    compared: frozenset[str] = frozenset(),
+) -> Iterator[Task]:
+    """Yield the tasks that judge all attempts, and compare what follows from the shards.
 
     Args:
-        file: The file, opened.
-        trials: What is known of it.
-        columns: The rows derived again, (n, ...) each.
-        start: First of the rows.
-        findings: Takes the violations.
-        size: Rows of a batch.
+        files: The files, by camera; the trials under "", if they can be read.
+        dataset: The dataset around them, if there is one.
+        again: The dataset assembled again, if its shards are sound.
+        compared: Cameras of the files that are compared; "" for the trials.
     """
-    rows = np.arange(start, start + len(columns["trial_id"]))
-    for batch in trials.batches(file, "trials", rows, size, findings):
-        rows = batch.rows - start
-        place = slice(rows[0], rows[-1] + 1) if rows[-1] - rows[0] + 1 == len(rows) else rows
-        own = {name: values[place] for name, values in columns.items()}
-        yield trials.judge(batch, findings, *_rules(own, batch, "its shard"))
+    # Trials need their objects: a broken layout is a finding already.
+    trials = files.get("")
+    sound = trials is not None and {"objects", "trials"} <= set(trials.counts)
+    trials = trials if sound else None
+    count = 0 if trials is None else trials.counts["trials"]
+
+    # What follows from the shards comes along, range by range.
+    packs: Iterator[PackTask] = iter(())
+    if dataset is not None and again is not None and compared:
+        certified = dataset.manifest.config.certified
+        packs = pack_tasks(dataset.out, *again, certified=certified)
+    data = {camera: files[camera] for camera in CAMERAS if camera in compared}
+    firsts = dict.fromkeys(SPLITS, 0)
+    for start, pack in zip_longest(range(0, count, TASK_ROWS), packs):
+        first = pack.start if start is None else start
+        rows = np.arange(first, max(first, min(first + TASK_ROWS, count)))
+        own = pack if "" in compared else None
+        yield (
+            len(rows),
+            partial(_judge, trials, rows, dataset, pack, own is not None, data, dict(firsts)),
+        )
+        for split, ids in {} if pack is None else pack.ids.items():
+            firsts[split] += len(ids)
 
 
-def compare_samples(
+def _judge(
+    trials: CheckedFile | None,
+    rows: AnyArray,
+    dataset: Dataset | None,
+    pack: PackTask | None,
+    compared: bool,
+    data: Mapping[str, CheckedFile],
+    firsts: Mapping[str, int],
+) -> Findings:
+    """Apply every rule to a range of attempts, and compare the samples among them.
+
+    Args:
+        trials: trials.hdf5; None if it cannot be read.
+        rows: Of /trials, (n,).
+        dataset: The dataset around the files, if there is one.
+        pack: Derives the rows again; None where they cannot be compared.
+        compared: Whether the attempts are compared, too.
+        data: The data files that are compared, by camera.
+        firsts: Row of the first sample of the range in each split.
+    """
+    findings = Findings()
+    columns, samples = ({}, {}) if pack is None else read_rows(pack)
+    if trials is not None and len(rows):
+        groups = trial_rules(trials, dataset)
+        with trials.opened() as file:
+            for batch in trials.batches(file, "trials", rows, TRIAL_ROWS, findings):
+                if compared:
+                    own = {name: v[batch.rows - rows[0]] for name, v in columns.items()}
+                    batch = batch.judge(
+                        findings, partial(Batch.follow, columns=own, what="its shard")
+                    )
+                for rules in groups:
+                    batch = batch.judge(findings, *rules)
+
+    if dataset is not None:
+        texts = sample_texts(dataset.manifest)
+        for camera, of_camera in data.items():
+            for split, due in samples.items():
+                if split in of_camera.counts:
+                    first = firsts[split]
+                    _compare_samples(of_camera, camera, split, first, due, texts, findings)
+    return findings
+
+
+def _compare_samples(
     data: CheckedFile,
     camera: str,
     split: str,
@@ -171,7 +337,7 @@ def compare_samples(
     """Compare some samples of a data file with those that are derived again.
 
     Args:
-        data: The file; it remembers the rows that differ.
+        data: The file.
         camera: `oto` or `otm`.
         split: Name of the split.
         first: Row of the first sample.
@@ -186,26 +352,18 @@ def compare_samples(
     with data.opened() as file:
         for batch in data.batches(file, split, rows, max(len(rows), 1), findings, list(due)):
             # A sample of another trial differs in all else.
-            own = {name: values[batch.rows - first] for name, values in due.items()}
-            trial_id = {"trial_id": own.pop("trial_id")}
-            same = data.judge(batch, findings, *_rules(trial_id, batch, "shards and manifest"))
-            own = {n: v[np.isin(batch.rows, same.rows)] for n, v in own.items()}
-            same = data.judge(same, findings, *_rules(own, same, "its trial"))
+            names = ["trial_id"], [name for name in due if name != "trial_id"]
+            for own, of in zip(names, ("shards and manifest", "its trial"), strict=True):
+                columns = {name: due[name][batch.rows - first] for name in own}
+                batch = batch.judge(findings, partial(Batch.follow, columns=columns, what=of))
             for name in IMAGES:
-                dataset, stored = file[split][name], samples.images[camera, name]
-                bad = [_differs(dataset, row, *stored[row - first]) for row in same.rows.tolist()]
+                stored = samples.images[camera, name]
+                differs = partial(_differs, file[split][name])
+                bad = [differs(row, *stored[row - first]) for row in batch.rows.tolist()]
                 what = f"{name} must be what the shard holds"
-                same = data.judge(same, findings, _images_rule(what, np.array(bad, dtype=bool)))
-
-
-def _images_rule(what: str, bad: AnyArray) -> Rule:
-    return lambda batch: batch.broken(what, bad, lambda i: "another image")
-
-
-def _rules(columns: Mapping[str, AnyArray], batch: Batch, of: str) -> list[Rule]:
-    """Return the rules that each field of a batch has the values of a column."""
-    names = [name for name in columns if name in batch.columns]
-    return [partial(Batch.follows, name=name, due=columns[name], what=of) for name in names]
+                other = np.array(bad, dtype=bool)
+                findings.add(batch.broken(what, other, lambda i: "another image"))
+                batch = batch.where(~other)
 
 
 def _differs(dataset: h5py.Dataset, row: int, chunk: bytes, skipped: int) -> bool:

@@ -1,23 +1,22 @@
-"""Rules of the images of a sample: they show the object and the table.
+"""What images show: the object and the table, where a sample or a scene says that they are.
 
-In: a `Batch` of samples of one data file, the `Lens` of its camera, and for some rules the mesh of
-the object. Out: a `Violation` for every row that is wrong. No file is read.
+In: the depth images [m] and masks of samples or of views. Out: points and distances of one image,
+for the rules of scenes; a `Violation` for every sample that is wrong. No file is read.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import binary_erosion
 
-from drakegrasp.config import CameraConfig, Config
-from drakegrasp.dataset.checks.findings import Violation
-from drakegrasp.dataset.checks.rows import UNIT_TOLERANCE, AnyArray, Batch
+from drakegrasp.config import Config
+from drakegrasp.dataset.checks.fields import UNIT_TOLERANCE
+from drakegrasp.dataset.checks.rows import AnyArray, Batch, Violation
 from drakegrasp.dataset.schema import CAMERAS
-from drakegrasp.frames import Array, invert_pose
+from drakegrasp.frames import X_WT, Array, invert_pose
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.vision.camera import intrinsics, project, unproject
 from drakegrasp.vision.depth_sensor import DepthSensor, clean_depth
@@ -42,107 +41,101 @@ TABLE_HALF = np.array([0.8, 0.8, 0.05])
 P_TTABLE = np.array([0.0, 0.0, -0.05])
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Lens:
-    """The camera of a data file.
-
-    Attributes:
-        camera: `oto` or `otm`.
-        size: Edge of the images [px].
-        K: Camera matrix (3, 3) [px].
-        near, far: Range of the depth image [m].
-        loses: Whether pixels that show something may have no depth, which is `far` then.
-    """
-
-    camera: str
-    size: int
-    K: Array
-    near: np.float32
-    far: np.float32
-    loses: bool
-
-    @cached_property
-    def rays_C(self) -> Array:
-        """What to multiply with a depth image for the points that it shows, (3, S, S)."""
-        v, u = np.indices((self.size, self.size)).reshape(2, -1)
-        rays = unproject(self.K, np.column_stack([u, v]), np.ones(len(u)))
-        return rays.T.reshape(3, self.size, self.size)
-
-    @classmethod
-    def of(cls, camera: str, config: Config) -> Lens:
-        """Return the lens of a configuration; its range is rounded to float32, as images are."""
-        rules = config.randomize
-        return cls(
-            camera=camera,
-            size=config.camera.size,
-            K=intrinsics(config.camera),
-            near=np.float32(config.camera.near),
-            far=np.float32(config.camera.far),
-            loses=rules.depth_noise is not None or rules.depth_baseline > 0.0,
-        )
-
-    def has_depth(self, depth: AnyArray) -> AnyArray:
-        """Return where a depth image (S, S) has a depth; everywhere if no pixel may lose its."""
-        return depth < self.far if self.loses else np.ones_like(depth, dtype=np.bool_)
+# One image
 
 
-def image_values(batch: Batch, lens: Lens) -> Iterator[Violation]:
-    """Colours are within 0..1 and depths within near..far."""
-    colour, depth = batch["images"][:, :3], batch["images"][:, 3]
-    for what, values, low, high in (
-        ("colours must be within 0..1", colour, 0.0, 1.0),
-        (f"depths must be within {lens.near:g}..{lens.far:g} m", depth, lens.near, lens.far),
+def points_of(depth: AnyArray, chosen: AnyArray, K: Array, X_AC: Array) -> Array:
+    """Return the points p_AQ (m, 3) [m] of the pixels of an image where `chosen` (h, w) is true."""
+    v, u = np.nonzero(chosen)
+    p_CQ = unproject(K, np.column_stack([u, v]), depth[v, u])
+    return np.asarray(p_CQ @ X_AC[:3, :3].T + X_AC[:3, 3])
+
+
+def off_table(p_TQ: Array) -> float:
+    """Return how far the worst of points (m, 3) is off the surface of the table's slab [m]."""
+    outside = np.abs(p_TQ - P_TTABLE) - TABLE_HALF
+    distance = np.linalg.norm(np.maximum(outside, 0.0), axis=1)
+    distance += np.abs(np.minimum(outside.max(axis=1, initial=-np.inf), 0.0))
+    return float(distance.max(initial=0.0))
+
+
+def some_of(points: Array) -> Array:
+    """Return MEASURED_PIXELS of points (m, 3), evenly from the first to the last."""
+    return points[np.linspace(0, len(points) - 1, MEASURED_PIXELS).astype(int)]
+
+
+def off_mesh(chosen: list[Array], model: ObjectModel) -> Array:
+    """Return how far (n,) the worst of some points p_OQ of each of n images is off a mesh [m]."""
+    _, distance, _ = model.visual.nearest.on_surface(np.concatenate(chosen))
+    return np.asarray(distance.reshape(len(chosen), -1).max(axis=1))
+
+
+def border_of(mask: AnyArray) -> AnyArray:
+    """Return which pixels of a mask (h, w) of 0 and 1 have a neighbour outside of it."""
+    return (mask == 1) & ~binary_erosion(mask, np.ones((3, 3)), border_value=1)
+
+
+# Samples
+
+
+def object_in_camera(batch: Batch, camera: str) -> Array:
+    """Return X_CO (n, 4, 4) of the object in a camera's frame."""
+    X_CT, X_WO = (
+        batch.pose(f"object_props/frame_{name}") for name in (f"cam2work_{camera}", "world2obj")
+    )
+    return X_CT @ invert_pose(X_WT) @ X_WO
+
+
+def contacts_of(batch: Batch) -> tuple[Array, Array]:
+    """Return p_CQ [m] and nhat_Q_C of `grasps`, (n, k, 3) each."""
+    vectors = batch["grasps"].astype(float).reshape(len(batch), 2, -1, 3)
+    return vectors[:, 0], vectors[:, 1]
+
+
+def has_depth(depth: AnyArray, config: Config) -> AnyArray:
+    """Return where depths of a sample are some; everywhere if no pixel may lose its."""
+    loses = config.randomize.depth_noise is not None or config.randomize.depth_baseline > 0.0
+    lost = depth >= np.float32(config.camera.far)
+    return np.asarray(~lost) if loses else np.ones_like(lost)
+
+
+def image_values(batch: Batch, config: Config) -> Iterator[Violation]:
+    """Colours are within 0..1 and depths within near..far; a mask has an object pixel."""
+    near, far = np.float32(config.camera.near), np.float32(config.camera.far)
+    for what, channels, low, high in (
+        ("colours must be within 0..1", slice(3), 0.0, 1.0),
+        (f"depths must be within {near:g}..{far:g} m", slice(3, 4), near, far),
     ):
-        flat = values.reshape(len(batch), -1)
-        least, most = flat.min(axis=1), flat.max(axis=1)
-        yield from batch.broken(
-            what,
-            (least < low) | (most > high),
-            lambda i, least=least, most=most: f"{least[i]:.6g}..{most[i]:.6g}",  # type: ignore[misc]
-        )
+        values = batch["images"][:, channels].reshape(len(batch), -1)
+        least, most = values.min(axis=1), values.max(axis=1)
+        got = [f"{a:.6g}..{b:.6g}" for a, b in zip(least, most, strict=True)]
+        yield from batch.broken(what, (least < low) | (most > high), got.__getitem__)
+    empty = np.logical_not(batch["masks"].any(axis=(1, 2)))
+    yield from batch.broken("mask must have an object pixel", empty, lambda i: "an empty mask")
 
 
-def mask_values(batch: Batch) -> Iterator[Violation]:
-    """A mask holds only 0 and 1, and at least one 1."""
-    largest = batch["masks"].reshape(len(batch), -1).max(axis=1)
-    yield from batch.broken("mask must hold 0 and 1 only", largest > 1, largest)
-    yield from batch.broken(
-        "mask must have an object pixel", largest == 0, lambda i: "an empty mask"
-    )
-
-
-def image_frames(batch: Batch, lens: Lens) -> Iterator[Violation]:
+def image_frames(batch: Batch, camera: str, config: Config) -> Iterator[Violation]:
     """The image frame is before the camera, faces away from it, and in otm is at the centroid."""
-    # Place and direction.
-    X_CI = batch.frame("cam2img_otm")
-    yield from batch.broken(
-        "frame_cam2img_otm must start before the camera [m]", X_CI[:, 2, 3] <= 0.0, X_CI[:, 2, 3]
-    )
+    name = "frame_cam2img_otm"
+    X_CI, K = batch.pose(f"object_props/{name}"), intrinsics(config.camera)
+    ahead = X_CI[:, 2, 3]
+    yield from batch.broken(f"{name} must start before the camera [m]", ahead <= 0.0, ahead)
     turned = np.abs(X_CI[:, :3, 0] - [0.0, 0.0, 1.0]).max(axis=1)
-    yield from batch.broken(
-        "frame_cam2img_otm must have +Ix along +Cz",
-        turned > UNIT_TOLERANCE,
-        lambda i: np.array2string(X_CI[i, :3, 0], precision=4),
-    )
+    got = [np.array2string(own, precision=4) for own in X_CI[:, :3, 0]]
+    what = f"{name} must have +Ix along +Cz"
+    yield from batch.broken(what, turned > UNIT_TOLERANCE, got.__getitem__)
 
     # The frame was estimated from the otm mask, so only that file can confirm its origin.
-    if lens.camera == "otm":
-        ahead = X_CI[:, 2, 3] > 0.0
+    if camera == "otm":
         off = np.zeros(len(batch))
-        for i in np.flatnonzero(ahead):
-            v, u = np.nonzero(batch["masks"][i])
-            off[i] = np.linalg.norm(project(lens.K, X_CI[i, None, :3, 3])[0] - [u.mean(), v.mean()])
-        yield from batch.broken(
-            f"frame_cam2img_otm must start within {CENTROID_TOLERANCE} px of the mask's centroid",
-            off > CENTROID_TOLERANCE,
-            off,
-        )
+        for i in np.flatnonzero(ahead > 0.0):
+            centroid = np.argwhere(batch["masks"][i]).mean(axis=0)[::-1]
+            off[i] = np.linalg.norm(project(K, X_CI[i, None, :3, 3])[0] - centroid)
+        what = f"{name} must start within {CENTROID_TOLERANCE} px of the mask's centroid"
+        yield from batch.broken(what, off > CENTROID_TOLERANCE, off)
 
 
-# What the images show
-
-
-def without_noise(batch: Batch, lens: Lens, config: CameraConfig) -> Batch:
+def without_noise(batch: Batch, camera: str, config: Config) -> Batch:
     """Return the samples with depth images from which the noise is taken that was drawn."""
     noise, seeds = batch["conditions/depth_noise"], batch["conditions/depth_seed"]
     if not noise.any():
@@ -150,106 +143,87 @@ def without_noise(batch: Batch, lens: Lens, config: CameraConfig) -> Batch:
     images = batch["images"].copy()
     for i in range(len(batch)):
         sensor = DepthSensor(noise=float(noise[i]), seed=int(seeds[i]))
-        number = CAMERAS.index(lens.camera)
-        images[i, 3] = clean_depth(images[i, 3], sensor, number, config)
+        number = CAMERAS.index(camera)
+        images[i, 3] = clean_depth(images[i, 3], sensor, number, config.camera)
     return replace(batch, columns={**batch.columns, "images": images})
 
 
-def contacts_in_image(batch: Batch, lens: Lens) -> Iterator[Violation]:
+def contacts_in_image(batch: Batch, config: Config) -> Iterator[Violation]:
     """Contacts project onto the mask, and lie on the visible surface or behind it."""
-    p_CQ, _ = batch.contacts()
+    p_CQ, _ = contacts_of(batch)
     for finger in range(p_CQ.shape[1]):
         # How far each contact is beside the mask [px], and before the surface there [m].
         z = p_CQ[:, finger, 2]
-        beside, before = np.zeros(len(batch)), np.zeros(len(batch))
+        beside, before = np.zeros((2, len(batch)))
         for i in np.flatnonzero(z > 0.0):
-            (pixel,) = project(lens.K, p_CQ[i, finger, None])
+            (pixel,) = project(intrinsics(config.camera), p_CQ[i, finger, None])
             v, u = np.nonzero(batch["masks"][i])
             beside[i] = np.hypot(u - pixel[0], v - pixel[1]).min()
             if beside[i] <= MASK_TOLERANCE:
-                nearest = _nearest_depth(batch["images"][i, 3], lens, pixel)
+                nearest = nearest_depth(batch["images"][i, 3], config, pixel)
                 before[i] = nearest - z[i] if np.isfinite(nearest) else 0.0
 
-        yield from batch.broken(
-            f"contact of finger {finger + 1} must be before the camera [m]", z <= 0.0, z
-        )
-        yield from batch.broken(
-            f"contact of finger {finger + 1} must project within {MASK_TOLERANCE:g} px of the mask",
-            beside > MASK_TOLERANCE,
-            beside,
-        )
-        yield from batch.broken(
-            f"contact of finger {finger + 1} must not lie more than {BEFORE_SURFACE:g} m before "
-            "the surface in the depth image",
-            before > BEFORE_SURFACE,
-            before,
-        )
+        mesh = f"not lie more than {BEFORE_SURFACE:g} m before the surface in the depth image"
+        for what, bad, got in (
+            ("be before the camera [m]", z <= 0.0, z),
+            (f"project within {MASK_TOLERANCE:g} px of the mask", beside > MASK_TOLERANCE, beside),
+            (mesh, before > BEFORE_SURFACE, before),
+        ):
+            yield from batch.broken(f"contact of finger {finger + 1} must {what}", bad, got)
 
 
-def table_pixels(batch: Batch, lens: Lens) -> Iterator[Violation]:
+def nearest_depth(depth: AnyArray, config: Config, pixel: Array) -> float:
+    """Return the least depth [m] around a pixel (2,), which is clipped into the image.
+
+    It is infinite where no pixel around has a depth.
+    """
+    u, v = np.clip(np.rint(pixel), 0, len(depth) - 1).astype(int)
+    rows, columns = (slice(max(at - SILHOUETTE, 0), at + SILHOUETTE + 1) for at in (v, u))
+    around = depth[rows, columns]
+    return float(around.min(initial=np.inf, where=has_depth(around, config)))
+
+
+def table_pixels(batch: Batch, camera: str, config: Config) -> Iterator[Violation]:
     """Pixels beside the mask, nearer than far, show the table."""
-    X_TC = invert_pose(batch.frame(f"cam2work_{lens.camera}"))
-    off = np.zeros(len(batch))
-    for i in range(len(batch)):
-        depth = batch["images"][i, 3]
-        p_TQ = _points(X_TC[i], lens, depth, (batch["masks"][i] == 0) & (depth < lens.far))
-
-        # Distance from the surface of the slab, from outside and from inside.
-        outside = np.abs(p_TQ - P_TTABLE) - TABLE_HALF
-        distance = np.linalg.norm(np.maximum(outside, 0.0), axis=1)
-        distance += np.abs(np.minimum(outside.max(axis=1, initial=-np.inf), 0.0))
-        off[i] = distance.max(initial=0.0)
-
-    yield from batch.broken(
-        f"points beside the mask must be on the table within {DEPTH_TOLERANCE:g} m",
-        off > DEPTH_TOLERANCE,
-        off,
-    )
+    X_TC = invert_pose(batch.pose(f"object_props/frame_cam2work_{camera}"))
+    K, off = intrinsics(config.camera), np.zeros(len(batch))
+    for i, depth in enumerate(batch["images"][:, 3]):
+        beside = (batch["masks"][i] == 0) & (depth < np.float32(config.camera.far))
+        off[i] = off_table(points_of(depth, beside, K, X_TC[i]))
+    what = f"points beside the mask must be on the table within {DEPTH_TOLERANCE:g} m"
+    yield from batch.broken(what, off > DEPTH_TOLERANCE, off)
 
 
-def object_pixels(batch: Batch, lens: Lens, model: ObjectModel) -> Iterator[Violation]:
+def object_pixels(
+    batch: Batch, camera: str, config: Config, model: ObjectModel
+) -> Iterator[Violation]:
     """Pixels in the mask show the object: all are in its box, and some are on its mesh."""
-    # All pixels against the box, which is cheap; keep some for the mesh.
-    X_OC = invert_pose(batch.object_in_camera(lens.camera))
+    X_OC, K = invert_pose(object_in_camera(batch, camera)), intrinsics(config.camera)
     beyond, chosen = np.zeros(len(batch)), []
-    for i in range(len(batch)):
-        depth = batch["images"][i, 3]
-        seen = (batch["masks"][i] == 1) & lens.has_depth(depth)
+    for i, depth in enumerate(batch["images"][:, 3]):
+        seen = (batch["masks"][i] == 1) & has_depth(depth, config)
         # A corner of the mesh stands for an image whose depths are all lost.
         if not seen.any():
-            chosen.append(np.repeat(model.visual_vertices[:1], MEASURED_PIXELS, axis=0))
+            chosen.append(some_of(model.visual_vertices[:1]))
             continue
-        border = _border(batch["masks"][i])
-        p_OQ = _points(X_OC[i], lens, depth, seen)
-        slack = np.where(border, depth / lens.K[0, 0], 0.0)[seen]
-        beyond[i] = _beyond_box(p_OQ, X_OC[i][:3, 3], model.half_extents, slack)
+        border = border_of(batch["masks"][i])
+        p_OQ = points_of(depth, seen, K, X_OC[i])
+        slack = np.where(border, depth / K[0, 0], 0.0)[seen]
+        beyond[i] = beyond_box(p_OQ, X_OC[i][:3, 3], model.half_extents, slack)
 
         # The mesh is measured inside the border, if there is any inside.
-        inside = p_OQ[~border[seen]] if (seen & ~border).any() else p_OQ
-        measured = np.linspace(0, len(inside) - 1, MEASURED_PIXELS).astype(int)
-        chosen.append(inside[measured])
-    yield from batch.broken(
-        f"points in the mask must be in the object's box within {DEPTH_TOLERANCE:g} m",
-        beyond > DEPTH_TOLERANCE,
-        beyond,
-    )
-
-    # The chosen pixels against the mesh.
-    _, distance, _ = model.visual.nearest.on_surface(np.concatenate(chosen))
-    off = distance.reshape(len(batch), -1).max(axis=1)
-    yield from batch.broken(
-        f"points in the mask must be on the object's mesh within {DEPTH_TOLERANCE:g} m",
-        (off > DEPTH_TOLERANCE) & (beyond <= DEPTH_TOLERANCE),
-        off,
-    )
+        chosen.append(some_of(p_OQ[~border[seen]] if (seen & ~border).any() else p_OQ))
+    off, outside = off_mesh(chosen, model), beyond > DEPTH_TOLERANCE
+    what = f"within {DEPTH_TOLERANCE:g} m"
+    box, mesh = (f"points in the mask must be {where} {what}" for where in _WHERE)
+    yield from batch.broken(box, outside, beyond)
+    yield from batch.broken(mesh, (off > DEPTH_TOLERANCE) & ~outside, off)
 
 
-def _border(mask: AnyArray) -> AnyArray:
-    """Return which pixels of a mask (S, S) have a neighbour outside of it, (S, S) bool."""
-    return (mask == 1) & ~binary_erosion(mask, np.ones((3, 3)), border_value=1)
+_WHERE = ("in the object's box", "on the object's mesh")
 
 
-def _beyond_box(p_OQ: Array, p_OC: Array, half_extents: Array, slack: Array) -> float:
+def beyond_box(p_OQ: Array, p_OC: Array, half_extents: Array, slack: Array) -> float:
     """Return how far the worst point is outside of the object's box [m], 0 if none is.
 
     A renderer moves corners to fractions of a pixel, so a pixel whose ray just misses the object
@@ -271,21 +245,3 @@ def _beyond_box(p_OQ: Array, p_OC: Array, half_extents: Array, slack: Array) -> 
     enters, leaves = cuts.min(axis=0).max(axis=1), cuts.max(axis=0).min(axis=1)
     wrong = np.maximum(enters, -slack) > np.minimum(leaves, slack)
     return float((np.abs(p_OQ) - half_extents).max(axis=1).max(where=wrong, initial=0.0))
-
-
-def _nearest_depth(depth: AnyArray, lens: Lens, pixel: Array) -> float:
-    """Return the least depth [m] around a pixel (2,), which is clipped into the image.
-
-    It is infinite where no pixel around has a depth.
-    """
-    size = len(depth)
-    u, v = np.clip(np.rint(pixel), 0, size - 1).astype(int)
-    low = np.maximum([v - SILHOUETTE, u - SILHOUETTE], 0)
-    around = depth[low[0] : v + SILHOUETTE + 1, low[1] : u + SILHOUETTE + 1]
-    return float(around.min(initial=np.inf, where=lens.has_depth(around)))
-
-
-def _points(X_AC: Array, lens: Lens, depth: AnyArray, chosen: AnyArray) -> Array:
-    """Return the points p_AQ (m, 3) of the pixels where `chosen` (S, S) is true."""
-    p_CQ = lens.rays_C[:, chosen] * depth[chosen]
-    return np.asarray((X_AC[:3, :3] @ p_CQ).T + X_AC[:3, 3])

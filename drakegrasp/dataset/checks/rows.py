@@ -1,41 +1,148 @@
-"""Rows of a file that is checked, the rules that judge them, and the tasks that do so.
+"""What a check works with: files that may hold anything, rows of them, rules, and violations.
 
-In: what is known of a file, plain data that any process can open. Out: batches of its rows;
-violations of the rules in them. A rule is given no row that broke one before: so the check reports
-a cause, and not all that follows from it.
+In: an open HDF5 file. Out: what is known of it, plain data that any process can open; batches of
+its rows; violations of rules in them. A rule is given no row that broke one before: so the check
+reports a cause, and not all that follows from it.
 """
 
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.config import Config
-from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
+from drakegrasp.config import Config, parse_stored
+from drakegrasp.dataset.assembly.decisions import lens_attributes
 from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.dataset.schema import Field
+from drakegrasp.dataset.opening import (
+    DATA_TABLES,
+    OF_CAMERA,
+    OF_SCENES,
+    ORIGIN,
+    SCENE_TABLES,
+    TRIAL_TABLES,
+    attribute_mistakes,
+    differences,
+)
+from drakegrasp.dataset.schema import CAMERAS, CONVENTIONS, OTHER_SCHEMA, SCHEMA_VERSION, Field
 from drakegrasp.errors import DataError, first_line
-from drakegrasp.frames import X_WT, Array, invert_pose, unpack_pose
+from drakegrasp.foreign_files import parse_json
+from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.runtime.executor import Executor, in_order
 from drakegrasp.runtime.progress import Report
 
 AnyArray = npt.NDArray[Any]
 Rows = npt.NDArray[np.int64]
-#: float32 rounds unit vectors and rotations by 2e-7; this leaves room for products.
-UNIT_TOLERANCE = 1e-5
+#: Rows listed per broken invariant and group; further rows are only counted.
+MAX_LISTED = 20
 #: float32 rounds points within a metre or two by 1e-7 m; this leaves room for products.
 POSITION_TOLERANCE = 1e-5  # [m]
 #: How far a number may be from the same derived again, in units in the last place of its row's
 #: largest value: a last bit may differ between machines.
 LAST_PLACES = 2
+#: K, near and far are float64 copies of the configuration's values.
+CAMERA_TOLERANCE = 1e-9
+#: Key of scenes.hdf5 among the files that are checked; "" is that of the trials.
+SCENES = "scenes"
+
+
+# Violations
+
+
+@dataclass(frozen=True, kw_only=True)
+class Violation:
+    """One broken invariant.
+
+    Attributes:
+        file: Path within the dataset's directory.
+        group: Group or split within the file, e.g. `/train`; empty for the whole file.
+        row: Row of the group; None for all of it.
+        what: The invariant in words, with its unit.
+        got: The value that breaks it.
+    """
+
+    file: str
+    group: str = ""
+    row: int | None = None
+    what: str
+    got: str
+
+    def __str__(self) -> str:
+        place = " ".join(p for p in (self.file, self.group) if p)
+        row = "" if self.row is None else f" row {self.row}"
+        return f"{place}{row}: {self.what}, got {self.got}"
+
+
+def of_file(file: str, what: str, got: object, group: str = "") -> Violation:
+    """Return a violation of a file, or of a group of it, as a whole."""
+    return Violation(file=file, group=group, what=what, got=str(got))
+
+
+@dataclass
+class Findings:
+    """The violations of a check, up to MAX_LISTED per invariant and group, and the bad rows."""
+
+    _listed: dict[tuple[str, str, str], list[Violation]] = field(default_factory=dict)
+    _more: Counter[tuple[str, str, str]] = field(default_factory=Counter)
+    _bad: dict[tuple[str, str], set[int]] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self._listed)
+
+    def add(self, violations: Iterable[Violation]) -> set[int]:
+        """Collect violations; return the rows that they are in."""
+        rows = set()
+        for violation in violations:
+            key = (violation.file, violation.group, violation.what)
+            listed = self._listed.setdefault(key, [])
+            if len(listed) < MAX_LISTED:
+                listed.append(violation)
+            else:
+                self._more[key] += 1
+            if violation.row is not None:
+                rows.add(violation.row)
+                self.mark(violation.file, violation.group, [violation.row])
+        return rows
+
+    def merge(self, other: Findings) -> None:
+        """Take over what a task found."""
+        for listed in other._listed.values():
+            self.add(listed)
+        self._more.update(other._more)
+        for (file, group), rows in other._bad.items():
+            self.mark(file, group, rows)
+
+    def mark(self, file: str, group: str, rows: Iterable[int]) -> None:
+        """Remember rows of a group that break a rule or cannot be read."""
+        self._bad.setdefault((file, group), set()).update(rows)
+
+    def bad(self, file: str, group: str) -> Rows:
+        """Return the rows (n,) of a group that break a rule or cannot be read, rising."""
+        return np.array(sorted(self._bad.get((file, group), ())), dtype=np.int64)
+
+    def of_rows(self, file: str, group: str, start: int, stop: int) -> Findings:
+        """Return what a task must know that judges a range of rows: those that are bad already."""
+        rows = self.bad(file, group)
+        known = rows[(rows >= start) & (rows < stop)].tolist()
+        return Findings(_bad={(file, group): set(known)})
+
+    def violations(self) -> list[Violation]:
+        """Return the listed violations, with a line for those that were only counted."""
+        result = []
+        for (file, group, what), listed in self._listed.items():
+            result += listed
+            if more := self._more[file, group, what]:
+                got = f"{more} more rows that break it"
+                result.append(Violation(file=file, group=group, what=what, got=got))
+        return result
 
 
 # Rows and rules
@@ -64,21 +171,8 @@ class Batch:
         return self.columns[name]
 
     def pose(self, name: str) -> Array:
-        """Return the poses (n, 4, 4) in a field."""
+        """Return the poses (n, ..., 4, 4) in a field."""
         return unpack_pose(self.columns[name])
-
-    def frame(self, name: str) -> Array:
-        """Return the poses (n, 4, 4) of a frame of `object_props`."""
-        return self.pose(f"object_props/frame_{name}")
-
-    def object_in_camera(self, camera: str) -> Array:
-        """Return X_CO (n, 4, 4) of the object in a camera's frame."""
-        return self.frame(f"cam2work_{camera}") @ invert_pose(X_WT) @ self.frame("world2obj")
-
-    def contacts(self, name: str = "grasps") -> tuple[Array, Array]:
-        """Return p_CQ [m] and nhat_Q_C of `grasps` or `grasps_held`, (n, k, 3) each."""
-        vectors = self.columns[name].astype(float).reshape(len(self), 2, -1, 3)
-        return vectors[:, 0], vectors[:, 1]
 
     def where(self, keep: AnyArray) -> Batch:
         """Return the rows where `keep` (n,) is true."""
@@ -86,6 +180,13 @@ class Batch:
             return self
         columns = {name: values[keep] for name, values in self.columns.items()}
         return Batch(file=self.file, group=self.group, rows=self.rows[keep], columns=columns)
+
+    def judge(self, findings: Findings, *rules: Rule) -> Batch:
+        """Apply rules that do not build on each other; return the rows that break none."""
+        if not len(self):
+            return self
+        bad = set[int]().union(*(findings.add(rule(self)) for rule in rules))
+        return self.where(~np.isin(self.rows, sorted(bad))) if bad else self
 
     def broken(
         self, what: str, bad: AnyArray, got: Callable[[int], str] | AnyArray
@@ -99,9 +200,8 @@ class Batch:
         """
         for i in np.flatnonzero(bad).tolist():
             figure = got(i) if callable(got) else f"{got[i].item():.6g}"
-            yield Violation(
-                file=self.file, group=self.group, row=int(self.rows[i]), what=what, got=figure
-            )
+            row = int(self.rows[i])
+            yield Violation(file=self.file, group=self.group, row=row, what=what, got=figure)
 
     def follows(
         self, name: str, due: AnyArray, what: str, tolerance: float | None = None
@@ -131,6 +231,12 @@ class Batch:
             lambda i: f"a difference of {off[i]:.4g}" if off[i] > 0.0 else str(values[i])[:60],
         )
 
+    def follow(self, columns: Mapping[str, AnyArray], what: str) -> Iterator[Violation]:
+        """Yield the violations of all fields of the batch that must have the values of a column."""
+        for name, due in columns.items():
+            if name in self.columns:
+                yield from self.follows(name, due, what)
+
 
 Rule = Callable[[Batch], Iterator[Violation]]
 
@@ -138,30 +244,6 @@ Rule = Callable[[Batch], Iterator[Violation]]
 def all_per_row(values: AnyArray) -> AnyArray:
     """Return for each row (n,) whether all of its values (n, ...) are true."""
     return np.asarray(values.all(axis=tuple(range(1, values.ndim))))
-
-
-def unit_length(batch: Batch, lengths: Array, what: str) -> Iterator[Violation]:
-    """Lengths (n, k) by finger are one."""
-    for k in range(lengths.shape[1]):
-        yield from batch.broken(
-            f"{what} {k + 1} must have length 1 within {UNIT_TOLERANCE:g}",
-            np.abs(lengths[:, k] - 1.0) > UNIT_TOLERANCE,
-            lengths[:, k],
-        )
-
-
-def rotation(batch: Batch, name: str) -> Iterator[Violation]:
-    """The pose of that name has an orthonormal rotation with determinant +1."""
-    R = batch.pose(name)[:, :3, :3]
-    # Poses that are NaN are none: `trials.stages` says where they must be.
-    R = np.where(np.isfinite(R).all(axis=(1, 2), keepdims=True), R, np.eye(3))
-    skew = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
-    determinant = np.linalg.det(R)
-    yield from batch.broken(
-        f"{name} must have an orthonormal rotation with determinant +1",
-        (skew > UNIT_TOLERANCE) | (determinant < 0.0),
-        lambda i: f"one that is off by {skew[i]:.3g}, with determinant {determinant[i]:.4g}",
-    )
 
 
 # Files
@@ -175,11 +257,10 @@ class CheckedFile:
         path: Of the file.
         identity: What tells it from another file at the same path.
         name: Its name in violations.
-        attributes: Its attributes.
+        attributes: Its attributes that break no rule of their own.
         config: Its configuration, if it is sound.
         fields: Fields of each group.
         counts: Number of rows of each group whose layout is sound.
-        bad: Rows of each group that break a rule or cannot be read, rising.
     """
 
     path: str
@@ -189,7 +270,6 @@ class CheckedFile:
     config: Config | None
     fields: Mapping[str, tuple[Field, ...]]
     counts: Mapping[str, int]
-    bad: dict[str, Rows] = field(default_factory=dict)
 
     @contextmanager
     def opened(self) -> Iterator[h5py.File]:
@@ -200,7 +280,7 @@ class CheckedFile:
             OSError: If it cannot be opened.
         """
         with open_hdf5(Path(self.path), again=True) as file:
-            if identity(file) != self.identity:
+            if _identity(file) != self.identity:
                 raise DataError(f"{self.path}: must stay while it is checked, got another file")
             yield file
 
@@ -218,20 +298,20 @@ class CheckedFile:
         Raises:
             OSError, UnicodeDecodeError: If the file is damaged there.
         """
-        fields = [f for f in self.fields[group] if names is None or f.name in names]
-        absent = [f for f in fields if f.optional and f.name not in file[group]]
         # HDF5 reads a slice far faster than the same rows as a list.
         dense = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
         choice = slice(int(rows[0]), int(rows[-1]) + 1) if dense else rows
-        own, columns = file[group], {f.name: f.empty(len(rows), {}) for f in absent if not f.shape}
-        for f in fields:
-            if f in absent:
+        own, columns = file[group], {}
+        for f in self.fields[group]:
+            if names is not None and f.name not in names:
                 continue
-            dataset = own[f.name]
-            columns[f.name] = (dataset.asstr() if f.dtype == "str" else dataset)[choice]
+            if f.name in own or not f.optional:
+                columns[f.name] = (own[f.name].asstr() if f.dtype == "str" else own[f.name])[choice]
+            elif not f.shape:
+                columns[f.name] = f.empty(len(rows), {})
         # In files made before it a derived number of a trial is derived here.
-        for f in absent:
-            if f.derive is not None and {*f.needs} <= {*columns}:
+        for f in self.fields[group]:
+            if f.derive is not None and f.name not in own and {*f.needs} <= {*columns}:
                 columns[f.name] = f.derive(columns)
         return Batch(file=self.name, group=f"/{group}", rows=rows, columns=columns)
 
@@ -247,60 +327,108 @@ class CheckedFile:
         """Yield rows of a group that are not bad, of `size` rows each; others become findings."""
         for first in range(0, len(rows), size):
             own = rows[first : first + size]
-            good = own[~np.isin(own, self.bad_rows(group))]
+            good = own[~np.isin(own, findings.bad(self.name, f"/{group}"))]
             try:
                 if len(good):
                     yield self.read(file, group, good, names)
             except (OSError, UnicodeDecodeError) as error:
                 what = f"rows {own[0]} to {own[-1]} must be readable"
                 findings.add([of_file(self.name, what, first_line(error), f"/{group}")])
-                self.mark_bad(group, own)
-
-    def judge(self, batch: Batch, findings: Findings, *rules: Rule) -> Batch:
-        """Apply rules that do not build on each other; return the rows that break none."""
-        if not len(batch):
-            return batch
-        rows = set[int]().union(*(findings.add(rule(batch)) for rule in rules))
-        self.mark_bad(batch.group[1:], np.array(sorted(rows), dtype=np.int64))
-        return batch.where(~np.isin(batch.rows, sorted(rows))) if rows else batch
-
-    def for_task(self, group: str = "", start: int = 0, stop: int = 0) -> CheckedFile:
-        """Return the file for a task, which need not know of all bad rows of a group."""
-        rows = self.bad_rows(group)
-        return replace(self, bad={group: rows[(rows >= start) & (rows < stop)]} if group else {})
-
-    def bad_rows(self, group: str) -> Rows:
-        """Return the rows (n,) of a group that break a rule or cannot be read."""
-        return self.bad.get(group, np.zeros(0, dtype=np.int64))
-
-    def mark_bad(self, group: str, rows: Rows) -> None:
-        """Remember rows (n,) of a group that break a rule or cannot be read."""
-        if len(rows):
-            self.bad[group] = np.union1d(self.bad_rows(group), rows)
+                findings.mark(self.name, f"/{group}", own.tolist())
 
 
-def identity(file: h5py.File) -> tuple[int, int]:
+def _identity(file: h5py.File) -> tuple[int, int]:
     """Return what tells an open file from others, also from one of the same name."""
     found = os.fstat(file.id.get_vfd_handle())
     return found.st_dev, found.st_ino
 
 
+def look_at(name: str, file: h5py.File, camera: str, findings: Findings) -> CheckedFile:
+    """Check the attributes and the layout of a file; no row is read.
+
+    Args:
+        name: Name of the file, for the violations.
+        file: The file.
+        camera: `oto` or `otm`; SCENES, or empty for the trials.
+        findings: Where violations go.
+    """
+    kinds = {"": (ORIGIN, TRIAL_TABLES), SCENES: (OF_SCENES, SCENE_TABLES)}
+    rules, fields = kinds.get(camera, (OF_CAMERA, DATA_TABLES))
+    config, attributes, counts = None, dict[str, Any](), dict[str, int]()
+
+    # Another version has another layout: its version is all that is told.
+    version = file.attrs.get("schema_version", "none")
+    if not isinstance(version, int | np.integer) or version != SCHEMA_VERSION:
+        what = f"attribute schema_version must be {SCHEMA_VERSION}"
+        findings.add([of_file(name, what, f"{version}; {OTHER_SCHEMA}")])
+    else:
+        # Its attributes: those that break no rule of their own are compared.
+        mistakes = attribute_mistakes(file, rules)
+        attributes = {key: value for key, value in file.attrs.items() if key not in mistakes}
+        for key, mistake in mistakes.items():
+            if key != "config":  # `_read_config` says it
+                findings.add([of_file(name, mistake.what, mistake.got)])
+        config = _read_config(name, file, findings)
+        findings.add(_attributes(name, attributes, config, camera))
+
+        # Its layout: a group with a broken dataset is not read.
+        image, broken = None if config is None else config.camera.size, set()
+        for found in differences(file, fields, image=image, thorough=True):
+            findings.add([of_file(name, found.what, found.got, found.path)])
+            if not found.text_only:
+                broken.add(found.path[1:].split("/")[0])
+        sound = [group for group in fields if group in file and group not in broken]
+        counts = {group: len(file[group][fields[group][0].name]) for group in sound}
+    return CheckedFile(
+        path=file.filename,
+        identity=_identity(file),
+        name=name,
+        attributes=attributes,
+        config=config,
+        fields=fields,
+        counts=counts,
+    )
+
+
+def _read_config(name: str, file: h5py.File, findings: Findings) -> Config | None:
+    """Return the configuration in a file, if it is sound."""
+    try:
+        return parse_stored(parse_json(str(file.attrs["config"])))
+    except KeyError:
+        got = "none"
+    except ValueError as error:  # no JSON, or no configuration
+        got = f"another ({first_line(error)})"
+    findings.add([of_file(name, "attribute config must be a configuration of drakegrasp", got)])
+    return None
+
+
+def _attributes(
+    name: str, attributes: Mapping[str, Any], config: Config | None, camera: str
+) -> Iterator[Violation]:
+    """The attributes agree with the configuration; conventions are there."""
+    for key in CONVENTIONS:
+        if not str(attributes.get(f"convention_{key}", "")).strip():
+            yield of_file(name, f"attribute convention_{key} must be there", "none")
+
+    due: dict[str, Any] = {"camera": camera} if camera in CAMERAS else {}
+    if config is not None:
+        due |= {"config_hash": config.simulation_hash(), "seed": config.seed}
+        lens = lens_attributes(config.camera)
+        due |= {k: getattr(config.scenes, k) for k in ("near", "far")} if camera == SCENES else lens
+    for key in due.keys() & attributes.keys():
+        value, expected = attributes[key], due[key]
+        same = value == expected
+        if not isinstance(expected, str | int):
+            same = np.allclose(value, expected, rtol=CAMERA_TOLERANCE, atol=CAMERA_TOLERANCE)
+        if not same:
+            expected = expected.tolist() if isinstance(expected, np.ndarray) else expected
+            yield of_file(name, f"attribute {key} must be {expected}", value)
+
+
 # Tasks
 
-
-class RowsTask(Protocol):
-    """Rows that a process judges; it marks the bad ones in the files of the task."""
-
-    @property
-    def files(self) -> Mapping[str, CheckedFile]:
-        """The files whose rows are judged, by camera; the trials under ""."""
-
-    @property
-    def size(self) -> int:
-        """Number of rows, for the progress."""
-
-    def judge(self, findings: Findings) -> None:
-        """Apply the rules."""
+#: A number of rows, and what judges them, in any process.
+Task = tuple[int, Callable[[], Findings]]
 
 
 @dataclass(kw_only=True, eq=False)
@@ -326,16 +454,11 @@ class Check:
         self.done += count
         self.report(self.done, self.total)
 
-    def judge(self, tasks: Iterable[RowsTask], files: Mapping[str, CheckedFile]) -> None:
-        """Judge rows in tasks; their files remember the bad ones."""
-        bad: dict[tuple[str, str], list[Rows]] = {}
-        for size, found, marked in in_order(self.execute)(_judge, tasks):
+    def judge(self, tasks: Iterable[Task]) -> None:
+        """Judge rows in tasks."""
+        for size, found in in_order(self.execute)(_judge, tasks):
             self.advance(size)
             self.findings.merge(found)
-            for key, rows in marked.items():
-                bad.setdefault(key, []).append(rows)
-        for (camera, group), parts in bad.items():
-            files[camera].mark_bad(group, np.concatenate(parts))
 
     @contextmanager
     def readable(self, file: CheckedFile) -> Iterator[None]:
@@ -347,9 +470,7 @@ class Check:
             self.findings.add([of_file(file.name, what, first_line(error))])
 
 
-def _judge(task: RowsTask) -> tuple[int, Findings, dict[tuple[str, str], Rows]]:
-    """Return the size of a task, its findings, and the bad rows by file and group."""
-    findings = Findings()
-    task.judge(findings)
-    bad = {(c, group): rows for c, file in task.files.items() for group, rows in file.bad.items()}
-    return task.size, findings, bad
+def _judge(task: Task) -> tuple[int, Findings]:
+    """Do a task; return its number of rows and what it found."""
+    size, judge = task
+    return size, judge()

@@ -1,12 +1,12 @@
 """`drakegrasp check`: every rule on every row of a dataset, or of one of its files.
 
-In: a dataset's directory, or grasping_oto.hdf5, grasping_otm.hdf5 or trials.hdf5 alone. Out: a
-list of violations, empty for a sound dataset. Rows are read in batches, so the memory is bounded,
-and judged in tasks, by an `Executor`. Imports no Drake.
+In: a dataset's directory, or grasping_oto.hdf5, grasping_otm.hdf5, trials.hdf5 or scenes.hdf5
+alone. Out: a list of violations, empty for a sound dataset. Rows are read in batches, so the memory
+is bounded, and judged in tasks, by an `Executor`. Imports no Drake.
 
-Of a whole dataset the three files are compared first with what assembling gives again of its shards
+Of a whole dataset the files are compared first with what assembling gives again of its shards
 (`assembled`). All other rules do not ask how a value was made: verdicts, poses, images, meshes.
-`trials_file` and `data_file` apply them in an order, see `rows`.
+`trials`, `samples` and `scenes` apply them in an order, see `rows`.
 """
 
 from __future__ import annotations
@@ -14,16 +14,29 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from drakegrasp.dataset.card.content import card_content
-from drakegrasp.dataset.checks.assembled import Again, objects_and_successes, origin, row_counts
-from drakegrasp.dataset.checks.attempts import Dataset
-from drakegrasp.dataset.checks.data_file import samples_tasks, splits
-from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
-from drakegrasp.dataset.checks.layout import SCENES, look_at
-from drakegrasp.dataset.checks.object_files import carried_hand_as_built, check_object, object_tasks
-from drakegrasp.dataset.checks.rows import Check, CheckedFile
-from drakegrasp.dataset.checks.scenes import other_state, scene_tasks, tables
-from drakegrasp.dataset.checks.trials_file import successes, trials_tasks
+from drakegrasp.dataset.card import card_content
+from drakegrasp.dataset.checks import scenes
+from drakegrasp.dataset.checks.assembled import (
+    Again,
+    assemble_again,
+    carried_hand_as_built,
+    check_object,
+    object_tasks,
+    objects_and_successes,
+    of_another_state,
+    trials_tasks,
+)
+from drakegrasp.dataset.checks.rows import (
+    SCENES,
+    Check,
+    CheckedFile,
+    Findings,
+    Violation,
+    look_at,
+    of_file,
+)
+from drakegrasp.dataset.checks.samples import samples_tasks, splits
+from drakegrasp.dataset.checks.trials import Dataset, successes
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, SCENES_FILE, TRIALS_FILE
@@ -43,8 +56,8 @@ def check_dataset(
     """Return every broken invariant of a dataset or of one of its files.
 
     Args:
-        path: Directory of a dataset, or one of its three HDF5 files. A file alone is checked for
-            all that needs no other file.
+        path: Directory of a dataset, or one of its HDF5 files. A file alone is checked for all
+            that needs no other file.
         execute: Runs the tasks; the result is the same whatever runs them.
         progress: Called with the number of rows and shards that are done and to do.
 
@@ -74,19 +87,17 @@ def _check_file(path: Path, check: Check) -> None:
     with file:
         camera = str(file.attrs.get("camera", ""))
         if "scenes" in file and "views" in file:
-            refuse_other_schema(path, file.attrs.get("schema_version"))
-            scenes = look_at(path.name, file, SCENES, check.findings)
-        elif camera not in CAMERAS and "trials" not in file:
+            camera = SCENES
+        elif camera not in CAMERAS:
+            camera = ""
+        if not camera and "trials" not in file:
             raise DataError(
                 f"{path}: must be a data file or the trials of a dataset, got another HDF5 file"
             )
-        else:
-            scenes = None
-            refuse_other_schema(path, file.attrs.get("schema_version"))
-            camera = camera if camera in CAMERAS else ""
-            files = {camera: look_at(path.name, file, camera, check.findings)}
-    if scenes is not None:
-        _check_scenes(scenes, check)
+        refuse_other_schema(path, file.attrs.get("schema_version"))
+        files = {camera: look_at(path.name, file, camera, check.findings)}
+    if camera == SCENES:
+        scenes.judge(files[SCENES], check, None)
         return
     check.total = _rows(files)
     _check_rows(files, check)
@@ -95,7 +106,9 @@ def _check_file(path: Path, check: Check) -> None:
 def _check_directory(out: Path, check: Check) -> None:
     """Check the files of a dataset, each with its objects, its shards and the other files."""
     manifest = read_manifest(out)
-    files = _look_at_files(out, check.findings)
+    names = (*DATA_FILES.items(), ("", TRIALS_FILE))
+    looked = {camera: _look_at(out, camera, name, check.findings) for camera, name in names}
+    files = {camera: file for camera, file in looked.items() if file is not None}
     check.total = _rows(files) + sum(entry.candidates for entry in manifest.objects)
 
     # The files that all others follow from.
@@ -104,21 +117,18 @@ def _check_directory(out: Path, check: Check) -> None:
     for entry, (found, readable, survey) in zip(manifest.objects, results, strict=True):
         check.findings.merge(found)
         check.advance(entry.candidates)
-        if readable:
-            objects.add(entry.name)
-        if survey is not None:
-            surveys.append(survey)
+        objects |= {entry.name} if readable else set()
+        surveys += [] if survey is None else [survey]
     check.findings.add(carried_hand_as_built(manifest))
     dataset = Dataset(out=out, manifest=manifest, readable=frozenset(objects))
     sound = len(surveys) == sum(entry.candidates > 0 for entry in manifest.objects)
     sound &= len(surveys) > 0 and len(objects) == len(manifest.objects)
-    again = Again.of(out, manifest, surveys, files.get("")) if sound else None
+    again = assemble_again(manifest, surveys, files.get("")) if sound else None
 
     # Files of another state are not compared row by row.
     current = set()
     for camera, file in files.items():
-        other = [*origin(file, manifest, again.shards.seals if again else "", camera)]
-        other += row_counts(file, again, camera) if again and not other else []
+        other = [*of_another_state(file, manifest, again, camera)]
         check.findings.add(other)
         if file.config is not None and not other:
             current.add(camera)
@@ -128,28 +138,12 @@ def _check_directory(out: Path, check: Check) -> None:
             objects_and_successes(trials, manifest, decided, check.findings)
     _check_rows(files, check, dataset, again, frozenset(current))
     if (out / SCENES_FILE).exists() and (
-        scenes := _look_at(out, SCENES, SCENES_FILE, check.findings)
+        shown := _look_at(out, SCENES, SCENES_FILE, check.findings)
     ):
         # Grasps of broken trials are not compared.
-        _check_scenes(scenes, check, dataset if "" in current else None)
+        scenes.judge(shown, check, dataset if "" in current else None)
     if not check.findings:
         _check_card(out, check.findings)  # else it would differ for the same cause
-
-
-def _check_scenes(scenes: CheckedFile, check: Check, dataset: Dataset | None = None) -> None:
-    """Judge scenes.hdf5, with the dataset around it if there is one."""
-    if len(scenes.counts) < len(scenes.fields):
-        return  # a finding already
-    check.total += scenes.counts["scenes"]
-    entries = dataset.manifest.objects if dataset else ()
-    groups = {entry.name: entry.group or entry.mesh_name for entry in entries}
-    before = len(check.findings.violations())
-    if dataset is not None:
-        check.findings.add(other_state(scenes, dataset.out))
-    with check.readable(scenes):
-        check.findings.add(tables(scenes, groups))
-    if len(check.findings.violations()) == before:
-        check.judge(scene_tasks(scenes, dataset), {SCENES: scenes})
 
 
 def _check_rows(
@@ -170,25 +164,18 @@ def _check_rows(
             trials. They are compared with what is assembled again, or else with each other.
     """
     compared = frozenset() if again is None else current
-    check.judge(trials_tasks(files, dataset, again, compared), files)
+    check.judge(trials_tasks(files, dataset, again, compared))
+    entries = dataset.manifest.objects if dataset else ()
     for camera, file in files.items():
-        # What is compared follows from the shards; other files are judged by themselves.
-        if camera not in compared:
-            with check.readable(file):
-                entries = dataset.manifest.objects if dataset else ()
-                known = {entry.name: entry for entry in entries}
-                check.findings.add(splits(file, known) if camera else successes(file))
         if camera:
             both = {"", camera} <= current - compared and "trials" in files[""].counts
             trials = files[""] if both else None
-            check.judge(samples_tasks(file, camera, dataset, trials), files)
-
-
-def _look_at_files(out: Path, findings: Findings) -> dict[str, CheckedFile]:
-    """Return the files of a dataset that can be read, by camera; the trials under ""."""
-    names = (*DATA_FILES.items(), ("", TRIALS_FILE))
-    looked = {camera: _look_at(out, camera, name, findings) for camera, name in names}
-    return {camera: file for camera, file in looked.items() if file is not None}
+            check.judge(samples_tasks(file, camera, dataset, trials, check.findings))
+        # What is compared follows from the shards; other files are judged by themselves.
+        if camera not in compared:
+            with check.readable(file):
+                known = {entry.name: entry for entry in entries}
+                check.findings.add(splits(file, known) if camera else successes(file))
 
 
 def _look_at(out: Path, camera: str, name: str, findings: Findings) -> CheckedFile | None:

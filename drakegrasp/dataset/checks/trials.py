@@ -1,24 +1,45 @@
-"""Rules of the rows of trials.hdf5: numbers, stages, contacts, poses, the verdict, the hold.
+"""What is checked of trials.hdf5: each attempt by itself, and what is derived of it again.
 
-In: a `Batch` of rows of `/trials`. Out: a `Violation` for every row that is wrong. A rule relies
-on those that `trials_file` applies before it: it is given no row that breaks one of them. No file
-is read.
+In: the file, with the dataset around it if there is one. Out: tasks; each judges a range of the
+attempts. What the shards give is compared first (`assembled`). All else a file alone shows: verdict
+and motion follow from contacts and poses, by the functions that a trial decides by; and with the
+dataset conditions, resting pose and chance, by those that a build draws and computes by.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from drakegrasp.config import CloseConfig, LiftConfig
-from drakegrasp.dataset.checks.findings import Violation
-from drakegrasp.dataset.checks.rows import AnyArray, Batch, all_per_row, rotation, unit_length
-from drakegrasp.dataset.schema import NO_PRESHAPE, TRIAL_FIELDS
+from drakegrasp.config import CloseConfig, LiftConfig, RandomizeConfig
+from drakegrasp.dataset.checks.fields import complete, derived, ranges, rigid
+from drakegrasp.dataset.checks.rows import (
+    POSITION_TOLERANCE,
+    AnyArray,
+    Batch,
+    CheckedFile,
+    Rule,
+    Violation,
+    of_file,
+)
+from drakegrasp.dataset.manifest import Manifest
+from drakegrasp.dataset.paths import FILE_NAME, model_path
+from drakegrasp.dataset.schema import CONDITION_FIELDS, NO_PRESHAPE, SUCCESS_FIELDS, TRIAL_FIELDS
+from drakegrasp.errors import HandError
 from drakegrasp.frames import invert_pose
 from drakegrasp.grasp import unused_fingers
+from drakegrasp.hand.folder import is_hand
+from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp, read_lift_chance
+from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.simulation.candidates import Source
+from drakegrasp.simulation.conditions import draw_conditions
 from drakegrasp.simulation.verdict import (
     is_lost_sample,
     is_precision,
@@ -37,214 +58,211 @@ MOTION_TOLERANCE = 1e-4
 PULL = 0.05
 #: With more friction a force may leave the object's side of a mean normal: a cone of 45 degrees.
 MAX_FRICTION = 1.0
+#: Objects whose meshes, with their search trees, stay in memory during a task; samples are ordered
+#: by object.
+KEPT_OBJECTS = 4
+#: Chances are rounded to about a millionth.
+CHANCE_TOLERANCE = 1e-5
+#: Attempts whose successes are looked for at once.
+BLOCK = 16_384
+
+#: Returns an object by its name, or None if its file is broken, which is a finding.
+LoadModel = Callable[[str], ObjectModel | None]
 
 
-def numbers(
-    batch: Batch,
-    objects: int,
-    candidates: Sequence[int] | None,
-    standoffs: int | None,
-    children: int | None,
-) -> Iterator[Violation]:
-    """The numbers of a trial are legal, and a refined palm pose has a parent.
+@dataclass(frozen=True, kw_only=True)
+class Dataset:
+    """The dataset around a file that is checked.
 
-    Args:
-        batch: Rows of `/trials`.
-        objects: Number of objects.
-        candidates: Number of candidates by object, if known.
-        standoffs: Number of stand-offs, if known.
-        children: Number of children of each parent, if known.
+    Attributes:
+        out: Its directory.
+        manifest: Its manifest.
+        readable: Names of the objects whose meshes can be read.
     """
+
+    out: Path
+    manifest: Manifest
+    readable: frozenset[str]
+
+    def loader(self) -> LoadModel:
+        """Return what loads the objects, and keeps some, while a task has it."""
+        out, readable = self.out, self.readable
+
+        def load(name: str) -> ObjectModel | None:
+            return load_object(model_path(out, name)) if name in readable else None
+
+        return lru_cache(KEPT_OBJECTS)(load)
+
+
+def trial_rules(trials: CheckedFile, dataset: Dataset | None) -> list[list[Rule]]:
+    """Return the rules for a file and the dataset around it, if there is one.
+
+    Each group relies on those before it: the first is for any values, stages need a legal outcome,
+    the third is for finite values of known objects, the last for sound poses and contacts.
+    """
+    config = trials.config
+    close, lift = (config.close, config.lift) if config else (None, None)
+    fingers = json.loads(trials.attributes.get("fingers", "{}"))
+    required = list(fingers.values()) or [True]
+    finite: list[Rule] = [
+        partial(verdicts, required=required, lift=lift, close=close),
+        partial(rigid, fields=TRIAL_FIELDS),
+        contacts,
+    ]
+    sound: list[Rule] = [motion]
+
+    # What follows from the dataset needs all of its objects.
+    if dataset is not None and trials.counts["objects"] == len(dataset.manifest.objects):
+        known: dict[str, Any] = {"manifest": dataset.manifest, "model": dataset.loader()}
+        finite += [partial(resting_poses, manifest=dataset.manifest), partial(conditions, **known)]
+        sound.append(partial(chances, required=required, **known))
+    stages: list[Rule] = [
+        partial(complete_stages, close=close),
+        partial(ranges, fields=TRIAL_FIELDS),
+        partial(derived, fields=TRIAL_FIELDS),
+        partial(repeats, most=None if config is None else config.certify.repeats),
+    ]
+    manifest = None if dataset is None else dataset.manifest
+    return [[partial(numbers, trials=trials, manifest=manifest)], stages, finite, sound]
+
+
+def numbers(batch: Batch, trials: CheckedFile, manifest: Manifest | None) -> Iterator[Violation]:
+    """The numbers of a trial are legal, and a refined palm pose has a parent."""
+    config, objects = trials.config, trials.counts["objects"]
     yield from batch.follows("trial_id", batch.rows, "the row's number")
     outcome, known = batch["outcome"], [o.value for o in Outcome if not o.verification_only]
     what = f"outcome must be one of {', '.join(map(str, known))}"
     yield from batch.broken(what, ~np.isin(outcome, known), outcome)
 
     # Of an unknown object, which is a finding, no number is too large.
-    most = np.full(len(batch), np.iinfo(np.int64).max)
-    index = batch["object"]
-    if candidates is not None and len(candidates) == objects:
+    most, index = np.full(len(batch), np.inf), batch["object"]
+    if manifest is not None and len(manifest.objects) == objects:
         there = (index >= 0) & (index < objects)
-        most[there] = np.array(candidates)[index[there]]
+        most[there] = np.array([entry.candidates for entry in manifest.objects])[index[there]]
     for name, of, limit in (
         ("object", "rows of /objects", objects),
         ("candidate", "candidates of its object", most),
-        ("standoff_index", "stand-offs", standoffs),
+        ("standoff_index", "stand-offs", len(config.candidates.standoffs) if config else np.inf),
         ("child", "numbers in a family", np.inf),
     ):
-        bad = (batch[name] < 0) | (batch[name] >= (np.inf if limit is None else limit))
+        bad = (batch[name] < 0) | (batch[name] >= limit)
         yield from batch.broken(f"{name} must be one of the {of}", bad, batch[name])
 
-    # The first of a family has no parent.
-    child, source = batch["child"], batch["source"]
-    refined = child > 0
-    what = "generation must be 0 for the first of a family and positive for others"
-    yield from batch.broken(what, (batch["generation"] > 0) != refined, batch["generation"])
-    what = "source must be 2 (refine) for a refined palm pose, and 0, 1, 3 or 4 for another"
-    bad = ((source == Source.REFINE) != refined) | (source > max(Source))
-    yield from batch.broken(what, bad, source)
-
-    # Only of a posture from outside may the density be unknown.
-    what, density = "log_density must be finite but for postures", batch["log_density"]
-    yield from batch.broken(what, ~np.isfinite(density) & (source != Source.POSTURES), density)
-    what = "preshape must be 255 of postures only, which use all fingers"
-    bad = (source != Source.POSTURES) | (batch["unused"] > 0)
-    bad &= batch["preshape"] == NO_PRESHAPE
-    yield from batch.broken(what, bad, batch["preshape"])
-    if children is not None:
-        parent = np.where(refined, (child - 1) // max(children, 1), 0)
+    # The first of a family has no parent. Only of a posture from outside may the density be
+    # unknown, or the preshape be none.
+    child, source, unused = batch["child"], batch["source"], batch["unused"] > 0
+    refined, given = child > 0, source == Source.POSTURES
+    for name, must, bad in (
+        (
+            "generation",
+            "0 for the first of a family and positive for others",
+            (batch["generation"] > 0) != refined,
+        ),
+        (
+            "source",
+            "2 (refine) for a refined palm pose, and 0, 1, 3 or 4 for another",
+            ((source == Source.REFINE) != refined) | (source > max(Source)),
+        ),
+        ("log_density", "finite but for postures", ~np.isfinite(batch["log_density"]) & ~given),
+        (
+            "preshape",
+            "255 of postures only, which use all fingers",
+            (~given | unused) & (batch["preshape"] == NO_PRESHAPE),
+        ),
+    ):
+        yield from batch.broken(f"{name} must be {must}", bad, batch[name])
+    if config is not None:
+        parent = np.where(refined, (child - 1) // max(config.refine.children, 1), 0)
         yield from batch.follows("parent", parent, "child")
 
 
-def stages(batch: Batch, close: CloseConfig | None) -> Iterator[Violation]:
-    """The fields of a stage have values if the attempt reached it, and none otherwise.
-
-    Args:
-        batch: Rows of `/trials`.
-        close: How hands close, if known.
-    """
+def complete_stages(batch: Batch, close: CloseConfig | None) -> Iterator[Violation]:
+    """The fields of a stage have values if the attempt reached it, and none otherwise."""
     stage = _stages(batch, close)
-    if close is not None:
-        yield from _clearances(batch, stage, close.scrape_depth is not None)
-    for f in TRIAL_FIELDS:
-        if f.derive is not None:
-            of = ", ".join(f.needs)
-            yield from batch.follows(f.name, f.derive(batch.columns), of)
-            continue
-        values = batch[f.name]
-        reached = stage >= f.stage
-
-        # What a value must be depends on its kind.
-        if np.dtype(f.dtype).kind != "f":
-            bad = ~reached & ~all_per_row(values == 0)
-            what = f"{f.name} must be 0 before the stage {f.stage.name.lower()}"
-        elif f.per_finger:
-            instant = "lifted" if f.name.startswith("lifted_") else "closed"
-            touching = reached[:, None] & batch[f"{instant}_touching"]
-            due = touching.reshape(*touching.shape, *(1,) * (values.ndim - 2))
-            bad = ~all_per_row(_as_due(values, due))
-            what = f"{f.name} must be finite where the finger touches and NaN elsewhere"
-        elif f.some:
-            bad = ~reached & ~np.isnan(values)
-            what = f"{f.name} must be NaN before the stage {f.stage.name.lower()}"
-        else:
-            due = reached.reshape(-1, *(1,) * (values.ndim - 1))
-            bad = ~all_per_row(_as_due(values, due))
-            what = f"{f.name} must be finite from the stage {f.stage.name.lower()} on"
-            what += "" if f.stage is Stage.PLACED else " and NaN before"
-        yield from batch.broken(what, bad, lambda i: _outcome(batch, i))
-
-
-def _clearances(batch: Batch, stage: AnyArray, measured: bool) -> Iterator[Violation]:
-    """Heights above the table are there where the configuration says so, and nowhere else."""
-    state = "finite" if measured else "NaN"
-    must = f"must be {state} with close.scrape_depth {'given' if measured else 'null'}"
-    for name, reached in (("close", Stage.CLOSED), ("lift", Stage.LIFTED)):
-        values = batch[f"clearance_{name}"]
-        bad = (stage >= reached) & (np.isfinite(values) != measured)
-        yield from batch.broken(f"clearance_{name} {must}", bad, values)
+    touching = {when: batch[f"{when}_touching"] for when in ("closed", "lifted")}
+    yield from complete(batch, TRIAL_FIELDS, stage, touching)
+    if close is None:
+        return
+    measured = close.scrape_depth is not None
+    state, given = ("finite", "given") if measured else ("NaN", "null")
+    for name, reached in (("clearance_close", Stage.CLOSED), ("clearance_lift", Stage.LIFTED)):
+        bad = (stage >= reached) & (np.isfinite(batch[name]) != measured)
+        what = f"{name} must be {state} with close.scrape_depth {given}"
+        yield from batch.broken(what, bad, batch[name])
 
 
 def repeats(batch: Batch, most: int | None) -> Iterator[Violation]:
-    """Of the repeats of an attempt some hold, and some of these are samples.
+    """Of the repeats of an attempt some hold, and of these some are samples.
 
     Args:
         batch: Rows of `/trials`.
         most: Number of repeats of an attempt that is drawn, if known.
     """
-    probability = batch["p_hold_probability"]
-    drawn = ~np.isnan(probability)
-    bad = drawn & ~((probability > 0.0) & (probability <= 1.0))
-    yield from batch.broken("p_hold_probability must be NaN or in 0..1", bad, probability)
-    limit = np.where(drawn, np.inf if most is None else most, 0)
-    for name in ("repeats", "held", "samples"):
-        values = batch[f"p_hold_{name}"]
-        what = "those drawn for" if name == "repeats" else "p_hold_repeats"
-        what = "p_hold_held" if name == "samples" else what
-        yield from batch.broken(f"p_hold_{name} must be at most {what}", values > limit, values)
-        limit = values
-    half = batch["p_hold_half_step"]
+    drawn, half = ~np.isnan(batch["p_hold_probability"]), batch["p_hold_half_step"]
+    limit, of = np.where(drawn, np.inf if most is None else most, 0), "those drawn for"
+    for name in ("p_hold_repeats", "p_hold_held", "p_hold_samples"):
+        values = batch[name]
+        yield from batch.broken(f"{name} must be at most {of}", values > limit, values)
+        limit, of = values, name
     bad = ~np.isnan(half) & (~np.isin(half, [0.0, 1.0]) | ~drawn)
     yield from batch.broken("p_hold_half_step must be 0, 1 or NaN, of those drawn", bad, half)
 
 
 def verdicts(
-    batch: Batch,
-    required: Sequence[bool],
-    rules: LiftConfig | None,
-    close: CloseConfig | None,
+    batch: Batch, required: Sequence[bool], lift: LiftConfig | None, close: CloseConfig | None
 ) -> Iterator[Violation]:
-    """The outcome is what follows from the recorded contacts and motion (`simulation.verdict`).
+    """The outcome is what follows from contacts, motion and chance (`simulation.verdict`).
 
     Args:
         batch: Rows of `/trials`.
         required: Whether a grasp needs each fingertip on the object.
-        rules: When lifts end, if known.
+        lift: When lifts end, if known.
         close: How hands close, if known.
     """
-    # What the contacts of each stage say.
-    own = required_of(batch, required)
-    closed = judge_closed(
-        batch["closed_touching"],
-        batch["closed_other_links"],
-        batch["closed_hand_on_table"],
-        required=own,
-        scraped=_scraped(batch, "close", close),
-    )
-    lifted = judge_lifted(
+    outcome, closed = batch["outcome"], judged_closed(batch, required, close)
+    due = judge_lifted(
         batch["lifted_touching"],
         batch["lifted_other_links"],
         batch["lifted_object_on_table"],
-        required=own,
+        required=required_of(batch, required),
         scraped=_scraped(batch, "lift", close),
     )
-
     # Older versions called slipped what is partly held.
-    older = (batch["outcome"] == Outcome.SLIPPED) & (lifted == Outcome.PARTLY_HELD)
-    lifted = np.where(older, Outcome.SLIPPED.value, lifted)
+    older = (outcome == Outcome.SLIPPED) & (due == Outcome.PARTLY_HELD)
+    due = np.where(older, Outcome.SLIPPED.value, due)
 
-    # A lift that was ended has no verdict, but a reason.
-    moved = batch["outcome"] == Outcome.MOVED
-    lifted = np.where(moved, Outcome.MOVED.value, lifted)
-    if rules is not None:
-        yield from batch.broken(
-            "outcome must be moved only where lift.stop_when, stop_slip and stop_turn_deg say so",
-            moved & ~is_lost_sample(batch["slip"], batch["turn"], rules),
-            lambda i: (
-                f"a slip of {batch['slip'][i]:.4g} m and a turn of {batch['turn'][i]:.4g} rad"
-            ),
-        )
-
-    # Neither has a closed hand that was not lifted.
-    judged, left = _stages(batch, close) >= Stage.CLOSED, batch["outcome"] == Outcome.NOT_LIFTED
-    lifted = np.where(left, Outcome.NOT_LIFTED.value, lifted)
-    if rules is not None:
-        may_lift, audited = judged & (closed == Outcome.SUCCESS), batch["audited"]
-        unlikely = (batch["chance"] < rules.least_chance) & ~audited
-        yield from batch.broken(
-            "outcome must be not_lifted where the hand may lift, the chance is below "
-            "lift.least_chance and the trial is not audited",
-            may_lift & unlikely & ~left,
-            batch["chance"],
-        )
+    # A lift that was ended has no verdict, but a reason; so has a closed hand that was not lifted.
+    ended, left = outcome == Outcome.MOVED, outcome == Outcome.NOT_LIFTED
+    must_stay = np.zeros(len(batch), dtype=np.bool_)
+    if lift is not None:
+        ended &= is_lost_sample(batch["slip"], batch["turn"], lift)
+        must_stay = (batch["chance"] < lift.least_chance) & ~batch["audited"]
         # Of a flat image the trial knows nothing; it has none.
-        flat = (rules.least_depth_variance > 0.0) & ~audited
-        yield from batch.broken(
-            "outcome must be not_lifted only where the chance is below lift.least_chance, or the "
-            "image may be flat, and the trial is not audited",
-            may_lift & left & ~unlikely & ~flat,
-            batch["chance"],
-        )
+        left &= must_stay | ((lift.least_depth_variance > 0.0) & ~batch["audited"])
+    due = np.where(ended, Outcome.MOVED.value, due)
+    due = np.where(left | must_stay, Outcome.NOT_LIFTED.value, due)
 
     # A hand that may not lift has no second verdict.
-    expected = np.where(closed != Outcome.SUCCESS, closed, lifted)
+    due = np.where(closed != Outcome.SUCCESS, closed, due)
     yield from batch.broken(
-        "outcome must follow from the contacts and the clearance",
-        judged & (expected != batch["outcome"]),
+        "outcome must follow from the contacts, the clearance, the motion and the chance",
+        (_stages(batch, close) >= Stage.CLOSED) & (due != outcome),
         lambda i: (
-            f"{Outcome(int(batch['outcome'][i])).label} where these say "
-            f"{Outcome(int(expected[i])).label}"
+            f"{Outcome(int(outcome[i])).label} where these say {Outcome(int(due[i])).label}: slip "
+            f"{batch['slip'][i]:.4g} m, turn {batch['turn'][i]:.4g} rad, chance "
+            f"{batch['chance'][i]:.4g}"
         ),
+    )
+
+
+def judged_closed(batch: Batch, required: Sequence[bool], close: CloseConfig | None) -> AnyArray:
+    """Return the outcomes (n,) of closed hands, SUCCESS where the hand may lift."""
+    return judge_closed(
+        batch["closed_touching"],
+        batch["closed_other_links"],
+        batch["closed_hand_on_table"],
+        required=required_of(batch, required),
+        scraped=_scraped(batch, "close", close),
     )
 
 
@@ -254,56 +272,26 @@ def required_of(batch: Batch, required: Sequence[bool]) -> AnyArray:
 
 
 def contacts(batch: Batch) -> Iterator[Violation]:
-    """Fingertips that touch have a patch and a unit normal, and push into an object that is held.
+    """Fingertips that touch have a patch, and push into an object that is held.
 
     A patch may span an edge or a thin rim: its mean normal then does not tell the direction of the
     force. So that rule is for successes only, and only where friction turns a force by less than
     `MAX_FRICTION` does.
     """
-    success = batch["outcome"] == Outcome.SUCCESS.value
-    judged = success & (batch["friction_hand"] <= MAX_FRICTION)
+    judged = (batch["outcome"] == Outcome.SUCCESS) & (batch["friction_hand"] <= MAX_FRICTION)
     for stage in ("closed", "lifted"):
-        touching = batch[f"{stage}_touching"]
-        normals, forces = batch[f"{stage}_nhat_Q_O"], batch[f"{stage}_f_Q_O"]
-        lengths = np.where(touching, np.linalg.norm(normals, axis=2), 1.0)
-        yield from unit_length(batch, lengths, f"{stage}_nhat_Q_O of finger")
-
-        # Forces, areas and depths, finger by finger.
-        push = (normals * forces).sum(axis=2)
-        area, depth = batch[f"{stage}_area"], batch[f"{stage}_penetration"]
+        touching, area = batch[f"{stage}_touching"], batch[f"{stage}_area"]
+        push = (batch[f"{stage}_nhat_Q_O"] * batch[f"{stage}_f_Q_O"]).sum(axis=2)
         for k in range(touching.shape[1]):
-            touches = touching[:, k]
-            yield from batch.broken(
-                f"{stage}_f_Q_O of finger {k + 1} must push into the object [N]",
-                judged & touches & ~(push[:, k] < PULL),
-                push[:, k],
-            )
-            yield from batch.broken(
-                f"{stage}_area of finger {k + 1} must be positive where it touches [m^2]",
-                touches & ~(area[:, k] > 0.0),
-                area[:, k],
-            )
-            yield from batch.broken(
-                f"{stage}_penetration of finger {k + 1} must not be negative [m]",
-                depth[:, k] < 0.0,
-                depth[:, k],
-            )
-
-
-def poses(batch: Batch) -> Iterator[Violation]:
-    """The rotations of a trial's poses are orthonormal with determinant +1."""
-    for name in ("X_TO", "X_OG", "X_C0C", "X_TO_lifted", "X_OG_lifted"):
-        yield from rotation(batch, name)
+            finger, touches = f"of finger {k + 1} must", touching[:, k]
+            what, bad = f"{stage}_f_Q_O {finger} push into the object [N]", ~(push[:, k] < PULL)
+            yield from batch.broken(what, judged & touches & bad, push[:, k])
+            what, bad = f"{stage}_area {finger} be positive where it touches [m^2]", area[:, k] <= 0
+            yield from batch.broken(what, touches & bad, area[:, k])
 
 
 def motion(batch: Batch) -> Iterator[Violation]:
-    """How the object moved in the hand is possible, and follows from the palm's two poses."""
-    for name, largest in (("slip", np.inf), ("turn", np.pi)):
-        for key in (name, f"{name}_released"):
-            bad = (batch[key] < 0.0) | (batch[key] > largest)
-            yield from batch.broken(f"{key} must be 0..{largest:.4g}", bad, batch[key])
-
-    # X_GO before and after the lift.
+    """How the object moved in the hand follows from the palm's two poses, and the words for it."""
     before, after = (invert_pose(batch.pose(name)) for name in ("X_OG", "X_OG_lifted"))
     slip = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
     cosine = (np.einsum("nij,nij->n", before[:, :3, :3], after[:, :3, :3]) - 1.0) / 2.0
@@ -311,18 +299,12 @@ def motion(batch: Batch) -> Iterator[Violation]:
     for name, due in (("slip", slip), ("turn", turn)):
         yield from batch.follows(name, due, "X_OG and X_OG_lifted", MOTION_TOLERANCE)
 
-    # The words for it.
-    outcome, other_links = batch["outcome"], batch["lifted_other_links"]
-    stable = is_stable(outcome, other_links, batch["slip"], batch["turn"])
-    yield from batch.follows(
-        "precision", is_precision(outcome, other_links), "outcome and lifted_other_links"
-    )
-    yield from batch.follows("stable", stable, "precision, slip and turn")
-
-
-def _as_due(values: AnyArray, due: AnyArray) -> AnyArray:
-    """Return where values are finite if they are due, and NaN if they are not."""
-    return np.asarray(np.where(due, np.isfinite(values), np.isnan(values)))
+    outcome, links = batch["outcome"], batch["lifted_other_links"]
+    words = {
+        "precision": is_precision(outcome, links),
+        "stable": is_stable(outcome, links, batch["slip"], batch["turn"]),
+    }
+    yield from batch.follow(words, "outcome, lifted_other_links, slip and turn")
 
 
 def _scraped(batch: Batch, when: str, close: CloseConfig | None) -> AnyArray:
@@ -342,5 +324,102 @@ def _stages(batch: Batch, close: CloseConfig | None) -> AnyArray:
     return np.where(lifted, Stage.LIFTED.value, table[batch["outcome"]])
 
 
-def _outcome(batch: Batch, i: int) -> str:
-    return f"the contrary at outcome {Outcome(int(batch['outcome'][i])).label}"
+# What an attempt has from the configuration, its object and the seed
+
+
+def resting_poses(batch: Batch, manifest: Manifest) -> Iterator[Violation]:
+    """Every attempt starts from one of its object's resting poses."""
+    objects, resting = batch["object"].astype(int), batch["resting"].astype(int)
+    poses = [np.array([pose.X_TO for pose in entry.resting]) for entry in manifest.objects]
+    unknown = resting >= np.array([len(own) for own in poses])[objects]
+    yield from batch.broken("resting must be one of its object's resting poses", unknown, resting)
+    if not unknown.all():
+        known = batch.where(~unknown)
+        pairs = zip(objects[~unknown], resting[~unknown], strict=True)
+        due = np.array([poses[i][k] for i, k in pairs])
+        of = f"the resting poses in {FILE_NAME}"
+        yield from known.follows("X_TO", due, of, POSITION_TOLERANCE)
+
+
+def conditions(batch: Batch, manifest: Manifest, model: LoadModel) -> Iterator[Violation]:
+    """Friction, mass, looks, cameras and noise are what the seed gives, or the usual ones."""
+    due = {f.name: np.array(batch[f.name]) for f in CONDITION_FIELDS}
+    identity = ("candidate", "standoff_index", "child")
+    for name, known, rows in _by_object(batch, manifest, model):
+        own = manifest.config_of(name)
+        # Where nothing is drawn all attempts of an object have the same conditions.
+        same = own.randomize == RandomizeConfig()
+        for chosen in [rows] if same else rows[:, None]:
+            numbers = [0, 0, 0] if same else [int(batch[key][chosen[0]]) for key in identity]
+            for key, value in draw_conditions(known, own, *numbers).values().items():
+                due[key][chosen] = value
+    for key, values in due.items():
+        yield from batch.follows(key, values, "what the seed gives the attempt", 0.0)
+
+
+def chances(
+    batch: Batch, required: Sequence[bool], manifest: Manifest, model: LoadModel
+) -> Iterator[Violation]:
+    """A closed hand that may lift has the chance of a sample that its contacts give.
+
+    Args:
+        batch: Rows of `/trials`, with sound contacts.
+        required: Whether a grasp needs each fingertip on the object.
+        manifest: Of the dataset.
+        model: Loads its objects.
+    """
+    # Other files of the hand may have other weights.
+    try:
+        if not is_hand(manifest.config.hand_source, manifest.versions.get("hand")):
+            return
+        chance = read_lift_chance(manifest.config.hand_source)
+    except HandError:
+        return
+
+    # A hand that was never closed has no `time_close`.
+    lifts = judged_closed(batch, required, manifest.config.close) == Outcome.SUCCESS
+    lifts &= np.isfinite(batch["time_close"])
+    due = np.where(lifts & (chance is not None), batch["chance"], np.nan)
+    for _, known, rows in _by_object(batch, manifest, model):
+        # That of fewer fingers is of their contacts alone.
+        own = rows[lifts[rows] & (batch["unused"][rows] == 0)]
+        if chance is not None and len(own):
+            closed = batch.where(np.isin(np.arange(len(batch)), own))
+            grasp = ClosedGrasp(
+                **{name: closed[f"closed_{name}"] for name in GRASP_CONTACTS},
+                X_TO=closed.pose("X_TO"),
+                p_OOcm=known.p_OOcm,
+                friction_hand=closed["friction_hand"],
+            )
+            due[own] = chance.of(grasp)
+    yield from batch.follows("chance", due, "the contacts after closing", CHANCE_TOLERANCE)
+
+
+def _by_object(
+    batch: Batch, manifest: Manifest, model: LoadModel
+) -> Iterator[tuple[str, ObjectModel, AnyArray]]:
+    """Yield name and model of each object that can be read, and the indices of its rows."""
+    for index in np.unique(batch["object"]).tolist():
+        # Its file may have another name of it, see `ObjectEntry.drawn_as`.
+        name = manifest.objects[index].name
+        known = model(name)
+        if known is not None:
+            yield name, known, np.flatnonzero(batch["object"] == index)
+
+
+def successes(trials: CheckedFile) -> Iterator[Violation]:
+    """Every success is in /successes, in order, with a legal reason of removal and certificate."""
+    if not {"trials", "successes"} <= set(trials.counts):
+        return
+    with trials.opened() as file:
+        outcome = file["trials/outcome"]
+        blocks = range(0, len(outcome), BLOCK)
+        hits = [np.flatnonzero(outcome[a : a + BLOCK] == Outcome.SUCCESS) + a for a in blocks]
+        due = np.concatenate([np.zeros(0, dtype=np.int64), *hits])
+        batch = trials.read(file, "successes", np.arange(trials.counts["successes"]))
+
+    if not np.array_equal(batch["trial_id"], due):
+        different = sorted(set(batch["trial_id"].tolist()) ^ set(due.tolist()))
+        got = f"differences at trials {different[:5]}" if different else "another order"
+        yield of_file(trials.name, "trial_id must list the successes of /trials", got, "/successes")
+    yield from ranges(batch, SUCCESS_FIELDS)

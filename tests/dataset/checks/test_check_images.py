@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -29,11 +28,10 @@ from scipy import ndimage
 
 from drakegrasp.config import parse_config
 from drakegrasp.dataset.checks import images as image_rules
-from drakegrasp.dataset.checks.images import Lens
 from drakegrasp.dataset.checks.rows import Batch
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
-from drakegrasp.frames import invert_pose, make_pose, pack_pose, rotation_about, unpack_pose
+from drakegrasp.frames import invert_pose, pack_pose, unpack_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import load_object
 
@@ -183,49 +181,6 @@ def test_mesh_is_measured_inside_the_border_of_the_mask(out: Path, inside: bool)
     must_find_without_shards(out, *([(OTO, "/train", 0, what)] if inside else []))
 
 
-# The geometry of the rules, in closed form
-
-#: A camera of 33 pixels that sees 45 degrees to each side.
-LENS = Lens(
-    camera="oto",
-    size=33,
-    K=np.array([[16.0, 0.0, 16.0], [0.0, 16.0, 16.0], [0.0, 0.0, 1.0]]),
-    near=np.float32(0.01),
-    far=np.float32(0.75),
-    loses=True,
-)
-HALF = np.array([0.02, 0.03, 0.05])
-
-
-@pytest.mark.parametrize(
-    ("p_OQ", "slack", "beyond"),
-    [
-        # On the face that the camera sees, and on an edge of it.
-        ([0.0, 0.0, 0.05], 0.0, 0.0),
-        ([0.02, -0.03, 0.05], 0.0, 0.0),
-        # Within the box a pixel may show the object.
-        ([0.01, 0.01, 0.0], 0.0, 0.0),
-        # Outside by less than the tolerance, and by more.
-        ([0.0, 0.0, 0.0502], 0.0, 0.0),
-        ([0.0, 0.0, 0.051], 0.0, 0.001),
-        ([0.0, 0.0, -0.052], 0.0, 0.002),
-        ([0.023, 0.0, 0.0], 0.0, 0.003),
-        ([0.0, -0.034, 0.0], 0.0, 0.004),
-        # A point may be moved along its ray by the slack, but not aside.
-        ([0.0, 0.0, 0.051], 0.0015, 0.0),
-        ([0.0, 0.0, 0.051], 0.0005, 0.001),
-        ([0.023, 0.0, 0.0], 0.0015, 0.003),
-    ],
-)
-def test_point_beyond_the_box_is_told_by_how_far(
-    p_OQ: list[float], slack: float, beyond: float
-) -> None:
-    """Seen from far above, so that rays are almost parallel to z."""
-    points = np.array([[0.0, 0.0, 0.05], p_OQ])
-    found = image_rules._beyond_box(points, np.array([0.0, 0.0, 1e3]), HALF, np.array([0.0, slack]))
-    assert found == pytest.approx(beyond, abs=1e-9)
-
-
 def test_image_without_a_depth_hides_no_other(sound: Path) -> None:
     """A sensor may lose all depths of an object; the object of the next image is still found."""
     with h5py.File(sound / OTO) as file:
@@ -237,67 +192,28 @@ def test_image_without_a_depth_hides_no_other(sound: Path) -> None:
     batch = Batch(
         file=OTO, group="/test", rows=rows, columns={k: v[rows] for k, v in columns.items()}
     )
-    lens = replace(Lens.of("oto", config), loses=True)
+    loses = config.randomize.model_copy(update={"depth_baseline": 0.02})
+    config = config.model_copy(update={"randomize": loses})
     model = load_object(model_path(sound, name))
     assert len(rows) > 1
-    batch["images"][0, 3] = lens.far
-    assert list(image_rules.object_pixels(batch, lens, model)) == []
+    batch["images"][0, 3] = config.camera.far
+    assert list(image_rules.object_pixels(batch, "oto", config, model)) == []
     batch["images"][1, 3][batch["masks"][1] == 1] -= 0.02
-    (violation,) = image_rules.object_pixels(batch, lens, model)
+    (violation,) = image_rules.object_pixels(batch, "oto", config, model)
     assert violation.row == rows[1]
 
 
 def test_nearest_depth_is_the_least_within_two_pixels() -> None:
+    """Lost pixels have none, where errors are drawn; beside the image its nearest pixel counts."""
+    loses, shows = load_config(overrides=["randomize.depth_noise=[0.001,0.002]"]), load_config()
     depth = np.full((33, 33), 0.6)
     depth[10, 20], depth[10, 25], depth[0, 0] = 0.3, 0.75, 0.2
     for pixel, expected in (
-        ([20.0, 10.0], 0.3),
-        ([22.4, 12.4], 0.3),
-        ([17.6, 8.0], 0.3),
-        ([22.6, 10.0], 0.6),
-        ([20.0, 12.6], 0.6),
-        ([17.4, 10.0], 0.6),
-        # Beside the image the nearest pixel of it counts.
-        ([-5.0, -9.0], 0.2),
-        ([40.0, 40.0], 0.6),
+        *(([20.0, 10.0], 0.3), ([22.4, 12.4], 0.3), ([17.6, 8.0], 0.3)),
+        *(([22.6, 10.0], 0.6), ([20.0, 12.6], 0.6), ([17.4, 10.0], 0.6)),
+        *(([-5.0, -9.0], 0.2), ([40.0, 40.0], 0.6)),
     ):
-        assert image_rules._nearest_depth(depth, LENS, np.array(pixel)) == expected
-    lost = np.full((33, 33), 0.75)
-    assert np.isinf(image_rules._nearest_depth(lost, LENS, np.array([5.0, 5.0])))
-    shows = replace(LENS, loses=False)
-    assert image_rules._nearest_depth(lost, shows, np.array([5.0, 5.0])) == 0.75
-
-
-def test_border_of_a_mask_is_its_outermost_ring() -> None:
-    mask = np.zeros((9, 9), dtype=np.uint8)
-    mask[2:7, 3:9] = 1
-    expected = np.zeros((9, 9), dtype=bool)
-    expected[2:7, 3:9] = True
-    # The edge of the image is none of the object's.
-    expected[3:6, 4:9] = False
-    assert np.array_equal(image_rules._border(mask), expected)
-
-
-def test_pixels_become_points() -> None:
-    """One pixel beside the centre is a 16th of the depth beside the axis."""
-    depth = np.full((33, 33), 0.5)
-    depth[20, 12] = 0.32
-    chosen = np.zeros((33, 33), dtype=bool)
-    chosen[20, 12] = True
-    X_AC = make_pose(rotation_about([0.0, 0.0, 1.0], np.pi / 2.0), [1.0, 2.0, 3.0])
-    found = image_rules._points(X_AC, LENS, depth, chosen)
-    np.testing.assert_allclose(found, [[1.0 - 0.08, 2.0 - 0.08, 3.32]], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("settings", "loses"),
-    [
-        ([], False),
-        (["randomize.depth_noise=[0.001,0.002]"], True),
-        (["randomize.depth_baseline=0.02"], True),
-    ],
-)
-def test_pixels_lose_their_depth_only_where_errors_are_drawn(
-    settings: list[str], loses: bool
-) -> None:
-    assert Lens.of("oto", load_config(overrides=settings)).loses is loses
+        assert image_rules.nearest_depth(depth, loses, np.array(pixel)) == expected
+    lost, middle = np.full((33, 33), 0.75), np.array([5.0, 5.0])
+    assert np.isinf(image_rules.nearest_depth(lost, loses, middle))
+    assert image_rules.nearest_depth(lost, shows, middle) == 0.75

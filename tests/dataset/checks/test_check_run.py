@@ -28,7 +28,7 @@ from helpers.datasets import (
 )
 
 from drakegrasp.dataset.assembly import decisions
-from drakegrasp.dataset.checks import attempts, data_file, object_files, trials_file
+from drakegrasp.dataset.checks import assembled, samples, trials
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.paths import model_path, plan_path
@@ -81,9 +81,9 @@ def test_two_processes_find_what_one_does(out: Path, monkeypatch: pytest.MonkeyP
     assert kinds.count((TRIALS, "/trials")) == 22  # 20 candidates, the number of more, an object
     assert {(OTO, "/test"), (OTM, "/test"), ("objects/1_box_a.npz", "")} <= set(kinds)
 
-    for module in (trials_file, decisions):
+    for module in (assembled, decisions):
         monkeypatch.setattr(module, "TASK_ROWS", 7)
-    monkeypatch.setattr(data_file, "TASK_ROWS", 1)
+    monkeypatch.setattr(samples, "TASK_ROWS", 1)
     small = check_dataset(out)
     assert sorted(map(str, small)) == sorted(map(str, expected))
     assert check_dataset(out, execute=backwards) == small
@@ -118,7 +118,7 @@ def test_meshes_and_files_are_let_go_with_each_task(
         alive.append(weakref.ref(model))
         return model
 
-    monkeypatch.setattr(attempts, "load_object", load)
+    monkeypatch.setattr(trials, "load_object", load)
     gc.collect()
     gc.disable()
     try:
@@ -178,7 +178,7 @@ def test_object_file_that_cannot_be_read_is_found(
     def fail(out: Path, name: str, expected: str) -> None:
         raise OSError(5, "Input/output error")
 
-    monkeypatch.setattr(object_files, "refuse_changed_model", fail)
+    monkeypatch.setattr(assembled, "refuse_changed_model", fail)
     what = "an object's file must be as it was written"
     names = [entry.name for entry in read_manifest(out).objects]
     must_find(out, *((f"objects/{name}.npz", "", None, what) for name in names))
@@ -285,5 +285,5 @@ def test_a_broken_invariant_is_listed_for_twenty_rows_and_then_counted(out: Path
     violations = check_dataset(out / TRIALS)
     assert len(violations) == 21
     assert violations[0].row == 0
-    assert str(violations[0]).startswith("trials.hdf5 /trials row 0: spread must be finite from")
+    assert str(violations[0]).startswith("trials.hdf5 /trials row 0: spread must be finite, got")
     assert str(violations[-1]).endswith("got 16 more rows that break it")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from drakegrasp.dataset.checks.run import check_dataset
-from drakegrasp.generation.scenes.make import make_scenes
+from drakegrasp.generation.scenes import make_scenes
 
 pytestmark = pytest.mark.sim
 
@@ -70,7 +70,7 @@ def shrink_mask(file: h5py.File) -> None:
 FAULTS = {
     "height": (add("scenes/X_TO", np.eye(12)[11] * 1e-3), "X_TO must be the object's resting pose"),
     "mass": (add("scenes/mass", 0.1), "mass must be the object's"),
-    "split": (put("scenes/split", 3), "split must be 0, 1 or 2"),
+    "split": (put("scenes/split", 3), "split must be 0..2"),
     "order": (swap("visible/grasp"), "rows must be each view with each grasp"),
     "scene": (put("views/scene", 99), "scene must be rows of /scenes"),
     "trial": (add("grasps/trial_id", 1), "must follow from its trial"),
@@ -78,13 +78,19 @@ FAULTS = {
     "contact": (add("grasps/p_TQ", 1e-3), "p_TQ must follow from its trial"),
     "held": (success("grasps/held", False), "held must be that of a success"),
     "tested": (success("grasps/tested", False), "tested must be that of a lift"),
-    "sample": (success("grasps/sample", False), "sample must follow from /successes"),
+    "sample": (success("grasps/sample", False), "sample must follow from its trial"),
     "camera": (add("views/X_TC", np.eye(12)[11] * 2e-3), "points beside the mask"),
     "rotation": (add("views/X_TC", np.eye(12)[0] * 1e-3), "orthonormal rotation"),
     "depth": (shift_depth, "points in the mask must be on the object's mesh"),
     "mask": (add("views/mask", 2), "mask must be 0 to the number of objects"),
-    "blind": (put("visible/visible", False, slice(None)), "hidden contacts that face the camera"),
-    "sighted": (put("visible/visible", True, slice(None)), "visible contacts must"),
+    "blind": (
+        put("visible/visible", False, slice(None)),
+        "visible contacts must follow",
+    ),
+    "sighted": (
+        put("visible/visible", True, slice(None)),
+        "visible contacts must follow",
+    ),
 }
 
 

@@ -80,7 +80,7 @@ TRIAL_CASES: Mapping[str, tuple[str, int, Edit, str]] = {
         "closed_penetration",
         SUCCESS,
         set_at(1, to=-1e-3),
-        "closed_penetration of finger 2 must not be negative",
+        "closed_penetration must be 0..inf",
     ),
     "pose": ("X_OG", BELOW, lambda p: 1.1 * p, "X_OG must have an orthonormal rotation"),
     "palm after the lift": ("X_OG_lifted", SUCCESS, mirrored, "X_OG_lifted must have an orthon"),
@@ -88,8 +88,8 @@ TRIAL_CASES: Mapping[str, tuple[str, int, Edit, str]] = {
     "turn": ("turn", SLIPPED, lambda t: t + 1e-2, "turn must follow from X_OG and X_OG_lifted"),
     "slip back": ("slip_released", SUCCESS, lambda s: -s, "slip_released must be 0..inf"),
     "turn too far": ("turn_released", SUCCESS, lambda _: 4.0, "turn_released must be 0..3.142"),
-    "precision": ("precision", SUCCESS, lambda _: False, "precision must follow from outcome and"),
-    "stable": ("stable", SLIPPED, lambda _: True, "stable must follow from precision, slip"),
+    "precision": ("precision", SUCCESS, lambda _: False, "precision must follow from outcome"),
+    "stable": ("stable", SLIPPED, lambda _: True, "stable must follow from outcome"),
     "early word": ("stable", MISSING, lambda _: True, "stable must be 0 before the stage lifted"),
     "lifted pose": ("X_TO_lifted", SUCCESS, mirrored, "X_TO_lifted must have an orthonormal"),
     "resting": ("X_TO", SUCCESS, moved(0.001, 0, 0), "X_TO must follow from the resting poses"),
@@ -145,7 +145,7 @@ def test_lift_is_ended_only_where_the_configuration_says_so(
     """Whatever its contacts say then."""
     out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=[override])
     end_lift(out, SLIPPED, slip)
-    what = (TRIALS, "/trials", SLIPPED, "outcome must be moved only where lift.stop_when")
+    what = (TRIALS, "/trials", SLIPPED, "outcome must follow from the contacts")
     must_find(out / TRIALS, *([] if sound else [what]))
 
 
@@ -172,7 +172,7 @@ def test_hand_is_not_lifted_where_its_chance_says_so_and_nowhere_else(
     change(out, TRIALS, "trials/audited", SLIPPED, lambda _: audited)
     if left:
         leave_closed(out, SLIPPED)
-    what = f"outcome must be not_lifted {'only ' if left else ''}where the"
+    what = "outcome must follow from the contacts"
     must_find(out / TRIALS, *([] if sound else [(TRIALS, "/trials", SLIPPED, what)]))
 
 
@@ -184,7 +184,7 @@ def test_hand_that_is_likely_to_hold_is_not_lifted_only_for_its_image(
     out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=settings)
     change(out, TRIALS, "trials/audited", SLIPPED, lambda _: audited)
     leave_closed(out, SLIPPED)
-    what = (TRIALS, "/trials", SLIPPED, "outcome must be not_lifted only where the")
+    what = (TRIALS, "/trials", SLIPPED, "outcome must follow from the contacts")
     must_find(out / TRIALS, *([what] if audited else []))
 
 
@@ -241,8 +241,8 @@ def test_certificates_are_checked(out: Path) -> None:
     )
     must_find(
         out / TRIALS,
-        (TRIALS, "/successes", 1, "certified_share must be 0..1 or NaN"),
-        (TRIALS, "/successes", 1, "certified_friction must be 0..inf or NaN"),
+        (TRIALS, "/successes", 1, "certified_share must be 0..1"),
+        (TRIALS, "/successes", 1, "certified_friction must be 0..inf"),
     )
 
 

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from helpers.commands import run
 
-from drakegrasp.dataset.card.content import LIMITS, card_content
+from drakegrasp.dataset.card import LIMITS, card_content
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import DEPTH_UNIT
 from drakegrasp.errors import DataError, MachineError

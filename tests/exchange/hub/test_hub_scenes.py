@@ -18,7 +18,7 @@ from PIL import Image
 from drakegrasp.dataset.schema import SCENE_GRASP_FIELDS, SPLITS, VIEW_FIELDS, Field
 from drakegrasp.errors import DataError
 from drakegrasp.exchange.export import export_dataset
-from drakegrasp.generation.scenes.make import make_scenes
+from drakegrasp.generation.scenes import make_scenes
 
 pytest.importorskip("pyarrow")
 pytestmark = pytest.mark.sim

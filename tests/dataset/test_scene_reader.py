@@ -12,10 +12,10 @@ import h5py
 import numpy as np
 import pytest
 
-from drakegrasp.dataset.scenes.reader import SceneDataset
+from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.errors import DataError
 from drakegrasp.frames import invert_pose, transform_points
-from drakegrasp.generation.scenes.make import make_scenes
+from drakegrasp.generation.scenes import make_scenes
 
 pytestmark = pytest.mark.sim
 
@@ -23,7 +23,8 @@ pytestmark = pytest.mark.sim
 @pytest.fixture(scope="module")
 def path(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = Path(shutil.copytree(sound, tmp_path_factory.mktemp("scenes") / "out"))
-    return make_scenes(out).path
+    make_scenes(out)
+    return out / "scenes.hdf5"
 
 
 def same(a: dict[str, Any], b: dict[str, Any]) -> bool:

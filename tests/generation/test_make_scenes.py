@@ -13,17 +13,16 @@ import pytest
 from click.testing import CliRunner
 
 from drakegrasp.cli.main import main
-from drakegrasp.dataset.card.content import card_content
+from drakegrasp.dataset.card import card_content
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import CARD_FILES
 from drakegrasp.errors import ConfigError
 from drakegrasp.frames import unpack_pose
-from drakegrasp.generation.scenes.make import make_scenes, split_objects
-from drakegrasp.generation.scenes.visible import visible_contacts
+from drakegrasp.generation.scenes import make_scenes, split_objects
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import processes
-from drakegrasp.vision.viewpoints import fixed_viewpoints
+from drakegrasp.vision.camera import fixed_viewpoints
 
 pytestmark = pytest.mark.sim
 
@@ -31,13 +30,14 @@ pytestmark = pytest.mark.sim
 @pytest.fixture(scope="module")
 def scenes(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = Path(shutil.copytree(sound, tmp_path_factory.mktemp("scenes") / "out"))
-    return make_scenes(out).path
+    make_scenes(out)
+    return out / "scenes.hdf5"
 
 
 def test_bytes_do_not_depend_on_the_number_of_workers(scenes: Path, out: Path) -> None:
     with processes(2) as execute:
-        again = make_scenes(out, execute=execute)
-    assert again.path.read_bytes() == scenes.read_bytes()
+        make_scenes(out, execute=execute)
+    assert (out / "scenes.hdf5").read_bytes() == scenes.read_bytes()
 
 
 def test_card_counts_them_as_long_as_they_are_of_the_dataset(scenes: Path, out: Path) -> None:
@@ -107,8 +107,8 @@ def test_other_settings_than_of_scenes_are_refused(out: Path) -> None:
     with pytest.raises(ConfigError, match="only keys of scenes can change"):
         make_scenes(out, overrides=["filters.max_slip=1"])
     made = make_scenes(out, overrides=["scenes.views=2", "scenes.width=64", "scenes.height=48"])
-    assert made.views["train"] == 2 * made.scenes["train"]
-    with h5py.File(made.path) as file:
+    assert made["train"]["views"] == 2 * made["train"]["scenes"]
+    with h5py.File(out / "scenes.hdf5") as file:
         assert file["views/rgb"].shape[1:] == (48, 64, 3)
 
 
@@ -129,36 +129,6 @@ def test_by_class_no_object_is_in_two_splits(
     split = manifest.config.split.model_copy(update={"by": "class", "valid_fraction": 0.0})
     manifest = replace(manifest, config=manifest.config.model_copy(update={"split": split}))
     assert split_objects(manifest, present) == splits
-
-
-def test_what_is_before_a_contact_hides_it_and_so_does_its_normal() -> None:
-    # The camera looks down at a plane 0.5 m away, half of which is hidden by one at 0.4 m.
-    depth = np.full((48, 64), 5000, dtype=np.uint16)
-    depth[:, :32] = 4000
-    K = np.array([[100.0, 0.0, 31.5], [0.0, 100.0, 23.5], [0.0, 0.0, 1.0]])
-    X_TC = np.diag([1.0, -1.0, -1.0, 1.0])
-    X_TC[2, 3] = 0.5
-    up, down = [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]
-    p_TQ = [[0.1, 0, 0], [-0.1, 0, 0], [0.1, 0, 0], [0.1, 0, -0.002], [0.1, 0, -0.004], [1, 0, 0]]
-    nhat = [up, up, down, up, up, up]
-    picture = K, depth, np.ones(depth.shape, dtype=np.uint8)
-    seen = visible_contacts(np.array(p_TQ), np.array(nhat), X_TC, *picture)
-    assert seen.tolist() == [True, False, False, True, False, False]
-    assert not visible_contacts(np.full((1, 3), np.nan), np.array([up]), X_TC, *picture).any()
-
-
-def test_a_contact_that_is_no_place_on_the_object_is_hidden() -> None:
-    """The mask ends at column 40; the contacts are 5 mm, a pixel, apart."""
-    depth, mask = np.full((48, 64), 5000, dtype=np.uint16), np.zeros((48, 64), dtype=np.uint8)
-    mask[:, :41] = 1
-    K = np.array([[100.0, 0.0, 32.0], [0.0, 100.0, 24.0], [0.0, 0.0, 1.0]])
-    X_TC = np.diag([1.0, -1.0, -1.0, 1.0])
-    X_TC[2, 3] = 0.5
-    p_TQ = np.array([[0.005 * (column - 32), 0, 0] for column in (39.5, 41.5, 42.1, 50)])
-    nhat = np.tile([0.0, 0.0, 1.0], (4, 1))
-    seen = visible_contacts(p_TQ, nhat, X_TC, K, depth, mask)
-    assert seen.tolist() == [True, True, False, False]
-    assert not visible_contacts(p_TQ, nhat, X_TC, K, depth, 0 * mask).any()
 
 
 def test_assemble_makes_them_where_the_configuration_says_so(out: Path) -> None:

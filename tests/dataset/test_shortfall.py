@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drakegrasp.config import SplitConfig
-from drakegrasp.dataset.card.shortfall import (
+from drakegrasp.dataset.shortfall import (
     objects_without_samples,
     split_shortfall,
     why_no_sample,

@@ -13,8 +13,7 @@ from helpers.datasets import SLIPPED, end_lift
 
 from drakegrasp.config import CarriedHand
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.card.content import card_content, content_of
-from drakegrasp.dataset.card.text import card_text
+from drakegrasp.dataset.card import card_content, card_text, content_of
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.paths import CARD_FILES
@@ -87,7 +86,7 @@ def test_card_compares_forces_with_the_rated_load(out: Path) -> None:
 
 
 def test_limits_name_pages_that_exist(out: Path) -> None:
-    root = Path(__file__).resolve().parents[3]
+    root = Path(__file__).resolve().parents[2]
     for each in card_content(out)["limits"]:
         assert (root / each["docs"]).is_file()
 

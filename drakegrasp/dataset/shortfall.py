@@ -6,7 +6,7 @@ In: counts. Out: sentences.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,8 +30,7 @@ _MET = {
 MUCH = 2.0
 
 
-@dataclass(frozen=True)
-class Shortfall:
+class Shortfall(NamedTuple):
     """Why an object has no sample, and what would help; each a part of a sentence."""
 
     reason: str

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import h5py
 import numpy as np
@@ -48,8 +47,7 @@ LABELS = ("tested", "held", "sample")
 _VIEW, _ITEM, _ORDER, _ROUND = 0, 1, 2, 3
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Lens:
+class _Lens(NamedTuple):
     """What `spoil_depth` asks of a camera: near and far plane [m]."""
 
     near: float

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from helpers.datasets import TRIALS, change, make_dataset, must_find, must_find_without_shards
 
 from drakegrasp.cli.main import main
-from drakegrasp.dataset.card.holding import (
+from drakegrasp.dataset.holding import (
     COLUMNS,
     area_under_roc,
     bearing,
@@ -42,7 +42,7 @@ def test_repeats_are_checked(out: Path) -> None:
     wrong = {
         (0, "repeats"): (2, "p_hold_held must be at most p_hold_repeats"),
         (3, "repeats"): (9, "p_hold_repeats must be at most"),
-        (12, "probability"): (1.5, "p_hold_probability must be NaN or in 0..1"),
+        (12, "probability"): (1.5, "p_hold_probability must be above 0..1"),
         (15, "half_step"): (0.5, "p_hold_half_step must be 0, 1 or NaN"),
         (24, "held"): (2, "p_hold_samples must be at most p_hold_held"),
     }

@@ -1,4 +1,6 @@
-"""Views of scenes as rows of a data file, so that predictions for them are verified and scored.
+"""Rows of scenes: grasps as they follow from trials, and views as rows of a data file.
+
+Predictions for such views are verified and scored as those for samples.
 
 In: scenes.hdf5, in the directory of its dataset. Out: a `GraspDataset` whose rows are the views of
 scenes that have a sample. Imports h5py and NumPy only.
@@ -7,6 +9,7 @@ scenes that have a sample. Imports h5py and NumPy only.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +17,37 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import multiply
+from drakegrasp.arithmetic import Array, multiply
+from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.opening import opened, refuse_other_codes
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.scenes.reader import SceneDataset
+from drakegrasp.dataset.scenes import SceneDataset
+from drakegrasp.dataset.schema import SCENE_GRASP_FIELDS
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.frames import X_WT, invert_pose, pack_pose, unpack_pose
 from drakegrasp.grasp import pack_grasp
+from drakegrasp.outcomes import Outcome
 from drakegrasp.seeding import Stream
 
+Columns = dict[str, AnyArray]
+
+#: Outcomes of lifts to a verdict; `table_contact` after closing is none.
+LIFTED = (
+    *(Outcome.SUCCESS, Outcome.SLIPPED, Outcome.PARTLY_HELD, Outcome.DROPPED),
+    Outcome.TABLE_CONTACT,
+)
+#: Fields of /grasps that are columns of /trials, by their names here.
+_COPIED = {f.name: f.of for f in SCENE_GRASP_FIELDS if f.of} | {
+    name: name for name in ("trial_id", "outcome", "precision", "stable", "preshape", "unused")
+}
+#: Columns of /trials that grasps of scenes follow from.
+GRASPS_FOLLOW_FROM = (
+    *dict.fromkeys(_COPIED.values()),
+    *("candidate", "standoff_index", "child", "resting", "spread", "time_lift"),
+    *("X_OG", "X_OG_lifted"),
+    *(f"{when}_{name}" for when in ("closed", "lifted") for name in ("p_OQ", "nhat_Q_O", "f_Q_O")),
+)
 #: The camera of such rows.
 CAMERA = "view"
 #: First number of the place of the streams that choose own grasps.
@@ -46,6 +70,31 @@ def open_rows(path: Path, *, split: str, fewer_fingers: bool = False) -> GraspDa
     if of_scenes:
         return SceneRows(path, split=split)
     return GraspDataset(path, split=split, fewer_fingers=fewer_fingers)
+
+
+def grasps_of_trials(trials: Mapping[str, AnyArray], X_TO: Array, weights: Array) -> Columns:
+    """Return the columns of /grasps that follow from trials, put where their objects lie.
+
+    Args:
+        trials: Columns of n trials, by GRASPS_FOLLOW_FROM.
+        X_TO: Poses of their objects in the scenes, (n, 4, 4).
+        weights: (n,), of those that are samples, NaN of others.
+    """
+    outcome, R_OT = trials["outcome"], np.swapaxes(X_TO[:, :3, :3], 1, 2)
+    columns = {name: trials[of] for name, of in _COPIED.items()}
+    columns |= {
+        "tested": np.isin(outcome, LIFTED) & np.isfinite(trials["time_lift"]),
+        "held": outcome == Outcome.SUCCESS,
+        "sample": np.isfinite(weights),
+        "weight": np.nan_to_num(weights),
+    }
+    for suffix, when, X_OG in (("", "closed", "X_OG"), ("_held", "lifted", "X_OG_lifted")):
+        columns[f"X_TG{suffix}"] = pack_pose(multiply(X_TO, unpack_pose(trials[X_OG])))
+        points, normals, forces = (trials[f"{when}_{n}"] for n in ("p_OQ", "nhat_Q_O", "f_Q_O"))
+        columns[f"p_TQ{suffix}"] = multiply(points, R_OT) + X_TO[:, None, :3, 3]
+        columns[f"nhat_Q_T{suffix}"] = multiply(normals, R_OT)
+        columns[f"f_Q_T{suffix}"] = multiply(forces, R_OT)
+    return columns
 
 
 class SceneRows(GraspDataset):

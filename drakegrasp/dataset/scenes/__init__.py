@@ -1,1 +1,0 @@
-"""Reading scenes.hdf5 to train on it."""

@@ -1,0 +1,494 @@
+"""Makes scenes.hdf5 of an assembled dataset: a task per object, put together in their order.
+
+In: the directory of a dataset, each prepared object and the rows of its closed hands in
+trials.hdf5. Out: the file, with places, pictures, closed hands and what cameras see of them; it
+appears when it is complete, and nothing else changes. Its bytes do not depend on who does them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import Array, multiply
+from drakegrasp.config import Config
+from drakegrasp.dataset.assembly.split import may_train, rank_in_split
+from drakegrasp.dataset.card import write_card
+from drakegrasp.dataset.hdf5 import AnyArray, create_field, packed_chunk, write_field
+from drakegrasp.dataset.lock import build_lock
+from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manifest
+from drakegrasp.dataset.opening import SCENE_TABLES, open_samples
+from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
+from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
+from drakegrasp.dataset.scene_rows import GRASPS_FOLLOW_FROM, grasps_of_trials
+from drakegrasp.dataset.scenes import count_scenes
+from drakegrasp.dataset.schema import (
+    DEPTH_UNIT,
+    NO_PRESHAPE,
+    SCENE_GRASP_FIELDS,
+    SPLITS,
+    SURFACE_POINTS,
+    VIEW_FIELDS,
+    VIEW_KINDS,
+    stored_fields,
+)
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import ConfigError
+from drakegrasp.frames import make_pose, pack_pose, rotation_about
+from drakegrasp.generation.attempts import find_attempt
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.hand.parsing import position_order
+from drakegrasp.hand.settings import override_config
+from drakegrasp.mesh.surfaces import even_points, on_faces, unit_normals
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.environment import one_thread
+from drakegrasp.runtime.executor import Executor, in_order, run_here
+from drakegrasp.runtime.files import atomic_hdf5, disk_full_named
+from drakegrasp.runtime.progress import Report, silent
+from drakegrasp.seeding import Stream, object_key
+from drakegrasp.simulation.candidates import Source
+from drakegrasp.simulation.conditions import Conditions, conditions_from, usual_materials
+from drakegrasp.simulation.scene_cache import cached_renderer
+from drakegrasp.vision.camera import RING, Lens, draw_viewpoint, fixed_viewpoints, visible_contacts
+from drakegrasp.vision.rendering import Renderer, capture, paint
+
+#: Columns that count rows of other groups, which a task counts from its object's first.
+_ROWS_OF = {
+    ("scenes", "object"): "objects",
+    ("views", "scene"): "scenes",
+    ("grasps", "scene"): "scenes",
+    ("visible", "view"): "views",
+    ("visible", "grasp"): "grasps",
+}
+
+
+def make_scenes(
+    out: Path,
+    *,
+    overrides: Sequence[str] = (),
+    execute: Executor = run_here,
+    progress: Report = silent,
+) -> dict[str, dict[str, int]]:
+    """Write scenes.hdf5 of a dataset, and its card, which counts them; what is there is replaced.
+
+    Args:
+        out: Directory of an assembled dataset.
+        overrides: `scenes.key=value` texts, for this file alone.
+        execute: Does the work.
+        progress: Called with the number of objects that are done and to do.
+
+    Raises:
+        ConfigError: If an override cannot be used.
+        DataError: If there is no dataset, or it is damaged, or another process builds in it.
+        BlankImageError: If OpenGL failed.
+        DiskFullError: If there is no room.
+
+    Returns:
+        How many scenes, objects, views and grasps there are, by split, see `count_scenes`.
+    """
+    read_manifest(out)  # the lock would make a missing directory
+    with build_lock(out):
+        return make_scenes_locked(out, overrides=overrides, execute=execute, progress=progress)
+
+
+def make_scenes_locked(
+    out: Path,
+    *,
+    overrides: Sequence[str] = (),
+    execute: Executor = run_here,
+    progress: Report = silent,
+) -> dict[str, dict[str, int]]:
+    """Write scenes.hdf5 and the card, see `make_scenes`; the caller holds the lock."""
+    manifest = read_manifest(out)
+    config = _with_scenes(manifest.config, overrides)
+    hand = load_hand(config.hand_source)
+    joints = manifest.joints or position_order(hand.model, hand.palm_link)
+    manifest = replace(manifest, config=config, joints=joints)
+    trials = Trials(out)
+    tasks = _tasks(out, manifest, trials)
+
+    rows, tables = Counter[str](), dict[str, list[Columns]]()
+    with disk_full_named(out), atomic_hdf5(out / SCENES_FILE) as file:
+        file.attrs.update(_attributes(manifest, trials))
+        progress(0, len(tasks))
+        for done, (own, images) in enumerate(in_order(execute)(make_scenes_of, tasks), start=1):
+            _write_images(file, images, rows["views"], config)
+            for group, columns in own.items():
+                tables.setdefault(group, []).append(_numbered(group, columns, rows))
+            rows.update({group: len(next(iter(of.values()))) for group, of in own.items()})
+            progress(done, len(tasks))
+        for group, parts in tables.items():
+            _write_table(file, group, parts)
+        counts = count_scenes(file)
+    write_card(out)
+    return counts
+
+
+def _with_scenes(config: Config, overrides: Sequence[str]) -> Config:
+    """Return a configuration with other scenes.
+
+    Raises:
+        ConfigError: If an override is of anything else.
+    """
+    for text in overrides:
+        if not text.strip().startswith("scenes."):
+            raise ConfigError(f"only keys of scenes can change, as scenes.views=8, got {text!r}")
+    return override_config(config, overrides)
+
+
+def _tasks(out: Path, manifest: Manifest, trials: Trials) -> list[SceneTask]:
+    """Return a task per object, in the order of the dataset."""
+    columns = trials.columns(("object", "outcome", "time_close"))
+    weights = np.full(len(trials), np.nan)
+    sample_split = np.full(len(trials), len(SPLITS))
+    with open_samples(out / DATA_FILES["oto"]) as file:
+        for number, split in enumerate(SPLITS):
+            ids = file[split]["trial_id"][:]
+            weights[ids] = file[split]["grasp_props/weight"][:]
+            sample_split[ids] = number
+
+    # Hands that closed, whatever became of them; a simulator that failed says nothing.
+    failed = [outcome for outcome in Outcome if outcome.inconclusive]
+    closed = np.isfinite(columns["time_close"]) & ~np.isin(columns["outcome"], failed)
+    present = [
+        set(sample_split[(columns["object"] == i) & (sample_split < len(SPLITS))].tolist())
+        for i in range(len(manifest.objects))
+    ]
+    splits = split_objects(manifest, present)
+    return [
+        SceneTask(
+            out=out,
+            name=entry.name,
+            split=splits[i],
+            config=manifest.config_of(entry.name),
+            joints=manifest.joints,
+            trial_ids=(ids := np.flatnonzero(closed & (columns["object"] == i))),
+            weights=weights[ids],
+        )
+        for i, entry in enumerate(manifest.objects)
+    ]
+
+
+def split_objects(manifest: Manifest, present: Sequence[set[int]]) -> list[int]:
+    """Return the split of each object as an index into SPLITS: no object is in two.
+
+    Objects of a group go together. A group whose samples are tested is tested. By object, a group
+    validates if its samples do. By class every object has samples that validate, so of the groups
+    that are not tested a share as large validates: those of the highest rank. A group without
+    samples goes where its rank, or its class, would take it.
+
+    Args:
+        manifest: Of the dataset.
+        present: Of each object the splits that have samples of it.
+    """
+    config, seed = manifest.config.split, manifest.config.seed
+    train, valid, test = range(len(SPLITS))
+    groups, by_class = manifest.groups, manifest.split_rule == "class"
+    found = {group: set[int]() for group in groups}
+    for group, splits in zip(groups, present, strict=True):
+        found[group] |= splits
+    ranks = {group: rank_in_split(group, seed) for group in found}
+    classes = Counter(entry.class_name for entry in manifest.objects)
+
+    tested = {group for group, splits in found.items() if test in splits}
+    last = max((ranks[group] for group in tested), default=-1.0)
+    for entry, group in zip(manifest.objects, groups, strict=True):
+        trains = may_train(entry.class_name, classes[entry.class_name], config)
+        if not found[group] and (not trains if by_class else ranks[group] < last):
+            tested.add(group)
+    others = sorted(found.keys() - tested, key=lambda group: (ranks[group], group))
+    if by_class:
+        validating = set(others[len(others) - round(config.valid_fraction * len(others)) :])
+    else:
+        first = min((ranks[g] for g in others if found[g] == {valid}), default=2.0)
+        validating = {group for group in others if ranks[group] >= first}
+    return [test if g in tested else valid if g in validating else train for g in groups]
+
+
+def _attributes(manifest: Manifest, trials: Trials) -> dict[str, object]:
+    """Return the attributes of the file: those of trials.hdf5 that say of what it was made."""
+    config = manifest.config
+    return {
+        **origin_attributes(config, manifest.versions, manifest.fingers, manifest.joints),
+        "near": config.scenes.near,
+        "far": config.scenes.far,
+        **{key: trials.attributes[key] for key in ("signature", "shards")},
+    }
+
+
+# Writing
+
+
+def _write_images(
+    file: h5py.File, images: Mapping[str, Sequence[bytes]], start: int, config: Config
+) -> None:
+    """Add the packed images of an object's views, which begin with a row."""
+    group, sizes = (
+        file.require_group("views"),
+        {"h": config.scenes.height, "w": config.scenes.width},
+    )
+    for field in VIEW_FIELDS:
+        if field.sample:
+            if field.name not in group:
+                create_field(group, field, field.row_shape(sizes))
+            dataset, chunks = group[field.name], images[field.name]
+            dataset.resize(start + len(chunks), axis=0)
+            for row, chunk in enumerate(chunks, start):
+                dataset.id.write_direct_chunk((row, *(0,) * len(field.axes)), chunk)
+
+
+def _numbered(group: str, columns: Columns, rows: Mapping[str, int]) -> Columns:
+    """Return columns whose numbers count the rows of the file."""
+    added = {name: rows[of] for (own, name), of in _ROWS_OF.items() if own == group}
+    return {name: v + added[name] if name in added else v for name, v in columns.items()}
+
+
+def _write_table(file: h5py.File, name: str, parts: Sequence[Columns]) -> None:
+    """Write the columns of a group that are no images of views."""
+    group = file.require_group(name)
+    for field in SCENE_TABLES[name]:
+        if field.name not in group and field.name in parts[0]:
+            values = np.concatenate([part[field.name] for part in parts])
+            dtype = object if field.dtype == "str" else field.dtype
+            write_field(group, field, values.astype(dtype))
+
+
+# The scenes of one object
+
+#: Last number of the place of a scene's streams; streams of other things have other ones.
+_PLACE = 4
+#: The number before it: of where the object lies, how the scene looks, and of the first camera.
+_WHERE, _LOOK, _CAMERA = 0, 1, 2
+Columns = dict[str, AnyArray]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneTask:
+    """The scenes of an object to make.
+
+    Attributes:
+        out: Directory of the dataset.
+        name: Of the object.
+        split: Of its scenes, an index into SPLITS.
+        config: Of the object.
+        joints: Names of the hand's joints, in the order of the files.
+        trial_ids: (n,), rows of trials.hdf5 of its closed hands.
+        weights: (n,), of those that are samples, NaN of others.
+    """
+
+    out: Path
+    name: str
+    split: int
+    config: Config
+    joints: Sequence[str]
+    trial_ids: npt.NDArray[np.int64]
+    weights: Array
+
+
+@one_thread
+def make_scenes_of(task: SceneTask) -> tuple[dict[str, Columns], dict[str, list[bytes]]]:
+    """Return the scenes of an object, whose rows are counted from its first on.
+
+    Returns:
+        Columns by group without images; packed chunks of the rows of /views by the names of their
+        fields.
+
+    Raises:
+        DataError: If a file of the dataset is missing or damaged.
+        BlankImageError: If OpenGL failed.
+    """
+    prepared = load_prepared(task.out, task.name, task.config)
+    X_TO = np.array([_place(prepared, k, task.config) for k in range(len(prepared.resting_poses))])
+    grasps = _grasps(task, prepared, X_TO)
+    views, images, visible = _views(task, prepared, X_TO, grasps)
+    tables = {
+        "objects": _object(prepared),
+        "scenes": _scenes(task, prepared, X_TO),
+        "views": views,
+        "grasps": grasps,
+        "visible": visible,
+    }
+    return tables, images
+
+
+def _stream(config: Config, name: str, resting: int, number: int) -> Stream:
+    return Stream(config.seed, object_key(name), resting, number, _PLACE)
+
+
+def _place(prepared: PreparedObject, resting: int, config: Config) -> Array:
+    """Return X_TO (4, 4) of a resting pose, turned about Tz and moved to a drawn place."""
+    u = _stream(config, prepared.model.name, resting, _WHERE).uniform(3)
+    turn = make_pose(rotation_about([0.0, 0.0, 1.0], 2.0 * np.pi * u[0]), np.zeros(3))
+    X_TO = multiply(turn, prepared.resting_poses[resting])
+    X_TO[:2, 3] = config.scenes.place * (2.0 * u[1:] - 1.0)
+    return X_TO
+
+
+def _object(prepared: PreparedObject) -> Columns:
+    """Return the row of /objects."""
+    model = prepared.model
+    faces = model.visual_faces.astype(np.int64)
+    points, picked = on_faces(model.visual_vertices, faces, even_points(SURFACE_POINTS))
+    return {
+        **{n: np.array([getattr(model, n)]) for n in ("name", "class_name", "mesh_sha256")},
+        "p_OS": points[None],
+        "nhat_S_O": unit_normals(model.visual_vertices[faces[picked]])[None],
+    }
+
+
+def _scenes(task: SceneTask, prepared: PreparedObject, X_TO: Array) -> Columns:
+    """Return the rows of /scenes, a scene per resting pose; there is one object in each."""
+    count = len(X_TO)
+    materials = usual_materials(prepared.model, task.config.physics)
+    return {
+        "split": np.full(count, task.split),
+        "object": np.zeros((count, 1), dtype=np.int64),
+        "resting": np.arange(count)[:, None],
+        "probability": prepared.probability[:, None],
+        "X_TO": pack_pose(X_TO)[:, None],
+        **{name: np.full((count, 1), value) for name, value in vars(materials).items()},
+    }
+
+
+# Views
+
+
+def _views(
+    task: SceneTask, prepared: PreparedObject, X_TO: Array, grasps: Columns
+) -> tuple[Columns, dict[str, list[bytes]], Columns]:
+    """Return the rows of /views without their images, the images, and the rows of /visible."""
+    config, name = task.config, prepared.model.name
+    lens, renderer = Lens.of(config.scenes), cached_renderer(prepared.model, config.camera)
+    numbers: dict[str, list[Any]] = {f.name: [] for f in VIEW_FIELDS if not f.sample}
+    images: dict[str, list[bytes]] = {f.name: [] for f in VIEW_FIELDS if f.sample}
+    visible: dict[str, list[AnyArray]] = {"view": [], "grasp": [], "visible": []}
+    for k, X in enumerate(X_TO):
+        look = conditions_from(_stream(config, name, k, _LOOK), prepared.model, config)
+        own = np.flatnonzero(grasps["scene"] == k)
+        paint(renderer, look.appearance)
+        for number, (kind, X_TC) in enumerate(_cameras(task, name, k, X)):
+            depth, mask = _picture(renderer, lens, X, X_TC, images)
+            row = {
+                "scene": k,
+                "kind": kind,
+                "K": lens.K.ravel(),
+                "X_TC": pack_pose(X_TC),
+                **_conditions(look, _stream(config, name, k, _CAMERA + number)),
+            }
+
+            # What it sees of the contacts.
+            p_TQ, nhat_Q_T = (grasps[key][own] for key in ("p_TQ", "nhat_Q_T"))
+            sees = visible_contacts(p_TQ, nhat_Q_T, X_TC, lens.K, depth * DEPTH_UNIT, mask)
+            visible["visible"].append(sees)
+            visible["view"].append(np.full(len(own), len(numbers["scene"])))
+            visible["grasp"].append(own)
+            for key, values in numbers.items():
+                values.append(row[key])
+
+    columns = {key: np.array(values) for key, values in numbers.items()}
+    return columns, images, {key: np.concatenate(parts) for key, parts in visible.items()}
+
+
+def _cameras(task: SceneTask, name: str, resting: int, X_TO: Array) -> list[tuple[int, Array]]:
+    """Return the kind and the pose X_TC (4, 4) of each camera of a scene."""
+    drawn, ring, single = range(len(VIEW_KINDS))
+    if task.split:
+        fixed = fixed_viewpoints()
+        return [(ring if i < len(RING) else single, X_TC) for i, X_TC in enumerate(fixed)]
+    scenes = task.config.scenes
+    streams = (_stream(task.config, name, resting, _CAMERA + i) for i in range(scenes.views))
+    return [(drawn, draw_viewpoint(stream, X_TO[:3, 3], scenes)) for stream in streams]
+
+
+def _picture(
+    renderer: Renderer, lens: Lens, X_TO: Array, X_TC: Array, images: dict[str, list[bytes]]
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint8]]:
+    """Render a view, add its packed images to lists, and return its depth image and its mask."""
+    seen = capture(renderer, lens, X_TO, X_TC)
+    far = np.where(np.isfinite(seen.depth), np.rint(seen.depth / DEPTH_UNIT), 0)
+    depth = far.astype(np.uint16)
+    stored = {"rgb": seen.rgb, "depth": depth, "mask": seen.mask}
+    for key, image in stored.items():
+        images[key].append(packed_chunk(np.ascontiguousarray(image)[None], 1))
+    return depth, seen.mask
+
+
+def _conditions(look: Conditions, camera: Stream) -> dict[str, Any]:
+    """Return the looks of a scene and the noise of a camera, by their names in the schema."""
+    values = {key: value for key, value in look.values().items() if key in _VIEW_CONDITIONS}
+    return values | {"depth_seed": camera.key if look.sensor.noise else 0}
+
+
+_VIEW_CONDITIONS = {f.name for f in VIEW_FIELDS if f.of}
+
+
+# Grasps
+
+
+def _grasps(task: SceneTask, prepared: PreparedObject, X_TO: Array) -> Columns:
+    """Return the rows of /grasps, scene by scene in the order of the attempts."""
+    trials = Trials(task.out)[task.trial_ids].columns(GRASPS_FOLLOW_FROM)
+    order = np.argsort(trials["resting"], kind="stable")
+    trials = {name: values[order] for name, values in trials.items()}
+    scene = trials["resting"]
+    columns = grasps_of_trials(trials, X_TO[scene], task.weights[order])
+    stored = {f.name for f in stored_fields(SCENE_GRASP_FIELDS, certified=task.config.certified)}
+    return {name: values for name, values in columns.items() if name in stored} | {
+        "scene": scene.astype(np.int64),
+        "object": np.zeros(len(scene), dtype=np.int64),
+        "family": _families(scene, trials),
+        "q_open": _open_hands(task, prepared, trials),
+    }
+
+
+def _families(scene: AnyArray, trials: Columns) -> npt.NDArray[np.int64]:
+    """Return the number (n,) of each attempt's family in its scene."""
+    keys = np.column_stack([scene, trials["candidate"], trials["standoff_index"]])
+    known, family = np.unique(keys, axis=0, return_inverse=True)
+    first = np.searchsorted(known[:, 0], np.arange(known[:, 0].max(initial=0) + 1))
+    return np.asarray(family.ravel() - first[scene])
+
+
+def _open_hands(task: SceneTask, prepared: PreparedObject, trials: Columns) -> Array:
+    """Return the positions (n, j) of the hand's joints before it closes."""
+    hand, known = load_hand(task.config.hand_source), dict[tuple[float, int], Array]()
+    rows = np.zeros((len(trials["spread"]), len(task.joints)))
+    for i, spread in enumerate(trials["spread"].tolist()):
+        if trials["source"][i] == Source.POSTURES:
+            rows[i] = _given_start(task, prepared, hand, {n: int(trials[n][i]) for n in _IDENTITY})
+            continue
+        key = spread, int(trials["preshape"][i])
+        if key not in known:
+            shaped = hand.at(None if key[1] == NO_PRESHAPE else key[1])
+            known[key] = _positions(task, shaped, spread, np.zeros(shaped.num_fingers))
+        rows[i] = known[key]
+    return rows
+
+
+#: What names an attempt of an object.
+_IDENTITY = ("candidate", "standoff_index", "child")
+
+
+def _given_start(
+    task: SceneTask, prepared: PreparedObject, hand: Hand, identity: Mapping[str, int]
+) -> Array:
+    """Return the positions (j,) of the joints from which a posture closes."""
+    attempt = find_attempt(prepared, **identity, config=task.config)
+    if attempt.path is not None:
+        return attempt.path.start
+    shaped = hand.at(attempt.preshape)
+    closing = np.zeros(shaped.num_fingers) if attempt.closing is None else attempt.closing
+    return _positions(task, shaped, attempt.spread, closing)
+
+
+def _positions(task: SceneTask, hand: Hand, spread: float, closing: Array) -> Array:
+    named = joint_positions(hand, spread, closing)
+    return np.array([named[name] for name in task.joints])

@@ -1,1 +1,0 @@
-"""Making scenes.hdf5: what is on the table, the cameras, and all closed hands."""
