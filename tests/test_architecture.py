@@ -62,12 +62,12 @@ WALLS = {
     ),
     "mujoco": (
         "mjcf",
-        "hand.draft.compiled",
+        "commissioning.draft.mjcf",
         "protocols.scene",
         "bench",
         "exchange.mjcf",
     ),
-    "coacd": ("mjcf.convex_parts",),
+    "coacd": ("mjcf.scene",),
     "pyarrow": ("exchange", "verification.prediction"),
     "torch": ("dataset.torch_samples",),
 }

@@ -29,8 +29,8 @@ from drakegrasp.generation.pipeline import (
     refuse_unusable,
 )
 from drakegrasp.generation.request import BUILTIN, refuse_unknown
-from drakegrasp.hand.carried import carry_hand
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.folder import carry_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.runtime.progress import progress_bar

@@ -18,7 +18,7 @@ from drakegrasp.bench.mujoco_drive import FingerDrive
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, rotation_angle
 from drakegrasp.hand.description import load_plain_hand
-from drakegrasp.hand.strength import within_load
+from drakegrasp.hand.kinematics import within_load
 from drakegrasp.mjcf.links import TIME_STEP, pair_friction, quaternion
 from drakegrasp.mjcf.scene import IMMOVABLE, build_mujoco_scene
 from drakegrasp.objects.model import ObjectModel

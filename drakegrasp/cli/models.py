@@ -15,7 +15,7 @@ from drakegrasp.cli.options import FILE, NEW_FILE, PATH, chosen_settings, option
 from drakegrasp.errors import counted
 
 if TYPE_CHECKING:
-    from drakegrasp.commissioning.finding import Finding
+    from drakegrasp.commissioning.checks import Finding
 
 
 @click.command()
@@ -206,7 +206,7 @@ def new_hand(
     """
     import numpy as np
 
-    from drakegrasp.commissioning.draft.answers import Answers
+    from drakegrasp.commissioning.draft.fingers import Answers
     from drakegrasp.commissioning.draft.run import draft_hand
 
     # What a person says.
@@ -269,7 +269,7 @@ def check_hand_file(hand_file: str, picture: Path | None) -> None:
     Files, motion, strength and trial grasps in simulation are checked. NAME is a hand that comes
     with the package, YAML a hand file. Exit code 1 if anything is wrong.
     """
-    from drakegrasp.commissioning.run import check_hand
+    from drakegrasp.commissioning.trial_grasps import check_hand
 
     findings = check_hand(hand_file, report=_print)
 
@@ -283,8 +283,8 @@ def check_hand_file(hand_file: str, picture: Path | None) -> None:
 
 def _draw(hand_file: str | Path, picture: Path) -> None:
     """Draw a hand."""
-    from drakegrasp.commissioning.pinch import across_angle
     from drakegrasp.hand.description import load_hand
+    from drakegrasp.hand.finger_sweep import across_angle
     from drakegrasp.pictures.rendered import picture_hand
 
     loaded = load_hand(hand_file)

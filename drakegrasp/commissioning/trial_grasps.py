@@ -1,8 +1,8 @@
-"""Trial grasps: the hand closes on simple objects, and lifts them, in simulation.
+"""`check_hand`: all checks of a hand, and at last trial grasps: it lifts simple objects.
 
 In: a hand. Out: for each object the best of a few attempts, whose palm poses follow from how the
-fingertips close (`pinch`). The attempts are those of a build: `run_attempt` simulates them. The
-object hangs in the air until it is held, so that gravity may act along the line on which the
+fingertips close (`find_pinch`). The attempts are those of a build: `run_attempt` simulates them.
+The object hangs in the air until it is held, so that gravity may act along the line on which the
 fingers close, across it, or in between: a hand whose fingers do not resist along that line holds in
 only some of these.
 """
@@ -10,20 +10,33 @@ only some of these.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import trimesh
 
-from drakegrasp.commissioning.finding import Finding
-from drakegrasp.commissioning.pinch import Pinch, find_opposition, find_pinch, reach
+from drakegrasp.commissioning.checks import (
+    Finding,
+    check_couplings,
+    check_efforts,
+    check_geometry,
+    check_limits,
+    check_masses,
+    judge,
+)
 from drakegrasp.config import Config, ObjectConfig, with_whole_lifts
+from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, make_pose, rotation_about
-from drakegrasp.hand.description import Hand
+from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.file_format import Drive
+from drakegrasp.hand.finger_sweep import Pinch, find_opposition, find_pinch, reach
+from drakegrasp.hand.settings import load_config
+from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.objects.model import ObjectModel, make_object
 from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.drive import drive_of
@@ -67,6 +80,27 @@ class TrialGrasp:
     width: float
 
 
+#: What is held, but moves more in the hand than a sample may.
+MOVED = "moved too far in the hand"
+#: What a drive does to the fingers.
+_HOW = {"worm": "held by worms", "locked": "locked", "torque": "pushed open"}
+#: How to mend a hand that holds nothing along the line on which its fingers close.
+_SOFT = (
+    "two motors that push against each other do not hold along their line; say `drive: worm` if "
+    "its gears cannot be pushed open, or its fingers share a motor"
+)
+#: How to mend a hand that loses what it holds, and one whose grasps end otherwise, by what is said.
+_LOST = "pads must face each other where they meet, and motors press enough (efforts)"
+_MENDS = {
+    Outcome.HAND_CONTACT.label: "other links touch it first; open the hand wider, or move the palm "
+    "back (p_BG)",
+    Outcome.START_COLLISION.label: "the open hand is in its way; keep fingers that do not grasp "
+    "away with preshape",
+    **{o.label: _LOST for o in (Outcome.SLIPPED, Outcome.PARTLY_HELD, Outcome.DROPPED)},
+    MOVED: _LOST,
+}
+
+
 def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> Finding:
     """Return whether the hand can grasp and lift an object, and how far that slips.
 
@@ -81,37 +115,40 @@ def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> 
     """
     name = f"{shape}, {line}"
     if shape == "sphere" and _stands_wide(hand):
-        return Finding(name=name, ok=True, text="left out: the fingers stand too wide for a ball")
+        return judge(name, [], "left out: the fingers stand too wide for a ball")
 
     # Try until one holds, which a whole lift shows.
     config = with_whole_lifts(config)
     drive = drive_of(hand, config.lift)
-    rules = _with_drive(config, "locked" if drive == "torque" else drive)
+    rules: Drive = "locked" if drive == "torque" else drive
+    locked = config.model_copy(update={"lift": config.lift.model_copy(update={"drive": rules})})
     outcomes: Counter[str] = Counter()
     missing: Counter[str] = Counter()
     for grasp in trial_grasps(hand, shape, line):
         scene = build_scene(grasp.model, config.physics, hand)
-        record = run_attempt(scene, grasp.X_TO, grasp.pregrasp, rules)
-        held = record.outcome is Outcome.SUCCESS
-        outcomes[record.outcome.label if not held or _stays(record, config) else MOVED] += 1
-        if not held or not _stays(record, config):
-            missing.update(_missing(hand, record))
+        record = run_attempt(scene, grasp.X_TO, grasp.pregrasp, locked)
+        if not _stays(record, config):
+            held = record.outcome is Outcome.SUCCESS
+            outcomes[MOVED if held else record.outcome.label] += 1
+            if record.closed is not None:
+                rows = zip(hand.fingers, record.closed.contacts.touching, strict=True)
+                missing.update(finger.name for finger, touches in rows if not touches)
             continue
         text = (
             f"holds {1e3 * grasp.width:.0f} mm and {grasp.model.mass:g} kg; {_slip(record)} with "
-            f"fingers that are {_HOW[rules.lift.drive or drive]}"
+            f"fingers that are {_HOW[rules]}"
         )
         if drive != "torque":
-            return Finding(name=name, ok=True, text=text)
+            return judge(name, [], text)
         free = run_attempt(scene, grasp.X_TO, grasp.pregrasp, config)
         text += f", {_slip(free)} with its own, which are pushed open"
         ok = _stays(free, config) or not LINES[line]
-        mend = "" if ok else f": {_SOFT}"
-        return Finding(name=name, ok=ok, text=text + mend)
+        return judge(name, [] if ok else [f"{text}: {_SOFT}"], text)
 
     tried = ", ".join(f"{count} {label}" for label, count in outcomes.items())
     text = f"a {shape} must be held, got {tried or 'no posture that holds one'}"
-    return Finding(name=name, ok=False, text=text + _mend(outcomes, missing))
+    mend = _mend(outcomes, missing)
+    return judge(name, [f"{text}: {mend}" if mend else text], "")
 
 
 def _stands_wide(hand: Hand) -> bool:
@@ -124,40 +161,16 @@ def _stands_wide(hand: Hand) -> bool:
     return bool(aside > WIDEST * pinch.width)
 
 
-#: What is held, but moves more in the hand than a sample may.
-MOVED = "moved too far in the hand"
-#: How to mend a hand that holds nothing along the line on which its fingers close.
-_SOFT = (
-    "two motors that push against each other do not hold along their line; say `drive: worm` if "
-    "its gears cannot be pushed open, or its fingers share a motor"
-)
-
-
-def _missing(hand: Hand, record: TrialRecord) -> list[str]:
-    """Return the names of the fingers that do not touch the object when the hand has closed."""
-    if record.closed is None:
-        return []
-    touching = record.closed.contacts.touching
-    return [f.name for f, touches in zip(hand.fingers, touching, strict=True) if not touches]
-
-
 def _mend(outcomes: Counter[str], missing: Counter[str]) -> str:
-    """Return what may mend a hand whose trial grasps fail."""
+    """Return what may mend a hand whose trial grasps fail; nothing if it is not known."""
     label = outcomes.most_common(1)[0][0] if outcomes else ""
     if label == Outcome.MISSING_FINGERTIP.label and missing:
-        names = ", ".join(missing)
         return (
-            f": {names} must touch it within the pad_region, which contact elsewhere on the link "
-            "misses; let the region reach 3 mm behind its face and to the end of the finger"
+            f"{', '.join(missing)} must touch it within the pad_region, which contact elsewhere on "
+            "the link misses; let the region reach 3 mm behind its face and to the end of the "
+            "finger"
         )
-    if label == Outcome.HAND_CONTACT.label:
-        return ": other links touch it first; open the hand wider, or move the palm back (p_BG)"
-    if label == Outcome.START_COLLISION.label:
-        return ": the open hand is in its way; keep fingers that do not grasp away with preshape"
-    lost = (Outcome.SLIPPED, Outcome.PARTLY_HELD, Outcome.DROPPED)
-    if label in (*(outcome.label for outcome in lost), MOVED):
-        return ": pads must face each other where they meet, and motors press enough (efforts)"
-    return ""
+    return _MENDS.get(label, "")
 
 
 def _stays(record: TrialRecord, config: Config) -> bool:
@@ -166,14 +179,6 @@ def _stays(record: TrialRecord, config: Config) -> bool:
         return False
     turned = np.rad2deg(record.lift.turn)
     return bool(record.lift.slip <= config.lift.stop_slip and turned <= config.lift.stop_turn_deg)
-
-
-#: What a drive does to the fingers.
-_HOW = {"worm": "held by worms", "locked": "locked", "torque": "pushed open"}
-
-
-def _with_drive(config: Config, drive: Drive) -> Config:
-    return config.model_copy(update={"lift": config.lift.model_copy(update={"drive": drive})})
 
 
 def _slip(record: TrialRecord) -> str:
@@ -214,18 +219,16 @@ def _trial_grasp(hand: Hand, shape: str, pinch: Pinch, angle: float) -> TrialGra
         return None
 
     # A cylinder lies across the fingers. Those beside each other meet a ball off its middle.
-    radius = pinch.width / 2.0
+    radius, p_OM = pinch.width / 2.0, np.zeros(3)
     if shape == "box":
         mesh = trimesh.creation.box([wide, pinch.width, above + below]).subdivide().subdivide()
-        p_OM = np.array([0.0, 0.0, (below - above) / 2.0])
+        p_OM[2] = (below - above) / 2.0
     elif shape == "cylinder":
         mesh = trimesh.creation.cylinder(radius, wide, sections=48)
         mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2.0, [0, 1, 0]))
-        p_OM = np.zeros(3)
     else:
         radius = max((pinch.width**2 + aside**2) / (2.0 * pinch.width), radius)
         mesh = trimesh.creation.icosphere(3, radius)
-        p_OM = np.zeros(3)
     if shape != "box" and radius > room:
         return None
     mass = MASS if hand.payload is None else min(MASS, hand.payload)
@@ -246,3 +249,59 @@ def _trial_grasp(hand: Hand, shape: str, pinch: Pinch, angle: float) -> TrialGra
         pregrasp=Pregrasp(X_OG=X_OG, spread=0.0),
         width=pinch.width,
     )
+
+
+@one_thread
+def check_hand(
+    name_or_yaml: str | Path,
+    *,
+    config: Config | None = None,
+    report: Callable[[Finding], None] | None = None,
+) -> list[Finding]:
+    """Return what is right and wrong about a hand.
+
+    A check that others rely on comes before them, and where it fails they are left out.
+
+    Args:
+        name_or_yaml: A hand that comes with the package, or a hand file.
+        config: The rules of its trial grasps; the defaults if None.
+        report: Is called with each finding when it is there.
+    """
+    findings = []
+    for finding in _findings(name_or_yaml, config or load_config()):
+        findings.append(finding)
+        if report is not None:
+            report(finding)
+    return findings
+
+
+def _findings(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
+    """Yield the findings, up to the first check without which others make no sense."""
+    # The files: without them there is no hand.
+    try:
+        hand = load_hand(name_or_yaml)
+        count = sum(map(len, link_shapes(hand).values()))
+    except HandError as error:
+        yield judge("files", [str(error)], "")
+        return
+    joints, model = len(hand.joint_names), hand.model.path.name
+    fine = f"{hand.num_fingers} fingers, {joints} joints, {count} shapes in {model}"
+    yield judge("files", [], fine)
+
+    # Masses, limits and couplings; the rest closes the hand, for which it needs its limits.
+    yield check_masses(hand)
+    limits = check_limits(hand)
+    yield limits
+    yield check_couplings(hand)
+    if not limits.ok:
+        return
+    yield check_efforts(hand, config)
+
+    # Geometry, then grasps.
+    sound = True
+    for finding in check_geometry(hand):
+        sound = sound and finding.ok
+        yield finding
+    if sound:
+        for shape, line in GRASPS:
+            yield check_grasp(hand, config, shape, line)

@@ -47,10 +47,9 @@ from drakegrasp.dataset.schema import (
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import read_pose, unpack_pose
-from drakegrasp.hand.carried import HAND_FOLDER, carried_hand
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
-from drakegrasp.hand.folder import hand_digest, is_hand
+from drakegrasp.hand.folder import HAND_FOLDER, carried_hand, hand_digest, is_hand
 from drakegrasp.hand.settings import override_config
 from drakegrasp.runtime.files import probe_folder, refuse_half_replaced, write_atomic
 

@@ -14,7 +14,7 @@ then the joints in the order of `joint_names` and the units of `joint_units`, ra
 
 Keys that the benchmark does not read say under what the sample held: `hand`, `preshape`,
 `trial_id`, `start_qpos` (the joints of the open hand) and `conditions` (friction of hand and table,
-mass). All poses are over the table, in {T}. The hand is `mjcf.hand_model`: gains, torques and
+mass). All poses are over the table, in {T}. The hand is `mjcf.links`: gains, torques and
 damping are those of the benchmark's Shadow Hand. Of predictions, objects stand as
 `PlacedObject.X_TO_simulated` says; contacts become the posture of the first wrist pose that fits
 them, and a grasp that lacks pregrasp or squeeze gets those of the export.
@@ -72,7 +72,7 @@ OBJECTS = ASSETS / "objects"
 def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
     """Write the files and return the number of samples; see `export.export_dataset`."""
     require_mujoco("mujoco", "coacd")
-    from drakegrasp.mjcf.convex_parts import convex_parts
+    from drakegrasp.mjcf.scene import convex_parts
 
     # The hand, by a name that the benchmark does not have.
     hand = load_hand(read_manifest(out).config.hand_source)
@@ -110,7 +110,7 @@ class BenchFiles:
             hand: The hand.
             folder: To which the paths of objects in the files are relative.
         """
-        from drakegrasp.mjcf.hand_model import make_hand_model, write_hand_model
+        from drakegrasp.mjcf.links import make_hand_model, write_hand_model
 
         model = make_hand_model(hand)
         self.posed, self._joints = StillScene(hand), model.joints
@@ -333,7 +333,7 @@ def write_grasps(
 
 def _write_parts(task: tuple[ObjectModel, Path, Path | None]) -> None:
     """Cut an object into convex parts and write them."""
-    from drakegrasp.mjcf.convex_parts import convex_parts, kept_convex_parts
+    from drakegrasp.mjcf.scene import convex_parts, kept_convex_parts
 
     model, folder, keep = task
     write_object(folder, convex_parts(model) if keep is None else kept_convex_parts(model, keep))

@@ -23,10 +23,8 @@ from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import Hand, load_plain_hand
 from drakegrasp.mesh.wavefront import hull_text
-from drakegrasp.mjcf.convex_parts import convex_parts
-from drakegrasp.mjcf.hand_model import HandModel, make_hand_model
-from drakegrasp.mjcf.links import pair_friction, set_inertia
-from drakegrasp.mjcf.memory import MEMORY
+from drakegrasp.mjcf.links import MEMORY, HandModel, make_hand_model, pair_friction, set_inertia
+from drakegrasp.mjcf.scene import convex_parts
 from drakegrasp.objects.model import ObjectModel, load_object, object_colour
 from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.runtime.progress import Report

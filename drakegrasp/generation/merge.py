@@ -32,7 +32,7 @@ from drakegrasp.dataset.paths import model_path, plan_path, shards_folder
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import DataError
-from drakegrasp.hand.carried import carry_hand
+from drakegrasp.hand.folder import carry_hand
 from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
 from drakegrasp.runtime.progress import Report, silent

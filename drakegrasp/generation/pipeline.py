@@ -42,8 +42,8 @@ from drakegrasp.generation.events import BuildEvents, nothing_trains, too_heavy
 from drakegrasp.generation.prepare import PrepareTask, prepare_one
 from drakegrasp.generation.scenes import make_scenes_locked
 from drakegrasp.generation.work_unit import WorkUnit, run_unit
-from drakegrasp.hand.carried import carry_hand
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.folder import carry_hand
 from drakegrasp.hand.parsing import position_order
 from drakegrasp.objects.sources import MeshSource, source_sha256
 from drakegrasp.runtime.executor import Executor, WorkerPool

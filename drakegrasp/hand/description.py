@@ -12,7 +12,7 @@ positions are `closing_ratio` times those of these fingers. Frames: B palm link,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,16 +27,6 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.config import CarriedHand, HandSource
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, invert_pose, make_pose
-from drakegrasp.hand.chains import (
-    Chain,
-    find_drives,
-    find_joints,
-    is_carried,
-    joint_slides,
-    make_chain,
-    moving_joint,
-    refuse_joints_of_others,
-)
 from drakegrasp.hand.file_format import (
     Coupling,
     Drive,
@@ -50,7 +40,19 @@ from drakegrasp.hand.file_format import (
 from drakegrasp.hand.files import find_packages, hand_file
 from drakegrasp.hand.folder import hand_folder
 from drakegrasp.hand.lift_chance import LiftChance, read_lift_chance
-from drakegrasp.hand.parsing import KEPT_HANDS, ModelFile, add_model
+from drakegrasp.hand.parsing import (
+    KEPT_HANDS,
+    Chain,
+    ModelFile,
+    add_model,
+    find_drives,
+    find_joints,
+    is_carried,
+    joint_slides,
+    make_chain,
+    moving_joint,
+    refuse_joints_of_others,
+)
 from drakegrasp.hand.shapes import pad_surfaces
 
 #: Where one threshold serves closing joints of both kinds, a slide by so much counts as a turn by
@@ -212,13 +214,15 @@ def load_hand(source: HandSource = "barrett") -> Hand:
             packages = find_packages(own, described.model, described.packages)
         place = path.parent.resolve() / described.model
         model = ModelFile(place, tuple(sorted(packages.items())), stamp)
-        name = path.stem.removesuffix("_hand")
+        name, shaped = path.stem.removesuffix("_hand"), list[Hand]()
         hand = _build_hand(name, described, model)
-        hand = replace(
-            hand,
-            preshapes=_in_preshapes(name, described, model),
-            preshape_names=tuple(preshape.name for preshape in described.preshapes),
-        )
+        for i, preshape in enumerate(described.preshapes):
+            try:
+                shaped.append(_build_hand(name, described.in_preshape(preshape), model))
+            except HandError as error:
+                raise HandError(f"preshapes.{i}: {error}") from None
+        names = tuple(preshape.name for preshape in described.preshapes)
+        hand = replace(hand, preshapes=tuple(shaped), preshape_names=names)
         hand = replace(hand, lift_chance=read_lift_chance(path))
         _refuse_empty_pads(hand)
     except HandError as error:
@@ -246,10 +250,10 @@ def load_plain_hand(source: HandSource, where: str) -> Hand:
 
 
 #: Loaded hands with their files, the last used at the end: parsing takes 40 ms.
-_loaded: dict[Path | CarriedHand, tuple[Hand, Sequence[Path]]] = {}
+_loaded: dict[Path | CarriedHand, tuple[Hand, Collection[Path]]] = {}
 
 
-def _stamp(files: Sequence[Path]) -> tuple[int, ...]:
+def _stamp(files: Collection[Path]) -> tuple[int, ...]:
     """Return sizes [byte] and modification times [ns] of the files that exist."""
     stats = [path.stat() for path in files if path.exists()]
     return tuple(number for s in stats for number in (s.st_size, s.st_mtime_ns))
@@ -271,7 +275,13 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         [(j.position_lower_limit(), j.position_upper_limit()) for j in moving.values()]
     ).reshape(-1, 2)
     _refuse_other_kinds(described, moving)
-    _refuse_beyond_limits(described, dict(zip(moving, limits, strict=True)))
+    for joint, (lower, upper) in zip(moving, limits, strict=True):
+        position = described.preshape.get(joint, lower)
+        if not lower <= position <= upper:
+            raise HandError(
+                f"preshape.{joint}: must be {lower:g}..{upper:g}, the joint's limits, "
+                f"got {position:g}"
+            )
 
     # The chain from the palm to each fingertip; the finger's own closing joint must be in it.
     bodies = {body.name(): body for body in map(plant.get_body, plant.GetBodyIndices(instance))}
@@ -304,8 +314,8 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         rated_load=rated_load(described),
         joint_names=tuple(moving),
         joint_slides=np.array([joint_slides(joint) for joint in moving.values()], dtype=np.bool_),
-        joint_gain=np.array([drives[joint].gain for joint in moving]),
-        joint_offset=np.array([drives[joint].offset for joint in moving]),
+        joint_gain=np.array([drives[joint][0] for joint in moving]),
+        joint_offset=np.array([drives[joint][1] for joint in moving]),
         joint_limits=limits,
         chains=tuple(chains),
         link_chains={
@@ -315,17 +325,6 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         },
         lift_chance=None,
     )
-
-
-def _in_preshapes(name: str, described: HandFile, model: ModelFile) -> tuple[Hand, ...]:
-    """Return the hand in each of its preshapes."""
-    hands = []
-    for i, preshape in enumerate(described.preshapes):
-        try:
-            hands.append(_build_hand(name, described.in_preshape(preshape), model))
-        except HandError as error:
-            raise HandError(f"preshapes.{i}: {error}") from None
-    return tuple(hands)
 
 
 def _refuse_other_kinds(described: HandFile, joints: dict[str, Any]) -> None:
@@ -347,17 +346,6 @@ def _refuse_other_kinds(described: HandFile, joints: dict[str, Any]) -> None:
     for n, name in enumerate(described.spread.joints):
         if joint_slides(joints[name]):
             raise HandError(f"spread.joints.{n}: must be a joint that turns, got {name!r}")
-
-
-def _refuse_beyond_limits(described: HandFile, limits: dict[str, Array]) -> None:
-    """Refuse a preshape beyond its joint's limits."""
-    for name, position in described.preshape.items():
-        lower, upper = limits[name]
-        if not lower <= position <= upper:
-            raise HandError(
-                f"preshape.{name}: must be {lower:g}..{upper:g}, the joint's limits, "
-                f"got {position:g}"
-            )
 
 
 def _refuse_empty_pads(hand: Hand) -> None:

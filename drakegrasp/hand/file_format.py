@@ -8,8 +8,10 @@ A joint turns, and its positions are angles [rad], or it slides, and they are le
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import chain
 from math import sqrt
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -66,11 +68,10 @@ class Coupling:
             raise ValueError("ratio must not be zero, got 0.0")
 
 
-@with_config(_STRICT)
-@dataclass(frozen=True, kw_only=True)
-class DrivenBy:
+class DrivenBy(BaseModel):
     """Whose motor moves a finger: its closing position is ratio times that of the other finger."""
 
+    model_config = _STRICT
     finger: Name
     ratio: Positive = 1.0
 
@@ -89,7 +90,7 @@ _OF_MOTOR = {
 @with_config(_STRICT)
 @dataclass(frozen=True, kw_only=True)
 class Finger:
-    """A finger; its kinematics is its `chains.Chain`.
+    """A finger; its kinematics is its `parsing.Chain`.
 
     A finger with a `torque_limit` closes by turning, one with a `force_limit` by sliding. One that
     another finger's motor drives has neither in the file; in a `Hand` its limits are what that
@@ -112,34 +113,36 @@ class Finger:
     required: bool = True  # whether a grasp needs this fingertip on the object
 
     def __post_init__(self) -> None:
+        for fault in self._faults():
+            raise ValueError(fault)
+
+    def _faults(self) -> Iterator[str]:
+        """Yield what is wrong with it by itself."""
         # A finger either turns or slides; one that another drives does as that one.
         limits = self.torque_limit, self.force_limit
         if limits.count(None) != 1 and not (self.driven_by and limits.count(None) == 2):
-            raise ValueError(
+            yield (
                 "torque_limit must be given if the closing joint turns, else force_limit, "
                 f"got {'none' if self.torque_limit is None else 'both'}"
             )
-        self._check_worm()
+
+        # Its worm is one of the same kind of joint, and no weaker than its motor.
+        key, wrong = ("force", "torque") if self.slides else ("torque", "force")
+        if getattr(self, f"holding_{wrong}") is not None:
+            yield f"holding_{wrong} must be holding_{key} beside {key}_limit"
+        holding = self.holding_effort
+        if holding is not None and holding < self.effort_limit:
+            yield (
+                f"holding_{key} must be at least the {key}_limit of {self.effort_limit:g} "
+                f"{self.effort_unit}, got {holding:g}"
+            )
 
         # The pad.
         for i, (*normal, _) in enumerate(self.pad_region):
             if not any(normal):
-                raise ValueError(f"pad_region.{i} must have a normal that is not zero, got zero")
+                yield f"pad_region.{i} must have a normal that is not zero, got zero"
         if self.beside_pad(self.p_FiP) > 0.0:
-            raise ValueError(f"pad_point must lie in the pad_region, got {list(self.pad_point)}")
-
-    def _check_worm(self) -> None:
-        """Refuse a worm of another kind of joint, or one that is weaker than its motor."""
-        key, wrong = ("force", "torque") if self.slides else ("torque", "force")
-        if getattr(self, f"holding_{wrong}") is not None:
-            raise ValueError(f"holding_{wrong} must be holding_{key} beside {key}_limit")
-
-        holding = self.holding_effort
-        if holding is not None and holding < self.effort_limit:
-            raise ValueError(
-                f"holding_{key} must be at least the {key}_limit of {self.effort_limit:g} "
-                f"{self.effort_unit}, got {holding:g}"
-            )
+            yield f"pad_point must lie in the pad_region, got {list(self.pad_point)}"
 
     @property
     def slides(self) -> bool:
@@ -188,11 +191,10 @@ class Finger:
         return beside
 
 
-@with_config(_STRICT)
-@dataclass(frozen=True, kw_only=True)
-class Spread:
+class Spread(BaseModel):
     """The joints that keep the spread angle during an attempt; a hand may have none."""
 
+    model_config = _STRICT
     joints: tuple[Name, ...] = ()
 
 
@@ -237,92 +239,73 @@ class HandFile(BaseModel):
     rated_load: Positive | None = None  # largest force of a fingertip that its maker allows [N]
 
     @model_validator(mode="after")
-    def _check_names(self) -> HandFile:
-        """Refuse two fingers of one name: tables and figures tell them apart by it."""
-        names = [finger.name for finger in self.fingers]
-        if len(set(names)) < len(names):
-            raise ValueError(f"fingers must have a name each, got {', '.join(names)}")
+    def _check(self) -> HandFile:
+        for fault in chain(self._faults_of_fingers(), self._faults()):
+            raise ValueError(fault)
         return self
 
-    @model_validator(mode="after")
-    def _check_preshapes(self) -> HandFile:
-        """Demand that preshapes have a name each, and fingers of the hand with their motors."""
-        names, drivers = [preshape.name for preshape in self.preshapes], self._drivers()
+    def _faults_of_fingers(self) -> Iterator[str]:
+        """Yield what is wrong with names and motors: a finger has its own, or another drives it."""
+        # Tables and figures tell fingers apart by their names.
+        names = [finger.name for finger in self.fingers]
         if len(set(names)) < len(names):
-            raise ValueError(f"preshapes must have a name each, got {', '.join(names)}")
+            yield f"fingers must have a name each, got {', '.join(names)}"
+
+        # Preshapes have a name each, and fingers of the hand with their motors.
+        drivers = {f.name: f.driven_by.finger if f.driven_by else f.name for f in self.fingers}
+        named = [preshape.name for preshape in self.preshapes]
+        if len(set(named)) < len(named):
+            yield f"preshapes must have a name each, got {', '.join(named)}"
         for i, preshape in enumerate(self.preshapes):
             for finger in preshape.fingers:
                 if finger not in drivers:
-                    raise ValueError(
-                        f"preshapes.{i}.fingers must be of {', '.join(drivers)}, got {finger!r}"
-                    )
-                if drivers[finger] not in preshape.fingers:
-                    raise ValueError(
+                    yield f"preshapes.{i}.fingers must be of {', '.join(drivers)}, got {finger!r}"
+                elif drivers[finger] not in preshape.fingers:
+                    yield (
                         f"preshapes.{i}.fingers must include {drivers[finger]!r}, whose motor "
                         f"drives {finger!r}"
                     )
-        return self
 
-    def _drivers(self) -> dict[str, str]:
-        """Return the finger whose motor moves each finger, by name."""
-        return {f.name: f.driven_by.finger if f.driven_by else f.name for f in self.fingers}
-
-    @model_validator(mode="after")
-    def _check_drivers(self) -> HandFile:
-        """Demand that a finger that is driven by another has no motor, and that one has one."""
+        # A finger that is driven by another has no motor, and that one has one.
         motors = [finger.name for finger in self.fingers if finger.driven_by is None]
-        for i, finger in enumerate(self.fingers):
-            if finger.driven_by is None:
+        for i, driver in enumerate(drivers.values()):
+            if self.fingers[i].driven_by is None:
                 continue
-            if finger.driven_by.finger not in motors:
-                raise ValueError(
+            if driver not in motors:
+                yield (
                     f"fingers.{i}.driven_by.finger must be a finger with a motor of its own "
-                    f"({', '.join(motors) or 'there is none'}), got {finger.driven_by.finger!r}"
+                    f"({', '.join(motors) or 'there is none'}), got {driver!r}"
                 )
             for key, none in _OF_MOTOR.items():
-                if getattr(finger, key) != none:
-                    raise ValueError(
+                if getattr(self.fingers[i], key) != none:
+                    yield (
                         f"fingers.{i}.{key} must be left out beside driven_by: the motor is that "
-                        f"of finger {finger.driven_by.finger!r}"
+                        f"of finger {driver!r}"
                     )
-        return self
 
-    @model_validator(mode="after")
-    def _check_worms(self) -> HandFile:
-        """Refuse worms of unknown strength."""
-        for i, finger in enumerate(self.fingers):
-            if finger.driven_by is not None:
-                continue
+    def _faults(self) -> Iterator[str]:
+        """Yield what is wrong with the drive and the spread."""
+        # Worms of unknown strength.
+        own = [(i, f) for i, f in enumerate(self.fingers) if f.driven_by is None]
+        for i, finger in own:
             if self.drive == "worm" and finger.holding_effort is None:
                 key = "holding_force" if finger.slides else "holding_torque"
-                raise ValueError(f"fingers.{i}.{key} must be given where drive is worm, got none")
-        return self
+                yield f"fingers.{i}.{key} must be given where drive is worm, got none"
 
-    @model_validator(mode="after")
-    def _check_speeds(self) -> HandFile:
-        """Demand the speed of each kind of closing joint, and no other."""
+        # The speed of each kind of closing joint, and no other.
         for key, slides, how in (
             ("closing_speed_deg", False, "turns"),
             ("closing_speed", True, "slides"),
         ):
-            used = any(f.slides == slides for f in self.fingers if f.driven_by is None)
-            if used != (getattr(self, key) is not None):
-                must = f"be given where a closing joint {how}, got none"
-                raise ValueError(
-                    f"{key} must {must}"
-                    if used
-                    else f"{key} must be left out: no closing joint {how}"
-                )
-        return self
+            used, given = any(f.slides == slides for _, f in own), getattr(self, key) is not None
+            if used and not given:
+                yield f"{key} must be given where a closing joint {how}, got none"
+            if given and not used:
+                yield f"{key} must be left out: no closing joint {how}"
 
-    @model_validator(mode="after")
-    def _check_spreads(self) -> HandFile:
-        """Refuse angles of a spread that the hand does not have."""
+        # Angles of a spread that the hand does not have.
         if not self.spread.joints and set(self.spreads_deg) != {0.0}:
-            raise ValueError(
-                f"spreads_deg must be [0] without spread.joints, got {list(self.spreads_deg)}"
-            )
-        return self
+            yield f"spreads_deg must be [0] without spread.joints, got {list(self.spreads_deg)}"
 
     def in_preshape(self, preshape: Preshape) -> HandFile:
         """Return the file of a hand that has the fingers of a preshape alone.
@@ -343,11 +326,16 @@ class HandFile(BaseModel):
 
     def driven_fingers(self) -> tuple[Finger, ...]:
         """Return the fingers; one that another drives with the limits of that one's motor."""
-        named = {finger.name: finger for finger in self.fingers}
-        return tuple(
-            f if f.driven_by is None else _as_driven(f, named[f.driven_by.finger], f.driven_by)
-            for f in self.fingers
-        )
+        named, found = {finger.name: finger for finger in self.fingers}, []
+        for finger in self.fingers:
+            if (by := finger.driven_by) is not None:
+                # By virtual work a torque T at the driver is T / ratio at the finger.
+                driver = named[by.finger]
+                limit, holding = driver.effort_limit / by.ratio, driver.holding_effort
+                holding = None if holding is None else holding / by.ratio
+                finger = with_efforts(finger, limit, holding, slides=driver.slides)
+            found.append(finger)
+        return tuple(found)
 
     def closing_speeds(self) -> Array:
         """Return the speed (k,) of each closing joint [rad/s or m/s]."""
@@ -357,14 +345,6 @@ class HandFile(BaseModel):
             for f in self.driven_fingers()
         ]
         return np.array(speeds)
-
-
-def _as_driven(finger: Finger, driver: Finger, by: DrivenBy) -> Finger:
-    """Return a finger that closes by `ratio` times its driver, with the limits that this leaves."""
-    # By virtual work a torque T at the driver is T / ratio at the finger.
-    limit, holding = driver.effort_limit / by.ratio, driver.holding_effort
-    holding = None if holding is None else holding / by.ratio
-    return with_efforts(finger, limit, holding, slides=driver.slides)
 
 
 def rated_load(described: HandFile) -> float | None:

@@ -3,8 +3,9 @@
 In: a hand. Out: what such a folder holds: hand file, model, weights, meshes with the files that
 they name, licences. Files below the hand file keep their places and bytes. The hand file or the
 model is rewritten only where it names something else: an absolute path, one that leads out of the
-folder, or a `package://` URI. The hand in such a folder has the same folder and digest again. Does
-not import Drake.
+folder, or a `package://` URI. The hand in such a folder has the same folder and digest again. A
+dataset carries such a folder, `carry_hand`: copied at the start of a build, read there from then
+on, so that workers and later commands need no other file of the hand. Does not import Drake.
 """
 
 from __future__ import annotations
@@ -13,24 +14,30 @@ import hashlib
 import os
 import posixpath
 import re
-from collections.abc import Mapping
+import shutil
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import yaml
 
-from drakegrasp.config import CarriedHand, HandSource
-from drakegrasp.errors import HandError
-from drakegrasp.hand.files import MODELS, chance_file, find_packages, hand_file, refuse_outside
-from drakegrasp.hand.references import MODELS as MODEL_SUFFIXES
-from drakegrasp.hand.references import (
+from drakegrasp.config import CarriedHand, Config, HandSource
+from drakegrasp.errors import DataError, HandError
+from drakegrasp.hand.files import (
+    MODEL_SUFFIXES,
+    MODELS,
+    chance_file,
     file_of,
+    find_packages,
+    hand_file,
     mesh_references,
     model_references,
     names_packages,
+    refuse_outside,
     rewritten,
 )
+from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
 from drakegrasp.yaml_text import parse_yaml
 
 #: Limits of a hand's files, in all [byte] and their number: a dataset may be a stranger's.
@@ -44,39 +51,6 @@ MENTIONS = "LICENSE-mentioned.txt"
 #: The keys of a hand file that name other files.
 _MODEL_LINE = re.compile(r"^model:.*$", re.MULTILINE)
 _PACKAGES_LINES = re.compile(r"^packages:.*\n(?:[ \t]+\S.*\n)*", re.MULTILINE)
-
-
-@dataclass(frozen=True, kw_only=True)
-class HandFolder:
-    """What a folder with the files of a hand holds, by places in it.
-
-    Attributes:
-        texts: Hand file, models and lines about licences, as they are there.
-        files: The other files, where they are now.
-        counted: Places of what the digest is of, in its order; some may be of no file.
-        sources: Every file that was looked for.
-        licences: Places of the licences.
-    """
-
-    texts: Mapping[str, bytes]
-    files: Mapping[str, Path]
-    counted: tuple[str, ...]
-    sources: tuple[Path, ...]
-    licences: tuple[str, ...]
-
-    def content(self, place: str) -> bytes:
-        """Return the bytes of a file; none of one that is not there."""
-        if place in self.texts:
-            return self.texts[place]
-        return self.files[place].read_bytes() if place in self.files else b""
-
-    @property
-    def digest(self) -> str:
-        """A hash (16 hex digits) of hand file, model, weights and meshes; no path is in it."""
-        digest = hashlib.sha256()
-        for place in self.counted:
-            digest.update(self.content(place))
-        return digest.hexdigest()[:16]
 
 
 def hand_digest(source: HandSource) -> str:
@@ -116,7 +90,7 @@ def hand_folder(source: HandSource, name: str | None = None) -> HandFolder:
     """
     # The hand file; a model elsewhere is put beside it.
     path = hand_file(source)
-    found = _Found(within=path.parent if isinstance(source, CarriedHand) else None)
+    found = HandFolder(within=path.parent if isinstance(source, CarriedHand) else None)
     found.has(path)
     name, described = name or path.name, _described(path)
     packages = found.packages_of(path, described)
@@ -131,38 +105,48 @@ def hand_folder(source: HandSource, name: str | None = None) -> HandFolder:
     chance = f"{Path(name).stem.removesuffix('_hand')}_chance.yaml"
     found.add(chance, chance_file(source))
     folders = dict.fromkeys([path.parent, (path.parent / model).parent, *packages.values()])
-    licences = found.add_licences(list(folders), path.stem.removesuffix("_hand"))
-
+    found.licences = found.add_licences(list(folders), path.stem.removesuffix("_hand"))
     uris = (found.uris[uri] for uri in sorted(found.uris))
-    return HandFolder(
-        texts=found.texts,
-        files=found.files,
-        counted=(name, place, chance, *uris, *found.parts.values()),
-        sources=tuple(found.sources),
-        licences=licences,
-    )
+    found.counted = (name, place, chance, *uris, *found.parts.values())
+    return found
 
 
 @dataclass(kw_only=True)
-class _Found:
-    """The files of a hand that were found so far.
+class HandFolder:
+    """What a folder with the files of a hand holds, by places in it.
 
     Attributes:
         within: Folder that nothing may leave: that of a dataset's hand; None for another hand.
+        texts: Hand file, models and lines about licences, as they are there.
+        files: The other files, where they are now.
+        counted: Places of what the digest is of, in its order; some may be of no file.
+        licences: Places of the licences.
         uris: Places of what the model names, by its references, in the folder's model.
         parts: Places of geometry that other files name, by themselves.
-        texts, files: As in `HandFolder`.
         sources: Whether each file that was looked for is there.
         size: Of the files [byte].
     """
 
     within: Path | None
-    uris: dict[str, str] = field(default_factory=dict)
-    parts: dict[str, str] = field(default_factory=dict)
     texts: dict[str, bytes] = field(default_factory=dict)
     files: dict[str, Path] = field(default_factory=dict)
+    counted: tuple[str, ...] = ()
+    licences: tuple[str, ...] = ()
+    uris: dict[str, str] = field(default_factory=dict)
+    parts: dict[str, str] = field(default_factory=dict)
     sources: dict[Path, bool] = field(default_factory=dict)
     size: int = 0
+
+    def content(self, place: str) -> bytes:
+        """Return the bytes of a file; none of one that is not there."""
+        if place in self.texts:
+            return self.texts[place]
+        return self.files[place].read_bytes() if place in self.files else b""
+
+    @property
+    def digest(self) -> str:
+        """A hash (16 hex digits) of hand file, model, weights and meshes; no path is in it."""
+        return _digest(map(self.content, self.counted))
 
     def place_of(self, reference: str, base: str) -> str | None:
         """Return the place of what a file in the folder `base` names; None if it is elsewhere.
@@ -201,12 +185,8 @@ class _Found:
         # A stranger's files must not fill the memory, and YAML takes many times its bytes.
         size = path.stat().st_size
         self.size += size
-        is_text = path.suffix.lower() in (".yaml", ".yml")
-        if (
-            self.size > LARGEST
-            or (is_text and size > LARGEST_YAML)
-            or len(self.sources) > MOST_FILES
-        ):
+        long = path.suffix.lower() in (".yaml", ".yml") and size > LARGEST_YAML
+        if self.size > LARGEST or long or len(self.sources) > MOST_FILES:
             raise HandError(
                 f"{path}: the files of a hand must be at most {MOST_FILES} and {LARGEST >> 20} MB "
                 f"in all, its YAML {LARGEST_YAML >> 10} kB, got more"
@@ -342,7 +322,104 @@ def _plain_digest(path: Path) -> str:
     text = model.read_bytes() if model.is_file() else b""
     named = {uri for uri, is_geometry in model_references(text) if is_geometry}
     meshes = [file_of(uri, model.parent, packages) for uri in sorted(named)]
+    files = (path, model, chance_file(path), *meshes)
+    return _digest(file.read_bytes() if file.is_file() else b"" for file in files)
+
+
+def _digest(contents: Iterable[bytes]) -> str:
+    """Return a hash (16 hex digits) of contents one after the other."""
     digest = hashlib.sha256()
-    for file in (path, model, chance_file(path), *meshes):
-        digest.update(file.read_bytes() if file.is_file() else b"")
+    for content in contents:
+        digest.update(content)
     return digest.hexdigest()[:16]
+
+
+#: Folder of the hand's files in a dataset's directory.
+HAND_FOLDER = "hand"
+
+
+def carried_hand(out: Path, hand: str, digest: str) -> CarriedHand | None:
+    """Return the hand in a dataset's directory; None for a dataset that carries none.
+
+    Args:
+        out: Directory of the dataset.
+        hand: What the dataset's configuration names.
+        digest: What the dataset says of the hand's files.
+    """
+    path = out.absolute() / HAND_FOLDER / _file_name(hand)
+    own = hand == f"{HAND_FOLDER}/{path.name}"
+    named = not any(sign in hand for sign in "/\\\0") and os.path.lexists(path)
+    return CarriedHand(path=path, digest=digest) if own or named else None
+
+
+def carry_hand(out: Path, config: Config, known: str | None = None) -> Config:
+    """Copy the files of a hand into a dataset's directory, unless they are there.
+
+    Args:
+        out: The directory, which the caller holds.
+        config: The configuration.
+        known: What the dataset in the directory names, whose hand is the same; None for a new one.
+
+    Returns:
+        The configuration with the hand in the directory.
+
+    Raises:
+        HandError: If the hand's files cannot be read, or are too large.
+        DataError: If the directory is a new dataset's, and has files of somebody in that place.
+        DiskFullError: If there is no room for them.
+    """
+    # A hand of the package keeps its name; the name of a hand file is in the hash of every shard.
+    name = known or config.hand
+    if PurePath(name).name != name or name.endswith(".yaml"):
+        name = f"{HAND_FOLDER}/{_file_name(name)}"
+    path = out.absolute() / HAND_FOLDER / _file_name(name)
+    content = hand_folder(config.hand_source, path.name)
+    carried = CarriedHand(path=path, digest=content.digest)
+    if known is None and not isinstance(config.hand_source, CarriedHand):
+        _refuse_other_files(content, path.parent)
+    if not _is_there(carried):
+        with disk_full_named(out):
+            _write(content, path.parent)
+    return config.with_hand(name, carried)
+
+
+def _file_name(hand: str) -> str:
+    """Return the name of the hand file in a dataset, of a hand of the package or a hand file."""
+    return PurePath(hand).name if "/" in hand or hand.endswith(".yaml") else f"{hand}_hand.yaml"
+
+
+def _is_there(carried: CarriedHand) -> bool:
+    """Return whether a directory holds a hand already."""
+    try:
+        return hand_digest(carried) == carried.digest
+    except HandError:
+        return False
+
+
+def _refuse_other_files(content: HandFolder, folder: Path) -> None:
+    """Refuse a folder that may be somebody's own: a build replaces and removes what is in its own.
+
+    Raises:
+        DataError: If it is there, and no copy of the hand that a build left when it was killed.
+    """
+    if not os.path.lexists(folder):
+        return
+    there = {path for path in folder.rglob("*") if not path.is_dir()}
+    copies = {folder / place: content.content(place) for place in (*content.texts, *content.files)}
+    is_source = any(path.resolve().is_relative_to(folder.resolve()) for path in content.sources)
+    if is_source or there != copies.keys() or any(p.read_bytes() != copies[p] for p in there):
+        raise DataError(
+            f"{folder}: must not be there before a build, which puts the hand's files there, "
+            "got a folder; choose another --out"
+        )
+
+
+def _write(content: HandFolder, folder: Path) -> None:
+    """Write the files of a hand; what a build has left there of another one goes."""
+    shutil.rmtree(folder, ignore_errors=True)
+    with atomic_folder(folder) as temporary:
+        for place in (*content.texts, *content.files):
+            path = temporary / place
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content.content(place))
+            sync(path)

@@ -1,12 +1,16 @@
 """Links of a hand as bodies of MuJoCo: inertia, collision shapes and their contacts.
 
-In: a hand that Drake has read. Out: bodies, added to a specification.
+In: a hand that Drake has read. Out: bodies, added to a specification; or a `HandModel`, the hand
+alone as an MJCF, whose world is the palm link: for tools that move the root themselves. In it each
+joint that a motor moves has a position actuator, coupled joints follow. The root has no joint;
+joints that a preshape keeps are none.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -25,11 +29,14 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Joint, RigidBody
 
 from drakegrasp.frames import Array
-from drakegrasp.hand.chains import joint_axis, joint_slides, moving_joint
-from drakegrasp.hand.description import Hand
-from drakegrasp.hand.parsing import add_model
+from drakegrasp.hand.description import SLIDE, Hand
+from drakegrasp.hand.parsing import add_model, joint_axis, joint_slides, moving_joint
 from drakegrasp.hand.shapes import hull_corners
+from drakegrasp.mesh.wavefront import hull_text
 
+#: Bytes; only those that are needed are touched. By default MuJoCo takes some 14 MB, and leaves
+#: contacts out where that is too little, as with a hand deep in an object of many convex parts.
+MEMORY = 256_000_000
 #: Time step [s].
 TIME_STEP = 0.002
 #: Time constant [s] and damping ratio of contacts, joint limits and couplings: the stiffest that
@@ -41,14 +48,6 @@ RIGID = (0.999, 0.9999, 0.001, 0.5, 2.0)
 #: Torsion radius of a fingertip's patch in Drake [m]: the median of 336 patches of the Barrett Hand
 #: on built-in objects (pipelines/measurements/torsion_radius.py).
 TORSION_RADIUS = 0.0029
-
-
-@dataclass(frozen=True, kw_only=True)
-class Collides:
-    """With what a geom collides, as bits of MuJoCo's masks."""
-
-    contype: int
-    conaffinity: int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -92,7 +91,7 @@ def add_links(
     parent: mujoco.MjsBody,
     friction: float,
     *,
-    touches: Collides,
+    touches: tuple[int, int],
 ) -> Iterator[MovingJoint]:
     """Add the links of a hand; yield each joint that moves, which the caller adds.
 
@@ -103,7 +102,7 @@ def add_links(
         hand: The hand.
         parent: The body to which the palm link is fixed.
         friction: Coefficient of the hand's contacts.
-        touches: With what its shapes collide.
+        touches: With what its shapes collide: `contype` and `conaffinity`, bits of MuJoCo's masks.
     """
     # Drake reads the model.
     plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
@@ -183,7 +182,7 @@ def _add_link(
     plant: MultibodyPlant,
     inspector: SceneGraphInspector,
     friction: float,
-    touches: Collides,
+    touches: tuple[int, int],
     parent: mujoco.MjsBody,
     link: RigidBody,
     X_PL: RigidTransform,
@@ -207,8 +206,8 @@ def _add_link(
             meshname=mesh,
             pos=X_LS.translation(),
             quat=quaternion(X_LS.rotation().matrix()),
-            contype=touches.contype,
-            conaffinity=touches.conaffinity,
+            contype=touches[0],
+            conaffinity=touches[1],
             friction=pair_friction(friction),
             solref=STIFF,
             condim=4,
@@ -226,12 +225,11 @@ def _shape(
     shape, kinds = inspector.GetShape(geometry), mujoco.mjtGeom
     if isinstance(shape, Box):
         return kinds.mjGEOM_BOX, list(shape.size() / 2.0), ""
-    if isinstance(shape, Cylinder):
-        return kinds.mjGEOM_CYLINDER, [shape.radius(), shape.length() / 2.0, 0.0], ""
-    if isinstance(shape, Capsule):
-        return kinds.mjGEOM_CAPSULE, [shape.radius(), shape.length() / 2.0, 0.0], ""
     if isinstance(shape, Sphere):
         return kinds.mjGEOM_SPHERE, [shape.radius(), 0.0, 0.0], ""
+    if isinstance(shape, Cylinder | Capsule):
+        kind = kinds.mjGEOM_CAPSULE if isinstance(shape, Capsule) else kinds.mjGEOM_CYLINDER
+        return kind, [shape.radius(), shape.length() / 2.0, 0.0], ""
     corners = hull_corners(inspector, geometry)
     assert corners is not None
     name = f"{link}.{inspector.GetName(geometry)}"
@@ -244,3 +242,87 @@ def set_inertia(body: mujoco.MjsBody, mass: float, com: Array, central: Array) -
     body.explicitinertial = True
     body.mass, body.ipos = mass, com
     body.fullinertia = central[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+
+
+#: Gain [N m/rad] and largest torque [N m] of each motor, damping [N m s/rad] and inertia of rotors
+#: [kg m^2]: those of the Shadow Hand of DexGraspBench (assets/hand/shadow/right_hand.xml). Joints
+#: that slide have them by `description.SLIDE`.
+GAIN, TORQUE, DAMPING, ARMATURE = 5.0, 3.0, 0.05, 2e-4
+#: Links touch all that has MuJoCo's usual masks, and not each other.
+_TOUCHES = (1, 0)
+#: Friction of a model that is not told another.
+_FRICTION = 1.0
+#: Folder of the meshes, beside the MJCF.
+MESHES = "meshes"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HandModel:
+    """A hand as a specification of MuJoCo.
+
+    Attributes:
+        spec: With a mesh file for each shape that is no primitive.
+        joints: Names of the joints in the order of its positions.
+        meshes: Text of each mesh file, by its name.
+    """
+
+    spec: mujoco.MjSpec
+    joints: tuple[str, ...]
+    meshes: dict[str, str]
+
+
+def make_hand_model(hand: Hand, friction: float = _FRICTION) -> HandModel:
+    """Return a hand as a specification of MuJoCo.
+
+    Args:
+        hand: The hand.
+        friction: Coefficient of its contacts.
+    """
+    spec = mujoco.MjSpec()
+    spec.modelname = hand.name
+    spec.compiler.degree = False
+    spec.compiler.balanceinertia = True
+    coupled = {c.joint for i in hand.motor_fingers for c in hand.followers(i)}
+    for joint in add_links(spec, hand, spec.worldbody, friction, touches=_TOUCHES):
+        unit = SLIDE if joint.slides else 1.0
+        joint.add(damping=DAMPING / unit**2, armature=ARMATURE / unit**2)
+        if joint.name not in coupled:
+            motor = spec.add_actuator(
+                name=joint.name,
+                trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                target=joint.name,
+                forcelimited=True,
+                forcerange=[-TORQUE / unit, TORQUE / unit],
+            )
+            # As numbers: the word `position` of a newer MuJoCo is none to the benchmark's.
+            gain = GAIN / unit**2
+            motor.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+            motor.gainprm[0], motor.biasprm[1] = gain, -gain
+    add_couplings(spec, hand)
+
+    # Corners become mesh files, which other tools can read.
+    meshes = {}
+    for number, mesh in enumerate(spec.meshes):
+        name = f"link_{number}.obj"
+        meshes[name] = hull_text(np.array(mesh.uservert).reshape(-1, 3))
+        mesh.uservert, mesh.file = [], name
+    model = _compile(spec, meshes)
+    joints = tuple(model.joint(i).name for i in range(model.njnt))
+    return HandModel(spec=spec, joints=joints, meshes=meshes)
+
+
+def write_hand_model(hand: HandModel, path: Path) -> None:
+    """Write the MJCF of a hand, and its meshes in a folder beside it."""
+    (path.parent / MESHES).mkdir(parents=True, exist_ok=True)
+    for name, text in hand.meshes.items():
+        (path.parent / MESHES / name).write_text(text, encoding="utf-8")
+    _compile(hand.spec, hand.meshes)
+    hand.spec.meshdir = MESHES
+    path.write_text(hand.spec.to_xml(), encoding="utf-8")
+    hand.spec.meshdir = ""
+
+
+def _compile(spec: mujoco.MjSpec, meshes: dict[str, str]) -> mujoco.MjModel:
+    """Compile a specification whose mesh files are texts in memory."""
+    spec.assets = {name: text.encode() for name, text in meshes.items()}
+    return spec.compile()

@@ -7,27 +7,95 @@ friction are those that Drake simulates. Needs the extra `[peer]`.
 
 from __future__ import annotations
 
+import hashlib
+import io
 from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
 
+import coacd
 import mujoco
 import numpy as np
 
 from drakegrasp.config import Config
+from drakegrasp.foreign_files import read_content
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import SLIDE, Hand
-from drakegrasp.mjcf.convex_parts import convex_parts
 from drakegrasp.mjcf.links import (
+    MEMORY,
     RIGID,
     STIFF,
     TIME_STEP,
-    Collides,
     add_couplings,
     add_links,
     pair_friction,
     set_inertia,
 )
-from drakegrasp.mjcf.memory import MEMORY
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.runtime.files import write_atomic
+
+#: Largest concavity of a convex part over the object's size, the seed, and the largest number of a
+#: part's corners.
+SETTINGS = {"threshold": 0.02, "seed": 0, "max_convex_hull": 64}
+
+
+def convex_parts(model: ObjectModel) -> list[Array]:
+    """Return the corners of an object's convex parts, each (n, 3) in {O} [m]."""
+    coacd.set_log_level("error")
+    mesh = coacd.Mesh(model.collision_vertices, model.collision_faces)
+    parts = coacd.run_coacd(mesh, **SETTINGS)
+    return [np.asarray(corners, dtype=float) for corners, _ in parts]
+
+
+def kept_convex_parts(model: ObjectModel, keep: Path) -> list[Array]:
+    """Return the convex parts of an object, which a folder keeps: cutting takes many seconds.
+
+    Args:
+        model: The object.
+        keep: The folder, made with the first object. A file that holds no parts is written again.
+
+    Raises:
+        OSError: If the folder cannot be written.
+    """
+    path = keep / f"{_digest(model)}.npz"
+    try:
+        return _read_parts(path)
+    except Exception:  # missing, or damaged in any way: it can be made again
+        parts = convex_parts(model)
+
+    # The parts are read in the order in which they are written.
+    buffer = io.BytesIO()
+    np.savez(buffer, *parts)
+    write_atomic(path, buffer.getvalue())
+    return parts
+
+
+def _read_parts(path: Path) -> list[Array]:
+    """Return the parts in a file.
+
+    Raises:
+        Exception: Of any kind, if it is missing or holds something else.
+    """
+    with np.load(io.BytesIO(read_content(path)), allow_pickle=False) as content:
+        parts = [content[f"arr_{k}"] for k in range(len(content.files))]
+    if not parts or not all(map(_is_part, parts)):
+        raise ValueError(f"{path}: must hold the corners of convex parts, got something else")
+    return parts
+
+
+def _is_part(corners: Array) -> bool:
+    shaped = corners.dtype == float and corners.shape[1:] == (3,) and len(corners) >= 4
+    return shaped and bool(np.isfinite(corners).all())
+
+
+def _digest(model: ObjectModel) -> str:
+    """Return 32 hex digits that name all that decides an object's parts."""
+    digest = hashlib.sha256(repr((SETTINGS, metadata.version("coacd"))).encode())
+    for array in (model.collision_vertices, model.collision_faces):
+        digest.update(repr((array.shape, array.dtype.str)).encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:32]
+
 
 #: Friction is this much stiffer than the normal direction, and is solved again until it is exact
 #: (`noslip`): MuJoCo's regularized friction lets what is held creep.
@@ -43,7 +111,7 @@ CARRIER_MASS, CARRIER_INERTIA, ARMATURE = 0.01, 1e-5, 2e-4
 IMMOVABLE = 1e4
 #: Bits of MuJoCo's collision masks.
 _HAND, _OBJECT, _TABLE = 1, 2, 4
-_ON_HAND = Collides(contype=_HAND, conaffinity=_OBJECT | _TABLE)
+_ON_HAND = (_HAND, _OBJECT | _TABLE)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -150,11 +218,8 @@ def _add_hand(spec: mujoco.MjSpec, hand: Hand, config: Config) -> list[SpreadJoi
     wrist, spreads = _add_wrist(spec), []
     for joint in add_links(spec, hand, wrist, config.physics.friction_hand, touches=_ON_HAND):
         if joint.name in hand.spread.joints:
-            spreads.append(
-                SpreadJoint(
-                    body=joint.body.name, axis=joint.axis, quaternion=joint.body.quat.copy()
-                )
-            )
+            body, start = joint.body.name, joint.body.quat.copy()
+            spreads.append(SpreadJoint(body=body, axis=joint.axis, quaternion=start))
             continue
         unit = SLIDE if joint.slides else 1.0
         joint.add(

@@ -38,7 +38,7 @@ from drakegrasp.dataset.suspicion import COLUMNS, PARTS, suspicion
 from drakegrasp.dataset.trials import Stamp, TrialPart, Trials, sample_ids, shard_part, stamp
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import is_name, parse_json
-from drakegrasp.hand.carried import carried_hand
+from drakegrasp.hand.folder import carried_hand
 from drakegrasp.outcomes import Outcome
 
 Found = TypeVar("Found")

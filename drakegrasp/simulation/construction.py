@@ -65,9 +65,9 @@ from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.file_format import Finger, with_efforts
 from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.kinematics import within_load
 from drakegrasp.hand.parsing import add_model, make_parser
 from drakegrasp.hand.shapes import hull_corners
-from drakegrasp.hand.strength import within_load
 from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour

@@ -35,7 +35,7 @@ from scipy.spatial import ConvexHull, QhullError
 from drakegrasp.config import Config
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.strength import fingertip_forces, within_load
+from drakegrasp.hand.kinematics import fingertip_forces, within_load
 from drakegrasp.mesh.surfaces import winding_numbers
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.drive import drive_of

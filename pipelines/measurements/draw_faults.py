@@ -30,7 +30,7 @@ OTHERS = ("hand", "mesh", "objects", "vision", "dataset", "generation", "scoring
 _TELLING = {
     *(f"verification/{name}.py" for name in ("explanation", "figure", "recording", "views")),
     *("dataset/card.py", "dataset/holding.py", "dataset/shortfall.py", "dataset/log.py"),
-    *("hand/references.py", "scoring/card.py"),
+    *("hand/files.py", "scoring/card.py"),
     *(
         "vision/probe_image.py",
         "generation/events.py",

@@ -32,12 +32,11 @@ import trimesh
 from fuzz_files import change_tree, flip, judge, other_kind, preload, read, say_findings, truncate
 
 from drakegrasp.cli.main import main as command
-from drakegrasp.commissioning.model_checks import check_limits
-from drakegrasp.commissioning.run import check_geometry
+from drakegrasp.commissioning.checks import check_geometry, check_limits
+from drakegrasp.commissioning.draft.model import read_model
+from drakegrasp.commissioning.draft.run import write_urdf
+from drakegrasp.commissioning.draft.source import read_source
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.draft.parsing import read_model
-from drakegrasp.hand.draft.source import read_source
-from drakegrasp.hand.draft.writing import write_urdf
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.mesh.loading import load_mesh

@@ -29,7 +29,7 @@ from drakegrasp.dataset.holding import wilson_interval
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.mjcf import links, scene
-from drakegrasp.mjcf.convex_parts import convex_parts
+from drakegrasp.mjcf.scene import convex_parts
 from drakegrasp.outcomes import Outcome
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.conditions import usual_conditions

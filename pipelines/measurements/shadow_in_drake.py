@@ -33,12 +33,12 @@ import yaml
 from pydrake.multibody.tree import PdControllerGains
 
 from drakegrasp.arithmetic import multiply
+from drakegrasp.commissioning.draft.model import read_model
+from drakegrasp.commissioning.draft.run import write_urdf
+from drakegrasp.commissioning.draft.source import read_source
 from drakegrasp.config import Config
 from drakegrasp.frames import Array, invert_pose, make_pose
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.draft.parsing import read_model
-from drakegrasp.hand.draft.source import read_source
-from drakegrasp.hand.draft.writing import write_urdf
 from drakegrasp.hand.file_format import Finger
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import prepare_object

@@ -20,7 +20,7 @@ from drakegrasp.dataset.log import BuildLog, read_log
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
-from drakegrasp.hand.carried import carry_hand
+from drakegrasp.hand.folder import carry_hand
 from drakegrasp.page.gallery import TEMPLATES
 from drakegrasp.runtime.environment import host_label
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,9 +12,7 @@ import yaml
 from helpers.hands import write_tongs
 from helpers.vendors import box, fixed, link
 
-from drakegrasp.commissioning.finding import Finding
-from drakegrasp.commissioning.motion_checks import check_palm
-from drakegrasp.commissioning.pad_checks import check_pads
+from drakegrasp.commissioning.checks import Finding, check_pads, check_palm
 from drakegrasp.commissioning.trial_grasps import LINES, check_grasp, trial_grasps
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.files import MODELS
@@ -22,13 +21,11 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.trial import TrialRecord
 
 
-def changed_franka(
-    folder: Path, edit: Callable[[dict], None], model: Callable[[str], str] = str
-) -> Hand:
-    """Return the parallel gripper with changes of its file and of its model."""
+def changed_franka(folder: Path, edit: Callable[[dict], None]) -> Hand:
+    """Return the parallel gripper with changes of its file."""
     tree = yaml.safe_load((MODELS / "franka_hand.yaml").read_text())
     edit(tree)
-    (folder / "franka_hand.urdf").write_text(model((MODELS / "franka_hand.urdf").read_text()))
+    shutil.copy(MODELS / "franka_hand.urdf", folder)
     path = folder / "mine_hand.yaml"
     path.write_text(yaml.safe_dump(tree))
     return load_hand(path)
@@ -37,32 +34,15 @@ def changed_franka(
 def test_a_border_on_the_pads_face_is_moved_behind_it(tmp_path: Path) -> None:
     """The plane of the message is one that passes."""
 
-    def on_face(tree: dict) -> None:
-        tree["fingers"][0]["pad_region"] = [[0, -1, 0, 0.0], [0, 0, 1, 0.036]]
+    def checked(plane: list[float]) -> Finding:
+        return check_pads(changed_franka(tmp_path, lambda tree: tree["fingers"][0].update(
+            pad_region=[plane, [0, 0, 1, 0.036]])))  # fmt: skip
 
-    found = check_pads(changed_franka(tmp_path, on_face))
-    assert not found.ok
-    assert found.text == (
+    assert checked([0, -1, 0, 0.0]).text == (
         "fingers.0.pad_region.0 must leave room behind the pad's face, into which objects sink, "
         "got none: 3 mm are in [0.0, -1.0, 0.0, -0.003]"
     )
-
-    def mended(tree: dict) -> None:
-        tree["fingers"][0]["pad_region"] = [[0.0, -1.0, 0.0, -0.003], [0, 0, 1, 0.036]]
-
-    assert check_pads(changed_franka(tmp_path, mended)).ok
-
-
-def test_a_joint_that_opens_is_named_with_the_limits_of_the_reversed_one(tmp_path: Path) -> None:
-    hand = changed_franka(
-        tmp_path,
-        lambda tree: None,
-        lambda text: text.replace('<axis xyz="0 1 0"/>', '<axis xyz="0 -1 0"/>'),
-    )
-    assert (
-        "a positive position of joint 'right_joint' opens the hand; reverse its axis, limits "
-        "(-0.04..0) and origin" in check_pads(hand).text
-    )
+    assert checked([0.0, -1.0, 0.0, -0.003]).ok
 
 
 def test_a_palm_that_cannot_face_a_table_is_found(tmp_path: Path) -> None:

@@ -14,15 +14,14 @@ from helpers.machine import needs_egl
 from helpers.vendors import JAWS, JAWS_MJCF, MITTEN, box, joint, link, write_model
 
 from drakegrasp.cli.main import main
-from drakegrasp.commissioning.draft.answers import Answers
+from drakegrasp.commissioning.draft.fingers import Answers
 from drakegrasp.commissioning.draft.run import NewHand, draft_hand
 from drakegrasp.errors import HandError
-from drakegrasp.frames import transform_points
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.file_format import DrivenBy
 from drakegrasp.hand.files import MODELS
-from drakegrasp.hand.kinematics import closed_positions, fingertip_poses
-from drakegrasp.hand.strength import fingertip_forces
+from drakegrasp.hand.finger_sweep import pad_points_at
+from drakegrasp.hand.kinematics import closed_positions, fingertip_forces
 
 
 @pytest.fixture(autouse=True)
@@ -39,11 +38,7 @@ def draft(folder: Path, text: str, name: str = "hand.urdf", **answers: object) -
 
 def pads(hand: Hand, share: float) -> np.ndarray:
     """Return the pad points (k, 3) in {G} when the hand has closed by a share."""
-    X_GF = fingertip_poses(hand, spread=0.0, closing=share * closed_positions(hand))
-    points = [
-        transform_points(X, f.p_FiP[None])[0] for X, f in zip(X_GF, hand.fingers, strict=True)
-    ]
-    return np.array(points)
+    return pad_points_at(hand, share * closed_positions(hand))
 
 
 @pytest.mark.parametrize(("text", "name"), [(JAWS, "jaws.urdf"), (JAWS_MJCF, "jaws.xml")])
@@ -80,12 +75,13 @@ def test_fingers_oppose_a_thumb_whose_base_is_turned(tmp_path: Path) -> None:
     assert hand.X_BG[0, 2] > 0.9
 
 
+BAR = link("bar", 0.01, box("0.01 0.01 0.02", "0 0 0.01"))
+
+
 def test_bars_of_a_linkage_are_no_fingers(tmp_path: Path) -> None:
     """A bar of the jaws' motor, which reaches less far than they do."""
-    bar = link("bar", 0.01, box("0.01 0.01 0.02", "0 0 0.01")) + joint(
-        "bar_slide", "prismatic", "body", "bar", "0.02 0 0", "0 1 0", "0 0.05 60",
-        '<mimic joint="left_slide"/>',
-    )  # fmt: skip
+    bar = BAR + joint("bar_slide", "prismatic", "body", "bar", "0.02 0 0", "0 1 0", "0 0.05 60",
+                      '<mimic joint="left_slide"/>')  # fmt: skip
     hand = load_hand(draft(tmp_path, JAWS.replace("</robot>", bar + "</robot>")).path)
     assert set(hand.fingertip_links) == {"left_jaw", "right_jaw"}
     assert any(c.joint == "bar_slide" for finger in hand.fingers for c in finger.coupled)
@@ -93,9 +89,7 @@ def test_bars_of_a_linkage_are_no_fingers(tmp_path: Path) -> None:
 
 def test_a_bar_may_be_the_joint_that_leads(tmp_path: Path) -> None:
     """As in grippers whose fingers follow a knuckle beside them."""
-    bar = link("bar", 0.01, box("0.01 0.01 0.02", "0 0 0.01")) + joint(
-        "knuckle", "prismatic", "body", "bar", "0.02 0 0", "0 1 0", "0 0.05 60"
-    )
+    bar = BAR + joint("knuckle", "prismatic", "body", "bar", "0.02 0 0", "0 1 0", "0 0.05 60")
     text = JAWS.replace('"left_slide"/>', '"knuckle"/>').replace("</robot>", bar + "</robot>")
     slide = text.index("</joint>", text.index('name="left_slide"'))
     hand = load_hand(draft(tmp_path, text[:slide] + '<mimic joint="knuckle"/>' + text[slide:]).path)
@@ -112,12 +106,8 @@ def test_both_sides_press_equally(tmp_path: Path) -> None:
 
 def test_an_effort_is_that_of_the_weakest_joint(tmp_path: Path) -> None:
     """A thumb whose last joint has a tenth of the torque presses less."""
-    weak = MITTEN.replace(
-        'name="thumb_2" type="revolute"><parent link="thumb_near"/><child link="thumb_far"/>'
-        '<origin xyz="0.04 0 0"/><axis xyz="0 -1 0"/><limit lower="0" upper="1.2" effort="1.0"',
-        'name="thumb_2" type="revolute"><parent link="thumb_near"/><child link="thumb_far"/>'
-        '<origin xyz="0.04 0 0"/><axis xyz="0 -1 0"/><limit lower="0" upper="1.2" effort="0.1"',
-    )
+    strong = '<axis xyz="0 -1 0"/><limit lower="0" upper="1.2" effort="1.0"'
+    weak = MITTEN.replace(strong, strong.replace("1.0", "0.1"))
     assert weak != MITTEN
     limits = []
     for n, text in enumerate((MITTEN, weak)):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from helpers.hands import write_slider
 
-from drakegrasp.commissioning.pinch import find_opposition, find_pinch, reach
 from drakegrasp.commissioning.trial_grasps import check_grasp, trial_grasps
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.finger_sweep import find_opposition, find_pinch, reach
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.construction import build_scene

@@ -62,7 +62,5 @@ def test_the_page_has_every_key_of_a_hand_file() -> None:
     top = {key for key in named if "[" not in key} - fingers
     assert top == set(HandFile.model_fields)
     assert fingers == set(Finger.__dataclass_fields__)
-    for section in (Coupling, Spread):
-        for key in section.__dataclass_fields__:
-            assert key in PAGE
+    assert all(key in PAGE for key in (*Coupling.__dataclass_fields__, *Spread.model_fields))
     assert all(f"palm.{key}" in PAGE for key in Palm.model_fields)

@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from helpers.hands import write_pincer
+from helpers.hands import PINCER_SDF, write_pincer
 
 from drakegrasp.frames import invert_pose, transform_points
 from drakegrasp.hand.description import load_hand
@@ -115,8 +115,6 @@ def test_any_hand_has_paths(tmp_path):
 
 
 def test_hand_with_an_unlimited_finger_has_none(tmp_path):
-    from helpers.hands import PINCER_SDF
-
     free = PINCER_SDF.replace("<limit><lower>0</lower><upper>1</upper></limit>", "")
     assert free != PINCER_SDF
     assert hand_paths(load_hand(write_pincer(tmp_path, sdf=free)), 0.0) is None

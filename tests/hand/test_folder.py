@@ -15,11 +15,10 @@ from helpers.meshes import box, write
 
 from drakegrasp.config import CarriedHand, Config
 from drakegrasp.errors import DiskFullError, HandError
-from drakegrasp.hand import carried as carrying
-from drakegrasp.hand.carried import carry_hand
+from drakegrasp.hand import folder as carrying
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import MODELS
-from drakegrasp.hand.folder import hand_digest, hand_folder, is_hand
+from drakegrasp.hand.folder import carry_hand, hand_digest, hand_folder, is_hand
 from drakegrasp.hand.lift_chance import read_lift_chance
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.shapes import link_shapes
@@ -49,11 +48,7 @@ def write_layout(root: Path, layout: str) -> Path:
         "above": ("../vendor/urdf/pincer.sdf", "../meshes/palm.obj", {}),
         "absolute": (str(root / "vendor/urdf/pincer.sdf"), f"file://{mesh}", {}),
         "package": ("../vendor/urdf/pincer.sdf", "package://kit/meshes/palm.obj", {}),
-        "named package": (
-            "pincer.sdf",
-            "package://other/meshes/palm.obj",
-            {"other": "../vendor"},
-        ),
+        "named package": ("pincer.sdf", "package://other/meshes/palm.obj", {"other": "../vendor"}),
     }[layout]
     if layout == "beside":
         shutil.copy(mesh, folders["mine"])
@@ -86,18 +81,9 @@ def test_the_copy_loads_by_itself_as_the_same_hand(layout: str, tmp_path: Path) 
     hand = load_hand(copy)
     for name in ("joint_gain", "joint_offset", "joint_limits", "X_BG", "closing_speed"):
         assert np.array_equal(getattr(hand, name), getattr(known, name))
-    assert (hand.name, hand.fingers, hand.joint_names) == (
-        known.name,
-        known.fingers,
-        known.joint_names,
-    )
-    found = link_shapes(hand)
-    assert found.keys() == shapes.keys()
-    assert all(
-        np.array_equal(a, b)
-        for link in shapes
-        for a, b in zip(found[link], shapes[link], strict=True)
-    )
+    for name in ("name", "fingers", "joint_names"):
+        assert getattr(hand, name) == getattr(known, name)
+    np.testing.assert_equal(link_shapes(hand), shapes)
     # And it can be carried on.
     config = load_config().with_hand("hand/pincer_hand.yaml", copy)
     again = carried_source(tmp_path / "next", config)
@@ -148,49 +134,38 @@ def change(path: Path, before: str, after: str) -> None:
     path.write_text(text.replace(before, after))
 
 
-def link_out(folder: Path, name: str, target: Path) -> None:
-    (folder / name).unlink()
-    (folder / name).symlink_to(target)
+def link_out(path: Path, target: Path) -> None:
+    path.unlink()
+    path.symlink_to(target)
 
 
+#: What becomes of a carried hand's files, or what is replaced in one of them by what, where `{}` is
+#: the dataset's folder.
+MODEL = "model: pincer.sdf"
 FAULTS = {
-    "another model": lambda folder, out: change(folder / "pincer.sdf", "0.04 0.02", "0.05 0.02"),
-    "an absolute model": lambda folder, out: change(
-        folder / "pincer_hand.yaml", "model: pincer.sdf", f"model: {out}/secret.sdf"
-    ),
-    "a model above": lambda folder, out: change(
-        folder / "pincer_hand.yaml", "model: pincer.sdf", "model: ../secret.sdf"
-    ),
-    "a mesh above": lambda folder, out: change(folder / "pincer.sdf", "palm.obj", "../palm.obj"),
-    "an absolute mesh": lambda folder, out: change(
-        folder / "pincer.sdf", "palm.obj", f"file://{out}/palm.obj"
-    ),
-    "packages": lambda folder, out: change(
-        folder / "pincer_hand.yaml", "model: pincer.sdf", "packages: {a: ..}\nmodel: pincer.sdf"
-    ),
-    "a large hand file": lambda folder, out: change(
-        folder / "pincer_hand.yaml", "model: pincer.sdf", "model: pincer.sdf" + " " * 300_000
-    ),
-    "a package": lambda folder, out: change(folder / "pincer.sdf", "palm.obj", "package://a/b.obj"),
-    "a linked mesh": lambda folder, out: link_out(folder, "palm.obj", out / "palm.obj"),
+    "another model": ("pincer.sdf", "0.04 0.02", "0.05 0.02"),
+    "an absolute model": ("pincer_hand.yaml", MODEL, "model: {}/secret.sdf"),
+    "a model above": ("pincer_hand.yaml", MODEL, "model: ../secret.sdf"),
+    "a mesh above": ("pincer.sdf", "palm.obj", "../palm.obj"),
+    "an absolute mesh": ("pincer.sdf", "palm.obj", "file://{}/palm.obj"),
+    "packages": ("pincer_hand.yaml", MODEL, f"packages: {{{{a: ..}}}}\n{MODEL}"),
+    "a large hand file": ("pincer_hand.yaml", MODEL, MODEL + " " * 300_000),
+    "a package": ("pincer.sdf", "palm.obj", "package://a/b.obj"),
+    "a material above": ("palm.obj", "v ", "mtllib ../a.mtl\nv "),
+    "a linked mesh": lambda folder, out: link_out(folder / "palm.obj", out / "palm.obj"),
     "a linked hand file": lambda folder, out: link_out(
-        folder, "pincer_hand.yaml", out / "secret.yaml"
-    ),
-    "a material above": lambda folder, out: change(
-        folder / "palm.obj", "v ", "mtllib ../a.mtl\nv "
+        folder / "pincer_hand.yaml", out / "secret.yaml"
     ),
     "a directory": lambda folder, out: (
-        (folder / "palm.obj").unlink(),
-        (folder / "palm.obj").mkdir(),
+        (folder / "palm.obj").unlink(), (folder / "palm.obj").mkdir()
     ),
     "a linked folder": lambda folder, out: (
-        folder.rename(out / "elsewhere"),
-        folder.symlink_to(out / "elsewhere"),
+        folder.rename(out / "elsewhere"), folder.symlink_to(out / "elsewhere")
     ),
     "a pipe": lambda folder, out: ((folder / "palm.obj").unlink(), os.mkfifo(folder / "palm.obj")),
     "no model": lambda folder, out: (folder / "pincer.sdf").unlink(),
     "no hand file": lambda folder, out: (folder / "pincer_hand.yaml").unlink(),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -202,7 +177,11 @@ def test_a_stranger_s_hand_stays_in_its_folder(
     for name in ("secret.sdf", "palm.obj", "secret.yaml"):
         (tmp_path / "out" / name).write_text("nothing")
     load_hand(copy)
-    FAULTS[fault](copy.path.parent, tmp_path / "out")
+    folder, out, spoil = copy.path.parent, tmp_path / "out", FAULTS[fault]
+    if callable(spoil):
+        spoil(folder, out)
+    else:
+        change(folder / spoil[0], spoil[1], spoil[2].format(out))
     read, reader = list[Path](), Path.read_bytes
     monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path) or reader(path))
     with pytest.raises(HandError) as caught:
@@ -245,11 +224,8 @@ def test_a_copy_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_an_include_in_a_model_comes_along(tmp_path: Path) -> None:
     """And its text counts."""
     path = write_pincer(tmp_path)
-    change(
-        tmp_path / "pincer.sdf",
-        '<link name="palm">',
-        '<link name="palm"><!-- <uri>part.sdf</uri> -->',
-    )
+    palm = '<link name="palm">'
+    change(tmp_path / "pincer.sdf", palm, f"{palm}<!-- <uri>part.sdf</uri> -->")
     before = hand_digest(path)
     (tmp_path / "part.sdf").write_text("<sdf/>")
     folder = hand_folder(path)

@@ -36,29 +36,25 @@ PINCH = {
 }
 ALL = {"name": "all", "fingers": ["index", "middle", "ring", "thumb"]}
 REFUSALS = {
-    "no such finger": (
-        [{**PINCH, "fingers": ["index", "little"]}],
-        r"preshapes.0.fingers must be of index, middle, ring, thumb, got 'little'",
-    ),
+    "no such finger": ([{**PINCH, "fingers": ["index", "little"]}],
+                       r"preshapes.0.fingers must be of index, middle, ring, thumb, got 'little'"),
     "one name twice": ([PINCH, PINCH], "preshapes must have a name each, got pinch, pinch"),
     "a joint that closes": (
         [ALL, {**PINCH, "joints": {"index_mcp_joint": 0.3}}],
-        r"preshapes.1: fingers.0.closing_joint: must be a joint that nothing else drives",
-    ),
+        r"preshapes.1: fingers.0.closing_joint: must be a joint that nothing else drives"),
     "a joint beyond its limits": (
         [{**PINCH, "joints": {"ring_mcp_joint": 3.0}}],
-        r"preshapes.0: preshape.ring_mcp_joint: must be -0.196..1.61, .* got 3",
-    ),
+        r"preshapes.0: preshape.ring_mcp_joint: must be -0.196..1.61, .* got 3"),
     "a joint of another hand": (
         [{**PINCH, "joints": {"little_joint": 0.0}}],
-        r"preshapes.0: preshape.little_joint: must be a revolute or prismatic joint",
-    ),
-}
+        r"preshapes.0: preshape.little_joint: must be a revolute or prismatic joint"),
+}  # fmt: skip
 
 
-def allegro(folder: Path, *preshapes: dict) -> Hand:
-    tree = yaml.safe_load(hand_file("allegro_four").read_text())
-    tree |= {"model": str(load_hand("allegro_four").model.path), "preshapes": list(preshapes)}
+def allegro(folder: Path, *preshapes: dict, name: str = "allegro_four") -> Hand:
+    """Return a hand of the package with preshapes."""
+    tree = yaml.safe_load(hand_file(name).read_text())
+    tree |= {"model": str(load_hand(name).model.path), "preshapes": list(preshapes)}
     path = folder / "shaped_hand.yaml"
     path.write_text(yaml.safe_dump(tree))
     return load_hand(path)
@@ -86,13 +82,9 @@ def test_fingers_that_a_preshape_leaves_out_keep_their_joints(tmp_path: Path) ->
 
 
 def test_a_preshape_includes_the_finger_whose_motor_drives_its_own(tmp_path: Path) -> None:
-    tree = yaml.safe_load(hand_file("franka").read_text())
-    tree |= {"model": str(load_hand("franka").model.path)}
-    tree["preshapes"] = [{"name": "half", "fingers": ["right"]}]
-    path = tmp_path / "half_hand.yaml"
-    path.write_text(yaml.safe_dump(tree))
+    half = {"name": "half", "fingers": ["right"]}
     with pytest.raises(HandError, match=r"preshapes.0.fingers must include 'left', whose motor"):
-        load_hand(path)
+        allegro(tmp_path, half, name="franka")
 
 
 def test_preshapes_are_drawn_after_the_spreads() -> None:

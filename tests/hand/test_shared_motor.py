@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 from helpers.hands import SLIDER, slider_fingers, write_slider
 
-from drakegrasp.commissioning.model_checks import check_couplings
+from drakegrasp.commissioning.checks import check_couplings
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.kinematics import closed_positions, coordinate_limits, open_together
-from drakegrasp.hand.strength import fingertip_forces
+from drakegrasp.hand.kinematics import (
+    closed_positions,
+    coordinate_limits,
+    fingertip_forces,
+    open_together,
+)
 from drakegrasp.simulation.posture import Posture, start_of
 from drakegrasp.verification.wrist_solver import fit_wrist, make_postures
 
@@ -20,26 +24,19 @@ OWN, DRIVEN = slider_fingers(60.0, finger="left")
 REFUSALS = {
     "no such finger": (
         [OWN, {**DRIVEN, "driven_by": {"finger": "middle"}}],
-        r"fingers.1.driven_by.finger must be a finger with a motor of its own \(left\), "
-        "got 'middle'",
-    ),
+        r"fingers.1.driven_by.finger must be .* motor of its own \(left\), got 'middle'"),
     "each drives the other": (
         [{**DRIVEN, "name": "left", "driven_by": {"finger": "right"}}, DRIVEN],
-        r"fingers.0.driven_by.finger must be .* \(there is none\), got 'right'",
-    ),
+        r"fingers.0.driven_by.finger must be .* \(there is none\), got 'right'"),
     "a motor of its own as well": (
         [OWN, {**DRIVEN, "force_limit": 3.0}],
-        "fingers.1.force_limit must be left out beside driven_by: the motor is that of finger",
-    ),
-    "a rotor of its own": (
-        [OWN, {**DRIVEN, "rotor_inertia": 1e-6}],
-        "fingers.1.rotor_inertia must be left out",
-    ),
+        "fingers.1.force_limit must be left out beside driven_by: the motor is that of finger"),
+    "a rotor of its own": ([OWN, {**DRIVEN, "rotor_inertia": 1e-6}],
+                           "fingers.1.rotor_inertia must be left out"),
     "it opens while the other closes": (
         [OWN, {**DRIVEN, "driven_by": {"finger": "left", "ratio": -1.0}}],
-        "fingers.1.driven_by.ratio: .*greater than 0",
-    ),
-}
+        "fingers.1.driven_by.ratio: .*greater than 0"),
+}  # fmt: skip
 
 
 def shared(tmp_path: Path, ratio: float = 1.0, **changes: object) -> Hand:
@@ -55,16 +52,15 @@ def test_a_finger_is_driven_by_one_motor(tmp_path: Path, case: str) -> None:
 
 
 def test_a_finger_that_turns_is_not_driven_by_one_that_slides(tmp_path: Path) -> None:
-    turns = {"fingers": slider_fingers(60.0, finger="left")}
     turning = SLIDER.replace(
         'name="right_slide" type="prismatic"', 'name="right_slide" type="revolute"'
     )
-    with pytest.raises(
-        HandError,
-        match=r"fingers.1.driven_by: must be a finger whose closing joint turns, as 'right_slide', "
-        "got 'left'",
-    ):
-        load_hand(write_slider(tmp_path, urdf=turning, **turns))
+    message = (
+        r"fingers.1.driven_by: must be a finger whose closing joint turns, as 'right_slide', "
+        "got 'left'"
+    )
+    with pytest.raises(HandError, match=message):
+        shared(tmp_path, urdf=turning)
 
 
 def test_fingers_of_one_motor_close_in_step(tmp_path: Path) -> None:

@@ -9,8 +9,7 @@ from helpers.hands import drake_fingertip_poses
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import hand_names
-from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
-from drakegrasp.hand.strength import fingertip_forces
+from drakegrasp.hand.kinematics import coordinate_limits, fingertip_forces, fingertip_poses
 
 #: Centres of the round tips in the fingertip links [m]; SimLab's URDF.
 ALLEGRO_TIPS = np.array([[0.0, 0.0, 0.0267], [0.0, 0.0, 0.0267], [0.0, 0.0, 0.0423]])

@@ -13,278 +13,148 @@ from click.testing import CliRunner
 from helpers.vendors import JAWS, JAWS_MJCF, fixed, link, write_model
 
 from drakegrasp.cli.main import main
+from drakegrasp.commissioning.draft.model import read_model
+from drakegrasp.commissioning.draft.source import read_source
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.draft.parsing import read_model
-from drakegrasp.hand.draft.source import read_source
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.shapes import link_shapes
 
 MIMIC = '<mimic joint="left_slide"/>'
 JAW = '<geometry><box size="0.02 0.012 0.06"/></geometry>'
+LIMIT = '<limit lower="0" upper="0.05" effort="60" velocity="1"/>'
+MASS = '<mass value="0.05"/>'
 EMPTY = '<model name="{}"><link name="x"/></model>'
-BOMB = '<!DOCTYPE r [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;&a;&a;">]>'
+RIGHT = JAWS[JAWS.index('<joint name="right_slide"') : JAWS.index('<joint name="left_end_')]
+FILE = '<geometry><mesh filename="{}"/></geometry>'
+# fmt: off
+#: Of a file of its own: its text, its name, and what is said of it.
+FILES = {
+    "not XML": ("<robot", "hand.urdf", "must be XML, got text that is not"),
+    "empty": ("", "hand.urdf", "must be XML, got text that is not"),
+    "bytes": ("\x00\x01\x02", "hand.urdf", "must be XML, got text that is not"),
+    "another language": ("<html/>", "hand.urdf", "must be a model in URDF, SDFormat or MJCF"),
+    "xacro": (JAWS, "hand.xacro", "must be URDF, got xacro: run `xacro hand.xacro"),
+    "another suffix": (JAWS, "hand.step", r"must end in \.urdf, \.sdf or \.xml"),
+    "XML bomb": ('<!DOCTYPE r [<!ENTITY a "ha"><!ENTITY b "&a;&a;">]>'
+                 + JAWS.replace('name="jaws"', 'name="&b;"'), "hand.urdf", "document type"),
+    "deep": ("<robot>" + "<a>" * 5000 + "</a>" * 5000 + "</robot>", "hand.urdf", "200 levels"),
+    "no shapes": (re.sub(r"<(collision|visual)>.*?</\1>", "", JAWS), "hand.urdf",
+                  "must have shapes, got links without any"),
+    "one finger": (re.sub(r'<link name="right_jaw">.*?</link>\n', "", JAWS, flags=re.DOTALL)
+                   .replace(RIGHT, ""), "hand.urdf",
+                   r"must have two fingers or more, got one chain of links: .* --palm LINK"),
+    "joint that floats": (
+        re.sub('(right_slide" type=")prismatic', r"\1planar", JAWS.replace(MIMIC, "")),
+        "hand.urdf", "joint 'right_slide' must be revolute, prismatic or fixed"),
+    "no joints": (f'<robot name="block">{link("body", 0.5, JAW)}</robot>', "hand.urdf",
+                  r"must have two fingers or more, got one chain .* --palm LINK \(body\)"),
+    "two models": (f'<sdf version="1.7">{"".join(map(EMPTY.format, "ab"))}</sdf>', "hand.sdf",
+                   "can only contain one model"),
+    "other files": ('<sdf version="1.7"><model name="a"><include><uri>model://b</uri></include>'
+                    "</model></sdf>", "hand.sdf", "must be complete by itself, got <include>"),
+    "missing mesh of MJCF": ('<mujoco><asset><mesh file="lost.stl"/></asset></mujoco>', "hand.xml",
+                             "lost.stl' must be a file, got none"),
+    "frame that holds a joint": (
+        re.sub("(<joint name=.*?/>)", r"<frame>\1</frame>", JAWS_MJCF, count=1), "hand.xml",
+        "<joint> must lie in a body, got it in a <frame>"),
+}
+#: Of the jaws in URDF: what is replaced, how often (-1: everywhere), and what is said of it.
+URDF = {
+    "missing mesh": (JAW, FILE.format("lost.stl"), 1, "lost.stl' must be a file, got none"),
+    "mesh of the web": (JAW, FILE.format("https://x.org/a.stl"), 1, "nothing is fetched"),
+    "mesh of another format": (JAW, FILE.format("jaw.step"), 1, r"one of \.obj, .* got '\.step'"),
+    "mesh of no name": (JAW, FILE.format(""), 1, r"must be one of \.obj, .* got ''"),
+    "broken mesh": (JAW, FILE.format("broken.glb"), 1, "broken.glb' must be readable, got"),
+    "mesh without triangles": (JAW, FILE.format("empty.obj"), 1,
+                               "'empty.obj' must hold triangles with finite corners"),
+    "mesh outside": (JAW, FILE.format("../broken.glb"), 1,
+                     "'../broken.glb' must lie in the model's folder, got .* --root FOLDER"),
+    "mesh of an unknown package": (JAW, FILE.format("package://other/jaw.stl"), 1,
+                                   "must lie in a known package: .* --package other=FOLDER"),
+    "loop": ("</robot>", fixed("bridge", "right_jaw", "left_jaw") + "</robot>", -1,
+             "link 'left_jaw'|loop"),
+    "links in a circle": ("</robot>", fixed("bridge", "left_jaw", "mount") + "</robot>", -1,
+                          "one tree of links|loop"),
+    "two trees": ("</robot>", link("other", 0.1, JAW) + "</robot>", -1,
+                  r"must be one tree of links, with one root, got 2 \(.*other\)"),
+    "two links of a name": ("</robot>", link("left_jaw", 0.1, JAW) + "</robot>", -1,
+                            "already contains a body named 'left_jaw'"),
+    "missing link": ('<child link="left_jaw"/>', '<child link="lost"/>', -1,
+                     "Could not find link named 'lost'"),
+    "link without a name": ('<link name="left_end"/>', "<link/>", -1,
+                            "link tag is missing name attribute"),
+    "link that carries itself": ('<parent link="body"/><child link="left_jaw"/>',
+                                 '<parent link="left_jaw"/><child link="left_jaw"/>', -1,
+                                 "connect body left_jaw to itself"),
+    "negative mass": (MASS, '<mass value="-0.05"/>', 1,
+                      "link 'left_jaw' must have a mass of 0 kg or more, got -0.05"),
+    "mass that is no number": (MASS, '<mass value="heavy"/>', 1,
+                               "mass of link 'left_jaw' must be a number, got 'heavy'"),
+    "mass without a value": (MASS, '<mass value="nan"/>', 1,
+                             "mass of link 'left_jaw' must be a number, got 'nan'"),
+    "units in mm": (JAW, '<geometry><box size="20 12 60"/></geometry>', -1,
+                    "must be a hand in metres, got one of 6[0-9] m"),
+    "size below zero": (JAW, '<geometry><box size="-0.02 0.012 0.06"/></geometry>', 1,
+                        "width = -0.02"),
+    "circle of mimics": (f"{LIMIT}</joint>", f'{LIMIT}<mimic joint="right_slide"/></joint>', 1,
+                         "joint '(left|right)_slide' must follow a joint that leads, got a circle"),
+    "mimic of nothing": (MIMIC, '<mimic joint="thumb"/>', -1, "thumb"),
+    "mimic without motion": (MIMIC, '<mimic joint="left_slide" multiplier="0"/>', -1,
+                             "joint 'right_slide' must follow 'left_slide' by a ratio, got 0"),
+    "multiplier that is no number": (
+        MIMIC, '<mimic joint="left_slide" multiplier="twice"/>', -1,
+        "multiplier of joint 'right_slide' must be a number, got 'twice'"),
+    "limits the wrong way": ('lower="0" upper="0.05"', 'lower="0.05" upper="0"', 1, "lower|limit"),
+    "joints without limits": (LIMIT, "", -1,
+                              "no fingers of left_jaw, right_jaw close .* --reverse JOINT"),
+    "joint without a range": ('upper="0.05"', 'upper="0"', -1,
+                              "must have two fingers that can close from .*, got 0: .* --fingers"),
+    "effort of a placeholder": ('effort="60"', 'effort="0"', -1,
+                                r"the effort of joint '\w+_slide' must be .* --effort N"),
+    "effort that is no number": ('effort="60"', 'effort="strong"', 1,
+                                 "effort of joint 'left_slide' must be a number, got 'strong'"),
+    "axis of no length": ('<axis xyz="0 1 0"/>', '<axis xyz="0 0 0"/>', 1,
+                          "'left_slide' axis is zero"),
+    "origin that is no number": ('xyz="0 0 0.1"', 'xyz="0 0 nan"', -1,
+                                 "xyz of joint '\\w+' must be a number, got '0 0 nan'"),
+    "xacro's call": (">\n", '><xacro:finger xmlns:xacro="http://ros.org/xacro"/>\n', 1,
+                     "in which xacro left nothing to expand, got '<finger>'"),
+    "xacro's argument": ("</robot>", "<gazebo><p>$(find hand)/x</p></gazebo></robot>", -1,
+                         r"in which xacro left nothing to expand, got '\$\(find hand\)/x'"),
+}
+#: And of the jaws in MJCF.
+MJCF = {
+    "includes itself": ("<worldbody>", '<include file="hand.xml"/><worldbody>', -1,
+                        "got a loop of them"),
+    "curve in place of a line": ('"0 1 0 0 0"', '"0 1 2 0 0"', -1,
+                                 "polycoef of joint 'right_slide' must be a line, got a curve"),
+    "shape of a light second": ("0 0.006 0.03", "0 0.006 4294967295", 1,
+                                r"must be a hand in metres, got a shape that reaches 4\.29e\+09 m"),
+    "equality with nothing": ('joint2="left_slide"', 'joint2="lost"', -1,
+                              "must be MJCF that MuJoCo reads, got .*unknown element 'lost' in eq"),
+    "equality with a constant": ('joint2="left_slide" ', "", -1,
+                                 "joint 'right_slide' must follow a joint, got an equality with a"),
+    "bodies that are not written out": ("</worldbody>", '<replicate count="9"/></worldbody>', -1,
+                                        "must have its bodies written out, got <replicate>"),
+    "inertia of no body": (
+        '<body name="left_jaw">',
+        '<body name="left_jaw"><inertial pos="0 0 0" mass="1" diaginertia="1 1e-3 1e-3"/>', -1,
+        "must be MJCF that MuJoCo reads, got .*inertia must satisfy A"),
+}
+# fmt: on
 
 
-def changed(old: str, new: str, *, text: str = JAWS, count: int = -1) -> str:
+def changed(text: str, old: str, new: str, count: int = -1) -> str:
     assert old in text
     return text.replace(old, new, count)
 
 
-def mesh(uri: str) -> str:
-    return changed(JAW, f'<geometry><mesh filename="{uri}"/></geometry>', count=1)
-
-
-#: A model, the name of its file, and what is said of it.
-SPOILT: dict[str, tuple[str, str, str]] = {
-    "not XML": ("<robot", "hand.urdf", "must be XML, got text that is not"),
-    "empty": ("", "hand.urdf", "must be XML, got text that is not"),
-    "another language": ("<html/>", "hand.urdf", "must be a model in URDF, SDFormat or MJCF"),
-    "xacro": (JAWS, "hand.xacro", "must be URDF, got xacro: run `xacro hand.xacro"),
-    "another suffix": (JAWS, "hand.step", r"must end in \.urdf, \.sdf or \.xml"),
-    "XML bomb": (BOMB + changed('name="jaws"', 'name="&b;"'), "hand.urdf", "document type"),
-    "deep": ("<robot>" + "<a>" * 5000 + "</a>" * 5000 + "</robot>", "hand.urdf", "200 levels"),
-    "missing mesh": (mesh("lost.stl"), "hand.urdf", "lost.stl' must be a file, got none"),
-    "mesh of the web": (mesh("https://x.org/a.stl"), "hand.urdf", "nothing is fetched"),
-    "mesh of another format": (mesh("jaw.step"), "hand.urdf", r"one of \.obj, .* got '\.step'"),
-    "broken mesh": (mesh("broken.glb"), "hand.urdf", "broken.glb' must be readable, got"),
-    "loop": (
-        changed("</robot>", fixed("bridge", "right_jaw", "left_jaw") + "</robot>"),
-        "hand.urdf",
-        "link 'left_jaw'|loop",
-    ),
-    "links in a circle": (
-        changed("</robot>", fixed("bridge", "left_jaw", "mount") + "</robot>"),
-        "hand.urdf",
-        "one tree of links|loop",
-    ),
-    "two trees": (
-        changed("</robot>", link("other", 0.1, JAW) + "</robot>"),
-        "hand.urdf",
-        r"must be one tree of links, with one root, got 2 \(.*other\)",
-    ),
-    "negative mass": (
-        changed('<mass value="0.05"/>', '<mass value="-0.05"/>', count=1),
-        "hand.urdf",
-        "link 'left_jaw' must have a mass of 0 kg or more, got -0.05",
-    ),
-    "mass that is no number": (
-        changed('<mass value="0.05"/>', '<mass value="heavy"/>', count=1),
-        "hand.urdf",
-        "mass of link 'left_jaw' must be a number, got 'heavy'",
-    ),
-    "units in mm": (
-        changed(JAW, '<geometry><box size="20 12 60"/></geometry>'),
-        "hand.urdf",
-        "must be a hand in metres, got one of 6[0-9] m",
-    ),
-    "circle of mimics": (
-        changed(
-            '<limit lower="0" upper="0.05" effort="60" velocity="1"/></joint>',
-            '<limit lower="0" upper="0.05" effort="60" velocity="1"/>'
-            '<mimic joint="right_slide"/></joint>',
-            count=1,
-        ),
-        "hand.urdf",
-        "joint '(left|right)_slide' must follow a joint that leads, got a circle of mimics",
-    ),
-    "mimic of nothing": (
-        changed(MIMIC, '<mimic joint="thumb"/>'),
-        "hand.urdf",
-        "thumb",
-    ),
-    "no shapes": (
-        re.sub(r"<(collision|visual)>.*?</\1>", "", JAWS),
-        "hand.urdf",
-        "must have shapes, got links without any",
-    ),
-    "joint that floats": (
-        changed(MIMIC, "").replace(
-            'name="right_slide" type="prismatic"', 'name="right_slide" type="planar"'
-        ),
-        "hand.urdf",
-        "joint 'right_slide' must be revolute, prismatic or fixed",
-    ),
-    "limits the wrong way": (
-        changed('lower="0" upper="0.05"', 'lower="0.05" upper="0"', count=1),
-        "hand.urdf",
-        "lower|limit",
-    ),
-    "effort of a placeholder": (
-        changed('effort="60"', 'effort="0"'),
-        "hand.urdf",
-        r"the effort of joint '\w+_slide' must be .* N, got none in the model: .* --effort N",
-    ),
-    "one finger": (
-        re.sub(r'<link name="right_jaw">.*?</link>\n', "", JAWS, flags=re.DOTALL).replace(
-            JAWS[JAWS.index('<joint name="right_slide"') : JAWS.index('<joint name="left_end_')],
-            "",
-        ),
-        "hand.urdf",
-        r"must have two fingers or more, got one chain of links: .* --palm LINK",
-    ),
-    "includes itself": (
-        changed("<worldbody>", '<include file="hand.xml"/><worldbody>', text=JAWS_MJCF),
-        "hand.xml",
-        "got a loop of them",
-    ),
-    "curve in place of a line": (
-        changed('"0 1 0 0 0"', '"0 1 2 0 0"', text=JAWS_MJCF),
-        "hand.xml",
-        "polycoef of joint 'right_slide' must be a line, got a curve",
-    ),
-    "shape of a light second": (
-        changed("0 0.006 0.03", "0 0.006 4294967295", text=JAWS_MJCF, count=1),
-        "hand.xml",
-        r"must be a hand in metres, got a shape that reaches 4\.29e\+09 m from its link",
-    ),
-    "mass without a value": (
-        changed('<mass value="0.05"/>', '<mass value="nan"/>', count=1),
-        "hand.urdf",
-        "mass of link 'left_jaw' must be a number, got 'nan'",
-    ),
-    "effort that is no number": (
-        changed('effort="60"', 'effort="strong"', count=1),
-        "hand.urdf",
-        "effort of joint 'left_slide' must be a number, got 'strong'",
-    ),
-    "multiplier that is no number": (
-        changed(MIMIC, '<mimic joint="left_slide" multiplier="twice"/>'),
-        "hand.urdf",
-        "multiplier of joint 'right_slide' must be a number, got 'twice'",
-    ),
-    "mimic without motion": (
-        changed(MIMIC, '<mimic joint="left_slide" multiplier="0"/>'),
-        "hand.urdf",
-        "joint 'right_slide' must follow 'left_slide' by a ratio, got 0",
-    ),
-    "equality with nothing": (
-        changed('joint2="left_slide"', 'joint2="lost"', text=JAWS_MJCF),
-        "hand.xml",
-        "must be MJCF that MuJoCo reads, got .*unknown element 'lost' in equality",
-    ),
-    "axis of no length": (
-        changed('<axis xyz="0 1 0"/>', '<axis xyz="0 0 0"/>', count=1),
-        "hand.urdf",
-        "'left_slide' axis is zero",
-    ),
-    "origin that is no number": (
-        changed('xyz="0 0 0.1"', 'xyz="0 0 nan"'),
-        "hand.urdf",
-        "xyz of joint '\\w+' must be a number, got '0 0 nan'",
-    ),
-    "size below zero": (
-        changed(JAW, '<geometry><box size="-0.02 0.012 0.06"/></geometry>', count=1),
-        "hand.urdf",
-        "width = -0.02",
-    ),
-    "missing link": (
-        changed('<child link="left_jaw"/>', '<child link="lost"/>'),
-        "hand.urdf",
-        "Could not find link named 'lost'",
-    ),
-    "link without a name": (
-        changed('<link name="left_end"/>', "<link/>"),
-        "hand.urdf",
-        "link tag is missing name attribute",
-    ),
-    "two links of a name": (
-        changed("</robot>", link("left_jaw", 0.1, JAW) + "</robot>"),
-        "hand.urdf",
-        "already contains a body named 'left_jaw'",
-    ),
-    "link that carries itself": (
-        changed(
-            '<parent link="body"/><child link="left_jaw"/>',
-            '<parent link="left_jaw"/><child link="left_jaw"/>',
-        ),
-        "hand.urdf",
-        "connect body left_jaw to itself",
-    ),
-    "joints without limits": (
-        changed('<limit lower="0" upper="0.05" effort="60" velocity="1"/>', ""),
-        "hand.urdf",
-        "no fingers of left_jaw, right_jaw close against each other: .* --reverse JOINT",
-    ),
-    "joint without a range": (
-        changed('upper="0.05"', 'upper="0"'),
-        "hand.urdf",
-        "must have two fingers that can close from the palm 'body', got 0: .* --fingers",
-    ),
-    "no joints": (
-        f'<robot name="block">{link("body", 0.5, JAW)}</robot>',
-        "hand.urdf",
-        r"must have two fingers or more, got one chain of links: .* --palm LINK \(body\)",
-    ),
-    "mesh outside": (
-        mesh("../broken.glb"),
-        "hand.urdf",
-        "'../broken.glb' must lie in the model's folder, got .* --root FOLDER",
-    ),
-    "mesh of an unknown package": (
-        mesh("package://other/jaw.stl"),
-        "hand.urdf",
-        "must lie in a known package: .* --package other=FOLDER",
-    ),
-    "mesh without triangles": (
-        mesh("empty.obj"),
-        "hand.urdf",
-        "'empty.obj' must hold triangles with finite corners",
-    ),
-    "mesh of no name": (mesh(""), "hand.urdf", r"must be one of \.obj, .* got ''"),
-    "missing mesh of MJCF": (
-        '<mujoco><asset><mesh file="lost.stl"/></asset></mujoco>',
-        "hand.xml",
-        "lost.stl' must be a file, got none",
-    ),
-    "two models": (
-        f'<sdf version="1.7">{"".join(map(EMPTY.format, "ab"))}</sdf>',
-        "hand.sdf",
-        "can only contain one model",
-    ),
-    "other files": (
-        '<sdf version="1.7"><model name="a"><include><uri>model://b</uri></include></model></sdf>',
-        "hand.sdf",
-        "must be complete by itself, got <include>",
-    ),
-    "xacro's call": (
-        changed("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"').replace(
-            "</robot>", '<xacro:finger prefix="x_"/></robot>'
-        ),
-        "hand.urdf",
-        "in which xacro left nothing to expand, got '<finger>'",
-    ),
-    "xacro's argument": (
-        changed("</robot>", "<gazebo><p>$(find hand)/x</p></gazebo></robot>"),
-        "hand.urdf",
-        r"in which xacro left nothing to expand, got '\$\(find hand\)/x'",
-    ),
-    "frame that holds a joint": (
-        re.sub("(<joint name=.*?/>)", r"<frame>\1</frame>", JAWS_MJCF, count=1),
-        "hand.xml",
-        "<joint> must lie in a body, got it in a <frame>",
-    ),
-    "bodies that are not written out": (
-        changed("</worldbody>", '<replicate count="9"/></worldbody>', text=JAWS_MJCF),
-        "hand.xml",
-        "must have its bodies written out, got <replicate>",
-    ),
-    "equality with a constant": (
-        changed('joint2="left_slide" ', "", text=JAWS_MJCF),
-        "hand.xml",
-        "joint 'right_slide' must follow a joint, got an equality with a constant",
-    ),
-    "inertia of no body in MJCF": (
-        changed(
-            '<body name="left_jaw">',
-            '<body name="left_jaw"><inertial pos="0 0 0" mass="1" diaginertia="1 1e-3 1e-3"/>',
-            text=JAWS_MJCF,
-        ),
-        "hand.xml",
-        "must be MJCF that MuJoCo reads, got .*inertia must satisfy A",
-    ),
-    "bytes": ("\x00\x01\x02", "hand.urdf", "must be XML, got text that is not"),
-}
+SPOILT = (
+    FILES
+    | {name: (changed(JAWS, *row[:3]), "hand.urdf", row[3]) for name, row in URDF.items()}
+    | {name: (changed(JAWS_MJCF, *row[:3]), "hand.xml", row[3]) for name, row in MJCF.items()}
+)
 
 
 @pytest.mark.parametrize("fault", SPOILT)
@@ -318,7 +188,7 @@ def test_what_is_no_number_is_refused(
     tmp_path: Path, name: str, text: str, old: str, new: str, word: str
 ) -> None:
     """Parsers read its start, or nothing."""
-    path = write_model(tmp_path, changed(old, new.replace("{}", word), text=text, count=1), name)
+    path = write_model(tmp_path, changed(text, old, new.replace("{}", word), 1), name)
     with pytest.raises(HandError, match=r"must be a number, got|does not have enough data"):
         read_model(read_source(path, {}))
 
@@ -328,8 +198,8 @@ def test_a_sound_model_is_not_refused(tmp_path: Path, monkeypatch: pytest.Monkey
     drawn: list[Callable[..., None]] = []
     monkeypatch.setattr("drakegrasp.commissioning.draft.run.GRASPS", ())
     monkeypatch.setattr("drakegrasp.cli.hand._draw", lambda *files: drawn.append(files))
-    for n, (text, name) in enumerate(((JAWS, "hand.urdf"), (JAWS_MJCF, "hand.xml"))):
-        path, out = write_model(tmp_path / str(n), text, name), tmp_path / f"out{n}"
+    for name, text in (("hand.urdf", JAWS), ("hand.xml", JAWS_MJCF)):
+        path, out = write_model(tmp_path / name, text, name), tmp_path / f"out of {name}"
         result = CliRunner().invoke(main, ["hand", "new", str(path), "--out", str(out)])
         assert result.exit_code == 0, result.output
         assert len(list(out.glob("*.urdf"))) == 1
@@ -359,23 +229,15 @@ def test_pipe_in_place_of_a_model_is_not_waited_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("hand", "name", "spoil", "said"),
     [
-        (
-            "barrett",
-            "barrett_palm_plate.obj",
-            lambda text: re.sub(r"(?m)^v \S+", "v 26.5", text, count=1),
-            r"within 3 m of it, got one that reaches 26\.5 m",
-        ),
-        (
-            "franka",
-            "franka_hand.urdf",
-            lambda text: re.sub(r'<box size="\S+', '<box size="-0.5', text, count=1),
-            r"must be a file of one model, got .*width = -0\.5",
-        ),
+        ("barrett", "barrett_palm_plate.obj", (r"(?m)^v \S+", "v 26.5"),
+         r"within 3 m of it, got one that reaches 26\.5 m"),
+        ("franka", "franka_hand.urdf", (r'<box size="\S+', '<box size="-0.5'),
+         r"must be a file of one model, got .*width = -0\.5"),
         ("barrett", "barrett_palm_plate.obj", None, "plate.obj: must be a file, got a pipe, a s"),
     ],
-)
+)  # fmt: skip
 def test_spoilt_file_of_a_hand_is_refused(
-    tmp_path: Path, hand: str, name: str, spoil: Callable[[str], str] | None, said: str
+    tmp_path: Path, hand: str, name: str, spoil: tuple[str, str] | None, said: str
 ) -> None:
     for path in MODELS.glob(f"{hand}_*"):
         shutil.copyfile(path, tmp_path / path.name)
@@ -384,6 +246,6 @@ def test_spoilt_file_of_a_hand_is_refused(
     if spoil is None:
         (tmp_path / name).symlink_to("/dev/zero")
     else:
-        (tmp_path / name).write_text(spoil(text))
+        (tmp_path / name).write_text(re.sub(*spoil, text, count=1))
     with pytest.raises(HandError, match=said):
         link_shapes(load_hand(tmp_path / f"{hand}_hand.yaml"))

@@ -10,8 +10,13 @@ from helpers.hands import PINCER_SDF, changed_finger, write_pincer
 
 from drakegrasp.frames import transform_points
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
-from drakegrasp.hand.strength import closing_levers, fingertip_forces, within_load
+from drakegrasp.hand.kinematics import (
+    closing_levers,
+    coordinate_limits,
+    fingertip_forces,
+    fingertip_poses,
+    within_load,
+)
 
 #: Distance of the gripper's pad points from their hinges [m].
 ARM = np.hypot(0.01, 0.09)

@@ -10,11 +10,10 @@ import pytest
 from helpers.vendors import JAWS, JAWS_MJCF, write_mesh, write_model
 from trimesh.transformations import translation_matrix
 
+from drakegrasp.commissioning.draft.model import VendorModel, read_model
+from drakegrasp.commissioning.draft.run import write_urdf
+from drakegrasp.commissioning.draft.source import read_source
 from drakegrasp.errors import HandError
-from drakegrasp.hand.draft.model import VendorModel
-from drakegrasp.hand.draft.parsing import read_model
-from drakegrasp.hand.draft.source import read_source
-from drakegrasp.hand.draft.writing import write_urdf
 
 JAW_BOX = '<geometry><box size="0.02 0.012 0.06"/></geometry>'
 MESH = '<geometry><mesh filename="{}"/></geometry>'

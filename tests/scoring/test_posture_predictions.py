@@ -161,7 +161,7 @@ def test_a_protocol_cuts_an_object_once_for_all_that_is_scored(
 ) -> None:
     """Postures and contacts are tried apart, and nothing is kept for another call."""
     pytest.importorskip("mujoco")
-    cutting = pytest.importorskip("drakegrasp.mjcf.convex_parts")
+    cutting = pytest.importorskip("drakegrasp.mjcf.scene")
     cut, convex_parts = [], cutting.convex_parts
 
     def counted(model: Any) -> Any:

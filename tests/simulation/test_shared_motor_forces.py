@@ -11,10 +11,10 @@ import pytest
 import trimesh
 from helpers.hands import slider_fingers, write_slider
 
-from drakegrasp.commissioning.pinch import find_opposition, find_pinch
 from drakegrasp.config import ObjectConfig
 from drakegrasp.frames import make_pose
 from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.finger_sweep import find_opposition, find_pinch
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel, make_object
 from drakegrasp.simulation import drive as drive_module

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.kinematics import fingertip_forces
 from drakegrasp.hand.settings import load_config
-from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.simulation.lift import LiftPath, carrying_force, lift_path
 from drakegrasp.verification.forces import force_margin, hand_contacts
 

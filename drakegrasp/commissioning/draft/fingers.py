@@ -1,46 +1,90 @@
-"""The fingers of a vendor's model: its palm, and a chain of joints per finger.
+"""The fingers of a vendor's model: its palm, the joints of each finger, and how it may close.
 
-In: a `VendorModel`. Out: `Chain`s, each with the ways in which it may close.
+In: a `VendorModel`, and what a person says of it. Out: the joints of each finger, with its
+`Closing`s: straight lines in the space of its joints, from open to closed.
+
+Joints that turn about the same axis as the last one, at zero, bend the finger: they close together.
+The others (a spread, an abduction, a thumb's opposition) keep a position.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 
-from drakegrasp.commissioning.draft.answers import Answers
-from drakegrasp.commissioning.draft.closings import Closing, find_closings
+from drakegrasp.commissioning.draft.model import VendorJoint, VendorModel
 from drakegrasp.errors import HandError
-from drakegrasp.frames import Array
-from drakegrasp.hand.draft.model import VendorJoint, VendorModel
+from drakegrasp.frames import Array, transform_points
 
+#: Cosine from which two axes count as parallel.
+PARALLEL = 0.94
+#: Joints that keep a position are tried at several if they can turn so far [rad], else at 0.
+WIDE, POSITIONS = 0.8, 5
+#: Ratios of the second and later bending joints to the first, where each has a motor.
+RATIOS = {2: ((1.0,), (0.5,)), 3: ((1.0, 0.5), (1.0, 1.0), (0.5, 0.25))}
+#: How far the second bending joint is bent in the open hand [rad], and what that costs [1/rad].
+BENT, BENT_COST = (0.0, 0.3), 0.1
+#: What it costs to start elsewhere than at zero, to close in the smaller part of a range, and that
+#: another joint is away from its rest [1/rad].
+NOT_ZERO, SMALLER, AWAY = 1.0, 0.6, 0.08
+#: A closing joint moves at least so far [rad, m]; one without limits is taken to move so far [rad].
+LEAST, UNLIMITED = {False: 0.15, True: 0.004}, np.pi / 2.0
 #: Postures on the way from open to closed.
 STEPS = 12
 #: A link of the same motor that reaches less than this share of the farthest is no finger.
 REACH = 0.8
+#: What a motor moves in a finger: number of each joint, its ratio and its offset to a position.
+_Moved = list[tuple[int, float, float]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answers:
+    """What overrides the guesses; names are those of the vendor's model.
+
+    Attributes:
+        palm: The link that carries the fingers.
+        approach: (3,), +Gz in the palm link, out of the palm.
+        fingers: Fingertip links, all that grasp.
+        joints: Positions of joints that no finger closes [rad or m].
+        reverse: Closing joints that close the other way.
+        effort: Largest effort of the motors [N m or N], where it is one for all.
+        settings: Lines KEY=VALUE of the hand file.
+    """
+
+    palm: str | None = None
+    approach: Array | None = None
+    fingers: tuple[str, ...] = ()
+    joints: Mapping[str, float] = field(default_factory=dict)
+    reverse: tuple[str, ...] = ()
+    effort: float | None = None
+    settings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Chain:
-    """The joints from the palm to a fingertip link, and the ways in which they may close."""
+class Closing:
+    """A way to close a finger of m joints: positions q0 + gain * c, for c of 0..limit.
 
-    tip: str
-    joints: list[VendorJoint]
-    closings: list[Closing]
+    Attributes:
+        q0, gain: (m,), in the vendor's positions.
+        limit: Where a joint is at its own limit [rad or m].
+        preshape: Position of each joint that leads others, or none, and does not close.
+        at_rest: Whether those joints are as near to zero as they can be.
+        cost: How unusual it is.
+    """
 
-    def poses(self, q: Array) -> Array:
-        """Return the poses (..., 4, 4) of the fingertip link in the palm link at (..., m)."""
-        X = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
-        for j, joint in enumerate(self.joints):
-            X = X @ joint.X_PJ @ joint.motion(q[..., j])
-        return np.asarray(X)
+    q0: Array
+    gain: Array
+    limit: float
+    preshape: dict[str, float] = field(default_factory=dict)
+    at_rest: bool = True
+    cost: float = 0.0
 
-    def path(self, closing: Closing) -> Array:
+    def path(self) -> Array:
         """Return the positions (`STEPS`, m) from open to closed."""
-        c = np.linspace(0.0, closing.limit, STEPS)[:, None]
-        return closing.q0 + closing.gain * c
+        return self.q0 + self.gain * np.linspace(0.0, self.limit, STEPS)[:, None]
 
 
 def find_palm(model: VendorModel, answers: Answers) -> str:
@@ -54,69 +98,54 @@ def find_palm(model: VendorModel, answers: Answers) -> str:
             raise HandError(f"--palm must be one of {', '.join(model.links)}, got {answers.palm!r}")
         return answers.palm
     link = model.root
-    while True:
-        bearing = [j.child for j in model.joints.values() if j.parent == link]
-        bearing = [child for child in bearing if _has_shapes(model, child)]
-        if not bearing:
-            raise HandError(
-                "model: must have two fingers or more, got one chain of links: say which link "
-                f"carries the fingers with --palm LINK ({', '.join(model.links)})"
-            )
-        if len(bearing) > 1:
-            return link
+    while len(bearing := [child for child in model.below(link) if model.has_shapes(child)]) == 1:
         link = bearing[0]
+    if not bearing:
+        raise HandError(
+            "model: must have two fingers or more, got one chain of links: say which link "
+            f"carries the fingers with --palm LINK ({', '.join(model.links)})"
+        )
+    return link
 
 
-def find_chains(model: VendorModel, palm: str, answers: Answers) -> list[Chain]:
-    """Return the fingers, in the order of the model.
+def find_fingers(
+    model: VendorModel, palm: str, answers: Answers
+) -> list[tuple[list[VendorJoint], list[Closing]]]:
+    """Return the fingers in the order of the model: joints from the palm, and ways to close.
 
     Raises:
         HandError: If there are fewer than two, or an answer names none of them.
     """
-    chains = []
+    fingers = []
     for tip in find_tips(model, palm, answers):
         joints = model.chain(tip, palm)
         if not joints or joints[0].parent != palm:
             raise HandError(f"--fingers must be links beyond the palm {palm!r}, got {tip!r}")
-        closings = find_closings(model, joints, answers)
-        if closings:
-            chains.append(Chain(tip=tip, joints=joints, closings=closings))
-    if len(chains) < 2:
+        if closings := find_closings(model, joints, answers):
+            fingers.append((joints, closings))
+    if len(fingers) < 2:
         raise HandError(
             f"model: must have two fingers that can close from the palm {palm!r}, got "
-            f"{len(chains)}: name the palm with --palm LINK, fingertips with --fingers LINK,LINK"
+            f"{len(fingers)}: name the palm with --palm LINK, fingertips with --fingers LINK,LINK"
         )
-    return chains
+    return fingers
 
 
 def find_tips(model: VendorModel, palm: str, answers: Answers) -> list[str]:
-    """Return the last links of fingers.
+    """Return the last links of fingers: those with shapes that carry no others with shapes.
 
     Raises:
         HandError: If an answer is no link.
     """
-    leaves = [name for name in model.links if name != palm and _is_leaf(model, name, palm)]
+    leaves = [
+        name
+        for name, link in model.links.items()
+        if model.carries(palm, name) and link.collisions
+        if not any(map(model.has_shapes, model.below(name)))
+    ]
     if unknown := [name for name in answers.fingers if name not in model.links]:
         raise HandError(f"--fingers must be of {', '.join(leaves)}, got {unknown[0]!r}")
     return list(answers.fingers) or _without_linkages(model, palm, leaves)
-
-
-def _has_shapes(model: VendorModel, link: str) -> bool:
-    """Return whether a link, or one that it carries, has a shape."""
-    below = [joint.child for joint in model.joints.values() if joint.parent == link]
-    return bool(model.links[link].collisions) or any(_has_shapes(model, name) for name in below)
-
-
-def _is_leaf(model: VendorModel, link: str, palm: str) -> bool:
-    """Return whether a link is the last one with shapes of a chain from the palm."""
-    chain = model.chain(link, palm)
-    below = [joint.child for joint in model.joints.values() if joint.parent == link]
-    return (
-        bool(chain)
-        and chain[0].parent == palm
-        and bool(model.links[link].collisions)
-        and not any(_has_shapes(model, name) for name in below)
-    )
 
 
 def _without_linkages(model: VendorModel, palm: str, leaves: Sequence[str]) -> list[str]:
@@ -126,18 +155,125 @@ def _without_linkages(model: VendorModel, palm: str, leaves: Sequence[str]) -> l
     """
     reach, motors, joined = {}, {}, {}
     for leaf in leaves:
-        X = model.pose(leaf, {}, palm)
-        corners = model.links[leaf].corners() @ X[:3, :3].T + X[:3, 3]
+        corners = transform_points(model.pose(leaf, {}, palm), model.links[leaf].corners())
         reach[leaf] = float(np.linalg.norm(corners, axis=1).max())
         joints = model.chain(leaf, palm)
         joined[leaf] = len(joints)
         motors[leaf] = {model.mimic(joint.name).leader for joint in joints}
-    return [
-        leaf
-        for leaf in leaves
-        if not any(
-            motors[leaf] <= motors[other]
-            and (joined[leaf] < joined[other] or reach[leaf] < REACH * reach[other])
-            for other in leaves
-        )
-    ]
+
+    def is_bar(leaf: str, other: str) -> bool:
+        less = joined[leaf] < joined[other] or reach[leaf] < REACH * reach[other]
+        return motors[leaf] <= motors[other] and less
+
+    return [leaf for leaf in leaves if not any(is_bar(leaf, other) for other in leaves)]
+
+
+def find_closings(
+    model: VendorModel, joints: Sequence[VendorJoint], answers: Answers
+) -> list[Closing]:
+    """Return the ways in which a finger may close."""
+    # Which motors bend it, and what the others may be at.
+    motors: dict[str, _Moved] = {}
+    for j, joint in enumerate(joints):
+        mimic = model.mimic(joint.name)
+        motors.setdefault(mimic.leader, []).append((j, mimic.ratio, mimic.offset))
+    X, axes = np.eye(4), []
+    for joint in joints:
+        X = X @ joint.X_PJ
+        axes.append(X[:3, :3] @ joint.axis)
+    bending = {
+        leader: moved
+        for leader, moved in motors.items()
+        if leader not in answers.joints and _bends_finger(moved, joints, axes)
+    }
+    if not bending:
+        return []
+    kept = {leader: moved for leader, moved in motors.items() if leader not in bending}
+    choices = [_positions(model, leader, answers) for leader in kept]
+    rests = tuple(positions[0] for positions in choices)
+
+    # Both senses, unless a person said which it is.
+    found, lead = [], next(iter(bending.values()))[0][0]
+    for sign in (-1.0,) if joints[lead].name in answers.reverse else (1.0, -1.0):
+        senses = [sign * (1.0 if axes[m[0][0]] @ axes[lead] >= 0.0 else -1.0)
+                  for m in bending.values()]  # fmt: skip
+        bends = _bends(joints, list(bending.values()), senses)
+        for positions in product(*choices):
+            q0 = np.zeros(len(joints))
+            for moved, position in zip(kept.values(), positions, strict=True):
+                for j, ratio, offset in moved:
+                    q0[j] = np.clip(ratio * position + offset, *joints[j].limits)
+            preshape = dict(zip(kept, positions, strict=True))
+            away, at_rest = AWAY * float(np.abs(positions).sum()), positions == rests
+            found += [
+                replace(b, q0=q0 + b.q0, preshape=preshape, at_rest=at_rest, cost=b.cost + away)
+                for b in bends
+            ]
+    return found
+
+
+def _bends_finger(moved: _Moved, joints: Sequence[VendorJoint], axes: Sequence[Array]) -> bool:
+    """Return whether a motor moves the last joint, or one that turns about the same axis (3,)."""
+    first, last = moved[0][0], len(joints) - 1
+    turns = not (joints[last].slides or joints[first].slides)
+    return moved[-1][0] == last or (turns and bool(abs(axes[first] @ axes[-1]) > PARALLEL))
+
+
+def _positions(model: VendorModel, leader: str, answers: Answers) -> list[float]:
+    """Return the positions at which a joint that does not close is tried, its rest first."""
+    if leader in answers.joints:
+        return [answers.joints[leader]]
+    joint = model.joints[leader]
+    lower, upper = joint.limits
+    rest = float(np.clip(0.0, lower, upper))
+    if joint.slides or not WIDE <= upper - lower < np.inf:
+        return [rest]
+    return sorted({rest, *np.round(np.linspace(lower, upper, POSITIONS), 3).tolist()}, key=abs)
+
+
+def _bends(
+    joints: Sequence[VendorJoint], motors: Sequence[_Moved], senses: Sequence[float]
+) -> list[Closing]:
+    """Return the ways to bend a finger by motors in senses of theirs, the other joints at 0."""
+    # The first starts at zero if it can close from there, else at its end.
+    spans = [_span(joints, *motor) for motor in zip(motors, senses, strict=True)]
+    _, low, high = spans[0]
+    slides = joints[motors[0][0][0]].slides
+    from_zero = low <= 1e-9 and high >= max(0.25 * (high - low), LEAST[slides])
+    start = max(0.0, low) if from_zero else low
+    if high - start < LEAST[slides]:
+        return []
+    cost = SMALLER * (1.0 - (high - start) / max(high - low, 1e-9))
+    cost += 0.0 if from_zero or slides else NOT_ZERO
+
+    # The others follow in usual ratios, or each through its whole range.
+    ratios: list[tuple[float, ...]] = [()]
+    if len(spans) > 1:
+        whole = tuple((top - max(0.0, bottom)) / (high - start) for _, bottom, top in spans[1:])
+        ratios = [*RATIOS.get(len(spans), ()), whole]
+    found = []
+    for bent, own in product(BENT if len(spans) > 1 else (0.0,), ratios):
+        q0, gain, limit = np.zeros(len(joints)), np.zeros(len(joints)), np.inf
+        for g, ((moved, bottom, top), ratio) in enumerate(zip(spans, (1.0, *own), strict=True)):
+            at = start if g == 0 else float(np.clip(bent if g == 1 else 0.0, bottom, top))
+            limit = min(limit, (top - at) / ratio) if ratio > 0.0 else 0.0
+            for j, r, offset in moved:
+                q0[j], gain[j] = r * at + offset, r * ratio
+        if limit > 0.5 * min(high - start, 1.0):
+            bend_cost = cost + BENT_COST * bent
+            found.append(Closing(q0=q0, gain=gain, limit=float(limit), cost=bend_cost))
+    return found
+
+
+def _span(
+    joints: Sequence[VendorJoint], moved: _Moved, sense: float
+) -> tuple[_Moved, float, float]:
+    """Return how joints move with the first one in a sense of its positions, and how far it can."""
+    _, ratio, offset = moved[0]
+    own, ends = [(j, r / ratio, o - offset * r / ratio) for j, r, o in moved], []
+    for j, r, o in own:
+        limits = joints[j].limits
+        finite = np.where(np.isfinite(limits), limits, [-UNLIMITED, UNLIMITED])
+        ends.append(np.sort((finite - o) / r))
+    low, high = np.sort(np.array([np.max(ends, axis=0)[0], np.min(ends, axis=0)[1]]) * sense)
+    return [(j, r * sense, o) for j, r, o in own], float(low), float(high)

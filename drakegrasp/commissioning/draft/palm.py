@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.math import RollPitchYaw, RotationMatrix
 
-from drakegrasp.commissioning.draft.opposition import Grip
-from drakegrasp.commissioning.motion_checks import PALM_DEPTH, ray_end
+from drakegrasp.commissioning.checks import PALM_DEPTH, ray_end
+from drakegrasp.commissioning.draft.grips import Grip
+from drakegrasp.commissioning.draft.model import VendorModel
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
-from drakegrasp.hand.draft.model import VendorModel
 from drakegrasp.hand.shapes import ray_span
 
 #: Directions that are tried: their steps [deg], and how near an axis of the palm counts as one.
@@ -73,7 +73,7 @@ def find_palm_frames(
         return [
             transform_points(model.pose(name, posture, palm), shape.corners())
             for name, link in model.links.items()
-            if name == palm or (model.chain(name, palm)[:1] and _carried(model, name, palm))
+            if name == palm or model.carries(palm, name)
             for shape in link.collisions
         ]
 
@@ -106,10 +106,6 @@ def find_palm_frames(
             )
         )
     return sorted(frames, key=lambda frame: frame.cost)
-
-
-def _carried(model: VendorModel, link: str, palm: str) -> bool:
-    return model.chain(link, palm)[0].parent == palm
 
 
 def _directions(grip: Grip, centre: Array, approach: Array | None) -> list[tuple[Array, float]]:

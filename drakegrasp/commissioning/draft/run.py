@@ -1,8 +1,9 @@
 """Drafts a hand file from a vendor's model.
 
 In: a URDF, SDFormat or MJCF file, and what a person says of the hand. Out: a folder that is
-complete by itself: hand file, model, meshes. Of several ways to grasp, the first is taken that
-passes `hand check`, else the one that fails the fewest of its checks.
+complete by itself: hand file, with a comment on each line that was guessed, model as URDF, meshes.
+Of several ways to grasp, the first is taken that passes `hand check`, else the one that fails the
+fewest of its checks.
 """
 
 from __future__ import annotations
@@ -11,31 +12,194 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, count, islice
+from itertools import chain, combinations_with_replacement, count, islice
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
 
-from drakegrasp.commissioning.draft.answers import Answers
-from drakegrasp.commissioning.draft.clearance import Clearance
-from drakegrasp.commissioning.draft.fingers import find_chains, find_palm
-from drakegrasp.commissioning.draft.hand_text import hand_text
-from drakegrasp.commissioning.draft.hand_tree import Draft, draft_tree, positions
-from drakegrasp.commissioning.draft.notes import unused_parts
-from drakegrasp.commissioning.draft.opposition import Grip, find_grips, find_reach
+import numpy as np
+import yaml
+from pydrake.geometry import Box, Capsule, Cylinder, Sphere
+from pydrake.math import RotationMatrix
+
+from drakegrasp.commissioning.checks import (
+    Finding,
+    check_couplings,
+    check_efforts,
+    check_geometry,
+    check_limits,
+    judge,
+)
+from drakegrasp.commissioning.draft.fingers import Answers, find_fingers, find_palm
+from drakegrasp.commissioning.draft.grips import Clearance, find_grips, find_members
+from drakegrasp.commissioning.draft.model import Link, VendorJoint, VendorModel, read_model
 from drakegrasp.commissioning.draft.palm import find_palm_frames
-from drakegrasp.commissioning.finding import Finding
-from drakegrasp.commissioning.model_checks import check_couplings, check_efforts, check_limits
-from drakegrasp.commissioning.run import check_geometry
+from drakegrasp.commissioning.draft.shapes import Shape
+from drakegrasp.commissioning.draft.source import read_source
+from drakegrasp.commissioning.draft.tree import Draft, draft_tree, positions, unused_parts
 from drakegrasp.commissioning.trial_grasps import GRASPS, check_grasp
 from drakegrasp.config import Config
 from drakegrasp.errors import HandError
+from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.draft.model import VendorModel
-from drakegrasp.hand.draft.parsing import read_model
-from drakegrasp.hand.draft.source import read_source
-from drakegrasp.hand.draft.writing import write_urdf
+from drakegrasp.hand.parsing import Mimic
 from drakegrasp.hand.settings import load_config
+from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.files import atomic_folder
+
+#: Folder of the meshes.
+MESHES = "meshes"
+#: Velocity limit of a joint that has none [rad/s or m/s].
+FAST = 10.0
+#: Column of the comments of a hand file.
+COLUMN = 56
+
+
+def write_urdf(model: VendorModel, path: Path, comments: Sequence[str]) -> None:
+    """Write a model.
+
+    Args:
+        model: The model.
+        path: The URDF file; meshes come into a folder beside it.
+        comments: Lines for its head.
+    """
+    robot = Element("robot", {"name": model.name, "xmlns:drake": "https://drake.mit.edu"})
+    for line in comments:
+        robot.append(ElementTree.Comment(f" {line.replace('--', '- -')} "))
+    (path.parent / MESHES).mkdir(parents=True, exist_ok=True)
+    for number, link in enumerate(model.links.values()):
+        name = "".join(c if c.isalnum() else "_" for c in link.name)
+        _add_link(robot, link, f"{number:02d}_{name}", path.parent)
+    for joint in model.joints.values():
+        _add_joint(robot, joint, model.mimics.get(joint.name))
+    ElementTree.indent(robot)
+    text = ElementTree.tostring(robot, encoding="unicode")
+    path.write_text(f'<?xml version="1.0"?>\n{text}\n', encoding="utf-8")
+
+
+def _add(parent: Element, tag: str, **given: str | float | Array) -> Element:
+    """Add an element with its attributes: texts, numbers, or arrays of numbers."""
+    return SubElement(parent, tag, {
+        key: value if isinstance(value, str) else " ".join(
+            f"{float(number) + 0.0:.10g}" for number in np.ravel(value))
+        for key, value in given.items()
+    })  # fmt: skip
+
+
+def _add_origin(parent: Element, X: Array) -> None:
+    rpy = RotationMatrix.ProjectToRotationMatrix(X[:3, :3]).ToRollPitchYaw().vector()
+    _add(parent, "origin", xyz=X[:3, 3], rpy=rpy)
+
+
+def _add_link(robot: Element, link: Link, stem: str, folder: Path) -> None:
+    """Add a link; its meshes become files whose names start with a stem."""
+    # Inertia about the centre of mass.
+    element = _add(robot, "link", name=link.name)
+    inertial, p_LLcm = _add(element, "inertial"), link.inertia.get_com()
+    tensor = link.inertia.Shift(p_LLcm).CalcRotationalInertia().CopyToFullMatrix3()
+    _add(inertial, "origin", xyz=p_LLcm)
+    _add(inertial, "mass", value=link.inertia.get_mass())
+    pairs = combinations_with_replacement(range(3), 2)
+    _add(inertial, "inertia", **{f"i{'xyz'[a]}{'xyz'[b]}": tensor[a, b] for a, b in pairs})
+
+    # Shapes; meshes are files of their own.
+    for tag, shapes in (("collision", link.collisions), ("visual", link.visuals)):
+        for n, shape in enumerate(shapes):
+            _add_shape(element, tag, shape, f"{stem}_{tag}_{n}", folder)
+
+
+def _add_shape(parent: Element, tag: str, shape: Shape, name: str, folder: Path) -> None:
+    """Add a shape; a mesh becomes a file."""
+    element = _add(parent, tag, name=name)
+    _add_origin(element, shape.X_LS)
+    geometry, own = _add(element, "geometry"), shape.primitive
+    if isinstance(own, Box):
+        _add(geometry, "box", size=own.size())
+    elif isinstance(own, Sphere):
+        _add(geometry, "sphere", radius=own.radius())
+    elif isinstance(own, Cylinder | Capsule):
+        kind = "cylinder" if isinstance(own, Cylinder) else "drake:capsule"
+        _add(geometry, kind, radius=own.radius(), length=own.length())
+    else:
+        assert shape.vertices is not None and shape.faces is not None
+        file = f"{MESHES}/{name}.obj"
+        text = obj_text(shape.vertices, shape.faces, normals=tag == "visual")
+        (folder / file).write_text(text, encoding="utf-8")
+        mesh = _add(geometry, "mesh", filename=file)
+        if tag == "collision":
+            _add(mesh, "drake:declare_convex")
+
+    # Only what is drawn has a colour.
+    if tag == "visual" and shape.colour is not None:
+        material = _add(element, "material", name=f"{name}_colour")
+        _add(material, "color", rgba=np.array([*shape.colour, 1.0]))
+
+
+def _add_joint(robot: Element, joint: VendorJoint, mimic: Mimic | None) -> None:
+    """Add a joint, with what it follows."""
+    limited = bool(np.isfinite(joint.limits).all())
+    turns = "revolute" if limited else "continuous"
+    element = _add(robot, "joint", name=joint.name, type="prismatic" if joint.slides else turns)
+    _add(element, "parent", link=joint.parent)
+    _add(element, "child", link=joint.child)
+    _add_origin(element, joint.X_PJ)
+    _add(element, "axis", xyz=joint.axis)
+
+    # Limits, and the joint that leads it.
+    ends = dict(zip(("lower", "upper"), joint.limits, strict=True)) if limited else {}
+    speed = joint.velocity if np.isfinite(joint.velocity) else FAST
+    _add(element, "limit", **ends, effort=joint.effort, velocity=speed)
+    if mimic is not None:
+        line = {"multiplier": mimic.ratio, "offset": mimic.offset}
+        _add(element, "mimic", joint=mimic.leader, **line)
+
+
+def hand_text(tree: Mapping[str, Any], reasons: Mapping[str, str], head: list[str]) -> str:
+    """Return the YAML of a hand file.
+
+    Args:
+        tree: Its keys.
+        reasons: Comments, by the paths of keys.
+        head: Lines at its top.
+    """
+    lines = [f"# {line}" for line in head]
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            lines += ["", *_line(0, f"{key}:", reasons.get(key))]
+            for name, item in value.items():
+                lines += _line(2, f"{_flow(name)}: {_flow(item)}", reasons.get(f"{key}.{name}"))
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            lines += ["", *_line(0, f"{key}:", reasons.get(key))]
+            for i, entry in enumerate(value):
+                for n, (name, item) in enumerate(entry.items()):
+                    start = "- " if n == 0 else "  "
+                    why = reasons.get(f"{key}.{i}.{name}")
+                    lines += _entry(f"{start}{name}:", item, why)
+        else:
+            # What comes after a block stands apart from it.
+            lines += [""] if lines[-1].startswith(" ") else []
+            lines += _line(0, f"{key}: {_flow(value)}", reasons.get(key))
+    return "\n".join(lines) + "\n"
+
+
+def _entry(start: str, item: Any, why: str | None) -> list[str]:
+    """Return the lines of a key of a list's entry; a list of mappings takes one each."""
+    if isinstance(item, list) and item and isinstance(item[0], dict):
+        return [*_line(2, start, why), *(f"      - {_flow(part)}" for part in item)]
+    return _line(2, f"{start} {_flow(item)}", why)
+
+
+def _line(indent: int, text: str, why: str | None) -> list[str]:
+    text = " " * indent + text
+    return [text if why is None else f"{text:<{COLUMN}} # {why}"]
+
+
+def _flow(value: Any) -> str:
+    text = yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False)
+    return text.removesuffix("\n").removesuffix("\n...").strip()
+
 
 #: Grips that are tried, palm frames with each, and shares of the closing at which links are seen.
 GRIPS, FRAMES, SHARES = 6, 2, (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -134,7 +298,7 @@ def _find_best(
         for drafts in _drafts(model, answers, config):
             # The palm frames of a grip, until its geometry is sound; then whether it holds.
             for draft in drafts:
-                file = _write(_undrawn(draft), next(folders), path)
+                file = _write(draft, next(folders), path, drawn=False)
                 findings = _findings(file, config)
                 sound = all(finding.ok for finding in findings)
                 if sound:
@@ -170,42 +334,43 @@ def _refuse_unknown(model: VendorModel, answers: Answers) -> None:
 def _drafts(model: VendorModel, answers: Answers, config: Config) -> Iterator[Iterator[Draft]]:
     """Yield hand files, the likeliest first: for each grip those of its palm frames."""
     palm = find_palm(model, answers)
-    chains = find_chains(model, palm, answers)
-    grips = find_grips([find_reach(model, palm, c) for c in chains])
+    fingers = find_fingers(model, palm, answers)
+    grips = find_grips([find_members(model, palm, *finger) for finger in fingers])
     if not grips or grips[0].cost > WORST:
-        tips = ", ".join(c.tip for c in chains)
+        tips = ", ".join(joints[-1].child for joints, _ in fingers)
         raise HandError(
             f"model: no fingers of {tips} close against each other: give positions of joints that "
             "do not close with --joint NAME=POSITION, or what closes the other way with --reverse "
             "JOINT"
         )
+
     # Those whose links meet too early are left out; the first of all is better than none.
-    clearance = Clearance(model, palm)
-    clear = (g for g in grips if clearance.is_clear(g, _on_the_way(model, g)))
+    clearance, shares = Clearance(model, palm), np.arange(POSTURES) / (POSTURES - 1)
+    clear = (
+        grip
+        for grip in grips
+        if clearance.is_clear(grip, (positions(model, grip, share) for share in shares))
+    )
     for grip in chain(islice(clear, GRIPS), grips[:1]):
         postures = [positions(model, grip, share) for share in SHARES]
         frames = find_palm_frames(model, palm, grip, postures, answers.approach)
         yield (draft_tree(model, palm, grip, frame, answers, config) for frame in frames[:FRAMES])
 
 
-def _on_the_way(model: VendorModel, grip: Grip) -> Iterator[dict[str, float]]:
-    """Yield the positions of all joints on the way from the open hand to the closed one."""
-    return (positions(model, grip, n / (POSTURES - 1)) for n in range(POSTURES))
+def _write(draft: Draft, folder: Path, path: Path, *, drawn: bool = True) -> Path:
+    """Write the files of a hand, and return the hand file.
 
-
-def _undrawn(draft: Draft) -> Draft:
-    """Return a draft without pictures: most of the time of writing one is theirs."""
-    links = {name: replace(link, visuals=()) for name, link in draft.model.links.items()}
-    return replace(draft, model=replace(draft.model, links=links))
-
-
-def _write(draft: Draft, folder: Path, path: Path) -> Path:
-    """Write the files of a hand, and return the hand file."""
+    Most of the time of writing one is that of its pictures, which may be left out.
+    """
+    vendor = draft.model
+    if not drawn:
+        links = {name: replace(link, visuals=()) for name, link in vendor.links.items()}
+        vendor = replace(vendor, links=links)
     folder.mkdir(exist_ok=True)
     stem = path.stem if path.stem.endswith("_hand") else f"{path.stem}_hand"
     model = folder / f"{stem}.urdf"
-    head = [f"Made from {path.name} by `drakegrasp hand new`.", *draft.changed, *draft.model.notes]
-    write_urdf(draft.model, model, head)
+    head = [f"Made from {path.name} by `drakegrasp hand new`.", *draft.changed, *vendor.notes]
+    write_urdf(vendor, model, head)
     file = folder / f"{stem}.yaml"
     lines = [
         f"Drafted from {path.name} by `drakegrasp hand new`. Values with a comment were guessed:",
@@ -222,7 +387,7 @@ def _findings(file: Path, config: Config) -> tuple[Finding, ...]:
     try:
         hand = load_hand(file)
     except HandError as error:
-        return (Finding(name="files", ok=False, text=str(error).removeprefix(f"{file}: ")),)
+        return (judge("files", [str(error).removeprefix(f"{file}: ")], ""),)
     limits = check_limits(hand)
     if not limits.ok:
         return (limits,)

@@ -60,8 +60,7 @@ from drakegrasp.dataset.paths import (
 from drakegrasp.dataset.schema import CAMERAS, SPLITS
 from drakegrasp.dataset.shards import read_trials
 from drakegrasp.errors import DataError, HandError, MeshError, first_line
-from drakegrasp.hand.carried import HAND_FOLDER
-from drakegrasp.hand.folder import hand_digest
+from drakegrasp.hand.folder import HAND_FOLDER, hand_digest
 from drakegrasp.objects.model import load_object
 from drakegrasp.outcomes import Outcome, Removal
 

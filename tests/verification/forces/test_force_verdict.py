@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from drakegrasp.config import Config
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.kinematics import fingertip_forces
 from drakegrasp.hand.settings import load_config
-from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.lift import PEAK_ACCELERATION, lift_duration
 from drakegrasp.verification.forces import (

@@ -1,7 +1,8 @@
-"""The text of a vendor's model.
+"""The text of a vendor's model, and the folders whose files it may use.
 
 In: a URDF, SDFormat or MJCF file. Out: its XML, complete by itself but for meshes. A file that asks
 for too much (entities, depth, includes without end) is refused before anything else reads it.
+Nothing is fetched, and no file outside of the folders is read.
 """
 
 from __future__ import annotations
@@ -11,12 +12,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from drakegrasp.errors import HandError, one_line
 from drakegrasp.foreign_files import read_content
-from drakegrasp.hand.draft.folders import Folders
 from drakegrasp.hand.files import find_packages
 
 #: Formats by the tag of the root.
@@ -27,21 +28,17 @@ LONGEST, DEEPEST, MOST_INCLUDES = 20_000_000, 200, 50
 #: Bytes that are parsed at a time.
 BITE = 65_536
 #: Numbers of URDF (attributes) and SDFormat (elements), those of MJCF, and what may be infinite.
-_NUMBERS = frozenset(
-    {
-        *("xyz", "rpy", "ixx", "ixy", "ixz", "iyy", "iyz", "izz", "mass", "lower", "upper"),
-        *("effort", "velocity", "multiplier", "offset", "reference", "radius", "length", "size"),
-        *("scale", "rgba", "damping", "friction", "pose"),
-    }
-)
-_MJCF_NUMBERS = frozenset(
-    {
-        *("pos", "quat", "euler", "axisangle", "xyaxes", "zaxis", "axis", "fromto", "size"),
-        *("scale", "mass", "density", "diaginertia", "fullinertia", "range", "ref", "polycoef"),
-        *("coef", "kp", "gear", "ctrlrange", "forcerange", "actuatorfrcrange", "gainprm"),
-        *("biasprm", "damping"),
-    }
-)
+_NUMBERS = {
+    *("xyz", "rpy", "ixx", "ixy", "ixz", "iyy", "iyz", "izz", "mass", "lower", "upper", "pose"),
+    *("effort", "velocity", "multiplier", "offset", "reference", "radius", "length", "size"),
+    *("scale", "rgba", "damping", "friction"),
+}
+_MJCF_NUMBERS = {
+    *("pos", "quat", "euler", "axisangle", "xyaxes", "zaxis", "axis", "fromto", "size", "kp"),
+    *("scale", "mass", "density", "diaginertia", "fullinertia", "range", "ref", "polycoef"),
+    *("coef", "gear", "ctrlrange", "forcerange", "actuatorfrcrange", "gainprm", "biasprm"),
+    "damping",
+}
 _ENDLESS = ("lower", "upper", "effort", "velocity", "range", "ctrlrange", "forcerange")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 #: What an element of a model may not lead to: Drake would look for the file itself.
@@ -54,11 +51,53 @@ class Source:
 
     Attributes:
         root: Its XML, with what it includes.
-        folders: Of its meshes.
+        folder: That of the model.
+        packages: Of package:// URIs, by name.
+        given: Folders outside of the model's that it may use: those that the user named.
     """
 
     root: Element
-    folders: Folders
+    folder: Path
+    packages: Mapping[str, Path]
+    given: tuple[Path, ...]
+
+    def find(self, uri: str, base: Path) -> Path:
+        """Return the file of a URI or path; relative ones start at `base`.
+
+        Raises:
+            HandError: If it is a URI of another kind, or lies outside of the folders.
+        """
+        # A package is one that is known, or a folder of its name above the model.
+        scheme, separator, rest = uri.partition("://")
+        if separator and scheme not in ("package", "file", "model"):
+            raise HandError(
+                f"model: mesh {uri!r} must be a file, got an address: nothing is fetched"
+            )
+        if separator and scheme != "file":
+            name, _, rest = rest.partition("/")
+            above = (f for f in (self.folder, *self.folder.parents) if f.name == name)
+            folder = self.packages.get(name) or next(above, None)
+            if folder is None:
+                raise HandError(
+                    f"model: mesh {uri!r} must lie in a known package: say where it is with "
+                    f"--package {name}=FOLDER"
+                )
+            path, allowed = folder / unquote(rest), [folder]
+        else:
+            path, allowed = base / unquote(rest if separator else uri), [self.folder]
+
+        # What a link or `..` leads to is what counts.
+        try:
+            real = path.resolve()
+        except (OSError, RuntimeError, ValueError):
+            raise HandError(f"model: mesh {uri!r} must be a path, got none") from None
+        allowed += [*self.given, *self.packages.values()]
+        if not any(real.is_relative_to(folder.resolve()) for folder in allowed):
+            raise HandError(
+                f"model: mesh {uri!r} must lie in the model's folder, got {str(real)!r}: allow "
+                f"its folder with --root FOLDER"
+            )
+        return real
 
 
 def read_source(path: Path, packages: Mapping[str, Path], given: Sequence[Path] = ()) -> Source:
@@ -90,9 +129,9 @@ def read_source(path: Path, packages: Mapping[str, Path], given: Sequence[Path] 
     # What it is made of.
     folder = path.resolve().parent
     known = {**find_packages(folder, path.name, {}), **packages}
-    folders = Folders(model=folder, packages=known, given=tuple(given))
+    source = Source(root=root, folder=folder, packages=known, given=tuple(given))
     if root.tag == "mujoco":
-        _include(root, folders, [0])
+        _include(root, source, [0])
     for element in root.iter():
         if element.tag in _ELSEWHERE[root.tag] and (element.get("file") or len(element)):
             raise HandError(
@@ -101,7 +140,7 @@ def read_source(path: Path, packages: Mapping[str, Path], given: Sequence[Path] 
             )
     _refuse_xacro(root, path)
     _refuse_words(root, root.tag == "mujoco", f"<{root.tag}>")
-    return Source(root=root, folders=folders)
+    return source
 
 
 def _parse(path: Path) -> Element:
@@ -164,15 +203,15 @@ def _refuse_words(element: Element, mjcf: bool, owner: str) -> None:
         _refuse_words(child, mjcf, owner)
 
 
-def _include(root: Element, folders: Folders, count: list[int]) -> None:
+def _include(root: Element, source: Source, count: list[int]) -> None:
     """Put the content of included MJCF files in place of their <include>."""
     for parent in list(root.iter()):
         for child in [c for c in parent if c.tag == "include"]:
             count[0] += 1
             if count[0] > MOST_INCLUDES:
                 raise HandError("model: must include other files once each, got a loop of them")
-            included = _parse(folders.find(child.get("file", ""), folders.model))
-            _include(included, folders, count)
+            included = _parse(source.find(child.get("file", ""), source.folder))
+            _include(included, source, count)
             place = list(parent).index(child)
             parent.remove(child)
             parent[place:place] = list(included)

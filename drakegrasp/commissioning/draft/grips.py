@@ -1,0 +1,449 @@
+"""Which fingers close against which, where they touch, and whether other links meet before.
+
+In: the joints of a model's fingers, and how they may close. Out: `Grip`s, the best first: a finger,
+often a thumb, and one or two that it meets. Every way to close of every finger is compared with
+those of every other one. The `Pad` of a fingertip is the part of its surface that faces the closing
+motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from drakegrasp.commissioning.draft.fingers import STEPS, Closing
+from drakegrasp.commissioning.draft.model import VendorJoint, VendorModel
+from drakegrasp.frames import Array, invert_pose, transform_points
+from drakegrasp.hand.finger_sweep import even_points
+from drakegrasp.hand.shapes import hull_planes, ray_span
+
+#: A direction this near to an axis of the link is taken for the axis [rad].
+SNAP = np.deg2rad(12.0)
+#: Share of a link, from its end, that is pad; and of its thickness. The second is at least so deep
+#: and at most so deep [m]: what is pressed sinks in.
+LENGTH, DEPTH, DEEP = 0.55, 0.45, (0.004, 0.008)
+#: Distance of the pad point from the end, in thicknesses, and its bounds [m].
+FROM_END, NEAR_END = 0.7, (0.004, 0.014)
+#: Spacing of points on the surface of a fingertip, and of shapes that are compared [m].
+SPACING, COMPARED = 0.0015, 0.006
+#: Width of what is pinched [m], and how far from it costs nothing.
+WIDTH, TOLERANCE = 0.04, 0.01
+#: What it costs if one finger has closed fully and the other not at all, if pads come no nearer
+#: than they should [1/m], and if they pinch at another width [1/m].
+UNEVEN, APART, OFF_WIDTH = 0.5, 20.0, 40.0
+#: What it costs that a pad passes the other one instead of coming towards it.
+PASSING = 0.5
+#: What it costs to pinch near the end of the way, from this share on, and to open less far [1/m].
+LATE, LATE_COST, OPENING, NARROW = 0.75, 2.0, 0.06, 10.0
+#: Pads that come so close meet [m].
+MEETING = 0.006
+#: Angles by which a contact may be nearer to a fingertip's end than its pad [rad], and their cost.
+ROUND, ROUND_COST = np.deg2rad([0.0, 30.0, 60.0]), 0.2
+#: A finger that turns about its own direction has no side by which it closes, as a cosine.
+SQUARE = 0.3
+#: Grips that are returned at most.
+GRIPS = 40
+#: A hand of more fingers than this grasps with so many.
+FINGERS = 3
+#: Links other than fingertips overlap by less [m]: points miss a part of what Drake sees.
+SUNK = 2e-4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pad:
+    """A pad in its link's frame.
+
+    Attributes:
+        point: (3,), where contacts usually are [m].
+        normal: (3,), unit, out of the link.
+        along: (3,), unit, towards the end of the finger.
+        region: Half-spaces of the hand file's `pad_region`.
+    """
+
+    point: Array
+    normal: Array
+    along: Array
+    region: list[list[float]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Member:
+    """A finger that may be in a grip, and one of its ways to close, at s steps.
+
+    Attributes:
+        joints: Of the finger, from the palm.
+        closing: How it closes.
+        pad: Of its last link.
+        points: (s, 3), of the pad in the palm link, from open to closed [m].
+        moves: (s, 3), unit directions in which it moves.
+        normals: (r, s, 3), where it faces: a fingertip's end is round.
+    """
+
+    joints: list[VendorJoint]
+    closing: Closing
+    pad: Pad
+    points: Array
+    moves: Array
+    normals: Array
+
+    @property
+    def tip(self) -> str:
+        """The fingertip link."""
+        return self.joints[-1].child
+
+    @property
+    def first(self) -> int:
+        """The number of the joint that the motor drives: the first that closes."""
+        return int(np.flatnonzero(self.closing.gain)[0])
+
+    @property
+    def joint(self) -> VendorJoint:
+        """That joint, in the vendor's positions."""
+        return self.joints[self.first]
+
+    @property
+    def sign(self) -> float:
+        """Sense of that joint's positions in which it closes."""
+        return float(np.sign(self.closing.gain[self.first]))
+
+    @property
+    def zero(self) -> float:
+        """That joint's position in the open hand [rad or m]."""
+        return float(self.closing.q0[self.first])
+
+    def followers(self) -> dict[str, tuple[float, float]]:
+        """Return ratio and offset, to the driven joint, of the finger's joints that follow it."""
+        rows = zip(self.joints, self.closing.gain, self.closing.q0, strict=True)
+        return {j.name: (float(g), float(q)) for j, g, q in rows if g != 0.0 and j != self.joint}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Grip:
+    """Fingers that close against one.
+
+    Attributes:
+        members: The fingers; the last one opposes the others.
+        step: Of each, at which a thing of `WIDTH` is pinched.
+        cost: How far the pinch is from a straight and even one.
+    """
+
+    members: tuple[Member, ...]
+    step: tuple[int, ...]
+    cost: float
+
+    def ends(self) -> tuple[Array, Array]:
+        """Return the pad point (3,) of the last finger in the pinch, and the others' mean."""
+        points = np.array([m.points[s] for m, s in zip(self.members, self.step, strict=True)])
+        return points[-1], points[:-1].mean(axis=0)
+
+    @property
+    def axis(self) -> Array:
+        """(3,), unit, from the fingers to the last one, in the palm link."""
+        last, others = self.ends()
+        line = last - others
+        return np.asarray(line / np.linalg.norm(line))
+
+    @property
+    def middle(self) -> Array:
+        """(3,), between the fingers and the last one."""
+        last, others = self.ends()
+        return np.asarray((last + others) / 2.0)
+
+
+def find_members(
+    model: VendorModel, palm: str, joints: list[VendorJoint], closings: Sequence[Closing]
+) -> list[Member]:
+    """Return a finger with where its pad comes, for every way to close."""
+    # The end of the fingertip, and where it goes.
+    last, link = joints[-1], model.links[joints[-1].child]
+    X = _tip_poses(joints, np.stack([closing.path() for closing in closings]))
+    parts = [shape.corners() for shape in link.collisions]
+    surface = np.concatenate([even_points(part, SPACING) for part in parts])
+    end, along = _end_of(surface, _outward(model, palm, joints) if last.slides else None)
+    motion = np.diff(X[..., :3, :3] @ end + X[..., :3, 3], axis=1)
+    inside = (np.swapaxes(X[:, :-1, :3, :3], -1, -2) @ motion[..., None])[..., 0].mean(axis=1)
+
+    # It faces its motion, square to the finger and to the axis about which it turns.
+    front = last.axis if last.slides else np.cross(last.axis, along)
+    if np.linalg.norm(front) < SQUARE:
+        front = inside.mean(axis=0) - (inside.mean(axis=0) @ along) * along
+    sides = {sign: _find_pad(parts, surface, sign * front, along) for sign in (1.0, -1.0)}
+    members = []
+    for moved, X_BF, closing in zip(inside, X, closings, strict=True):
+        pad = sides[1.0 if moved @ front >= 0.0 else -1.0]
+        normal, towards, place = (
+            (X_BF[:, :3, :3] @ v[:, None])[..., 0] for v in (pad.normal, pad.along, pad.point)
+        )
+        points = place + X_BF[:, :3, 3]
+        moves = np.gradient(points, axis=0)
+        members.append(
+            Member(
+                joints=joints,
+                closing=closing,
+                pad=pad,
+                points=points,
+                moves=moves / np.linalg.norm(moves, axis=-1, keepdims=True),
+                normals=np.stack([np.cos(r) * normal + np.sin(r) * towards for r in ROUND]),
+            )
+        )
+    return members
+
+
+def _tip_poses(joints: Sequence[VendorJoint], q: Array) -> Array:
+    """Return the poses (..., 4, 4) of a fingertip link in the palm link at positions (..., m)."""
+    X = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
+    for j, joint in enumerate(joints):
+        X = X @ joint.X_PJ @ joint.motion(q[..., j])
+    return np.asarray(X)
+
+
+def _outward(model: VendorModel, palm: str, joints: Sequence[VendorJoint]) -> Array:
+    """Return the direction (3,) from the palm to a sliding fingertip, across its slide."""
+    X, axis = _tip_poses(joints, np.zeros(len(joints))), joints[-1].axis
+    corners = transform_points(X, model.links[joints[-1].child].corners())
+    line = X[:3, :3].T @ (corners.mean(axis=0) - model.links[palm].corners().mean(axis=0))
+    return _snapped(line - (line @ axis) * axis)
+
+
+def _end_of(points: Array, along: Array | None) -> tuple[Array, Array]:
+    """Return the end (3,) of a link, and the unit direction to it (3,).
+
+    Args:
+        points: (n, 3), of its surface, in the link's frame [m].
+        along: Direction of the finger; if None it leads from the origin, where the joint is.
+    """
+    if along is None:
+        centre, far = points.mean(axis=0), np.linalg.norm(points, axis=1)
+        ahead = points[far > 0.85 * far.max()].mean(axis=0)
+        along = ahead if ahead @ centre > 0.0 else centre
+        along = along / np.linalg.norm(along)
+    heights = points @ along
+    return points[heights > heights.max() - 0.003].mean(axis=0), along
+
+
+def _find_pad(parts: Sequence[Array], points: Array, normal: Array, along: Array) -> Pad:
+    """Return the pad of a link of convex parts (n, 3) [m], in its frame.
+
+    Args:
+        parts: Corners of each.
+        points: (m, 3), of their surfaces.
+        normal: Direction (3,) in which the link moves when it closes.
+        along: Direction (3,) towards the end of the finger.
+    """
+    normal = _snapped(normal)
+    along = _snapped(along - (along @ normal) * normal)
+    across = np.cross(normal, along)
+
+    # The level of the pad point: near the end, in the middle of what is there.
+    heights = points @ along
+    top, length = float(heights.max()), float(np.ptp(heights))
+    thickness = float(np.ptp(points[heights > top - 0.4 * length] @ normal))
+    level = max(top - float(np.clip(FROM_END * thickness, *NEAR_END)), top - 0.45 * length)
+    at = points[np.abs(heights - level) < 2.0 * SPACING]
+    sides = at[at @ normal > (at @ normal).max() - 0.002] @ across
+    middle = float(sides.max() + sides.min()) / 2.0
+
+    # The surface there: a ray along the normal leaves the last of the parts.
+    start = level * along + middle * across + (points @ normal).min() * normal
+    spans = [ray_span(part, start, normal) for part in parts]
+    leaves = [span[1] for span in spans if span is not None and span[1] >= 0.0]
+    height = max(leaves) if leaves else float((at @ normal).max() - start @ normal)
+    point = np.round(start + height * normal, 5) + 0.0
+
+    # How deep the region reaches below the point, and how far behind it, along the finger.
+    depth = float(np.clip(DEPTH * thickness, *DEEP))
+    back, region = max(LENGTH * length - (top - level), 0.004), []
+    for direction, space in ((normal, depth), (along, back)):
+        n = np.round(direction, 4) + 0.0
+        region.append([*n.tolist(), round(float(n @ point) - space, 5) + 0.0])
+    return Pad(point=point, normal=normal, along=along, region=region)
+
+
+def _snapped(direction: Array) -> Array:
+    """Return a unit direction (3,), or the axis that is near to it."""
+    direction = direction / np.linalg.norm(direction)
+    axis = int(np.argmax(np.abs(direction)))
+    if np.arccos(min(abs(direction[axis]), 1.0)) < SNAP:
+        return np.asarray(np.sign(direction[axis]) * np.eye(3)[axis])
+    return np.asarray(direction)
+
+
+def find_grips(fingers: Sequence[Sequence[Member]]) -> list[Grip]:
+    """Return the best ways in which fingers close against one of them.
+
+    The other joints of fingers are at rest: only one finger, which opposes, turns those.
+    """
+    # What each way to close the last finger costs with each way to close the others.
+    ranked: list[tuple[float, int, int, list[tuple[int, int]]]] = []
+    resting = [[m for m in ways if m.closing.at_rest] for ways in fingers]
+    for t, ways in enumerate(fingers):
+        others = [o for o in range(len(fingers)) if o != t]
+        costs = {o: _pair_costs(ways, resting[o]) for o in others}
+        for group in _alike(resting, others):
+            for b, last in enumerate(ways):
+                total, chosen = _cheapest(group, costs, b)
+                ranked.append((total + last.closing.cost, t, b, chosen))
+    ranked.sort(key=lambda entry: entry[:3])
+
+    # The best ones that differ in the last finger's positions.
+    grips: dict[tuple[int, tuple[float, ...]], Grip] = {}
+    for cost, t, b, chosen in ranked:
+        last = fingers[t][b]
+        key = t, tuple(np.round(last.closing.q0, 2).tolist())
+        if key not in grips and len(grips) < GRIPS:
+            grips[key] = _grip([resting[o][a] for o, a in chosen], last, cost)
+    return list(grips.values())
+
+
+def _alike(resting: Sequence[Sequence[Member]], others: Sequence[int]) -> list[list[int]]:
+    """Return which fingers may close together: those with as many ways to, or else all."""
+    groups = [
+        [o for o in others if len(resting[o]) == count]
+        for count in sorted({len(resting[o]) for o in others})
+    ]
+    wanted = min(len(others), FINGERS - 1)
+    return [group for group in groups if len(group) >= wanted] or [list(others)]
+
+
+def _cheapest(
+    group: Sequence[int], costs: dict[int, Array], b: int
+) -> tuple[float, list[tuple[int, int]]]:
+    """Return the cheapest fingers of a group against one, which close alike if they can."""
+    wanted = min(len(costs), FINGERS - 1)
+    rows = [costs[o][b] for o in group]
+    if len({len(row) for row in rows}) == 1:
+        table = np.array(rows)
+        best = np.sort(table, axis=0)[:wanted].mean(axis=0)
+        ways, total = np.full(len(rows), best.argmin()), float(best.min())
+        order = np.argsort(table[:, best.argmin()], kind="stable")[:wanted]
+    else:
+        least = np.array([row.min() for row in rows])
+        order = np.argsort(least, kind="stable")[:wanted]
+        ways, total = np.array([row.argmin() for row in rows]), float(least[order].mean())
+    return total, [(group[i], int(ways[i])) for i in sorted(order.tolist())]
+
+
+def _pair_costs(ways: Sequence[Member], others: Sequence[Member]) -> Array:
+    """Return the cost (b, a) of each way to close one finger with each of another."""
+    own = np.array([member.closing.cost for member in others])
+    stacked = (
+        np.stack([member.points for member in others]),
+        np.stack([member.moves for member in others]),
+        np.stack([member.normals for member in others], axis=1),
+    )
+    return np.stack([_costs(last, *stacked).min(axis=(1, 2)) + own for last in ways])
+
+
+def _costs(last: Member, points: Array, moves: Array, normals: Array) -> Array:
+    """Return the cost (a, s, s) of one way to close a finger, with each of another, by steps.
+
+    Args:
+        last: The finger that opposes.
+        points: (a, s, 3), where the other's pad is.
+        moves: (a, s, 3), unit directions in which it moves.
+        normals: (r, a, s, 3), where it faces.
+    """
+    # Pads that face each other along the line between them.
+    line = last.points[None, None] - points[:, :, None]
+    gap = np.linalg.norm(line, axis=-1)
+    unit = line / np.maximum(gap, 1e-6)[..., None]
+    toll = ROUND_COST * ROUND[:, None, None, None]
+    facing = (np.einsum("rasi,asti->rast", normals, unit) - toll).max(axis=0)
+    faced = (-np.einsum("rti,asti->rast", last.normals, unit) - toll).max(axis=0)
+    nearing = np.einsum("asi,asti->ast", moves, unit)
+    neared = -np.einsum("ti,asti->ast", last.moves, unit)
+    share = np.linspace(0.0, 1.0, STEPS)
+    uneven = np.abs(share[:, None] - share[None])
+    off = np.maximum(np.abs(gap - WIDTH) - TOLERANCE, 0.0)
+
+    # Pads that pass at a distance never meet.
+    apart = np.maximum(gap.min(axis=(1, 2)) - MEETING, 0.0)
+    narrow = np.maximum(OPENING - gap[:, 0, 0], 0.0)
+    late = np.maximum(share - LATE, 0.0)
+    cost = 2.0 - facing - faced + UNEVEN * uneven + OFF_WIDTH * off
+    cost = cost + LATE_COST * (late[:, None] + late[None]) + PASSING * (2.0 - nearing - neared)
+    return np.asarray(cost + (APART * apart + NARROW * narrow)[:, None, None])
+
+
+def _grip(others: Sequence[Member], last: Member, cost: float) -> Grip:
+    """Return the grip of some fingers against one, each with its way to close."""
+    costs = [_costs(last, m.points[None], m.moves[None], m.normals[:, None])[0] for m in others]
+    at = int(np.stack(costs).min(axis=1).sum(axis=0).argmin())
+    steps = [int(table[:, at].argmin()) for table in costs]
+    return Grip(members=(*others, last), step=(*steps, at), cost=cost)
+
+
+class Clearance:
+    """The shapes of a model, as planes and points, for comparing many grips."""
+
+    def __init__(self, model: VendorModel, palm: str) -> None:
+        self._model, self._palm = model, palm
+        self._links: dict[str, tuple[Array, float, list[tuple[Array, Array, Array, float]]]] = {}
+
+    def is_clear(self, grip: Grip, postures: Iterable[Mapping[str, float]]) -> bool:
+        """Return whether no links of two fingers overlap before their fingertips meet.
+
+        Args:
+            grip: The fingers.
+            postures: Positions of all joints, from the open hand to the closed one.
+        """
+        fingers = [[joint.child for joint in member.joints] for member in grip.members]
+        tips = {member.tip for member in grip.members}
+        pairs = [(a, b) for own, other in combinations(fingers, 2) for a in own for b in other]
+        for posture in postures:
+            X = {
+                name: self._model.pose(name, posture, self._palm)
+                for finger in fingers
+                for name in finger
+            }
+            if any(self._overlap(a, b, X, 0.0) for a, b in pairs if {a, b} <= tips):
+                return True
+            if any(self._overlap(a, b, X, SUNK) for a, b in pairs if not {a, b} <= tips):
+                return False
+        return True
+
+    def _overlap(self, a: str, b: str, X: Mapping[str, Array], depth: float) -> bool:
+        """Return whether points of one link are so deep [m] in another, or the other way round."""
+        # Balls around whole links tell most pairs apart.
+        X_AB = invert_pose(X[a]) @ X[b]
+        X_BA = invert_pose(X_AB)
+        (near_a, far_a, parts_a), (near_b, far_b, parts_b) = self._of(a), self._of(b)
+        if _apart(X_AB, near_b, near_a, far_a + far_b):
+            return False
+        return any(
+            _inside(planes_a, transform_points(X_AB, points_b), depth)
+            or _inside(planes_b, transform_points(X_BA, points_a), depth)
+            for planes_a, points_a, centre_a, radius_a in parts_a
+            for planes_b, points_b, centre_b, radius_b in parts_b
+            if not _apart(X_AB, centre_b, centre_a, radius_a + radius_b)
+        )
+
+    def _of(self, link: str) -> tuple[Array, float, list[tuple[Array, Array, Array, float]]]:
+        """Return the ball around a link, and planes, points and the ball of each of its shapes."""
+        if link not in self._links:
+            clouds = [
+                even_points(s.corners(), COMPARED) for s in self._model.links[link].collisions
+            ]
+            parts = [(hull_planes(points), points, *_ball(points)) for points in clouds]
+            self._links[link] = *_ball(np.concatenate([np.zeros((1, 3)), *clouds])), parts
+        return self._links[link]
+
+
+def _ball(points: Array) -> tuple[Array, float]:
+    """Return the centre (3,) and the radius of a ball around points (n, 3) [m]."""
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2.0
+    return centre, float(np.linalg.norm(points - centre, axis=1).max())
+
+
+def _apart(X_AB: Array, p_BQ: Array, p_AP: Array, distance: float) -> bool:
+    """Return whether two points (3,) are farther apart than a distance [m]."""
+    return bool(np.linalg.norm(X_AB[:3, :3] @ p_BQ + X_AB[:3, 3] - p_AP) > distance)
+
+
+def _inside(planes: Array, points: Array, depth: float) -> bool:
+    """Return whether one of points (n, 3) is inside planes (m, 4) by more than a depth [m]."""
+    heights = points @ planes[:, :3].T + planes[:, 3]
+    return bool((heights.max(axis=1) < -depth).any())

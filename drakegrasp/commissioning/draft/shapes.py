@@ -1,0 +1,304 @@
+"""Shapes of a vendor's links: primitives of Drake, and meshes of many formats.
+
+In: the XML of a model, the mesh files that it names, and the shapes that Drake parsed. Out: XML
+that names Wavefront files of a scratch folder, which Drake reads; and `Shape`s on the links. What
+is no primitive becomes triangles, few enough to be drawn quickly; what collides a convex hull.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import fast_simplification
+import numpy as np
+import trimesh
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    Convex,
+    Cylinder,
+    Ellipsoid,
+    GeometryId,
+    Mesh,
+    Role,
+    SceneGraphInspector,
+    Sphere,
+)
+from pydrake.multibody.tree import CalcSpatialInertia, SpatialInertia
+from scipy.spatial import cKDTree
+
+from drakegrasp.arithmetic import dot
+from drakegrasp.commissioning.draft.source import Source
+from drakegrasp.errors import HandError, first_line
+from drakegrasp.frames import Array, transform_points
+from drakegrasp.hand.shapes import ball_corners, hull_corners, primitive_corners
+from drakegrasp.mesh.surfaces import Faces
+from drakegrasp.mesh.wavefront import obj_text
+
+#: Formats of mesh files.
+FORMATS = (".obj", ".stl", ".dae", ".glb", ".gltf", ".ply")
+#: A mesh file has at most so many bytes; a mesh with more faces than this is drawn with so many.
+LARGEST, MOST_FACES = 200_000_000, 8_000
+#: No colour is darker: nothing of a black hand can be told in a picture.
+DARKEST = 0.15
+#: Corners of the hull of a collision mesh: of a ball of 10 mm radius they miss less than 0.4 mm.
+CORNERS = 64
+#: What is thinner than this [m] is made as thick: a plane has no hull.
+THIN = 4e-4
+#: Points on a hull that are compared with ten times as many of its mesh: some 3 mm apart on a palm.
+SAMPLES = 1000
+#: Mean density of links whose model gives no mass [kg/m^3]: own choice, that of solid plastic.
+DENSITY = 1200.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shape:
+    """A shape on a link: a primitive, or else a mesh.
+
+    Attributes:
+        X_LS: Pose on the link, (4, 4).
+        primitive: A box, cylinder, capsule or sphere.
+        vertices: (n, 3) of a mesh, in its own frame [m].
+        faces: (m, 3) of a mesh.
+        colour: (3,), if the model or the mesh file gives one.
+    """
+
+    X_LS: Array = field(default_factory=lambda: np.eye(4))
+    primitive: Box | Cylinder | Capsule | Sphere | None = None
+    vertices: Array | None = None
+    faces: Faces | None = None
+    colour: Array | None = None
+
+    def corners(self) -> Array:
+        """Return points (n, 3) whose hull is that of the shape, in the link's frame [m]."""
+        own = self.vertices if self.primitive is None else primitive_corners(self.primitive)
+        assert own is not None
+        return transform_points(self.X_LS, own)
+
+    def carried(self, X_AL: Array) -> Shape:
+        """Return the shape on a link A that the link is part of."""
+        return replace(self, X_LS=X_AL @ self.X_LS)
+
+    def hull(self) -> Shape:
+        """Return a mesh as its convex hull of few corners; other shapes as they are."""
+        if self.vertices is None:
+            return self
+        points = self.vertices
+        if np.ptp(points, axis=0).min() < THIN / 4.0:
+            points = np.concatenate([points - THIN / 2.0, points + THIN / 2.0])
+
+        # The farthest points along even directions.
+        directions = np.concatenate([np.eye(3), -np.eye(3), ball_corners(1.0, CORNERS)])
+        farthest = np.unique([int(np.argmax(dot(points, d))) for d in directions])
+        return _with_hull(self, points[farthest])
+
+    def reach_beyond(self, mesh: Shape) -> float:
+        """Return how far the surface of a hull is from that of its mesh at most [m]."""
+        (own, _), (other, _) = (
+            trimesh.sample.sample_surface(trimesh.Trimesh(s.vertices, s.faces), count, seed=0)
+            for s, count in ((self, SAMPLES), (mesh, 10 * SAMPLES))
+        )
+        return float(cKDTree(other).query(own)[0].max())
+
+
+def _with_hull(shape: Shape, points: Array) -> Shape:
+    """Return a shape whose mesh is the convex hull of points (n, 3)."""
+    solid = trimesh.convex.convex_hull(points)
+    return replace(shape, vertices=np.array(solid.vertices), faces=np.array(solid.faces))
+
+
+def read_shape(
+    inspector: SceneGraphInspector,
+    geometry: GeometryId,
+    role: Role,
+    meshes: Mapping[str, Shape],
+) -> Shape | None:
+    """Return a shape that Drake parsed, on its body; None for one without bounds.
+
+    Args:
+        inspector: Describes it.
+        geometry: The shape.
+        role: Whether it is seen or collides.
+        meshes: What the mesh files hold, by their names.
+    """
+    # What it is, and the colour that the model gives it.
+    shape, colour = inspector.GetShape(geometry), None
+    properties = inspector.GetProperties(geometry, role)
+    if properties is not None and properties.HasProperty("phong", "diffuse"):
+        rgba = properties.GetProperty("phong", "diffuse")
+        colour = np.array([rgba.r(), rgba.g(), rgba.b()])
+    found = Shape(X_LS=inspector.GetPoseInFrame(geometry).GetAsMatrix4(), colour=colour)
+    if isinstance(shape, Box | Cylinder | Capsule | Sphere):
+        return replace(found, primitive=shape)
+
+    # Else triangles: of its file, or of its hull.
+    if isinstance(shape, Mesh | Convex) and shape.source().is_path():
+        mesh = meshes[shape.source().path().name]
+        assert mesh.vertices is not None
+        vertices = mesh.vertices * np.asarray(shape.scale3())
+        colour = mesh.colour if colour is None else colour
+        return replace(found, vertices=vertices, faces=mesh.faces, colour=colour)
+    if isinstance(shape, Ellipsoid):
+        ball = trimesh.creation.icosphere(2)
+        axes = [shape.a(), shape.b(), shape.c()]
+        return replace(found, vertices=np.array(ball.vertices) * axes, faces=ball.faces)
+    corners = hull_corners(inspector, geometry)
+    return None if corners is None else _with_hull(found, corners)
+
+
+def solid_inertia(shapes: Sequence[Shape]) -> SpatialInertia:
+    """Return M_LLo_L of convex shapes of a link, solids of `DENSITY`, which may overlap."""
+    total = SpatialInertia.Zero()
+    for shape in shapes:
+        # Flat shapes have no volume: half a millimetre around makes one.
+        corners = shape.corners()
+        solid = Convex(np.concatenate([corners - 5e-4, corners + 5e-4]).T, "hull")
+        try:
+            total = added(total, CalcSpatialInertia(solid, DENSITY))
+        except (RuntimeError, ValueError):  # lengths whose powers are beyond arithmetic
+            reach = float(np.abs(corners).max())
+            raise HandError(
+                f"model: must be a hand in metres, got a shape that reaches {reach:.3g} m from its "
+                "link and has no inertia"
+            ) from None
+    return total
+
+
+def added(one: SpatialInertia, other: SpatialInertia) -> SpatialInertia:
+    """Return the inertia of two bodies about the same point, in the same axes."""
+    if one.get_mass() == 0.0:
+        return other
+    total = one.Shift(np.zeros(3))
+    total += other
+    return total
+
+
+def replace_meshes(source: Source, folder: Path) -> tuple[dict[str, Shape], list[str]]:
+    """Replace every mesh in the XML by a Wavefront file in a folder.
+
+    A picture of a link that cannot be read is left out: its collision shapes are drawn instead.
+
+    Returns:
+        What the files hold by their names, and notes of what was left out.
+
+    Raises:
+        HandError: If a mesh of a collision shape cannot be read.
+    """
+    files: dict[str, Shape] = {}
+
+    def convert(uri: str, base: Path) -> str:
+        path = source.find(uri, base)
+        name = f"{hashlib.sha256(str(path).encode()).hexdigest()[:16]}.obj"
+        if name not in files:
+            mesh = files[name] = _read_mesh(path)
+            assert mesh.vertices is not None and mesh.faces is not None
+            text = obj_text(mesh.vertices, mesh.faces, normals=True)
+            (folder / name).write_text(text, encoding="utf-8")
+        return name
+
+    # URDF and SDFormat: shapes of links that hold meshes.
+    notes: list[str] = []
+    if source.root.tag == "mujoco":
+        _replace_assets(source, convert)
+        return files, notes
+    for link in source.root.iter("link"):
+        for shape in [*link.findall("collision"), *link.findall("visual")]:
+            try:
+                for mesh in shape.iter("mesh"):
+                    _replace(mesh, source, convert)
+            except HandError as error:
+                if shape.tag == "collision":
+                    raise
+                notes.append(f"not drawn: {str(error).removeprefix('model: ')}")
+                link.remove(shape)
+    return files, notes
+
+
+def _replace(mesh: Element, source: Source, convert: Callable[[str, Path], str]) -> None:
+    """Replace the file of a mesh in URDF or SDFormat."""
+    if source.root.tag == "robot":
+        mesh.set("filename", convert(mesh.get("filename", ""), source.folder))
+        return
+    uri = mesh.find("uri")
+    if uri is None or mesh.find("submesh") is not None:
+        raise HandError("model: a mesh must be a whole file, got <submesh> or no <uri>")
+    uri.text = convert((uri.text or "").strip(), source.folder)
+
+
+def _replace_assets(source: Source, convert: Callable[[str, Path], str]) -> None:
+    """Replace the files of an MJCF model's meshes, and leave out its textures."""
+    # The folder of the meshes is the compiler's.
+    base = source.folder
+    for compiler in source.root.iter("compiler"):
+        place = compiler.attrib.pop("meshdir", None) or compiler.attrib.pop("assetdir", None)
+        base = base / place if place else base
+        for key in ("assetdir", "texturedir", "strippath"):
+            compiler.attrib.pop(key, None)
+
+    # A file's name stands for a name that is not given.
+    for assets in source.root.iter("asset"):
+        for element in list(assets):
+            if element.tag == "texture":
+                assets.remove(element)
+            element.attrib.pop("texture", None)
+            file = element.get("file")
+            if element.tag == "mesh" and file:
+                element.attrib.setdefault("name", Path(file).stem)
+                element.set("file", convert(file, base))
+
+
+def _read_mesh(path: Path) -> Shape:
+    """Return what a mesh file holds.
+
+    Raises:
+        HandError: If it is missing, of another format, or holds no triangles.
+    """
+    # Refuse what trimesh need not see.
+    what = f"model: mesh {path.name!r}"
+    if path.suffix.lower() not in FORMATS:
+        raise HandError(f"{what} must be one of {', '.join(FORMATS)}, got {path.suffix!r}")
+    if not path.is_file():
+        raise HandError(f"model: mesh {str(path)!r} must be a file, got none")
+    if path.stat().st_size > LARGEST:
+        raise HandError(f"{what} must have at most {LARGEST // 10**6} MB")
+
+    # Libraries raise all kinds of errors for a broken file.
+    logging.getLogger("trimesh").setLevel(logging.CRITICAL)
+    try:
+        scene: Any = trimesh.load_scene(path)
+        mesh: Any = scene.to_mesh()
+        # Seams of textures and shading would tear where faces are left out.
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        vertices = np.asarray(mesh.vertices, dtype=float)
+        faces = np.asarray(mesh.faces, dtype=np.int64)
+    except ImportError as error:
+        missing = "pycollada" if path.suffix.lower() == ".dae" else first_line(error)
+        raise HandError(f"{what} needs `pip install {missing}`, or another format") from None
+    except Exception as error:
+        raise HandError(f"{what} must be readable, got: {first_line(error)}") from None
+    if not len(faces) or not np.isfinite(vertices).all():
+        raise HandError(f"{what} must hold triangles with finite corners")
+
+    # Few faces are enough for a picture.
+    if len(faces) > MOST_FACES:
+        vertices, faces = fast_simplification.simplify(
+            vertices.astype(np.float32), faces.astype(np.int32), target_count=MOST_FACES
+        )
+    vertices, faces = vertices.astype(float), faces.astype(np.int64)
+    return Shape(vertices=vertices, faces=faces, colour=_colour(scene))
+
+
+def _colour(scene: Any) -> Array | None:
+    """Return the colour (3,) that most of a scene's surface has; None if it has none."""
+    found: list[tuple[float, Array]] = []
+    for mesh in scene.geometry.values():
+        colour = getattr(getattr(mesh.visual, "material", None), "main_color", None)
+        if colour is not None:
+            found.append((float(mesh.area), np.asarray(colour, dtype=float)[:3] / 255.0))
+    return np.maximum(max(found, key=lambda pair: pair[0])[1], DARKEST) if found else None

@@ -1,1 +1,0 @@
-"""Models of hands as vendors ship them, made into models that the package can use."""
