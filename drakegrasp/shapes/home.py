@@ -5,19 +5,29 @@ One function per class: sizes come in, a watertight mesh goes out; see `drakegra
 
 from __future__ import annotations
 
-# Names, and tables of points and sizes, are laid out by hand.
-# fmt: off
-# isort: off
 import numpy as np
 from trimesh import Trimesh
 
 from drakegrasp.arithmetic import sin_cos_deg
 from drakegrasp.frames import Array
 from drakegrasp.shapes.curves import (
-    BROAD, COARSE, EDGE, LARGE, arch, between, ellipse, foot_and_wall, joined, resample,
-    rounded_polygon, scaled, smooth, spaced, spread_evenly)
-from drakegrasp.shapes.parts import (
-    ball, block, hoop, lathe, moved, pillar, post, prism, rod, tube)
+    BROAD,
+    COARSE,
+    EDGE,
+    LARGE,
+    arch,
+    between,
+    ellipse,
+    foot_and_wall,
+    joined,
+    resample,
+    rounded_polygon,
+    scaled,
+    smooth,
+    spaced,
+    spread_evenly,
+)
+from drakegrasp.shapes.parts import ball, block, hoop, lathe, moved, pillar, post, prism, rod, tube
 from drakegrasp.shapes.solids import bar, capped, cut, flat_base, fuse, revolve, skin, solid, sweep
 
 #: Edge length of a hat [m].
@@ -35,14 +45,20 @@ def watertap(*, base: float, pipe: float, height: float, reach: float) -> Trimes
     column = 0.52 * top
     # The valve: a cross on the side of the column.
     z, y = 0.72 * column, -1.3 * pipe - 0.026
-    wings = [rod((-0.026 * a, y, z - 0.026 * b), (0.026 * a, y, z + 0.026 * b), 0.0055)
-        for a, b in ((1.0, 0.0), (0.0, 1.0))]
+    wings = [
+        rod((-0.026 * a, y, z - 0.026 * b), (0.026 * a, y, z + 0.026 * b), 0.0055)
+        for a, b in ((1.0, 0.0), (0.0, 1.0))
+    ]
     rose = [(base, 0.0), (base, 0.008), (0.75 * base, 0.014), (1.3 * pipe, 0.018)]
     return fuse(
         lathe(smooth(rose, EDGE)),
-        post(0.002, column, 1.45 * pipe, 1.3 * pipe), tube(resample(path, EDGE), pipe),
+        post(0.002, column, 1.45 * pipe, 1.3 * pipe),
+        tube(resample(path, EDGE), pipe),
         post(top - 0.026, top - 0.012, 1.2 * pipe, at=(reach, 0.0)),
-        rod((0.0, 0.0, z), (0.0, y, z), 0.75 * pipe), ball((0.0, y, z), 0.9 * pipe), *wings)
+        rod((0.0, 0.0, z), (0.0, y, z), 0.75 * pipe),
+        ball((0.0, y, z), 0.9 * pipe),
+        *wings,
+    )
 
 
 def knob(*, rose: float, neck: float, radius: float, height: float) -> Trimesh:
@@ -53,7 +69,7 @@ def knob(*, rose: float, neck: float, radius: float, height: float) -> Trimesh:
             (0.86 * rose, 0.011), (1.15 * neck, 0.016), (neck, 0.36 * height),
             (1.15 * neck, 0.5 * height), (0.8 * radius, 0.58 * height), (radius, 0.74 * height),
             (0.86 * radius, 0.92 * height), (0.5 * radius, height), (0.25 * radius, 0.995 * height),
-        ], 0.8 * EDGE)]
+        ], 0.8 * EDGE)]  # fmt: skip
     return lathe(side)
 
 
@@ -73,7 +89,7 @@ def lamp(*, base: float, shade: float, height: float) -> Trimesh:
             (0.86 * base, 0.013), (0.3 * base, 0.024), (0.15 * base + 0.003, 0.034),
             (0.38 * base, 0.26 * height), (0.4 * base, 0.33 * height),
             (0.15 * base + 0.002, 0.46 * height), (0.14 * base, 0.55 * height),
-        ], EDGE)])
+        ], EDGE)])  # fmt: skip
     stem = post(0.5 * height, height - 0.002, 0.14 * base)
     finial = ball((0.0, 0.0, height + 0.005), 0.007, edge=0.7 * EDGE)
     return fuse(screen, foot, stem, finial)
@@ -97,7 +113,7 @@ def iron(*, length: float, width: float, height: float) -> Trimesh:
         (-0.24 * length, 0.0, 0.42 * height), (-0.27 * length, 0.0, 0.72 * height),
         (-0.18 * length, 0.0, z), (0.05 * length, 0.0, z), (0.19 * length, 0.0, 0.8 * height),
         (0.2 * length, 0.0, 0.42 * height),
-    ], EDGE)
+    ], EDGE)  # fmt: skip
     dial = post(0.46 * height, 0.5 * height + 0.006, 0.19 * width)
     return fuse(sole, body, tube(path, thick), dial)
 
@@ -109,17 +125,27 @@ def hourglass(*, radius: float, waist: float, height: float) -> Trimesh:
     half = [
         (0.8 * bulb, plate - 0.002), (bulb, 0.1 * height + plate), (0.92 * bulb, 0.24 * height),
         (0.4 * bulb + 0.5 * waist, 0.4 * height), (waist, 0.5 * height),
-    ]
+    ]  # fmt: skip
     glass = lathe(smooth([*half, *((r, height - z) for r, z in half[-2::-1])], BROAD), edge=BROAD)
 
     # Three posts around it.
     s, c = sin_cos_deg(np.array([30.0, 150.0, 270.0]))
     posts = [
-        post(plate / 2.0, height - plate / 2.0, 0.0042, at=(0.86 * radius * x, 0.86 * radius * y),
-            edge=EDGE) for x, y in zip(c, s, strict=True)]
+        post(
+            plate / 2.0,
+            height - plate / 2.0,
+            0.0042,
+            at=(0.86 * radius * x, 0.86 * radius * y),
+            edge=EDGE,
+        )
+        for x, y in zip(c, s, strict=True)
+    ]
     return fuse(
-        glass, *posts, post(0.0, plate, radius, edge=BROAD),
-        post(height - plate, height, radius, edge=BROAD))
+        glass,
+        *posts,
+        post(0.0, plate, radius, edge=BROAD),
+        post(height - plate, height, radius, edge=BROAD),
+    )
 
 
 def bell(*, radius: float, body: float, handle: float) -> Trimesh:
@@ -129,19 +155,19 @@ def bell(*, radius: float, body: float, handle: float) -> Trimesh:
         (radius, 0.0), (0.9 * radius, 0.09 * body), (0.7 * radius, 0.3 * body),
         (0.58 * radius, 0.65 * body), (0.48 * radius, 0.86 * body), (0.25 * radius, 0.98 * body),
         (0.14 * radius + 0.003, body),
-    ], EDGE)
+    ], EDGE)  # fmt: skip
     grip = smooth([
         (0.14 * radius + 0.003, body), (0.22 * radius + 0.003, body + 0.12 * handle),
         (0.14 * radius + 0.003, body + 0.26 * handle),
         (0.27 * radius + 0.003, body + 0.62 * handle), (0.22 * radius, body + 0.9 * handle),
         (0.1 * radius, body + handle),
-    ], EDGE)
+    ], EDGE)  # fmt: skip
 
     # Hollow from below.
     inner = smooth([
         (0.0, 0.86 * body), (0.3 * radius, 0.82 * body), (0.58 * radius - wall, 0.55 * body),
         (0.7 * radius - wall, 0.28 * body), (radius - wall, 0.0),
-    ], 1.5 * EDGE)
+    ], 1.5 * EDGE)  # fmt: skip
     head = resample([grip[-1], (0.0, body + handle)], EDGE)
     return revolve(joined(inner, outer, grip, head))
 
@@ -154,7 +180,7 @@ def candlestick(*, foot_radius: float, stem_radius: float, height: float) -> Tri
         (stem_radius, 0.3 * height), (stem_radius, 0.5 * height),
         (1.6 * stem_radius, 0.56 * height), (stem_radius, 0.62 * height),
         (stem_radius, 0.78 * height), (cup, height - 0.012), (cup, height),
-    ]
+    ]  # fmt: skip
     side = joined(resample(outline[:2], EDGE), smooth(outline[1:], 0.8 * EDGE))
     top = [(cup, height), (socket, height), (socket, height - 0.018), (0.0, height - 0.018)]
     foot = resample([(0.0, 0.0), side[0]], COARSE * EDGE)
@@ -195,22 +221,34 @@ def book(*, width: float, length: float, thickness: float, edge: float = 0.011) 
 
 
 def flashlight(
-    *, head_radius: float, body_radius: float, height: float, head_height: float,
+    *,
+    head_radius: float,
+    body_radius: float,
+    height: float,
+    head_height: float,
 ) -> Trimesh:
     """Return a flashlight that stands on its lens, with a switch at +x."""
     taper = head_height + 0.022
     side = resample([*foot_and_wall(head_radius, head_height, 0.003), (body_radius, taper),
         (body_radius, height - 0.024), (body_radius + 0.0025, height - 0.021),
-        (body_radius + 0.0025, height - 0.003), (body_radius - 0.0005, height)], EDGE)
+        (body_radius + 0.0025, height - 0.003), (body_radius - 0.0005, height)], EDGE)  # fmt: skip
 
     z = taper + 0.022
-    switch = bar((0.0, 0.0, z), (body_radius + 0.003, 0.0, z),
-        ellipse(0.01, 0.006, edge=0.5 * EDGE), normal=(0.0, 1.0, 0.0))
+    switch = bar(
+        (0.0, 0.0, z),
+        (body_radius + 0.003, 0.0, z),
+        ellipse(0.01, 0.006, edge=0.5 * EDGE),
+        normal=(0.0, 1.0, 0.0),
+    )
     return fuse(lathe(side), switch)
 
 
 def dumbbell(
-    *, length: float, head_width: float, head_length: float, grip_radius: float,
+    *,
+    length: float,
+    head_width: float,
+    head_length: float,
+    grip_radius: float,
 ) -> Trimesh:
     """Return a dumbbell along x with six-sided heads of `head_width` between flats."""
     apothem = head_width / 2.0
@@ -228,7 +266,7 @@ def dumbbell(
         heads.append(sweep(path, hexagon, normal=across, scale=scale))
     grip = bar((start + head_length / 2.0, 0.0, apothem), (end - head_length / 2.0, 0.0, apothem),
         ellipse(grip_radius, grip_radius, edge=EDGE), normal=across,
-        scale=((0.0, 0.85), (0.25, 0.85), (0.5, 1.0), (0.75, 0.85), (1.0, 0.85)))
+        scale=((0.0, 0.85), (0.25, 0.85), (0.5, 1.0), (0.75, 0.85), (1.0, 0.85)))  # fmt: skip
     return fuse(*heads, grip)
 
 
@@ -237,25 +275,38 @@ def camera(*, width: float, height: float, depth: float, lens: float) -> Trimesh
     z = 0.46 * height
     front = -depth / 2.0
     body = block((width, depth, height), (0.0, 0.0, height / 2.0), corner=0.009, edge=LARGE)
-    grip = block((0.17 * width, 0.55 * depth, 0.9 * height),
-        (-0.38 * width, -0.42 * depth, 0.47 * height), corner=0.006)
-    hump = pillar([
-        (height - 0.006, 0.4 * width, 0.86 * depth), (height + 0.01, 0.3 * width, 0.8 * depth),
-        (height + 0.016, 0.2 * width, 0.7 * depth),
-    ], corner=0.005)
+    grip = block(
+        (0.17 * width, 0.55 * depth, 0.9 * height),
+        (-0.38 * width, -0.42 * depth, 0.47 * height),
+        corner=0.006,
+    )
+    hump = pillar(
+        [
+            (height - 0.006, 0.4 * width, 0.86 * depth),
+            (height + 0.01, 0.3 * width, 0.8 * depth),
+            (height + 0.016, 0.2 * width, 0.7 * depth),
+        ],
+        corner=0.005,
+    )
 
     # The lens: two rings, hollow in front, and a curved glass.
     glass = ball((0.0, front - 0.026, z), (0.62 * lens, 0.010, 0.62 * lens))
     barrel = fuse(
         rod((0.0, front + 0.008, z), (0.0, front - 0.02, z), lens),
-        rod((0.0, front + 0.008, z), (0.0, front - 0.034, z), 0.88 * lens))
+        rod((0.0, front + 0.008, z), (0.0, front - 0.034, z), 0.88 * lens),
+    )
     mouth = rod((0.0, front - 0.028, z), (0.0, front - 0.060, z), 0.70 * lens)
 
     # With a release button and a dial on top.
     return fuse(
-        body, grip, hump, cut(barrel, mouth), glass,
+        body,
+        grip,
+        hump,
+        cut(barrel, mouth),
+        glass,
         post(height - 0.004, height + 0.007, 0.0075, at=(-0.36 * width, -0.2 * depth)),
-        post(height - 0.004, height + 0.008, 0.012, at=(0.34 * width, 0.0)))
+        post(height - 0.004, height + 0.008, 0.012, at=(0.34 * width, 0.0)),
+    )
 
 
 def alarm_clock(*, radius: float, depth: float) -> Trimesh:
@@ -263,23 +314,34 @@ def alarm_clock(*, radius: float, depth: float) -> Trimesh:
     z, face = 0.016 + radius, -depth / 2.0
     case = cut(
         rod((0.0, -face, z), (0.0, face, z), radius, edge=BROAD),
-        rod((0.0, face + 0.004, z), (0.0, -depth, z), 0.86 * radius, edge=BROAD))
+        rod((0.0, face + 0.004, z), (0.0, -depth, z), 0.86 * radius, edge=BROAD),
+    )
     hands = [
         block((0.006, 0.009, 0.62 * radius), (0.0, face + 0.004, z + 0.27 * radius), corner=0.0015),
         block((0.44 * radius, 0.009, 0.007), (0.18 * radius, face + 0.004, z), corner=0.0015),
-        rod((0.0, face + 0.006, z), (0.0, face - 0.002, z), 0.006, edge=0.6 * EDGE)]
-    marks = [block((0.006, 0.007, 0.006), (0.72 * radius * x, face + 0.005, z + 0.72 * radius * y))
-        for x, y in ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))]
+        rod((0.0, face + 0.006, z), (0.0, face - 0.002, z), 0.006, edge=0.6 * EDGE),
+    ]
+    marks = [
+        block((0.006, 0.007, 0.006), (0.72 * radius * x, face + 0.005, z + 0.72 * radius * y))
+        for x, y in ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+    ]
 
     # Two bells on stalks, a hammer between them, and four feet.
     bells = [_bell_on_stalk(radius, z, side) for side in (1.0, -1.0)]
     hammer = [
         post(z + 0.9 * radius, z + 1.28 * radius, 0.0035),
-        rod((-0.009, 0.0, z + 1.3 * radius), (0.009, 0.0, z + 1.3 * radius), 0.0065)]
+        rod((-0.009, 0.0, z + 1.3 * radius), (0.009, 0.0, z + 1.3 * radius), 0.0065),
+    ]
     legs = [
-        rod((0.5 * radius * x, 0.32 * y * depth, z - 0.7 * radius),
-            (0.72 * radius * x, 0.36 * y * depth, 0.0), 0.009, 0.0065)
-        for x in (-1.0, 1.0) for y in (-1.0, 1.0)]
+        rod(
+            (0.5 * radius * x, 0.32 * y * depth, z - 0.7 * radius),
+            (0.72 * radius * x, 0.36 * y * depth, 0.0),
+            0.009,
+            0.0065,
+        )
+        for x in (-1.0, 1.0)
+        for y in (-1.0, 1.0)
+    ]
     return flat_base(fuse(case, *hands, *marks, *bells, *legs, *hammer))
 
 
@@ -294,9 +356,13 @@ def _bell_on_stalk(radius: float, z: float, side: float) -> Trimesh:
     s, c = map(float, sin_cos_deg(60.0))
     dome = cut(
         ball((0.0, 0.0, 0.0), (0.42 * radius, 0.42 * radius, 0.36 * radius)),
-        block((radius, radius, radius), (0.0, 0.0, -0.5 * radius)))
-    stalk = rod((0.9 * radius * c * side, 0.0, z + 0.9 * radius * s),
-        (1.3 * radius * c * side, 0.0, z + 1.3 * radius * s), 0.0045)
+        block((radius, radius, radius), (0.0, 0.0, -0.5 * radius)),
+    )
+    stalk = rod(
+        (0.9 * radius * c * side, 0.0, z + 0.9 * radius * s),
+        (1.3 * radius * c * side, 0.0, z + 1.3 * radius * s),
+        0.0045,
+    )
     place = (1.18 * radius * c * side, 0.0, z + 1.18 * radius * s)
     return fuse(moved(dome, place, y=30.0 * side), stalk)
 
@@ -305,14 +371,24 @@ def hat(*, brim: float, crown: float, height: float) -> Trimesh:
     """Return a top hat: radii of `brim` and `crown`; the brim is curled up at both sides."""
     wall, thick = 0.006, 0.006
     top = 1.06 * crown
-    inner = smooth([
-        (0.9 * crown, height - 0.008), (0.95 * crown - wall, 0.5 * height), (crown - wall, 0.0),
-    ], 1.6 * FELT)
+    inner = smooth(
+        [
+            (0.9 * crown, height - 0.008),
+            (0.95 * crown - wall, 0.5 * height),
+            (crown - wall, 0.0),
+        ],
+        1.6 * FELT,
+    )
     under = resample([inner[-1], (brim - 0.002, 0.0)], FELT)
     over = resample([(brim, 0.5 * thick), (brim - 0.002, thick), (crown, thick)], FELT)
-    band = resample([
-        (crown + 0.002, thick), (crown + 0.002, 0.26 * height), (0.97 * crown, 0.26 * height),
-    ], FELT)
+    band = resample(
+        [
+            (crown + 0.002, thick),
+            (crown + 0.002, 0.26 * height),
+            (0.97 * crown, 0.26 * height),
+        ],
+        FELT,
+    )
     side = smooth([band[-1], (0.95 * crown, 0.55 * height), (top - 0.002, height)], FELT)
     cap = resample([(top - 0.002, height), (0.0, height - 0.004)], FELT)
     ceiling = resample([(0.0, height - 0.010), inner[0]], 1.6 * FELT)
@@ -333,15 +409,20 @@ def comb(*, length: float, depth: float, spine: float, teeth: float, count: int)
     side = smooth([
         (-length / 2.0, 0.96 * teeth), (-0.47 * length, height - 0.005), (-0.3 * length, height),
         (0.3 * length, height), (0.47 * length, height - 0.005), (length / 2.0, 0.96 * teeth),
-    ], LEATHER)
+    ], LEATHER)  # fmt: skip
     body = _slab(side, depth)
 
     # The gaps between the teeth; the outer teeth are wider.
     pitch = 0.88 * length / count
     gaps = [
-        block((0.52 * pitch, 2.0 * depth, teeth),
-            (pitch * (k - (count - 1) / 2.0), 0.0, teeth / 2.0 - 0.01), corner=0.2 * pitch,
-            edge=LEATHER) for k in range(count)]
+        block(
+            (0.52 * pitch, 2.0 * depth, teeth),
+            (pitch * (k - (count - 1) / 2.0), 0.0, teeth / 2.0 - 0.01),
+            corner=0.2 * pitch,
+            edge=LEATHER,
+        )
+        for k in range(count)
+    ]
     return cut(body, *gaps)
 
 
@@ -350,13 +431,25 @@ def shoe(*, length: float, width: float, height: float) -> Trimesh:
     last = _last(length, width, 0.62 * height, height)
 
     # Where the foot goes in, and what covers the instep.
-    opening = moved(ball((0.0, 0.0, 0.0), (0.24 * length, 0.29 * width, 0.5 * height),
-        edge=LEATHER), (-0.24 * length, 0.0, 1.18 * height), y=12.0)
-    tongue = moved(ball((0.0, 0.0, 0.0), (0.15 * length, 0.22 * width, 0.05 * height + 0.002),
-        edge=LEATHER), (0.02 * length, 0.0, 0.86 * height), y=33.0)
+    opening = moved(
+        ball((0.0, 0.0, 0.0), (0.24 * length, 0.29 * width, 0.5 * height), edge=LEATHER),
+        (-0.24 * length, 0.0, 1.18 * height),
+        y=12.0,
+    )
+    tongue = moved(
+        ball((0.0, 0.0, 0.0), (0.15 * length, 0.22 * width, 0.05 * height + 0.002), edge=LEATHER),
+        (0.02 * length, 0.0, 0.86 * height),
+        y=33.0,
+    )
     laces = [
-        rod((x * length, -0.24 * width, z * height), (x * length, 0.24 * width, z * height), 0.0035,
-            edge=0.8 * EDGE) for x, z in ((0.01, 0.9), (0.075, 0.8), (0.14, 0.705))]
+        rod(
+            (x * length, -0.24 * width, z * height),
+            (x * length, 0.24 * width, z * height),
+            0.0035,
+            edge=0.8 * EDGE,
+        )
+        for x, z in ((0.01, 0.9), (0.075, 0.8), (0.14, 0.705))
+    ]
     return fuse(cut(last, opening), tongue, *laces, _sole(length, width, 0.13 * height))
 
 
@@ -364,11 +457,14 @@ def boot(*, length: float, width: float, height: float) -> Trimesh:
     """Return a rubber boot on its heel and sole, open at the top."""
     foot = _last(length, width, 0.36 * height, 0.5 * height)
     x, radius = -0.24 * length, 0.25 * length
-    levels = smooth(scaled([(0.95, 0.12), (0.92, 0.4), (1.0, 0.75), (1.1, 1.0)], radius, height),
-        LEATHER)
+    levels = smooth(
+        scaled([(0.95, 0.12), (0.92, 0.4), (1.0, 0.75), (1.1, 1.0)], radius, height), LEATHER
+    )
     rings = [
         np.column_stack([r * c + x, 0.86 * min(r, 0.56 * width) / r * r * s, np.full_like(s, z)])
-        for r, z in levels for s, c in (sin_cos_deg(np.arange(24) * 15.0),)]
+        for r, z in levels
+        for s, c in (sin_cos_deg(np.arange(24) * 15.0),)
+    ]
     shaft = capped(rings)
 
     # A thick rim, and the hollow inside.
@@ -386,7 +482,7 @@ def _last(length: float, width: float, instep: float, collar: float) -> Trimesh:
         (-0.49, 0.24, 0.55), (-0.45, 0.34, 0.92), (-0.3, 0.38, 1.0), (-0.12, 0.38, 1.0),
         (0.02, 0.41, 0.86), (0.2, 0.48, 0.6), (0.36, 0.45, 0.47), (0.45, 0.33, 0.38),
         (0.49, 0.18, 0.26),
-    ], along).T
+    ], along).T  # fmt: skip
     halves = width * half
     heights = np.where(along > 0.2, np.minimum(collar * rise, instep), collar * rise)
 
@@ -395,9 +491,15 @@ def _last(length: float, width: float, instep: float, collar: float) -> Trimesh:
     roof = np.column_stack([np.sign(c) * np.abs(c) ** 0.6, 0.3 + 0.7 * s])
     across = np.vstack([[(0.0, 0.0), (0.5, 0.0), (0.96, 0.0)], roof, [(-0.96, 0.0), (-0.5, 0.0)]])
     rings = [
-        np.column_stack([np.full(len(across), x * length), half * across[:, 0],
-            0.004 + (high - 0.004) * across[:, 1]])
-        for x, half, high in zip(along, halves, heights, strict=True)]
+        np.column_stack(
+            [
+                np.full(len(across), x * length),
+                half * across[:, 0],
+                0.004 + (high - 0.004) * across[:, 1],
+            ]
+        )
+        for x, half, high in zip(along, halves, heights, strict=True)
+    ]
     return capped(rings)
 
 
@@ -407,7 +509,7 @@ def _sole(length: float, width: float, thick: float) -> Trimesh:
     halves = between([
         (-0.505, 0.0), (-0.49, 0.24), (-0.42, 0.38), (-0.28, 0.42), (-0.05, 0.38), (0.2, 0.5),
         (0.36, 0.46), (0.46, 0.3), (0.5, 0.16), (0.505, 0.0),
-    ], along)
+    ], along)  # fmt: skip
     right = np.column_stack([along * length, -halves * width])
     outline = np.vstack([right, right[-2:0:-1] * [1.0, -1.0]])
 
@@ -424,7 +526,10 @@ def _slab(side: Array, depth: float) -> Trimesh:
     for x, high in side:
         z = np.linspace(0.0, high, max(2, round(float(side[:, 1].max()) / LEATHER)) + 1)
         ring = [
-            *((x, v, 0.0) for v in y[:-1]), *((x, y[-1], w) for w in z[:-1]),
-            *((x, v, high) for v in y[:0:-1]), *((x, y[0], w) for w in z[:0:-1])]
+            *((x, v, 0.0) for v in y[:-1]),
+            *((x, y[-1], w) for w in z[:-1]),
+            *((x, v, high) for v in y[:0:-1]),
+            *((x, y[0], w) for w in z[:0:-1]),
+        ]
         rings.append(np.array(ring))
     return capped(rings)

@@ -5,29 +5,63 @@ One function per class: sizes come in, a watertight mesh goes out; see `drakegra
 
 from __future__ import annotations
 
-# Names, and tables of points and sizes, are laid out by hand.
-# fmt: off
-# isort: off
 import numpy as np
 from trimesh import Trimesh
 
 from drakegrasp.shapes.curves import (
-    BROAD, COARSE, EDGE, LARGE, bevelled, ellipse, foot_and_wall, inset, joined, resample,
-    rounded_rectangle, scaled, smooth, spaced, spread_evenly)
+    BROAD,
+    COARSE,
+    EDGE,
+    LARGE,
+    bevelled,
+    ellipse,
+    foot_and_wall,
+    inset,
+    joined,
+    resample,
+    rounded_rectangle,
+    scaled,
+    smooth,
+    spaced,
+    spread_evenly,
+)
 from drakegrasp.shapes.parts import (
-    ball, block, lathe, loop_handle, moved, pillar, post, rod, rotated, scalloped, trimmed,
-    tube, vessel)
+    ball,
+    block,
+    lathe,
+    loop_handle,
+    moved,
+    pillar,
+    post,
+    rod,
+    rotated,
+    scalloped,
+    trimmed,
+    tube,
+    vessel,
+)
 from drakegrasp.shapes.solids import bar, cut, extrude, fuse, grid_box, revolve, solid, sweep
 
 
 def mug(
-    *, radius: float, height: float, handle_reach: float, handle_radius: float, wall: float = 0.005,
+    *,
+    radius: float,
+    height: float,
+    handle_reach: float,
+    handle_radius: float,
+    wall: float = 0.005,
 ) -> Trimesh:
     """Return a hollow straight mug with a handle at +x; `handle_reach` is how far it stands out."""
-    shell, core = vessel(resample(foot_and_wall(radius, height, 0.004), EDGE), wall=wall,
-        floor=0.007)
-    handle = loop_handle(x=radius - wall / 2.0, top=0.84 * height, bottom=0.2 * height,
-        reach=handle_reach - handle_radius + wall / 2.0, radius=handle_radius)
+    shell, core = vessel(
+        resample(foot_and_wall(radius, height, 0.004), EDGE), wall=wall, floor=0.007
+    )
+    handle = loop_handle(
+        x=radius - wall / 2.0,
+        top=0.84 * height,
+        bottom=0.2 * height,
+        reach=handle_reach - handle_radius + wall / 2.0,
+        radius=handle_radius,
+    )
     return fuse(shell, trimmed(handle, core))
 
 
@@ -42,25 +76,37 @@ def bowl(*, radius: float, height: float, foot_radius: float, wall: float = 0.00
     side = smooth([
         (foot_radius, 0.0), (foot_radius + 0.001, 0.005), (0.72 * radius, 0.22 * height),
         (0.92 * radius, 0.58 * height), (radius, height),
-    ], EDGE)
+    ], EDGE)  # fmt: skip
     return vessel(side, wall=wall, floor=0.008)[0]
 
 
 def vase(
-    *, foot_radius: float, belly_radius: float, neck_radius: float, lip_radius: float,
-    height: float, wall: float = 0.005, edge: float = 0.007,
+    *,
+    foot_radius: float,
+    belly_radius: float,
+    neck_radius: float,
+    lip_radius: float,
+    height: float,
+    wall: float = 0.005,
+    edge: float = 0.007,
 ) -> Trimesh:
     """Return a hollow vase with a belly, a neck and a lip."""
     side = smooth([
         (foot_radius, 0.0), (belly_radius, 0.4 * height), (neck_radius, 0.82 * height),
         (lip_radius, height),
-    ], edge)
+    ], edge)  # fmt: skip
     return vessel(side, wall=wall, floor=0.008, edge=edge)[0]
 
 
 def wineglass(
-    *, foot_radius: float, stem_radius: float, belly_radius: float, rim_radius: float,
-    height: float, stem_height: float, wall: float = 0.0045,
+    *,
+    foot_radius: float,
+    stem_radius: float,
+    belly_radius: float,
+    rim_radius: float,
+    height: float,
+    stem_height: float,
+    wall: float = 0.0045,
 ) -> Trimesh:
     """Return a wineglass: a solid foot and stem, a hollow cup."""
     # The cup, outside and inside.
@@ -68,7 +114,7 @@ def wineglass(
     outer = smooth([
         (stem_radius, stem_height), (0.75 * belly_radius, stem_height + 0.14 * cup_height),
         (belly_radius, stem_height + 0.42 * cup_height), (rim_radius, height),
-    ], EDGE)
+    ], EDGE)  # fmt: skip
     floor = stem_height + 0.012
     inner = spread_evenly(inset(outer, wall, floor=floor), COARSE * EDGE)[::-1]
 
@@ -77,7 +123,7 @@ def wineglass(
     stem = smooth([
         (foot_radius, 0.005), (0.4 * foot_radius, 0.009), (stem_radius, 0.3 * stem_height),
         (stem_radius, stem_height),
-    ], EDGE)
+    ], EDGE)  # fmt: skip
 
     # One outline, with longer edges inside.
     bottom = resample([inner[-1], (0.0, floor)], COARSE * EDGE)[1:]
@@ -88,18 +134,32 @@ def wineglass(
 
 
 def pitcher(
-    *, foot_radius: float, belly_radius: float, neck_radius: float, rim_radius: float,
-    height: float, handle_reach: float, handle_radius: float, lip: float, wall: float = 0.005,
+    *,
+    foot_radius: float,
+    belly_radius: float,
+    neck_radius: float,
+    rim_radius: float,
+    height: float,
+    handle_reach: float,
+    handle_radius: float,
+    lip: float,
+    wall: float = 0.005,
     edge: float = 0.008,
 ) -> Trimesh:
     """Return a hollow pitcher with a handle at +x and a lip pulled out by `lip` at -x."""
     side = smooth([
         (foot_radius, 0.0), (belly_radius, 0.35 * height), (neck_radius, 0.8 * height),
         (rim_radius, height),
-    ], edge)
+    ], edge)  # fmt: skip
     shell, core = vessel(side, wall=wall, floor=0.008, edge=edge)
-    handle = loop_handle(x=neck_radius - wall / 2.0, top=0.85 * height, bottom=0.3 * height,
-        reach=belly_radius - neck_radius + handle_reach, radius=handle_radius, edge=edge)
+    handle = loop_handle(
+        x=neck_radius - wall / 2.0,
+        top=0.85 * height,
+        bottom=0.3 * height,
+        reach=belly_radius - neck_radius + handle_reach,
+        radius=handle_radius,
+        edge=edge,
+    )
     body = fuse(shell, trimmed(handle, core))
 
     # The lip: points near the rim on the far side move outwards, the wall with them.
@@ -112,29 +172,40 @@ def pitcher(
 def saucepan(*, radius: float, height: float, handle_length: float, wall: float = 0.005) -> Trimesh:
     """Return a hollow saucepan with a straight handle along +x."""
     edge = 1.2 * EDGE
-    shell, core = vessel(resample(foot_and_wall(radius, height, 0.005), edge), wall=wall,
-        floor=0.007, edge=edge)
+    shell, core = vessel(
+        resample(foot_and_wall(radius, height, 0.005), edge), wall=wall, floor=0.007, edge=edge
+    )
     z = 0.78 * height
-    handle = bar((radius - wall, 0.0, z), (radius + handle_length, 0.0, z),
-        ellipse(0.008, 0.011, edge=edge), normal=(0.0, 1.0, 0.0),
-        scale=((0.0, 0.9), (0.4, 0.8), (1.0, 1.0)), edge=edge)
+    handle = bar(
+        (radius - wall, 0.0, z),
+        (radius + handle_length, 0.0, z),
+        ellipse(0.008, 0.011, edge=edge),
+        normal=(0.0, 1.0, 0.0),
+        scale=((0.0, 0.9), (0.4, 0.8), (1.0, 1.0)),
+        edge=edge,
+    )
     return fuse(shell, trimmed(handle, core))
 
 
 def funnel(
-    *, radius: float, spout_radius: float, cone_height: float, height: float, wall: float = 0.0045,
+    *,
+    radius: float,
+    spout_radius: float,
+    cone_height: float,
+    height: float,
+    wall: float = 0.0045,
 ) -> Trimesh:
     """Return a funnel, open at both ends, that stands on its wide end."""
     outer = resample([
         (radius, 0.0), (radius, 0.008), (spout_radius + 0.002, cone_height), (spout_radius, height),
-    ], EDGE)
+    ], EDGE)  # fmt: skip
     # Across a sloping wall the thickness is measured along r: wall / sin(slope).
     slope = np.arctan2(cone_height - 0.008, radius - spout_radius)
     step = wall / np.sin(slope)
     inner = resample([
         (spout_radius - wall, height), (spout_radius + 0.002 - wall, cone_height),
         (radius - step, 0.008), (radius - step, 0.0),
-    ], COARSE * EDGE)
+    ], COARSE * EDGE)  # fmt: skip
     profile = np.vstack([outer, inner])
     edges = np.r_[np.full(len(outer), EDGE), np.full(len(inner), COARSE * EDGE)]
     return revolve(profile, edge=edges, closed=True)
@@ -152,17 +223,31 @@ def toaster(*, length: float, width: float, height: float) -> Trimesh:
     scale[[0, -1]] = 0.94
     body = sweep(path, across, normal=(0.0, 1.0, 0.0), scale=scale)
     feet = [
-        block((0.014, 0.014, 2.0 * foot + 0.016),
-            (0.36 * x * length, 0.24 * y * width, foot + 0.008), edge=LARGE)
-        for x in (-1.0, 1.0) for y in (-1.0, 1.0)]
+        block(
+            (0.014, 0.014, 2.0 * foot + 0.016),
+            (0.36 * x * length, 0.24 * y * width, foot + 0.008),
+            edge=LARGE,
+        )
+        for x in (-1.0, 1.0)
+        for y in (-1.0, 1.0)
+    ]
 
     slots = [
-        block((0.78 * length, 0.17 * width, 0.11),
-            (0.0, 0.19 * side * width, 0.42 * height + 0.055), edge=LARGE) for side in (-1.0, 1.0)]
+        block(
+            (0.78 * length, 0.17 * width, 0.11),
+            (0.0, 0.19 * side * width, 0.42 * height + 0.055),
+            edge=LARGE,
+        )
+        for side in (-1.0, 1.0)
+    ]
     groove = block((0.02, 0.009, 0.5 * height), (length / 2.0 + 0.005, 0.0, 0.56 * height))
     lever = block((0.03, 0.30 * width, 0.011), (length / 2.0 + 0.004, 0.0, 0.72 * height))
-    dial = rod((length / 2.0 - 0.01, 0.3 * width, 0.3 * height),
-        (length / 2.0 + 0.008, 0.3 * width, 0.3 * height), 0.0085, edge=0.7 * EDGE)
+    dial = rod(
+        (length / 2.0 - 0.01, 0.3 * width, 0.3 * height),
+        (length / 2.0 + 0.008, 0.3 * width, 0.3 * height),
+        0.0085,
+        edge=0.7 * EDGE,
+    )
     return fuse(cut(fuse(body, *feet), *slots, groove), lever, dial)
 
 
@@ -174,20 +259,38 @@ def coffeemaker(*, width: float, depth: float, height: float) -> Trimesh:
     # Base, tank, head, and the filter under it.
     parts = [
         block((depth, width, floor), (0.0, 0.0, floor / 2.0), corner=0.01, edge=2.0 * BROAD),
-        block((tank, width, height), ((tank - depth) / 2.0, 0.0, height / 2.0), corner=0.01,
-            edge=2.0 * BROAD),
-        pillar([(height - head, 0.86 * depth, 0.94 * width), (height, depth, width)], corner=0.012,
-            edge=2.0 * BROAD),
-        moved(lathe(resample([(0.45 * jug, 0.0), (0.8 * jug, 0.02)], BROAD), edge=LARGE),
-            (x, 0.0, height - head - 0.014))]
+        block(
+            (tank, width, height),
+            ((tank - depth) / 2.0, 0.0, height / 2.0),
+            corner=0.01,
+            edge=2.0 * BROAD,
+        ),
+        pillar(
+            [(height - head, 0.86 * depth, 0.94 * width), (height, depth, width)],
+            corner=0.012,
+            edge=2.0 * BROAD,
+        ),
+        moved(
+            lathe(resample([(0.45 * jug, 0.0), (0.8 * jug, 0.02)], BROAD), edge=LARGE),
+            (x, 0.0, height - head - 0.014),
+        ),
+    ]
 
     # The jug on its plate, with a handle.
     top = 0.52 * height
-    side = smooth(scaled([(0.8, 0.0), (1.0, 0.3), (0.9, 0.65), (0.62, 0.9), (0.68, 1.0)], jug,
-        top - floor), LARGE)
+    side = smooth(
+        scaled([(0.8, 0.0), (1.0, 0.3), (0.9, 0.65), (0.62, 0.9), (0.68, 1.0)], jug, top - floor),
+        LARGE,
+    )
     body = moved(lathe(side, edge=LARGE), (x, 0.0, floor - 0.002))
-    handle = loop_handle(x=x + 0.6 * jug, top=0.92 * top, bottom=floor + 0.22 * (top - floor),
-        reach=0.78 * jug, radius=0.0045, edge=LARGE)
+    handle = loop_handle(
+        x=x + 0.6 * jug,
+        top=0.92 * top,
+        bottom=floor + 0.22 * (top - floor),
+        reach=0.78 * jug,
+        radius=0.0045,
+        edge=LARGE,
+    )
     lamp = ball((0.5 * depth, 0.25 * width, height - 0.5 * head), 0.006, edge=0.6 * EDGE)
     return fuse(*parts, body, handle, lamp)
 
@@ -195,20 +298,30 @@ def coffeemaker(*, width: float, depth: float, height: float) -> Trimesh:
 def teapot(*, radius: float, height: float, spout: float) -> Trimesh:
     """Return a teapot with its lid on: spout towards +x by `spout`, handle at -x."""
     body = lathe(smooth(scaled([(0.58, 0.0), (0.62, 0.03), (1.0, 0.42), (0.78, 0.76), (0.46, 0.86)],
-        radius, height), BROAD), edge=BROAD)
-    lid = lathe([
-        *resample([(0.5 * radius, 0.84 * height), (0.5 * radius, 0.88 * height)], BROAD),
-        *smooth([(0.4 * radius, 0.93 * height), (0.12 * radius, height)], BROAD)], edge=BROAD)
+        radius, height), BROAD), edge=BROAD)  # fmt: skip
+    lid = lathe(
+        [
+            *resample([(0.5 * radius, 0.84 * height), (0.5 * radius, 0.88 * height)], BROAD),
+            *smooth([(0.4 * radius, 0.93 * height), (0.12 * radius, height)], BROAD),
+        ],
+        edge=BROAD,
+    )
     button = ball((0.0, 0.0, 1.06 * height), (0.17 * radius, 0.17 * radius, 0.09 * height))
 
     # An S-shaped spout that narrows, and a round handle.
     path = smooth([
         (0.7 * radius, 0.0, 0.3 * height), (radius + 0.35 * spout, 0.0, 0.4 * height),
         (radius + 0.65 * spout, 0.0, 0.66 * height), (radius + spout, 0.0, 0.86 * height),
-    ], EDGE)
+    ], EDGE)  # fmt: skip
     size = np.linspace(0.24 * radius, 0.11 * radius, len(path))
-    handle = loop_handle(x=0.72 * radius, top=0.76 * height, bottom=0.24 * height,
-        reach=0.78 * radius, radius=0.11 * radius, edge=BROAD)
+    handle = loop_handle(
+        x=0.72 * radius,
+        top=0.76 * height,
+        bottom=0.24 * height,
+        reach=0.78 * radius,
+        radius=0.11 * radius,
+        edge=BROAD,
+    )
     pipe = tube(path, size, edge=0.9 * EDGE)
     return fuse(body, lid, button, pipe, rotated(handle, "z", 180.0))
 
@@ -217,22 +330,40 @@ def juicer(*, radius: float, rim: float, cone: float) -> Trimesh:
     """Return a citrus juicer: a dish with a rim of height `rim`, and in it a ribbed `cone`."""
     wall = 0.005
     side = smooth(scaled([(0.7, 0.0), (0.92, 0.3), (1.0, 1.0)], radius, rim), BROAD)
-    inner = smooth([(radius - wall, rim), (0.86 * radius, 0.5 * rim), (0.62 * radius, 0.32 * rim)],
-        BROAD)
-    dish = revolve(joined(
-        resample([(0.0, 0.0), side[0]], 1.5 * BROAD), side, inner,
-        resample([inner[-1], (0.0, 0.3 * rim)], 1.5 * BROAD)), edge=BROAD)
+    inner = smooth(
+        [(radius - wall, rim), (0.86 * radius, 0.5 * rim), (0.62 * radius, 0.32 * rim)], BROAD
+    )
+    dish = revolve(
+        joined(
+            resample([(0.0, 0.0), side[0]], 1.5 * BROAD),
+            side,
+            inner,
+            resample([inner[-1], (0.0, 0.3 * rim)], 1.5 * BROAD),
+        ),
+        edge=BROAD,
+    )
     ribs = scalloped(0.5 * radius, 0.07 * radius, 10, edge=BROAD)
     heights = np.linspace(0.0, 1.0, max(5, round(cone / BROAD)) + 1)
     profile = [
         *((0.9 * share, 0.2 * rim) for share in (0.0, 0.5)),
-        *((float(np.sqrt(max(0.0, 1.0 - h ** 1.6))), 0.2 * rim + h * (cone - 0.2 * rim))
-            for h in heights)]
+        *(
+            (float(np.sqrt(max(0.0, 1.0 - h**1.6))), 0.2 * rim + h * (cone - 0.2 * rim))
+            for h in heights
+        ),
+    ]
 
-    handle = block((0.5 * radius, 0.36 * radius, 0.008), (-1.15 * radius, 0.0, rim - 0.006),
-        corner=0.12 * radius)
-    lip = pillar([(rim - 0.015, 0.1 * radius, 0.12 * radius, 0.93 * radius, 0.0),
-        (rim, 0.3 * radius, 0.3 * radius, 1.03 * radius, 0.0)], corner=0.04 * radius)
+    handle = block(
+        (0.5 * radius, 0.36 * radius, 0.008),
+        (-1.15 * radius, 0.0, rim - 0.006),
+        corner=0.12 * radius,
+    )
+    lip = pillar(
+        [
+            (rim - 0.015, 0.1 * radius, 0.12 * radius, 0.93 * radius, 0.0),
+            (rim, 0.3 * radius, 0.3 * radius, 1.03 * radius, 0.0),
+        ],
+        corner=0.04 * radius,
+    )
     return fuse(dish, extrude(ribs, profile), handle, lip)
 
 
@@ -244,7 +375,7 @@ def pepper_mill(*, radius: float, waist: float, height: float) -> Trimesh:
         (0.52 * radius, 0.69 * height), (0.86 * radius, 0.74 * height),
         (0.92 * radius, 0.8 * height), (0.66 * radius, 0.89 * height),
         (0.16 * radius, 0.915 * height),
-    ], 0.8 * EDGE)
+    ], 0.8 * EDGE)  # fmt: skip
     button = ball((0.0, 0.0, 0.945 * height), 0.055 * height)
     return fuse(lathe(side), button)
 
@@ -271,7 +402,7 @@ def bottle(*, radius: float, height: float, neck_radius: float) -> Trimesh:
         resample([
             (neck_radius, neck), (neck_radius, cap), (wide, cap), (wide, height - 0.003),
             (neck_radius, height),
-        ], BROAD)))
+        ], BROAD)))  # fmt: skip
 
 
 def jar(*, radius: float, height: float, lid_radius: float, lid_height: float) -> Trimesh:
@@ -289,7 +420,7 @@ def jar(*, radius: float, height: float, lid_radius: float, lid_height: float) -
         resample([
             (neck, height - lid_height), (lid_radius, height - lid_height),
             (lid_radius, height - 0.003), (lid_radius - 0.003, height),
-        ], EDGE)))
+        ], EDGE)))  # fmt: skip
 
 
 def carton(*, width: float, height: float, roof: float) -> Trimesh:
@@ -298,7 +429,7 @@ def carton(*, width: float, height: float, roof: float) -> Trimesh:
     shell = pillar([
         (0.0, width, width), (height, width, width), (height + roof, width, 0.008),
         (height + roof + fin, width, 0.008),
-    ], corner=0.003, edge=LARGE)
+    ], corner=0.003, edge=LARGE)  # fmt: skip
     # The gable's ends are folded inwards.
     fold = pillar([(height + 0.004, 0.0105, 0.86 * width), (height + 0.86 * roof, 0.024, 0.005)])
     folds = [moved(fold, (0.5 * side * width, 0.0, 0.0)) for side in (-1.0, 1.0)]
@@ -314,9 +445,14 @@ def spray_bottle(*, width: float, depth: float, height: float, edge: float = 0.0
     neck, section = 0.013, rounded_rectangle(width, depth, 0.45 * depth, edge=edge)
     foot = [(0.0, 0.0), (0.5, 0.0), (0.94, 0.0), (1.0, 0.004)]
     heights = spaced(edge, 0.004, 0.72 * body_height)[1:]
-    shoulder = smooth([
-        (width / 2.0, 0.72 * body_height), (0.42 * width, 0.85 * body_height), (neck, body_height),
-    ], edge)[1:]
+    shoulder = smooth(
+        [
+            (width / 2.0, 0.72 * body_height),
+            (0.42 * width, 0.85 * body_height),
+            (neck, body_height),
+        ],
+        edge,
+    )[1:]
     shoulder = shoulder / [width / 2.0, 1.0]
     profile = [*foot, *((1.0, z) for z in heights), *shoulder, (0.0, body_height)]
     body = extrude(section, profile)
@@ -326,16 +462,20 @@ def spray_bottle(*, width: float, depth: float, height: float, edge: float = 0.0
         (0.0, body_height - 0.01), (neck + 0.002, body_height - 0.01),
         (neck + 0.002, body_height + 0.014), (0.011, body_height + 0.018), (0.011, head_z),
         (0.0, head_z),
-    ], edge))
+    ], edge))  # fmt: skip
     head = bar((-0.028, 0.0, head_z), (0.048, 0.0, head_z),
         rounded_rectangle(0.028, 0.024, 0.007, edge=edge), normal=(0.0, 1.0, 0.0),
-        scale=((0.0, 0.75), (0.35, 1.0), (0.75, 0.9), (1.0, 0.55)))
+        scale=((0.0, 0.75), (0.35, 1.0), (0.75, 0.9), (1.0, 0.55)))  # fmt: skip
     reach = np.linspace(0.0, 1.0, 50)
-    bend = np.column_stack([0.026 + 0.014 * np.sin(1.6 * reach), 0.0 * reach,
-        head_z - 0.055 * reach])
+    bend = np.column_stack(
+        [0.026 + 0.014 * np.sin(1.6 * reach), 0.0 * reach, head_z - 0.055 * reach]
+    )
     trigger = sweep(
-        spread_evenly(bend, edge), rounded_rectangle(0.008, 0.014, 0.003, edge=edge),
-        normal=(0.0, 1.0, 0.0), scale=1.0)
+        spread_evenly(bend, edge),
+        rounded_rectangle(0.008, 0.014, 0.003, edge=edge),
+        normal=(0.0, 1.0, 0.0),
+        scale=1.0,
+    )
     return fuse(body, collar, head, trigger)
 
 
@@ -344,7 +484,7 @@ def soap_dispenser(*, width: float, depth: float, height: float) -> Trimesh:
     body = 0.64 * height
     bottle = pillar(scaled([
         (0.0, 0.94, 0.94), (0.3, 1.0, 1.0), (0.75, 1.0, 1.0), (0.93, 0.72, 0.76), (1.0, 0.42, 0.52),
-    ], body, width, depth), corner=0.48 * depth, edge=BROAD)
+    ], body, width, depth), corner=0.48 * depth, edge=BROAD)  # fmt: skip
 
     # The pump: collar, stem and spout.
     collar, stem = 0.25 * depth + 0.004, 0.006
@@ -352,18 +492,31 @@ def soap_dispenser(*, width: float, depth: float, height: float) -> Trimesh:
     spout = tube(smooth([
         (-0.012, 0.0, z), (0.2 * width, 0.0, z), (0.46 * width, 0.0, z - 0.001),
         (0.56 * width, 0.0, z - 0.011),
-    ], EDGE), 0.0062)
+    ], EDGE), 0.0062)  # fmt: skip
     return fuse(
-        bottle, post(body - 0.006, body + 0.016, collar), post(body, z, stem),
-        post(z - 0.01, height, 0.013, 0.0125), spout)
+        bottle,
+        post(body - 0.006, body + 0.016, collar),
+        post(body, z, stem),
+        post(z - 0.01, height, 0.013, 0.0125),
+        spout,
+    )
 
 
 def towel_roll(*, radius: float, height: float, core: float) -> Trimesh:
     """Return a paper towel roll that stands, with an open `core` and a loose sheet at +y."""
-    paper = revolve(joined(
-        resample(bevelled(radius, height, 0.002), BROAD),
-        resample([(core, height), (core, 0.0)], 1.5 * BROAD),
-        resample([(core, 0.0), (radius - 0.002, 0.0)], 2.0 * BROAD)[:-1]), edge=BROAD, closed=True)
-    sheet = block((0.62 * radius, 0.005, height - 0.004),
-        (0.36 * radius, radius - 0.0035, height / 2.0), corner=0.0015, edge=BROAD)
+    paper = revolve(
+        joined(
+            resample(bevelled(radius, height, 0.002), BROAD),
+            resample([(core, height), (core, 0.0)], 1.5 * BROAD),
+            resample([(core, 0.0), (radius - 0.002, 0.0)], 2.0 * BROAD)[:-1],
+        ),
+        edge=BROAD,
+        closed=True,
+    )
+    sheet = block(
+        (0.62 * radius, 0.005, height - 0.004),
+        (0.36 * radius, radius - 0.0035, height / 2.0),
+        corner=0.0015,
+        edge=BROAD,
+    )
     return fuse(paper, sheet)
