@@ -109,7 +109,7 @@ def trial_rules(trials: CheckedFile, dataset: Dataset | None) -> list[list[Rule]
         partial(rigid, fields=TRIAL_FIELDS),
         contacts,
     ]
-    sound: list[Rule] = [motion]
+    sound: list[Rule] = [motion, partial(derived, fields=TRIAL_FIELDS)]
 
     # What follows from the dataset needs all of its objects.
     if dataset is not None and trials.counts["objects"] == len(dataset.manifest.objects):
@@ -119,7 +119,6 @@ def trial_rules(trials: CheckedFile, dataset: Dataset | None) -> list[list[Rule]
     stages: list[Rule] = [
         partial(complete_stages, close=close),
         partial(ranges, fields=TRIAL_FIELDS),
-        partial(derived, fields=TRIAL_FIELDS),
         partial(repeats, most=None if config is None else config.certify.repeats),
     ]
     manifest = None if dataset is None else dataset.manifest
