@@ -1,0 +1,263 @@
+"""Try stored attempts of a dataset again with something changed, and tell what becomes of them.
+
+    python pipelines/measurements/relift.py OUT --count 256 --set physics.time_step=0.002
+    python pipelines/measurements/relift.py OUT --rows both --count 300 --set lift.stop_when=never
+    python pipelines/measurements/relift.py OUT --rows attempts --set lift.stop_when=lost_sample
+    python pipelines/measurements/relift.py OUT --rows samples --count 100 --disturbed
+
+Each attempt is tried as it is stored, then with the settings of `--set`, or with `--disturbed` once
+for each disturbance: friction and mass changed by their share, up and down; half the time step; the
+palm off by 3 mm in a random direction and 3 degrees about a random axis; `together` changes
+friction, mass and palm, with random signs. Disturbed lifts are whole ones.
+
+Prints JSON, for each change: the lifts, with a verdict; those that are held, and that are samples
+by the filters but for those of pictures, of outliers, and the user's own, with their intervals; the
+outcomes that are others than as stored; CPU seconds; of lifts also the medians of slip, turn, force
+and of how far a closing joint opened. With `--disturbed`, also how well numbers of the stored lift
+tell the samples of which half of the lifts `palm` and `together` or more are samples (area under
+the ROC curve).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.config import Config, with_whole_lifts
+from drakegrasp.dataset.holding import (
+    COLUMNS,
+    MUCH,
+    area_under_roc,
+    predictors,
+    wilson_interval,
+)
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.frames import make_pose, rotation_about
+from drakegrasp.generation.attempts import find_attempt
+from drakegrasp.generation.columns import judge_sample
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.settings import override_config
+from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.runtime.environment import one_thread
+from drakegrasp.runtime.progress import progress_bar
+from drakegrasp.seeding import Stream
+from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.conditions import usual_conditions
+from drakegrasp.simulation.scene_cache import cached_scene
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
+
+#: What becomes of an attempt with one change, and this of all changes.
+Found = dict[str, Any]
+#: Changes of friction and mass as shares, and of the palm.
+FRICTION, MASS, SHIFT, TURN = 0.15, 0.20, 3e-3, np.deg2rad(3.0)
+#: Lifts of each sample with the palm off, and with all changes.
+PALMS, TOGETHER = 2, 4
+#: Last number of the place of the streams that are drawn from.
+PLACE = 25
+STORED, SET = "as stored", "as set"
+
+
+def disturbances(stream: Stream) -> Iterator[tuple[str, float, float, bool]]:
+    """Yield the name of each change, the factors of friction and mass, whether the palm is off."""
+    yield "half step", 1.0, 1.0, False
+    for sign in (-1.0, 1.0):
+        yield f"friction {sign * FRICTION:+.0%}", 1.0 + sign * FRICTION, 1.0, False
+        yield f"mass {sign * MASS:+.0%}", 1.0, 1.0 + sign * MASS, False
+    for _ in range(PALMS):
+        yield "palm", 1.0, 1.0, True
+    for _ in range(TOGETHER):
+        friction, mass = (2.0 * stream.integers(2, 2) - 1.0).tolist()
+        yield "together", 1.0 + friction * FRICTION, 1.0 + mass * MASS, True
+
+
+def palm_off(attempt: Attempt, stream: Stream) -> Attempt:
+    """Return an attempt with the palm off, in a direction and about an axis that are drawn."""
+    shift, axis = (v / np.linalg.norm(v) for v in stream.normal(6).reshape(2, 3))
+    X_GH = make_pose(rotation_about(axis, TURN), SHIFT * shift)
+    return replace(attempt, X_OG=multiply(attempt.X_OG, X_GH))
+
+
+def chosen_rows(out: Path, kind: str, count: int, seed: int) -> npt.NDArray[np.int64]:
+    """Return ids of attempts that are drawn: of one kind, or as many samples as other lifts."""
+    trials = Trials(out)
+    ids, is_lift = trials.trial_ids, np.isfinite(trials["time_lift"])
+    is_sample = np.isin(ids, trials.where(sample=True).trial_ids)
+    groups = {
+        "attempts": [np.isfinite(trials["time_close"])],
+        "lifts": [is_lift],
+        "samples": [is_sample],
+        "both": [is_sample, is_lift & ~is_sample],
+    }[kind]
+    found = []
+    for group in groups:
+        pile = ids[group]
+        found.append(pile[Stream(seed, PLACE).permutation(len(pile))[:count]])
+    return np.sort(np.concatenate(found))
+
+
+def try_again(
+    out: Path, trial_id: int, stored: Config, other: Config | None, prepared: Any
+) -> list[Found]:
+    """Return what becomes of an attempt as stored, and with each change.
+
+    Args:
+        out: Directory of the dataset.
+        trial_id: The attempt.
+        stored: The configuration of the dataset.
+        other: With the settings that are changed; None: disturb it.
+        prepared: Returns a prepared object of the dataset by its name.
+    """
+    row = Trials(out).trial(trial_id)
+    model = prepared(row["object_name"])
+    candidate, standoff, child = (int(row[k]) for k in ("candidate", "standoff_index", "child"))
+    attempt = find_attempt(model, candidate, standoff, child, stored)
+    known = attempt.conditions or usual_conditions(model.model, stored.physics)
+    X_TO = model.resting_poses[attempt.resting]
+    hand = load_hand(stored.hand_source)
+
+    def once(change: str, attempt: Attempt, rules: Config) -> Found:
+        scene = cached_scene(model.model, rules.physics, rules.hand_source, attempt.preshape)
+        start = time.process_time()
+        record = run_attempt(scene, X_TO, attempt, rules)
+        spent = time.process_time() - start
+        removal = judge_sample(model.model, record, rules, views=False)
+        told = {"outcome": record.outcome.label, "sample": removal is Removal.KEPT}
+        return {"change": change, **told, "seconds": spent, **measured(hand, record)}
+
+    if other is not None:
+        # Hands that may lift do, whatever their chance: verdicts are compared.
+        # Friction and mass are those asked for.
+        asked = {"physics": other.physics, "randomize": other.randomize}
+        rules = stored.model_copy(update=asked)
+        again = find_attempt(model, candidate, standoff, child, rules)
+        both = ((STORED, attempt, stored), (SET, again, other))
+        return [once(name, replace(each, audited=True), by) for name, each, by in both]
+    whole = with_whole_lifts(stored)
+    half = {"time_step": whole.physics.time_step / 2.0, "coarse_steps": 1}
+    finer = whole.model_copy(update={"physics": whole.physics.model_copy(update=half)})
+    stream, found = Stream(stored.seed, trial_id, PLACE), [once(STORED, attempt, whole)]
+    for change, friction, mass, is_off in disturbances(stream):
+        materials = replace(
+            known.materials,
+            friction_hand=friction * known.materials.friction_hand,
+            mass=mass * known.materials.mass,
+        )
+        changed = replace(attempt, conditions=replace(known, materials=materials))
+        changed = palm_off(changed, stream) if is_off else changed
+        found.append(once(change, changed, finer if change == "half step" else whole))
+    return found
+
+
+def measured(hand: Hand, record: TrialRecord) -> Found:
+    """Return slip [mm], turn [deg], sum of forces [N] and widest opening [deg] of a lift."""
+    if record.lift is None or record.closed is None:
+        return {}
+    joints = [hand.joint_names.index(finger.closing_joint) for finger in hand.fingers]
+    opened = float((record.closed.q - record.lift.q)[joints].max())
+    return {
+        "slip": 1e3 * record.lift.slip,
+        "turn": float(np.rad2deg(record.lift.turn)),
+        "force": float(np.linalg.norm(record.lift.contacts.f_Q_O, axis=1).sum()),
+        "opened": float(np.rad2deg(opened)),
+    }
+
+
+def summary(rows: Sequence[Sequence[Found]]) -> dict[str, Found]:
+    """Return by change what became of all attempts."""
+    by_change: dict[str, list[tuple[Found, Found]]] = {}
+    for row in rows:
+        for found in row:
+            by_change.setdefault(found["change"], []).append((row[0], found))
+    return {change: _of_change(pairs) for change, pairs in by_change.items()}
+
+
+def _of_change(pairs: Sequence[tuple[Found, Found]]) -> Found:
+    failed = {outcome.label for outcome in Outcome if outcome.inconclusive}
+    own = [found for _, found in pairs if found["outcome"] not in failed]
+    others = Counter(
+        f"{stored['outcome']} -> {found['outcome']}"
+        for stored, found in pairs
+        if stored["outcome"] != found["outcome"]
+    )
+    lifted = [found for found in own if "slip" in found]
+    return {
+        "tried": len(pairs),
+        "with a verdict": len(own),
+        "held": _share([found["outcome"] == Outcome.SUCCESS.label for found in own]),
+        "sample": _share([found["sample"] for found in own]),
+        "CPU seconds": round(sum(found["seconds"] for _, found in pairs), 2),
+        "changed": dict(others.most_common()),
+        "medians": {
+            name: round(float(np.median([found[name] for found in lifted])), 3)
+            for name in ("slip", "turn", "force", "opened")
+            if lifted
+        },
+    }
+
+
+def _share(hits: Sequence[bool]) -> list[float]:
+    """Return the count, the share, and its interval."""
+    low, high = wilson_interval(sum(hits), len(hits)) if hits else (np.nan, np.nan)
+    return [
+        sum(hits),
+        *(round(float(x), 3) for x in (np.mean(hits) if hits else np.nan, low, high)),
+    ]
+
+
+def ranking(out: Path, ids: npt.NDArray[np.int64], rows: Sequence[Sequence[Found]]) -> Found:
+    """Return how well numbers of stored lifts tell which samples bear half or more of the noise."""
+    noisy = [[x["sample"] for x in row if x["change"] in ("palm", "together")] for row in rows]
+    much = np.array([np.mean(own) >= MUCH for own in noisy])
+    told = predictors(Trials(out)[ids].columns(COLUMNS))
+    areas = {name: area_under_roc(values, much) for name, values in told.items()}
+    ranked = sorted(areas.items(), key=lambda pair: -pair[1])
+    return {"bear half or more": int(much.sum()), "AUC": {k: round(v, 2) for k, v in ranked}}
+
+
+@one_thread
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the script; return its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("dataset", type=Path, help="directory of a dataset")
+    parser.add_argument("--rows", default="lifts", choices=("attempts", "lifts", "samples", "both"))
+    parser.add_argument("--count", type=int, default=100, help="of each kind (default: 100)")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings")
+    parser.add_argument("--disturbed", action="store_true", help="disturb each, instead of --set")
+    arguments = parser.parse_args(argv)
+    if arguments.disturbed and arguments.settings:
+        parser.error("--disturbed must be used without --set")
+
+    out, rows = arguments.dataset, list[list[Found]]()
+    config = read_manifest(out).config
+    other = None if arguments.disturbed else override_config(config, arguments.settings)
+    prepared = lru_cache(1)(lambda name: load_prepared(out, name, config))
+    ids = chosen_rows(out, arguments.rows, arguments.count, config.seed)
+    with progress_bar("attempts", "attempts") as report:
+        for trial_id in ids.tolist():
+            rows.append(try_again(out, trial_id, config, other, prepared))
+            report(len(rows), len(ids))
+    result: Found = {"settings": arguments.settings, "rows": arguments.rows, **summary(rows)}
+    if other is None and rows:
+        result |= ranking(out, ids, rows)
+    sys.stdout.write(json.dumps(result, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
