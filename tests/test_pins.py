@@ -23,6 +23,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> pins.Pins:
 
 @pytest.mark.sim
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_nothing_that_is_pinned_has_changed(found: pins.Pins) -> None:
     assert pins.far(pins.summaries(found), pins.read_values(EXPECTED)) == []
 
