@@ -50,7 +50,7 @@ LARGE = 10_000
 #: Simulated numbers of other machines are as near as this: metres, radians, newtons, shares.
 NEAR = 1e-4
 #: Leaves of JSON that say when, where and with what, or how long.
-MACHINE = ("seconds", "version", "time", "path", "file", "sha256", "hash", "again")
+MACHINE = ("seconds", "version", "time", "path", "file", "sha256", "hash", "again", "content")
 
 
 def command(*arguments: object) -> None:
@@ -245,9 +245,8 @@ def digest(value: np.ndarray) -> str:
 
 
 def differences(found: dict[str, str], expected: dict[str, str]) -> list[str]:
-    """Return a line for each name that differs."""
+    """Return a line for each name that differs or is gone; what is new has changed nothing."""
     lines = [f"gone: {name}" for name in expected.keys() - found.keys()]
-    lines += [f"new: {name}" for name in found.keys() - expected.keys()]
     both = found.keys() & expected.keys()
     return sorted(lines + [f"differs: {name}" for name in both if found[name] != expected[name]])
 
