@@ -66,7 +66,18 @@ class How(TypedDict, total=False):
 
 
 def verify_grasp(
-    grasp: npt.ArrayLike, on: GraspTarget, *, row: int | None = None, **how: Unpack[How]
+    grasp: npt.ArrayLike,
+    on: GraspTarget,
+    *,
+    row: int | None = None,
+    frame: str | None = None,
+    X_TC: npt.ArrayLike | None = None,
+    units: str | None = None,
+    X_TO: npt.ArrayLike | None = None,
+    hand: str | Path | None = None,
+    method: str = "hand",
+    snap_points: bool = False,
+    config: Config | None = None,
 ) -> Verification:
     """Return whether a predicted grasp holds its object in the simulator, why not, and how.
 
@@ -79,8 +90,15 @@ def verify_grasp(
             a tensor of torch.
         on: What the grasp is on, see `verify_grasps`.
         row: The grasp's row, if `on` is a `GraspDataset`.
-        how: The arguments of `verify_grasps`: frame, X_TC (4, 4), units, X_TO (4, 4), hand,
-            method, snap_points, config.
+        frame: Of the grasp, "object", "camera" or "table"; `verify_grasps` says more of this and
+            the next ones.
+        X_TC: With frame "camera" on an object: pose (4, 4) of the camera in {T}.
+        units: Of a mesh: m, cm or mm.
+        X_TO: Pose (4, 4) of an object on the table.
+        hand: Name or YAML file of the hand.
+        method: "hand" or "forces".
+        snap_points: Whether to move the points to the object's surface first.
+        config: Hand, physics, lift and rules.
 
     Returns:
         The verdict. Numbers that are no grasp, e.g. NaN, have the outcome `invalid`.
@@ -101,7 +119,19 @@ def verify_grasp(
     if row is None and isinstance(on, GraspDataset):
         raise GraspError(f"row must be given with a GraspDataset, 0 to {len(on) - 1}, got None")
 
-    (verdict,) = verify_grasps(vector, on, rows=None if row is None else [row], **how)
+    (verdict,) = verify_grasps(
+        vector,
+        on,
+        rows=None if row is None else [row],
+        frame=frame,
+        X_TC=X_TC,
+        units=units,
+        X_TO=X_TO,
+        hand=hand,
+        method=method,
+        snap_points=snap_points,
+        config=config,
+    )
     return verdict
 
 

@@ -136,6 +136,8 @@ def judge_sample(
     """
     if trial.outcome is not Outcome.SUCCESS:
         return None
+
+    # Its row of /trials, as a build would write it.
     assert trial.closed is not None
     closed = trial.closed.contacts
     fingers = len(closed.touching)
@@ -151,6 +153,8 @@ def judge_sample(
     shape = sizes(fingers=fingers, joints=len(trial.closed.q), image=0)
     columns = {field.name: field.empty(1, shape) for field in fields}
     _fill_row(columns, 0, fields, row, fingers)
+
+    # And where the cameras would be.
     if views:
         X_TG = multiply(trial.X_TO, trial.X_OG)
         for name, pose in (("oto", camera_pose_oto), ("otm", camera_pose_otm)):

@@ -246,6 +246,7 @@ class Attempts(Gallery):
             strip = f"/strip/{snapshot.label(i)}-{camera}.png"
             dots = contact_dots(snapshot, row, camera, look)
             views.append({"camera": camera, "strip": strip, "unread": unread, "dots": dots})
+
         key = snapshot.key(i)
         return {
             "trial": trial,

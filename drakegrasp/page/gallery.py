@@ -276,6 +276,8 @@ class Gallery(ABC):
         pages = max(1, -(-len(chosen) // PAGE))
         page = min(int(query.values["page"]), pages)
         shown = chosen if site.static else chosen[(page - 1) * PAGE : page * PAGE]
+
+        # The cards, each with where it leads.
         cards = self.cards(shown)
         for i, card in zip(shown.tolist(), cards, strict=True):
             card |= self.identity(i) | {"label": self.label(i), "href": self._address(i, query)}
@@ -354,6 +356,7 @@ class Gallery(ABC):
     def _form(self, query: Query, site: Site) -> dict[str, Any]:
         """Return the fields of the form of filters and order; files hold one outcome alone."""
         names = {"object": self.snapshot.names, "class": sorted(set(self.snapshot.classes))}
+        # What is chosen from a list.
         selects = []
         for name, title in self.SELECTS.items():
             known = {n: n for n in names[name]} if name in names else self.options(name)
@@ -361,6 +364,8 @@ class Gallery(ABC):
             options = [(value, text, value == query[name]) for value, text in known.items()]
             if not (any_ and site.static):
                 selects.append((name, title, [(any_, "any", not query[name]), *options]))
+
+        # Numbers between two bounds.
         ranges = []
         for name in self.RANGES:
             bounds = query.ranges.get(name, (None, None))

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import threading
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from drakegrasp.dataset.statistics import count_splits
 from drakegrasp.dataset.trials import NONE
@@ -17,6 +16,9 @@ from drakegrasp.page.attempts import QUANTITIES
 from drakegrasp.page.catalog import Snapshot
 from drakegrasp.pictures.charts import draw_codes, draw_distributions, draw_objects
 from drakegrasp.pictures.style import svg_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: Plots by name, with what they show.
 PLOTS = {
@@ -66,6 +68,8 @@ def _draw(snapshot: Snapshot, name: str) -> Figure:
         decided = table.removal[table.removal != NONE]
         counts = np.bincount(decided, minlength=1 + max(Removal))
         return draw_codes(counts, Removal.KEPT, "successes")[0]
+
+    # The others tell held grasps, and the better ones of these, apart.
     held, size = table.outcome == Outcome.SUCCESS, len(snapshot.names)
     groups = {"held": held, "precision": table.precision, "stable": table.stable}
     if name == "objects":

@@ -220,6 +220,7 @@ class Predictions(Gallery):
         snapshot, camera = self.snapshot, self.rows.camera
         places, cards = self.places[shown].tolist(), []
         rows, verdicts = read_rows(snapshot, places, THUMBNAIL), self.read(shown.tolist(), ON_CARDS)
+
         for i, at, row, verdict in zip(shown.tolist(), places, rows, verdicts, strict=True):
             numbers = {name: float(values[i]) for name, values in self.features.items()}
             marks, size = self._marks(verdict, row, camera), snapshot.config.camera.size
@@ -266,6 +267,7 @@ class Predictions(Gallery):
             marks = self._marks(verdict, row, camera, look)
             window = _window(marks, size, wide=camera != self.rows.camera)
             views.append({"camera": camera, "strip": strip, "marks": marks, "window": window})
+
         return {
             "verdict": self._verdict(i),
             "reason": verdict.get("reason") or "",

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, dataclass_transform
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -70,13 +70,12 @@ class PostureVerdict:
     push: int | None = None
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=True)
 @dataclass(frozen=True, kw_only=True)
 class MujocoProtocol:
     """A protocol that runs in MuJoCo; without changes the numbers of DexGraspBench.
 
-    A protocol of your own is a subclass with a name, a source and other numbers, or with another
-    `run`.
+    A protocol of your own is a subclass, a frozen dataclass as this one, with a name, a source and
+    other numbers, or with another `run`.
 
     Attributes:
         name: By which it is asked for.
@@ -123,10 +122,6 @@ class MujocoProtocol:
     max_penetration: float | None = 0.01
     max_moved: float = 0.05
     max_turned: float | None = float(np.deg2rad(15.0))
-
-    def __init_subclass__(cls) -> None:
-        """Make the numbers that a subclass has of its own those of what is made of it."""
-        dataclass(frozen=True, kw_only=True)(cls)
 
     def __post_init__(self) -> None:
         """Refuse an object of two masses, or of none."""
@@ -255,6 +250,7 @@ class Lift:
         return {}
 
 
+@dataclass(frozen=True, kw_only=True)
 class DexGraspBench(MujocoProtocol):
     """Pushes along six axes without gravity, of DexGraspBench (BODex, Chen et al., ICRA 2025).
 
@@ -271,6 +267,7 @@ class DexGraspBench(MujocoProtocol):
     source: str = DEXGRASPBENCH
 
 
+@dataclass(frozen=True, kw_only=True)
 class DexGraspBenchTabletop(MujocoProtocol):
     """A lift by 10 cm from a table, of DexGraspBench with `setting=tabletop`.
 
@@ -285,6 +282,7 @@ class DexGraspBenchTabletop(MujocoProtocol):
     lift: float | None = 0.1
 
 
+@dataclass(frozen=True, kw_only=True)
 class DexonomyHard(MujocoProtocol):
     """Pushes along six axes with half the friction, of Dexonomy (Chen et al., RSS 2025), `hard`.
 
@@ -317,6 +315,7 @@ class DexonomyHard(MujocoProtocol):
         scene.push_where_it_is(self.acceleration * scene.modelled_mass * direction)
 
 
+@dataclass(frozen=True, kw_only=True)
 class DexonomyHardAsRun(DexonomyHard):
     """`dexonomy-hard` with the solver's settings that the code of the commit has.
 

@@ -175,6 +175,8 @@ def _fingers(
         finger: dict[str, Any] = {
             "name": name, "fingertip": member.tip, "closing_joint": joint.name
         }  # fmt: skip
+
+        # A motor of its own, or that of another finger.
         if i in drivers:
             driver, ratio = drivers[i]
             finger["driven_by"] = {"finger": names[driver], "ratio": round(ratio, 5)}

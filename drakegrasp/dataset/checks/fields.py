@@ -49,6 +49,8 @@ def complete(
             continue  # see `derived`; it is in no older file
         values, reached, late = batch[f.name], stage >= f.stage, f.stage is not Stage.PLACED
         by_finger = f.per_finger or f.axes == ("6k",)
+
+        # What a value must be depends on its kind.
         if not f.dtype.startswith("float"):
             if not late:
                 continue
