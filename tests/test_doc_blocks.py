@@ -43,7 +43,7 @@ NOT_RUN = {
     "drakegrasp scenes TRIED": "wants a dataset; tests/generation/test_make_scenes.py",
     "python docs/examples/": "tests/test_examples.py runs it",
     "python pipelines/measurements/": "measures for minutes to hours",
-    "drakegrasp build ": "simulates for minutes to hours; tests/build; with --plan it is run",
+    "drakegrasp build ": "simulates for minutes to hours; tests/generation; with --plan it is run",
     "drakegrasp objects export ": "makes hundreds of meshes; tests/objects/test_builtin.py",
     "drakegrasp inspect ": "serves until Ctrl-C; tests/page/test_serve.py",
     "drakegrasp figures OUT --compare ": "wants two datasets; tests/pictures/test_files.py",

@@ -75,7 +75,12 @@ def test_wheel_has_every_file_of_the_package(wheel: Path) -> None:
     }
     files = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert files == tree
-    for name in ("py.typed", "models/barrett_hand.sdf", "presets/paper.yaml", "build/pipeline.py"):
+    for name in (
+        "py.typed",
+        "models/barrett_hand.sdf",
+        "presets/paper.yaml",
+        "generation/work_unit.py",
+    ):
         assert f"drakegrasp/{name}" in files
 
 

@@ -132,7 +132,7 @@ def build_on(
         show: Whether to show progress on standard error.
 
     Raises:
-        ConfigError: As `refuse_unusable` of `build.pipeline`.
+        ConfigError: As `refuse_unusable` of `generation.pipeline`.
         DataError: If `out` cannot be used, another process builds there, or no mesh can be
             simulated.
         MeshError: If `only` names no object.

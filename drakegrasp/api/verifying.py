@@ -325,7 +325,7 @@ def run_verification(
     longer.
 
     Args:
-        grasps: From `verification.placed_grasp`.
+        grasps: See `verification.placing`.
         client: A Dask client whose workers do the work.
         on_result: Is called with each verdict in the caller's order, once all earlier ones exist.
         show: Whether to show progress on standard error.

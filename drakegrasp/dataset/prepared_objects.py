@@ -1,6 +1,6 @@
 """Objects at rest with their palm poses, and their files.
 
-In: an object that `build.prepare` made. Out: `objects/<name>.npz` with the object and
+In: an object that `generation.prepare` made. Out: `objects/<name>.npz` with the object and
 `objects/<name>.plan.h5` with its resting pose and palm poses, in the dataset's directory. Work
 units, `check` and `replay` read these two files and do not need the mesh file.
 """

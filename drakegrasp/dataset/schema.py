@@ -114,9 +114,9 @@ class Field:
         derive: Of a field of `/trials` that follows from others: given a table of rows with the
             columns of `needs`, its values (n, ...). No shard stores it.
         needs: Names of these columns.
-        of: Where its value is measured, as a path of attributes: from the row of `build.columns`
-            for a trial, from a `Verification` for a verdict. For a number of a sample, the column
-            of its trial that it copies. Empty if it is computed otherwise.
+        of: Where its value is measured, as a path of attributes: from a `TrialRow` of
+            `generation.columns` for a trial, from a `Verification` for a verdict. For a number of a
+            sample, the column of its trial that it copies. Empty if it is computed otherwise.
         shown: How people read it; None if it is not shown by itself.
     """
 

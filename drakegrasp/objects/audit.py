@@ -141,8 +141,8 @@ def audit(
         directory: The meshes, as for `find_meshes`.
         units: Unit of their lengths.
         manifest: Their YAML file, if it is not beside them.
-        opening: Largest distance of the hand's fingertips [m], see `hand.shapes.opening`; objects
-            that are wider everywhere get a warning.
+        opening: Largest distance of the hand's fingertips [m], see `hand.kinematics.opening`;
+            objects that are wider everywhere get a warning.
         flat: See `hand.kinematics.flat_limits` [m]; objects that stand lower get one, too.
         progress: Is told of each mesh.
 

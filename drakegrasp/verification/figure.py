@@ -2,7 +2,7 @@
 
 In: a verification. Out: a matplotlib figure with the object from two sides, then the last state
 that was reached, with the hand, with the verdict and a legend; or an HTML file that plays the
-trial. The pictures come from `visualization.still_scene`, so they need OpenGL and a single thread.
+trial. The pictures come from `pictures.still_scene`, so they need OpenGL and a single thread.
 """
 
 from __future__ import annotations

@@ -67,13 +67,13 @@ def place_on_object(
     snap_points: bool = False,
     overrides: Sequence[str] = (),
 ) -> list[PlacedGrasp]:
-    """Return grasps in {O} of one object, in their order; see `api.verify_grasps`.
+    """Return grasps in {O} of one object, in their order; see `drakegrasp.verify_grasps`.
 
     Postures are of it, whatever they call it. Those that name no resting pose are for all of a
     build. `overrides` is what the caller sets, which is stronger than the conditions of a posture.
 
     Raises:
-        GraspError: If they are in the frame of a mesh file, or as `api.verify_grasps`.
+        GraspError: If they are in the frame of a mesh file, or as `drakegrasp.verify_grasps`.
     """
     if not isinstance(grasps, Attempts):
         rows = _read(grasps, method, placed.config)
@@ -113,9 +113,10 @@ def place_on_rows(
     """Return grasps in {O} of the objects of a dataset's rows.
 
     Those of the same object stand together, so that its scene is built once. Arguments and errors
-    are those of `api.verify_grasps`, and of `dataset_config`; one row may be for all grasps. Where
-    no configuration is given, each grasp has the friction and mass that were drawn for its row, but
-    for what is overridden. Postures lie as their rows, whatever they say of object and pose.
+    are those of `drakegrasp.verify_grasps`, and of `dataset_config`; one row may be for all grasps.
+    Where no configuration is given, each grasp has the friction and mass that were drawn for its
+    row, but for what is overridden. Postures lie as their rows, whatever they say of object and
+    pose.
     """
     # Read all grasps before any object: a wrong number is reported at once.
     used = dataset_config(dataset, config, hand, overrides)

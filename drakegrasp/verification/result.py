@@ -47,7 +47,7 @@ class PoseTrial:
             closing [m]; NaN for a fingertip that does not touch, and for a posture.
         normal_error: (k,), angle between their normals [rad]; NaN likewise.
         removal: The first filter of a dataset that would remove the grasp, `KEPT` if none does, see
-            `build.columns`; None if it does not hold.
+            `generation.columns`; None if it does not hold.
     """
 
     fit: WristFit | None

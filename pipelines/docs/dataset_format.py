@@ -102,13 +102,11 @@ table then, and the forces of the fingertips need not balance.
 
 ## Versions of the schema
 
-Files of the `schema_version` above and of version 3 are read. Of version 3 `GraspDataset`,
-`stats`, `inspect`, `figures` and `export` read what there is; all else, and any other version, is
-refused with a line that names the file and both versions: build the dataset again, in another
-directory. Version 4 came with resting poses, sampler, refined palm poses, weights, chance and
-audit. Version 2 had no conditions of an attempt, and no mass, density, friction, scale and axis
-of each object. Version 1 had other labels, too: fingers that the object pushed open, and contacts
-anywhere on a fingertip's link.
+Files of the `schema_version` above are read. Any other version is refused with a line that names
+the file and both versions: build the dataset again, in another directory. Version 4 came with
+resting poses, sampler, refined palm poses, weights, chance and audit. Version 2 had no conditions
+of an attempt, and no mass, density, friction, scale and axis of each object. Version 1 had other
+labels, too: fingers that the object pushed open, and contacts anywhere on a fingertip's link.
 
 ## Seals
 

@@ -28,14 +28,9 @@ JUDGES = ("simulation", "verification")
 OTHERS = ("hand", "mesh", "objects", "vision", "dataset", "generation", "scoring")
 #: Modules and folders that draw a picture or tell a story: they decide nothing.
 _TELLING = {
-    *(f"verification/{name}.py" for name in ("explanation", "figure", "recording", "views")),
     *("dataset/card.py", "dataset/holding.py", "dataset/shortfall.py", "dataset/log.py"),
-    *("hand/files.py", "scoring/card.py"),
-    *(
-        "vision/probe_image.py",
-        "generation/events.py",
-        "generation/warnings.py",
-    ),
+    *("generation/events.py", "hand/files.py", "scoring/card.py"),
+    *("verification/figure.py", "vision/probe_image.py"),
 }
 #: How many imports may lie between a module and a test, in its room and elsewhere.
 NEAR, NEAR_ELSEWHERE = 2, 1

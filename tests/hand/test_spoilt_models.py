@@ -197,7 +197,7 @@ def test_a_sound_model_is_not_refused(tmp_path: Path, monkeypatch: pytest.Monkey
     """What the faults were planted in."""
     drawn: list[Callable[..., None]] = []
     monkeypatch.setattr("drakegrasp.commissioning.draft.run.GRASPS", ())
-    monkeypatch.setattr("drakegrasp.cli.hand._draw", lambda *files: drawn.append(files))
+    monkeypatch.setattr("drakegrasp.cli.models._draw", lambda *files: drawn.append(files))
     for name, text in (("hand.urdf", JAWS), ("hand.xml", JAWS_MJCF)):
         path, out = write_model(tmp_path / name, text, name), tmp_path / f"out of {name}"
         result = CliRunner().invoke(main, ["hand", "new", str(path), "--out", str(out)])
