@@ -44,7 +44,7 @@ NOT_RUN = {
     "python docs/examples/": "tests/test_examples.py runs it",
     "python pipelines/measurements/": "measures for minutes to hours",
     "drakegrasp build ": "simulates for minutes to hours; tests/generation; with --plan it is run",
-    "drakegrasp objects export ": "makes hundreds of meshes; tests/objects/test_builtin.py",
+    "drakegrasp objects export ": "makes hundreds of meshes; tests/shapes/test_shape_catalog.py",
     "drakegrasp inspect ": "serves until Ctrl-C; tests/page/test_serve.py",
     "drakegrasp figures OUT --compare ": "wants two datasets; tests/pictures/test_files.py",
     "drakegrasp merge ": "wants two datasets; tests/generation/test_merge.py",

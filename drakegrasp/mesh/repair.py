@@ -7,9 +7,8 @@ with the reason; `drakegrasp.objects.model` adds the file's name. A mesh that is
 its own vertices.
 
 The order matters: gaps are stitched and inner walls dropped while neighbours are still known. Then
-the surface is separated into `components`, whose holes are closed (`hole_filling`). Last come their
-`union` and a check of the result by generalised winding numbers, which is independent of the steps
-before.
+the surface is separated into `components`, whose holes are closed. Last come their `union` and a
+check of the result by generalised winding numbers, which is independent of the steps before.
 """
 
 from __future__ import annotations

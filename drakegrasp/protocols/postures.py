@@ -87,7 +87,7 @@ def prepare_trials(name: str, hand: Path, objects: Path) -> PostureTrials:
     """Return the trials of a protocol; everything but the files is checked here.
 
     Args:
-        name: Of `catalog.PROTOCOLS`, or `FILE.py:NAME`.
+        name: Of a protocol in the registry, or `FILE.py:NAME`.
         hand: MJCF of the hand.
         objects: Folder to which the paths of objects in the files are relative.
 

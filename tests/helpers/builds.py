@@ -50,7 +50,7 @@ def start_build(
         out: Directory of the dataset.
         workers: Number of workers.
         *arguments: More of them.
-        fault: What `fault_injection` shall cause.
+        fault: What goes wrong, see `drakegrasp.runtime.journal`.
         largest_file: Size of the largest file that can be written [B].
         new_session: Whether it has a terminal of its own, as it were: a group of processes.
     """
