@@ -158,7 +158,7 @@ def test_every_block_is_run_or_in_a_list() -> None:
                 rest = [line for line in block.lines if line not in known]
                 assert not [line for line in rest if why_not(line) is None], where
         else:
-            assert block.language in ("python", "yaml", "xml", "text"), where
+            assert block.language in ("python", "toml", "yaml", "xml", "text"), where
 
 
 def test_lists_name_nothing_that_is_gone() -> None:

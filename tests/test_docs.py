@@ -154,6 +154,15 @@ def test_each_stop_of_a_walk_is_a_function_of_its_module() -> None:
         assert re.search(rf"^(def|class) {name}\b", source, re.MULTILINE), f"{module} {name}"
 
 
+def test_pictures_of_the_architecture_name_modules() -> None:
+    page = ROOT / "docs" / "explanation" / "architecture.md"
+    named = {
+        name for text in blocks(page, "text") for name in re.findall(r"\w+(?:/\w+)+\.py", text)
+    }
+    assert len(named) > 20
+    assert not {name for name in named if not (ROOT / "drakegrasp" / name).is_file()}
+
+
 def guards(page: Path) -> Iterator[str]:
     """Yield the tests that a page names as guards, by `pytest -k`: in its tables, or in prose."""
     table = False
