@@ -1,4 +1,4 @@
-"""How an attempt can end, and why a success is no sample: the enums that all files share."""
+"""How an attempt can end, and how far it got: the enums that all files share."""
 
 from __future__ import annotations
 
@@ -71,33 +71,6 @@ class Outcome(IntEnum):
     def stage(self) -> Stage:
         """The stage that every attempt with this outcome has reached, at least."""
         return _STAGE[self]
-
-
-class Removal(IntEnum):
-    """Why a success is not a sample, in the order of the filters but for the last."""
-
-    KEPT = 0
-    OTHER_LINKS = 1  # after the lift more than fingertips touch the object
-    SLID = 2  # the object moved too far in the hand
-    TURNED = 3  # the object turned too far in the hand
-    NOT_SEEN = 4  # the object is missing in an image
-    OUT_OF_VIEW = 5  # a contact point lies outside of an image
-    BISECTS_TABLE = 6  # the camera is at the table's height or below
-    FLAT_DEPTH = 7  # the otm depth image varies too little
-    OFF_SURFACE = 8  # a contact's centre is off the surface: its patches span an edge
-    NORMAL_OFF = 9  # a contact's mean normal is not that of the surface: its patches span an edge
-    OUTLIER = 10  # a component of the grasp is too far from the mean of its object's grasps
-    REJECTED = 11  # an inspection rejected it; the last of the filters
-    # Values are stored in files: a filter that came later has the next number, not the next place.
-    SUSPICIOUS = 12  # the suspicion score or a part of it is too high; before OUTLIER
-    MISSING_FINGER = 13  # a fingertip that is not required does not touch; the first of all
-    REFINED_TEST = 14  # a refined palm pose whose split is test; after the split is drawn
-    OWN = 15  # a filter of the user's own does not keep it; before OUTLIER
-
-    @property
-    def label(self) -> str:
-        """The name as written in tables."""
-        return self.name.lower()
 
 
 _STAGE = {

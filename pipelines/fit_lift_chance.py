@@ -32,7 +32,7 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.errors import DataError
-from drakegrasp.filters import first_removal
+from drakegrasp.filters import Removal, first_removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.lift_chance import (
     FEATURES,
@@ -42,7 +42,7 @@ from drakegrasp.hand.lift_chance import (
     features,
     read_lift_chance,
 )
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.table import Table
 
 #: Weight of the squares of the standardized weights.

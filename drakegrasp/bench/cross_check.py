@@ -23,9 +23,10 @@ from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
+from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.description import load_hand
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream, object_key

@@ -35,9 +35,10 @@ from drakegrasp.dataset.statistics import (
 )
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import counted, printable
+from drakegrasp.filters import Removal
 from drakegrasp.objects.audit import AuditRow
 from drakegrasp.objects.model import needed_limit
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification

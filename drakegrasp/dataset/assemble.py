@@ -49,7 +49,7 @@ from drakegrasp.dataset.schema import (
     stored_fields,
 )
 from drakegrasp.errors import DataError
-from drakegrasp.outcomes import Removal
+from drakegrasp.filters import Removal
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.files import disk_full_named, new_hdf5, replaced_together, sweep_temporary
 from drakegrasp.runtime.progress import Report, silent

@@ -35,10 +35,11 @@ from drakegrasp.dataset.statistics import (
 )
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError, HandError, printable
+from drakegrasp.filters import Removal
 from drakegrasp.hand.file_format import HandFile, rated_load, read_hand_file
 from drakegrasp.hand.files import hand_file, hand_names
 from drakegrasp.hand.folder import HandFolder, hand_folder
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.files import write_atomic
 
 #: What the licence is called of meshes for which none is stated.

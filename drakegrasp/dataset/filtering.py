@@ -10,8 +10,7 @@ import numpy.typing as npt
 
 from drakegrasp.config import FilterConfig
 from drakegrasp.errors import ConfigError
-from drakegrasp.filters import Flags, first_removal, is_outlier
-from drakegrasp.outcomes import Removal
+from drakegrasp.filters import Flags, Removal, first_removal, is_outlier
 from drakegrasp.registry import own_class, run_own
 from drakegrasp.table import Table
 

@@ -20,7 +20,7 @@ from drakegrasp.dataset.schema import HOLD_FIELDS
 from drakegrasp.dataset.suspicion import COLUMNS as SUSPECTED
 from drakegrasp.dataset.suspicion import suspicion
 from drakegrasp.dataset.trials import Trials
-from drakegrasp.outcomes import Removal
+from drakegrasp.filters import Removal
 
 #: Probability that the true share lies in an interval.
 CONFIDENCE = 0.95

@@ -17,7 +17,8 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import norm
 from drakegrasp.errors import DataError, printable
-from drakegrasp.outcomes import Outcome, Removal, Stage
+from drakegrasp.filters import Removal
+from drakegrasp.outcomes import Outcome, Stage
 
 #: Goes up with every change of the table that an older reader cannot read.
 SCHEMA_VERSION = 4

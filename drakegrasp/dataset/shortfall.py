@@ -13,7 +13,8 @@ import numpy as np
 from drakegrasp.config import Config, SplitConfig
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.statistics import Funnel, SplitCount
-from drakegrasp.outcomes import Outcome, Removal, Stage
+from drakegrasp.filters import Removal
+from drakegrasp.outcomes import Outcome, Stage
 
 #: What attempts with an outcome met, in words.
 _MET = {

@@ -27,9 +27,10 @@ from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRI
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
 from drakegrasp.dataset.trials import NONE, Trials, shard_part
 from drakegrasp.errors import DataError, HandError, counted
+from drakegrasp.filters import Removal
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import Executor, run_here
 
 #: What stands for the name of a preshape of postures for which all fingers close.

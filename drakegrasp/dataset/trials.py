@@ -20,8 +20,9 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError, MachineError
+from drakegrasp.filters import Removal
 from drakegrasp.frames import X_WT, Array, invert_pose, unpack_pose
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 
 if TYPE_CHECKING:
     import pandas

@@ -17,12 +17,12 @@ from drakegrasp.config import Config, FilterConfig
 from drakegrasp.dataset.assembly.survey import successes_of
 from drakegrasp.dataset.schema import LOOK_FIELDS, NO_PRESHAPE, Field, sizes
 from drakegrasp.dataset.shards import trial_columns
-from drakegrasp.filters import RULES, first_removal
+from drakegrasp.filters import RULES, Removal, first_removal
 from drakegrasp.frames import pack_pose
 from drakegrasp.generation.attempts import TrialSetup, View
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.objects.model import ContactFit, ObjectModel, fit_contacts
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.conditions import Conditions, usual_conditions
 from drakegrasp.simulation.scene import hand_joint_names

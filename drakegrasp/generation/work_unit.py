@@ -25,6 +25,7 @@ from drakegrasp.dataset.filtering import judge_successes
 from drakegrasp.dataset.schema import HOLD_FIELDS
 from drakegrasp.dataset.shards import Shard, ShardHeader, read_trials, write_shard
 from drakegrasp.errors import DataError, MachineError
+from drakegrasp.filters import Removal
 from drakegrasp.generation.attempts import (
     TrialSetup,
     lift_scraped,
@@ -38,7 +39,7 @@ from drakegrasp.generation.attempts import (
 )
 from drakegrasp.generation.columns import empty_looks, fill_look, judge_sample, trial_rows
 from drakegrasp.generation.counts import has_target
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread, timed, trim_memory
 from drakegrasp.runtime.files import disk_full_named
 from drakegrasp.runtime.journal import (

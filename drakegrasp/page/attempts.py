@@ -16,8 +16,9 @@ from drakegrasp.dataset.rejections import FILE_NAME, Decisions
 from drakegrasp.dataset.schema import CAMERAS, SPLITS, TRIAL_FIELDS, Shown
 from drakegrasp.dataset.suspicion import PARTS, suspicion
 from drakegrasp.dataset.trials import NONE
+from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.page.catalog import Snapshot
 from drakegrasp.page.gallery import Gallery, Places, Query
 from drakegrasp.page.looks import (

@@ -11,7 +11,8 @@ import numpy as np
 from drakegrasp.dataset.statistics import count_splits
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.filters import Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.page.attempts import QUANTITIES
 from drakegrasp.page.catalog import Snapshot
 from drakegrasp.pictures.charts import draw_codes, draw_distributions, draw_objects

@@ -15,8 +15,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.style import INK, PREDICTED, png_bytes, shortened
 
 #: Colours of grasps that are held, precision and stable (Okabe and Ito), and of failures.

@@ -25,8 +25,9 @@ from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.statistics import Funnel, count_funnel
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError, MachineError
+from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.approaches import approaches_figure, coverage, read_approaches
 from drakegrasp.pictures.charts import (
     FAILED,

@@ -16,11 +16,12 @@ import numpy as np
 
 from drakegrasp.arithmetic import norm
 from drakegrasp.config import Config
+from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
 from drakegrasp.generation.columns import unjudged
 from drakegrasp.grasp import for_all_fingers
 from drakegrasp.hand.description import load_hand
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift

@@ -22,9 +22,10 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DrakegraspError
+from drakegrasp.filters import Removal
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.posture import joint_order
 
 #: Models of the right hands, and what `hand new` asks of them.

@@ -46,12 +46,13 @@ from drakegrasp.dataset.holding import (
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.trials import Trials
+from drakegrasp.filters import Removal
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.generation.attempts import find_attempt
 from drakegrasp.generation.columns import judge_sample
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import override_config
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.seeding import Stream

@@ -31,10 +31,11 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.filters import Removal
 from drakegrasp.frames import X_WT
 from drakegrasp.generation.attempts import TrialSetup, find_attempt, try_attempt
 from drakegrasp.hand.description import load_hand
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.simulation import drive

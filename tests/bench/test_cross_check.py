@@ -21,7 +21,8 @@ from helpers.datasets import (
 from drakegrasp.bench.cross_check import GROUPS, agreement, draw_lifts
 from drakegrasp.dataset.holding import wilson_interval
 from drakegrasp.errors import DataError
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.filters import Removal
+from drakegrasp.outcomes import Outcome
 
 
 @pytest.fixture(scope="module")

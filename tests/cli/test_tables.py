@@ -11,7 +11,8 @@ from rich.table import Table
 
 from drakegrasp.cli.tables import funnel_table, hold_table, preshape_table
 from drakegrasp.dataset.statistics import NO_NAME, Funnel, PreshapeCount
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.filters import Removal
+from drakegrasp.outcomes import Outcome
 
 
 def make_funnel(outcomes: np.ndarray, *names: str, **counts: np.ndarray) -> Funnel:

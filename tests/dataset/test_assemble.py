@@ -22,6 +22,7 @@ from drakegrasp.dataset.lock import FILE_NAME, build_lock
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.filters import Removal
 from drakegrasp.frames import (
     invert_pose,
     make_pose,
@@ -31,7 +32,6 @@ from drakegrasp.frames import (
     unpack_pose,
 )
 from drakegrasp.grasp import pack_grasp, unpack_grasp
-from drakegrasp.outcomes import Removal
 from drakegrasp.runtime.executor import processes
 from drakegrasp.runtime.files import refuse_broken_seal
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from drakegrasp.config import FilterConfig
 from drakegrasp.dataset.filtering import judge_successes
-from drakegrasp.filters import is_outlier
-from drakegrasp.outcomes import Removal
+from drakegrasp.filters import Removal, is_outlier
 
 
 @pytest.mark.parametrize(

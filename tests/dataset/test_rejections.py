@@ -17,7 +17,7 @@ from drakegrasp.dataset.rejections import (
     write_decisions,
 )
 from drakegrasp.errors import DataError
-from drakegrasp.outcomes import Removal
+from drakegrasp.filters import Removal
 
 A, B = AttemptKey("1_box_a", 0, 0), AttemptKey("3_brick", 1, 0)
 

@@ -14,8 +14,9 @@ from drakegrasp.dataset.shortfall import (
     why_no_sample,
 )
 from drakegrasp.dataset.statistics import SplitCount, count_funnel
+from drakegrasp.filters import Removal
 from drakegrasp.hand.settings import load_config
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 
 
 @pytest.mark.parametrize(

@@ -26,8 +26,9 @@ from drakegrasp.dataset.statistics import (
     preshapes_of,
 )
 from drakegrasp.dataset.trials import NONE
+from drakegrasp.filters import Removal
 from drakegrasp.hand.settings import load_config
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.page.catalog import Catalog
 from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from drakegrasp.dataset.log import BuildLog
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.filters import Removal
 from drakegrasp.generation.estimate import (
     CERTIFY_SECONDS,
     MEASURED,
@@ -25,7 +26,6 @@ from drakegrasp.generation.estimate import (
     read_times,
 )
 from drakegrasp.hand.settings import load_config, override_config
-from drakegrasp.outcomes import Removal
 
 EVEN = replace(
     MEASURED, prepare=2.0, scene=0.0, attempt=0.1, look=0.0, survey=0.0, pack=0.0, put=0.0

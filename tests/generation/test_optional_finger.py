@@ -10,11 +10,11 @@ from helpers.hands import write_with_optional_fingers
 from helpers.meshes import SMALL
 
 from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.filters import Removal
 from drakegrasp.generation.pipeline import BuildReport, build
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
-from drakegrasp.outcomes import Removal
 from drakegrasp.page.catalog import Catalog
 from drakegrasp.runtime.executor import run_here
 

@@ -25,12 +25,12 @@ from drakegrasp.dataset.filtering import judge_successes
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.filters import Removal
 from drakegrasp.generation.pipeline import build, refuse_unusable
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource, find_meshes
-from drakegrasp.outcomes import Removal
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.simulation.candidates import Candidates, Source, sample_candidates

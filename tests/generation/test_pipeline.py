@@ -24,13 +24,14 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.shards import read_shard, trial_columns, write_shard
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import ConfigError, DataError, MachineError, MeshError
+from drakegrasp.filters import Removal
 from drakegrasp.generation.pipeline import BuildReport, build
 from drakegrasp.generation.prepare import prepare_one
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.generation.work_unit import run_unit
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import find_meshes
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import Executor, run_here
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]

@@ -32,6 +32,7 @@ from drakegrasp.dataset.rejections import (
 from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import MachineError
+from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.generation import attempts
 from drakegrasp.generation.pipeline import NEAR_BORDER, build
@@ -39,7 +40,7 @@ from drakegrasp.generation.replay import record_trial, replay_trial
 from drakegrasp.generation.work_unit import WorkUnit, run_unit
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.page.attempts import Attempts
 from drakegrasp.page.catalog import Catalog
 from drakegrasp.pictures.approaches import read_approaches

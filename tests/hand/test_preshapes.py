@@ -17,13 +17,14 @@ from drakegrasp.errors import HandError
 from drakegrasp.exchange.dexgraspbench import grasp_dictionary
 from drakegrasp.exchange.export import ClosedGrasp
 from drakegrasp.exchange.isaac_grasp import grasp_entry
+from drakegrasp.filters import Removal
 from drakegrasp.generation.columns import trial_rows
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand, load_plain_hand
 from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.simulation.candidates import Attempt, Candidates, Source, make_attempts
 from drakegrasp.simulation.construction import build_scene

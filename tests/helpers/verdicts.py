@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from drakegrasp.filters import Removal
 from drakegrasp.frames import Array, make_pose
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift

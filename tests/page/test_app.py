@@ -37,8 +37,8 @@ from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.rejections import AttemptKey, read_decisions, read_rejected
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
+from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
-from drakegrasp.outcomes import Removal
 from drakegrasp.page import plots
 from drakegrasp.page.app import HEADERS, TOKEN_HEADER, Inspection, make_app
 from drakegrasp.page.gallery import PAGE

@@ -32,8 +32,8 @@ from drakegrasp.dataset.rejections import (
     read_rejected,
     write_decisions,
 )
+from drakegrasp.filters import Removal
 from drakegrasp.generation.scenes import make_scenes
-from drakegrasp.outcomes import Removal
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.page.catalog import Catalog, Snapshot
 from drakegrasp.page.serve import listen

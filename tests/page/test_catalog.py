@@ -17,7 +17,8 @@ from drakegrasp.dataset.manifest import Manifest, read_manifest, write_manifest
 from drakegrasp.dataset.rejections import Decisions
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.filters import Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.page import catalog as catalog_module
 from drakegrasp.page.attempts import Attempts
 from drakegrasp.page.catalog import FEATURES, Catalog

@@ -10,9 +10,10 @@ import trimesh
 from helpers.objects import standing
 from helpers.verdicts import some_contacts, some_forces, some_trial, some_try
 
+from drakegrasp.filters import Removal
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import make_object
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.verification.result import Verification
 

@@ -26,8 +26,8 @@ from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.manifest import Manifest, origin_attributes
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.schema import OBJECT_FIELDS, SUCCESS_FIELDS
+from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
-from drakegrasp.outcomes import Removal
 from drakegrasp.runtime.files import temporary_name
 from drakegrasp.table import Table, join
 from drakegrasp.vision.camera import intrinsics

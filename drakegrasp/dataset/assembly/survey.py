@@ -20,10 +20,10 @@ from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.schema import CAMERAS, CERTIFICATE_FIELDS, sizes, sources_of, with_derived
 from drakegrasp.dataset.shards import ShardHeader, open_shard, read_trials
 from drakegrasp.dataset.suspicion import COLUMNS, suspicion
-from drakegrasp.filters import NEEDED
+from drakegrasp.filters import NEEDED, Removal
 from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp, unused_fingers
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.files import read_seal
 from drakegrasp.table import AnyArray, Table, join

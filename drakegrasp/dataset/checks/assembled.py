@@ -60,9 +60,10 @@ from drakegrasp.dataset.paths import (
 from drakegrasp.dataset.schema import CAMERAS, SPLITS
 from drakegrasp.dataset.shards import read_trials
 from drakegrasp.errors import DataError, HandError, MeshError, first_line
+from drakegrasp.filters import Removal
 from drakegrasp.hand.folder import HAND_FOLDER, hand_digest
 from drakegrasp.objects.model import load_object
-from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.outcomes import Outcome
 
 #: Attributes that say of what a file was assembled, the cause of others first.
 ORIGIN = ("config", "split_by", "versions", "fingers", "joints", "shards", "signature")

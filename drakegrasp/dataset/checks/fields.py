@@ -12,8 +12,9 @@ import numpy as np
 
 from drakegrasp.dataset.checks.rows import AnyArray, Batch, Violation, all_per_row
 from drakegrasp.dataset.schema import SPLITS, Field
+from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
-from drakegrasp.outcomes import Removal, Stage
+from drakegrasp.outcomes import Stage
 
 #: float32 rounds unit vectors and rotations by 2e-7; this leaves room for products.
 UNIT_TOLERANCE = 1e-5

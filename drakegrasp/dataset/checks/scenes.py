@@ -48,9 +48,10 @@ from drakegrasp.dataset.schema import (
     Field,
 )
 from drakegrasp.dataset.trials import Trials
+from drakegrasp.filters import Removal
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points, unpack_pose
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.outcomes import Outcome, Removal, Stage
+from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.vision.camera import visible_contacts
 
 #: Half a step of the stored depths comes on top.
