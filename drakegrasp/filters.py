@@ -45,6 +45,7 @@ class Removal(IntEnum):
     MISSING_FINGER = 13  # a fingertip that is not required does not touch; the first of all
     REFINED_TEST = 14  # a refined palm pose whose split is test; after the split is drawn
     OWN = 15  # a filter of the user's own does not keep it; before OUTLIER
+    NEAR_CONE = 16  # a fingertip uses too much of its friction cone; before OUTLIER
 
     @property
     def label(self) -> str:
@@ -102,6 +103,9 @@ LIMITS = {
     "max_normal_sum": Limit(
         None, "positive", "of the contact normals, per finger: 0 balanced, 1 not", True
     ),
+    "max_slip_use": Limit(
+        None, "positive", "share of its friction cone that a fingertip uses", True, later=True
+    ),
 }
 
 
@@ -147,10 +151,14 @@ class Rule:
 def at_most(
     removal: Removal, column: str, limit: str, *, scale: float = 1.0, of_hold: bool = False
 ) -> Rule:
-    """Return the rule that a value, times `scale`, is not above a limit; NaN is."""
+    """Return the rule that a value, times `scale`, is not above a limit; NaN is.
+
+    Of a number of each finger (n, k) that of each finger counts that the grasp uses.
+    """
 
     def refuses(t: Table, limits: Limits) -> Flags:
-        return np.asarray(~(scale * t[column] <= getattr(limits, limit)))
+        above: Flags = ~(scale * t[column] <= getattr(limits, limit))
+        return above if above.ndim == 1 else np.any(above & ~t["unused"], axis=1)
 
     return Rule(removal=removal, needs=(column,), refuses=refuses, limit=limit, of_hold=of_hold)
 
@@ -201,6 +209,7 @@ RULES = (
     at_most(Removal.SUSPICIOUS, "penetration", "max_penetration"),
     at_most(Removal.SUSPICIOUS, "imbalance", "max_imbalance"),
     at_most(Removal.SUSPICIOUS, "normal_sum", "max_normal_sum"),
+    at_most(Removal.NEAR_CONE, "slip_use", "max_slip_use"),
 )
 #: The columns that the rules look at.
 NEEDED = tuple(dict.fromkeys(name for rule in RULES for name in rule.needs))

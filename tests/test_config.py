@@ -163,6 +163,7 @@ filters:
   max_penetration: 0.004
   max_imbalance: 0.1
   max_normal_sum: 0.5
+  max_slip_use: 0.9
   own: ["my_filter.py:Wide@0123456789abcdef"]
 split:
   valid_fraction: 0.2

@@ -114,7 +114,8 @@ def test_outliers_are_judged_among_the_grasps_that_are_left() -> None:
 def test_numbers_of_removals_are_those_in_files() -> None:
     """Files of earlier builds have them: a new one comes at the end."""
     names = "kept other_links slid turned not_seen out_of_view bisects_table flat_depth "
-    names += "off_surface normal_off outlier rejected suspicious missing_finger refined_test own"
+    names += "off_surface normal_off outlier rejected suspicious missing_finger refined_test own "
+    names += "near_cone"
     assert [(r.value, r.label) for r in Removal] == list(enumerate(names.split()))
 
 
@@ -184,3 +185,13 @@ def test_seventeen_equal_values_and_one_far_off_make_an_outlier() -> None:
     values = np.zeros((18, 2))
     values[3, 1] = 1.0
     assert np.flatnonzero(is_outlier(values, 4.0)).tolist() == [3]
+
+
+def test_no_finger_that_is_used_may_come_near_its_cone() -> None:
+    use = np.array([[0.2, 0.9, 0.3], [0.2, 0.7, 0.3], [np.nan, 0.2, 0.2], [np.nan, 0.2, 0.2]])
+    unused = np.zeros((4, 3), dtype=bool)
+    unused[3, 0] = True
+    successes = good(4).with_columns(slip_use=use, unused=unused)
+    assert np.all(judge_successes(successes, FilterConfig()) == Removal.KEPT)
+    removal = judge_successes(successes, FilterConfig(max_slip_use=0.8))
+    assert removal.tolist() == [Removal.NEAR_CONE, Removal.KEPT, Removal.NEAR_CONE, Removal.KEPT]
