@@ -24,7 +24,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.settings import load_config, override_config
-from drakegrasp.objects.sources import find_mesh
+from drakegrasp.objects.sources import file_frame, find_mesh
 from drakegrasp.simulation.placement import place_object
 from drakegrasp.verification.placing import (
     dataset_config,
@@ -208,14 +208,16 @@ def _place_postures(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
 
     # All are tried on the one object, which they need not name.
     assert request.mesh is not None
-    name = find_mesh(request.mesh, units=request.units or "m").name
+    source = find_mesh(request.mesh, units=request.units or "m")
+    name = source.name
     table = read_attempts(request.grasps, load_hand(config.hand_source), of=name)
     thing = place_object(request.mesh, units=request.units, config=config)
     others = sorted({each for each in table.objects if each not in ("", name)})
     if others:
         told = f"postures of {listed(others)} are tried on {name}, the --object"
         say(f"{request.grasps}: {told}", err=True)
-    return place_on_object(table, thing, overrides=request.overrides), config
+    X_OM = file_frame(source) if table.frame == "mesh" else None
+    return place_on_object(table, thing, overrides=request.overrides, X_OM=X_OM), config
 
 
 def _postures_on(dataset: Path, request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:

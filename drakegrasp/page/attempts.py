@@ -346,7 +346,7 @@ def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, s
     return [
         ("palm pose, stand-off", f"{key.candidate}, {standoff}"),
         *(
-            (field.shown.title, field.shown.text(float(row[field.name])))
+            (field.shown.title, " ".join(map(field.shown.text, np.ravel(row[field.name]).tolist())))
             for field in TRIAL_FIELDS
             if field.shown is not None and field.name not in in_parts
         ),

@@ -21,8 +21,8 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.paths import DATA_FILES, shards_folder
-from drakegrasp.dataset.schema import CERTIFICATE_FIELDS, SPLITS
-from drakegrasp.dataset.shards import trial_columns
+from drakegrasp.dataset.schema import CERTIFICATE_FIELDS, SPLITS, TRIAL_FIELDS
+from drakegrasp.dataset.shards import ASSEMBLED_FIELDS
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points, unpack_pose
@@ -77,12 +77,13 @@ def read_rows(
     Args:
         snapshot: State of the files.
         places: Of the attempts in the table.
-        names: Of the columns; all that a shard has if None.
+        names: Of the columns; all but those of the whole dataset if None.
 
     Raises:
         DataError: If a file was replaced meanwhile.
     """
-    columns = snapshot.trials[places].columns(names or [f.name for f in trial_columns()])
+    own = [f.name for f in TRIAL_FIELDS if f.name not in ASSEMBLED_FIELDS]
+    columns = snapshot.trials[places].columns(names or own)
     return [
         dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)
     ]

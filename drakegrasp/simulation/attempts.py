@@ -139,7 +139,10 @@ class Attempts:
             return np.eye(4)
         if self.frame == "mesh":
             if X_OM is None:
-                raise GraspError("frame must be object, table, camera or world here, got mesh")
+                raise GraspError(
+                    "frame must be object, table, camera or world on a dataset, which does not "
+                    "know the frames of its mesh files, got mesh: the mesh itself does (--object)"
+                )
             return X_OM
         X_OT = invert_pose(X_TO)
         if self.frame == "table":

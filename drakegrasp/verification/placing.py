@@ -66,14 +66,17 @@ def place_on_object(
     method: str = "hand",
     snap_points: bool = False,
     overrides: Sequence[str] = (),
+    X_OM: Array | None = None,
 ) -> list[PlacedGrasp]:
     """Return grasps in {O} of one object, in their order; see `drakegrasp.verify_grasps`.
 
     Postures are of it, whatever they call it. Those that name no resting pose are for all of a
-    build. `overrides` is what the caller sets, which is stronger than the conditions of a posture.
+    build. `overrides` is what the caller sets, which is stronger than the conditions of a posture;
+    `X_OM` is the pose (4, 4) of the mesh file's frame in {O}, if it is known.
 
     Raises:
-        GraspError: If they are in the frame of a mesh file, or as `drakegrasp.verify_grasps`.
+        GraspError: If postures are in the frame of a mesh file that is not known, or as
+            `drakegrasp.verify_grasps`.
     """
     if not isinstance(grasps, Attempts):
         rows = _read(grasps, method, placed.config)
@@ -95,7 +98,7 @@ def place_on_object(
     if config.objects.resting_poses > 1:
         others = find_resting_poses(placed.model, config)[1:]
         things += [replace(placed, X_TO=resting.X_TO) for resting in others]
-    return _placed_postures(named, range(len(named)), things, config, overrides)
+    return _placed_postures(named, range(len(named)), things, config, overrides, X_OM=X_OM)
 
 
 def place_on_rows(
@@ -424,10 +427,12 @@ def _placed_postures(
     config: Config,
     overrides: Sequence[str] = (),
     cameras: Mapping[str, Array] | None = None,
+    X_OM: Array | None = None,
 ) -> list[PlacedGrasp]:
     """Return some rows of a table on one object, which is there in each of its resting poses.
 
-    `cameras` are poses X_TC (n, 4, 4) for the rows of the table, by their frames.
+    `cameras` are poses X_TC (n, 4, 4) for the rows of the table, by their frames; `X_OM` is the
+    pose (4, 4) of the mesh file's frame, if it is known.
     """
     # The cameras that are known, and what no posture has.
     model, found = things[0].model, list[PlacedGrasp]()
@@ -446,11 +451,11 @@ def _placed_postures(
         if not reason:
             try:
                 for thing in stands.of(table, i):
-                    posture = table.posture(i, thing.X_TO)
+                    posture = table.posture(i, thing.X_TO, X_OM)
                     told, used = stands.under(thing, config, table.conditions[i], known)
                     tried.append((told, posture))
             except GraspError as error:
-                if table.frame == "mesh":
+                if table.frame == "mesh" and X_OM is None:
                     raise
                 tried, reason = [], str(error)
         first = tried[0][1] if tried else None

@@ -155,22 +155,6 @@ def test_rule_of_the_split_and_groups_are_stated(tmp_path: Path, manifest: Manif
         read_manifest(tmp_path)
 
 
-def test_a_manifest_of_before_the_rule_is_of_a_split_by_class(
-    tmp_path: Path, manifest: Manifest
-) -> None:
-    write_manifest(manifest, tmp_path)
-    tree = json.loads((tmp_path / FILE_NAME).read_text(encoding="utf-8"))
-    del (
-        tree[DIGEST],
-        tree["split_by"],
-        tree["config"]["split"]["by"],
-        tree["config"]["split"]["test_fraction"],
-    )
-    (tmp_path / FILE_NAME).write_text(json.dumps(tree), encoding="utf-8")
-    assert manifest.split_rule == "object"
-    assert read_manifest(tmp_path).split_rule == "class"
-
-
 def test_units_cover_the_candidates_of_each_object(manifest: Manifest) -> None:
     manifest = replace(manifest, objects=(MUG, replace(MUG, name="3_cup", candidates=3)))
     ranges = [(h.object_name, h.start, h.stop) for h in manifest.headers()]

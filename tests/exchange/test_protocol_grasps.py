@@ -193,12 +193,12 @@ def test_workers_fit_and_cut_in_any_order(closed: tuple[Path, TrialRecord], tmp_
 
     # Postures are those of their grasps.
     found = fitted_postures(placed, backwards)
-    assert [each.placed for each in found] == [each.placed for each in placed]
-    for each, grasp in zip(found[:2], placed, strict=False):
-        assert isinstance(each.posture, Posture)
-        np.testing.assert_array_equal(each.posture.X_OG, first_fit(grasp).X_OG)
-    assert found[2].posture == "it is none"
-    assert not np.array_equal(found[0].posture.X_OG, found[1].posture.X_OG)
+    assert [thing for thing, _ in found] == [each.placed for each in placed]
+    for (_, posture), grasp in zip(found[:2], placed, strict=False):
+        assert isinstance(posture, Posture)
+        np.testing.assert_array_equal(posture.X_OG, first_fit(grasp).X_OG)
+    assert found[2][1] == "it is none"
+    assert not np.array_equal(found[0][1].X_OG, found[1][1].X_OG)
 
     # The object of what is no grasp is not cut.
     told: list[tuple[int, int]] = []

@@ -90,7 +90,7 @@ def ranges(batch: Batch, fields: Sequence[Field]) -> Iterator[Violation]:
             # In single precision the largest turn is beyond itself.
             low, high = (values.dtype.type(limit) for limit in RANGES[f.name])
             positive = RANGES[f.name][0] == POSITIVE
-            what = f"{'above ' if positive else ''}{low:g}..{high:.4g}"
+            what = f"above 0..{high:.4g}" if positive else f"{low:g}..{high:.4g}"
             bad = (values < low) | (values > high) | (positive & (values <= 0))
             worst = np.where(bad.any(axis=1), values[range(len(values)), bad.argmax(axis=1)], 0)
             yield from batch.broken(f"{f.name} must be {what}", bad.any(axis=1), worst)
