@@ -21,9 +21,10 @@ from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.shapes import hull_triangles, link_shapes
-from drakegrasp.objects.model import ObjectModel, load_object, object_colour
+from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.pictures.still_scene import Poses, StillScene
 from drakegrasp.runtime.progress import Report
+from drakegrasp.vision.camera import object_colour
 
 #: What `drakegrasp export --help` says of the format.
 HELP = "a 3D scene per grasp: the object in the closed hand"

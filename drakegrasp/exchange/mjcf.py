@@ -25,9 +25,10 @@ from drakegrasp.hand.description import Hand, load_plain_hand
 from drakegrasp.mesh.wavefront import hull_text
 from drakegrasp.mjcf.links import MEMORY, HandModel, make_hand_model, pair_friction, set_inertia
 from drakegrasp.mjcf.scene import convex_parts
-from drakegrasp.objects.model import ObjectModel, load_object, object_colour
+from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.runtime.progress import Report
+from drakegrasp.vision.camera import object_colour
 
 #: What `drakegrasp export --help` says of the format.
 HELP = "the same for MuJoCo, with the table; needs drakegrasp[peer]"

@@ -9,7 +9,6 @@ simulates nonsense, so everything that it needs is checked here. Faults are repa
 
 from __future__ import annotations
 
-import colorsys
 import io
 import math
 from dataclasses import dataclass, fields, replace
@@ -40,7 +39,6 @@ from drakegrasp.objects.sources import (
     upright_vertices,
 )
 from drakegrasp.runtime.files import write_atomic
-from drakegrasp.seeding import object_key
 
 #: Smaller objects are sheets or specks, which hydroelastic contact does not resolve.
 MIN_EXTENT = 0.5e-3  # [m]
@@ -368,12 +366,6 @@ def _mistake(values: dict[str, Any]) -> str | None:
         if faces.dtype.kind != "i" or (faces.size and not 0 <= faces.min() <= faces.max() < count):
             return f"{kind}_faces of vertices that are not there"
     return None
-
-
-def object_colour(name: str) -> tuple[float, float, float]:
-    """Return the RGB colour of an object, 0 to 1: its hue depends on its name alone."""
-    hue = (object_key(name) % 997) / 997.0
-    return colorsys.hsv_to_rgb(hue, 0.65, 0.85)
 
 
 #: On a wall thinner than twice this the face behind a contact may be nearer than its own, so the

@@ -114,7 +114,9 @@ def write_figures(
         MachineError: If OpenGL failed and `trial_id` was given.
         OSError: If a file cannot be written.
     """
-    held, funnel = read_held(out), count_funnel(out)
+    held = read_held(out)
+    read_manifest(out)  # a damaged one is no reason to leave out a figure or two
+    funnel = count_funnel(out)
     drawings: dict[str, Callable[[], Drawn]] = {
         "palm_poses": lambda: _one("palm_poses", samplers_figure(out, compare)),
         "phases": lambda: _phases(out, held, trial_id),

@@ -55,9 +55,9 @@ from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import hull_corners
-from drakegrasp.objects.model import ObjectModel, object_colour
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.environment import require_render_memory
-from drakegrasp.vision.camera import Picture
+from drakegrasp.vision.camera import Picture, object_colour
 from drakegrasp.vision.rendering import BLANK, add_drawn_object
 
 #: Vertical field of view [deg]: narrow, so that perspective distorts little.

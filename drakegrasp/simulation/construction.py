@@ -70,8 +70,9 @@ from drakegrasp.hand.parsing import add_model, make_parser
 from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.mesh.wavefront import obj_text
-from drakegrasp.objects.model import ObjectModel, object_colour
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.scene import Motor, ObjectScene, Scene, joint_limits
+from drakegrasp.vision.camera import object_colour
 
 #: Mass of each of the three bodies that carry the wrist [kg]; small compared to the hand's.
 WRIST_BODY_MASS = 0.02

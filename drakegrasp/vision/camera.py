@@ -10,6 +10,7 @@ are those of Drake and OpenCV; pixel centres have integer coordinates, as in Dra
 
 from __future__ import annotations
 
+import colorsys
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +19,7 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos, sin_cos_deg
 from drakegrasp.config import CameraConfig, ScenesConfig
 from drakegrasp.frames import invert_pose, make_pose, rotation_about, transform_points
-from drakegrasp.objects.model import object_colour
-from drakegrasp.seeding import Stream
+from drakegrasp.seeding import Stream, object_key
 
 #: Sine of the angle between view and vertical below which +Ty is up in the image (0.06 degrees).
 LOOKS_VERTICALLY = 1e-3
@@ -328,6 +328,12 @@ class Appearance:
     table_colour: Array
     light_direction: Array
     light_strength: float
+
+
+def object_colour(name: str) -> tuple[float, float, float]:
+    """Return the RGB colour of an object, 0 to 1: its hue depends on its name alone."""
+    hue = (object_key(name) % 997) / 997.0
+    return colorsys.hsv_to_rgb(hue, 0.65, 0.85)
 
 
 def usual_appearance(name: str) -> Appearance:

@@ -45,9 +45,9 @@ from drakegrasp.frames import X_WT, invert_pose, transform_points
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.parsing import make_parser
 from drakegrasp.mesh.wavefront import obj_text
-from drakegrasp.objects.model import ObjectModel, object_colour
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.environment import require_render_memory
-from drakegrasp.vision.camera import Appearance, Lens, unproject, usual_appearance
+from drakegrasp.vision.camera import Appearance, Lens, object_colour, unproject, usual_appearance
 
 #: Colour of pixels beyond the table.
 BACKGROUND = np.array([0.86, 0.90, 0.94])
