@@ -79,7 +79,7 @@ test-browser: $(DEV)  ## the pages in Chromium, which it installs as root on Deb
 # torch is large: only this target installs it, and without it the tests that it runs skip.
 test-torch: $(DEV)  ## the baseline and the loaders for torch, which it installs
 	$(BIN)/python -m pip install --quiet --editable '.[torch]'
-	DRAKEGRASP_TORCH=1 $(BIN)/python -m pytest tests/test_baseline.py tests/dataset/loaders
+	DRAKEGRASP_TORCH=1 $(BIN)/python -m pytest tests/test_baseline.py tests/dataset/test_torch_samples.py
 
 test-cluster: $(DEV)  ## with a real SLURM and a real sshd, which it installs; as root, on Debian
 	apt-get update -qq
