@@ -46,7 +46,7 @@ NOT_RUN = {
     "drakegrasp build ": "simulates for minutes to hours; tests/generation; with --plan it is run",
     "drakegrasp objects export ": "makes hundreds of meshes; tests/shapes/test_shape_catalog.py",
     "drakegrasp inspect ": "serves until Ctrl-C; tests/page/test_serve.py",
-    "drakegrasp figures OUT --compare ": "wants two datasets; tests/pictures/test_files.py",
+    "drakegrasp figures OUT --compare ": "wants two datasets; tests/pictures/test_picture_files.py",
     "drakegrasp merge ": "wants two datasets; tests/generation/test_merge.py",
     "drakegrasp score ": "tries hundreds of grasps; tests/cli/test_score_command.py",
     "drakegrasp bench-set ": "simulates for hours; tests/scoring/test_benchmark.py",
