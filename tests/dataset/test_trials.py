@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from helpers.datasets import OTO, SUCCESS, TRIALS, edit_file
 
-from drakegrasp.dataset import trials
+from drakegrasp.dataset import trials as trials_module
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
@@ -33,7 +33,7 @@ def stored(out: Path, name: str) -> Any:
 def test_columns_are_those_of_the_file(
     sound: Path, block: int, rows: list[int] | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trials, "BLOCK", block)
+    monkeypatch.setattr(trials_module, "BLOCK", block)
     trials = Trials(sound) if rows is None else Trials(sound)[rows]
     columns = trials.columns([field.name for field in TRIAL_FIELDS])
     picked = slice(None) if rows is None else np.array(rows, dtype=int)
@@ -45,7 +45,7 @@ def test_columns_are_those_of_the_file(
 
 
 def test_blocks_are_the_columns_in_parts(sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trials, "BLOCK", 5)
+    monkeypatch.setattr(trials_module, "BLOCK", 5)
     blocks = list(Trials(sound).blocks(["slip", "object_name"]))
     assert [len(block["slip"]) for block in blocks] == [5] * 7 + [1]
     np.testing.assert_array_equal(
