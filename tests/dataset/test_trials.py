@@ -208,7 +208,7 @@ def test_numbers_that_stand_for_nothing_are_refused(out: Path) -> None:
     ):
         Trials(out)[[7, 9]]["outcome"]
     edit_file(out / TRIALS, lambda f: f["successes/removal"].write_direct(np.full(9, 99, "u1")))
-    with pytest.raises(DataError, match="/successes/removal must be 0 to 15, got 99 in row 0"):
+    with pytest.raises(DataError, match="/successes/removal must be 0 to 16, got 99 in row 0"):
         Trials(out)["removal"]
     edit_file(out / TRIALS, lambda f: f["trials/object"].write_direct(np.full(36, 3, "i4")))
     with pytest.raises(DataError, match="/trials/object must be 0 to 2, got 3 in row 0"):
