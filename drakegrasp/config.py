@@ -434,7 +434,10 @@ _KINDS: dict[str, Any] = {
 def _filter_config() -> type[_Filters]:
     """Return section `filters`: its settings are those of `drakegrasp.filters.LIMITS`."""
     settings: dict[str, Any] = {
-        name: (_KINDS[limit.kind] | None if limit.off else _KINDS[limit.kind], limit.default)
+        name: (
+            _KINDS[limit.kind] | None if limit.off == "null" else _KINDS[limit.kind],
+            limit.default,
+        )
         for name, limit in LIMITS.items()
     }
     # Filters of the user's own, `file.py:Name` each.

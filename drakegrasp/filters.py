@@ -61,7 +61,7 @@ class Limit:
         default: Its value where a configuration gives none.
         kind: Which numbers it may be.
         meaning: What it limits, with its unit.
-        off: Whether null switches it off.
+        off: Which value switches it off, if one does.
         later: Whether it came after the first datasets of this schema: where it has its default it
             leaves no trace in a dataset, so that older ones are continued.
     """
@@ -69,42 +69,42 @@ class Limit:
     default: float | None
     kind: Literal["number", "positive", "not negative", "count"]
     meaning: str
-    off: bool = False
+    off: Literal["", "null", "zero"] = ""
     later: bool = False
 
 
 #: The settings of the filters; those of the hold are own choices, see docs/reference/outcomes.md.
 LIMITS = {
-    "max_slip": Limit(0.010, "positive", "[m], of the object in the hand during the lift", True),
-    "max_turn_deg": Limit(10.0, "positive", "of the object in the hand during the lift", True),
-    "other_links": Limit(0, "count", "that touch the object after the lift, at most", True),
+    "max_slip": Limit(0.010, "positive", "[m], of the object in the hand during the lift", "null"),
+    "max_turn_deg": Limit(10.0, "positive", "of the object in the hand during the lift", "null"),
+    "other_links": Limit(0, "count", "that touch the object after the lift, at most", "null"),
     "min_depth_variance": Limit(
-        1e-3, "not negative", "[m^2], flatter otm depth images are removed"
+        1e-3, "not negative", "[m^2], flatter otm depth images are removed", "zero"
     ),
     "min_camera_height": Limit(
         0.01, "number", "[m] above the table; lower cameras see the table edge-on"
     ),
     "outlier_sigma": Limit(
-        4.0, "not negative", "per object and component of the grasp; 0 switches it off"
+        4.0, "not negative", "deviations, per object and component of the grasp", "zero"
     ),
     "max_surface_distance": Limit(
         2e-3, "positive", "[m], of a contact point from the object's surface"
     ),
     # The paper removed such grasps by eye.
     "max_normal_angle_deg": Limit(
-        30.0, "positive", "between a contact's mean normal and the object's nearest face", True
+        30.0, "positive", "between a contact's mean normal and the object's nearest face", "null"
     ),
     # As thresholds the score and its parts also remove sound grasps: they are off.
-    "max_suspicion": Limit(None, "positive", "score of dataset/suspicion.py", True),
-    "max_penetration": Limit(None, "positive", "[m], of the object in a fingertip", True),
+    "max_suspicion": Limit(None, "positive", "score of dataset/suspicion.py", "null"),
+    "max_penetration": Limit(None, "positive", "[m], of the object in a fingertip", "null"),
     "max_imbalance": Limit(
-        None, "positive", "of the fingertips' forces, as a share of the weight", True
+        None, "positive", "of the fingertips' forces, as a share of the weight", "null"
     ),
     "max_normal_sum": Limit(
-        None, "positive", "of the contact normals, per finger: 0 balanced, 1 not", True
+        None, "positive", "of the contact normals, per finger: 0 balanced, 1 not", "null"
     ),
     "max_slip_use": Limit(
-        None, "positive", "share of its friction cone that a fingertip uses", True, later=True
+        None, "positive", "share of its friction cone that a fingertip uses", "null", later=True
     ),
 }
 
@@ -127,8 +127,7 @@ class Rule:
         removal: The reason that it gives.
         needs: Names of the columns that it looks at; of a table without one it says nothing.
         refuses: Given a table of n rows and the limits, which rows (n,) it refuses.
-        limit: Name of its limit, whose null (or 0 for a least value) switches it off; empty: it is
-            always on.
+        limit: Name of the limit that can switch it off; empty: it is always on.
         of_hold: Whether it judges the hold, which `require: held` switches off.
     """
 
@@ -145,22 +144,29 @@ class Rule:
         if not self.limit:
             return True
         value = getattr(limits, self.limit)
-        return value is not None and (value > 0.0 or not self.limit.startswith("min_"))
+        return not (value == 0.0 if LIMITS[self.limit].off == "zero" else value is None)
 
 
 def at_most(
-    removal: Removal, column: str, limit: str, *, scale: float = 1.0, of_hold: bool = False
+    removal: Removal,
+    column: str,
+    limit: str,
+    *,
+    scale: float = 1.0,
+    of_hold: bool = False,
+    by_finger: bool = False,
 ) -> Rule:
     """Return the rule that a value, times `scale`, is not above a limit; NaN is.
 
-    Of a number of each finger (n, k) that of each finger counts that the grasp uses.
+    Of a number of each finger (n, k), `by_finger`, none may be that the grasp uses.
     """
 
     def refuses(t: Table, limits: Limits) -> Flags:
         above: Flags = ~(scale * t[column] <= getattr(limits, limit))
-        return above if above.ndim == 1 else np.any(above & ~t["unused"], axis=1)
+        return np.any(above & ~t["unused"], axis=1) if by_finger else above
 
-    return Rule(removal=removal, needs=(column,), refuses=refuses, limit=limit, of_hold=of_hold)
+    needs = (column, "unused") if by_finger else (column,)
+    return Rule(removal=removal, needs=needs, refuses=refuses, limit=limit, of_hold=of_hold)
 
 
 def _not_finite(column: str) -> Rule:
@@ -209,7 +215,7 @@ RULES = (
     at_most(Removal.SUSPICIOUS, "penetration", "max_penetration"),
     at_most(Removal.SUSPICIOUS, "imbalance", "max_imbalance"),
     at_most(Removal.SUSPICIOUS, "normal_sum", "max_normal_sum"),
-    at_most(Removal.NEAR_CONE, "slip_use", "max_slip_use"),
+    at_most(Removal.NEAR_CONE, "slip_use", "max_slip_use", by_finger=True),
 )
 #: The columns that the rules look at.
 NEEDED = tuple(dict.fromkeys(name for rule in RULES for name in rule.needs))

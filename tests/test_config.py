@@ -594,3 +594,10 @@ def test_simulation_hash_is_that_of_the_value_not_of_its_spelling() -> None:
     two = load_config(overrides=["objects.mass=2.0", "candidates.standoffs=[1.0, 5e-1]"])
     assert one.simulation_hash() == two.simulation_hash()
     assert re.fullmatch(r"[0-9a-f]{16}", one.simulation_hash())
+
+
+def test_a_later_limit_of_the_filters_leaves_no_trace_at_its_default() -> None:
+    """Else the signature of each older dataset was another one."""
+    assert "max_slip_use" not in load_config().to_dict()["filters"]
+    tree = load_config(overrides=["filters.max_slip_use=0.8"]).to_dict()
+    assert parse_stored(tree).filters.max_slip_use == 0.8

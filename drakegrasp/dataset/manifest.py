@@ -87,8 +87,8 @@ Pose = Annotated[
 ]
 
 
-#: Section `verify` of version 0.2's defaults. No row depends on that section, and as it is in every
-#: signature like this, files of that version still count as assembled.
+#: Stands for section `verify` in every signature. No row depends on that section, and its first
+#: defaults keep the signatures of datasets that were made with them.
 VERIFY_BEFORE = {
     "max_surface_distance": 0.01,
     "max_residual": 0.008,

@@ -383,7 +383,7 @@ def _differs(dataset: h5py.Dataset, row: int, chunk: bytes, skipped: int) -> boo
 def _rows_depend_on(key: str, text: str) -> str:
     """Return an attribute without what no row depends on: the section `verify` of a configuration.
 
-    Version 0.2 had other keys there, and its files are still assembled.
+    It acts on predicted grasps, and may be another one now.
     """
     if key != "config":
         return text
