@@ -32,6 +32,8 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 NOT_RUN = {
     "make ": "`make` runs this test",
     "pip install ": "installing",
+    "python3 -m venv ": "installing",
+    "env/bin/": "installing",
     "ssh ": "another machine",
     "dask ": "a cluster; tests/cluster starts one",
     "python pipelines/submit_build.py ": "a cluster; tests/cluster/test_submit.py",
