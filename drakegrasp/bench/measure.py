@@ -57,7 +57,7 @@ def measure(
     mujoco: bool = False,
     progress: Report = silent,
 ) -> Iterator[dict[str, Any]]:
-    """Yield the measurements of each object, see `docs/benchmarks.md`.
+    """Yield the measurements of each object, see `docs/results/speed.md`.
 
     Args:
         sources: The meshes.

@@ -59,7 +59,7 @@ LIMITS = (
     (
         "Labels depend on the drive of the fingers, on friction and mass. With the Barrett Hand "
         "about 3 % of the simulated attempts change their outcome when the time step is halved.",
-        "benchmarks.md",
+        "results/labels.md",
     ),
     (
         "Samples are successes that passed the filters, so they say nothing of how often a grasp "
