@@ -278,7 +278,7 @@ def test_results_are_dated_and_of_now(page: Path) -> None:
     text = read(page)
     for section in re.split(r"^## ", text, flags=re.M)[1:]:
         assert re.search(r"\b20\d\d-\d\d-\d\d\b", section), section.splitlines()[0]
-    # A hash of a commit of ours says nothing to a reader, and an older number belongs to the changelog.
+    # A hash of our commits says nothing to a reader, and an older number belongs to the changelog.
     assert not re.findall(r"(?<!commit )\b(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,40}\b", text)
     assert not re.findall(r"^\|.*\bbefore \|.*\bnow \|", text, re.M)
 
