@@ -17,8 +17,8 @@ DEV    := $(VENV)/.installed-dev
 export LP_NUM_THREADS := 0
 export DRAKE_ALLOW_NETWORK := none
 
-.PHONY: FORCE help install demo test test-fast test-browser test-torch test-cluster lint format \
-	docs docs-pages package clean
+.PHONY: FORCE help install demo test test-fast test-nightly test-browser test-torch test-cluster \
+	lint format docs docs-pages package clean
 
 help:            ## what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -58,11 +58,14 @@ demo: $(STAMP)   ## a small dataset of built-in objects, its funnel and a contac
 	$(BIN)/drakegrasp doctor
 	$(BIN)/python pipelines/demo.py $(DEMO)
 
-test: $(DEV)   ## the whole test suite
+test: $(DEV)   ## the tests of every change: the first tier
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-test-fast: $(DEV)  ## without simulations and clusters
-	$(BIN)/python -m pytest -n 2 -m 'not sim and not cluster and not slow'
+test-fast: $(DEV)  ## of these the ones without simulations and clusters
+	$(BIN)/python -m pytest -n 2 -m 'not sim and not cluster and not slow and not nightly'
+
+test-nightly: $(DEV)  ## the second tier: kills, hangs, full disks, spoilt files, repeats
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'nightly and not server'
 
 # Without root or apt-get the tests of pages run where Chromium is there, and else skip.
 test-browser: $(DEV)  ## the pages in Chromium, which it installs as root on Debian

@@ -7,6 +7,7 @@ import importlib
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from types import ModuleType
@@ -98,10 +99,6 @@ def modules() -> dict[str, Path]:
 MODULE_NAMES = modules()
 
 
-def folders() -> list[Path]:
-    return [PACKAGE, *sorted({path.parent for path in PACKAGE.rglob("__init__.py")} - {PACKAGE})]
-
-
 def room_of(module: str) -> str:
     """Return the place of a module in the order."""
     top, _, rest = module.partition(".")
@@ -109,6 +106,12 @@ def room_of(module: str) -> str:
     return top if rest else "cli" if top == "__main__" else "(root)"
 
 
+@cache
+def tree_of(module: str) -> ast.Module:
+    return ast.parse(MODULE_NAMES[module].read_text(encoding="utf-8"))
+
+
+@cache
 def imports_of(module: str, *, types: bool = True) -> set[str]:
     """Return what a module imports at any depth of its code, as dotted names.
 
@@ -116,9 +119,8 @@ def imports_of(module: str, *, types: bool = True) -> set[str]:
         module: Its name below the package.
         types: Whether imports for the type checker alone count.
     """
-    tree = ast.parse(MODULE_NAMES[module].read_text(encoding="utf-8"))
     found: set[str] = set()
-    for node in _nodes(tree, types):
+    for node in _nodes(tree_of(module), types):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -150,9 +152,11 @@ def own_imports(module: str, *, types: bool = True) -> set[str]:
     return names & MODULE_NAMES.keys()
 
 
-def loaded_by(module: str, names: tuple[str, ...]) -> str:
+def loaded_by(modules: tuple[str, ...], names: tuple[str, ...]) -> str:
+    """Return which libraries a process has loaded after it imported modules of the package."""
+    imports = ", ".join(["drakegrasp", *(f"drakegrasp.{module}" for module in modules)])
     code = (
-        f"import sys, {module}; "
+        f"import sys, {imports}; "
         f"print(sorted(name for name in {names} if sys.modules.get(name) is not None))"
     )
     result = subprocess.run(
@@ -168,11 +172,10 @@ def test_every_folder_is_in_the_order() -> None:
     assert not [path for name in DATA for path in (PACKAGE / name).rglob("*.py")]
 
 
-@pytest.mark.parametrize("module", MODULE_NAMES)
-def test_imports_point_to_rooms_before(module: str) -> None:
-    own = ORDER.index(room_of(module))
-    behind = {name for name in own_imports(module) if ORDER.index(room_of(name)) > own}
-    assert not behind, f"{module} imports {sorted(behind)}"
+def test_imports_point_to_rooms_before() -> None:
+    place = {module: ORDER.index(room_of(module)) for module in MODULE_NAMES}
+    behind = {(m, name) for m in MODULE_NAMES for name in own_imports(m) if place[name] > place[m]}
+    assert not behind
 
 
 def test_no_module_imports_itself_through_others() -> None:
@@ -184,37 +187,35 @@ def test_no_module_imports_itself_through_others() -> None:
         pytest.fail(" -> ".join(error.args[1]))
 
 
-@pytest.mark.parametrize("folder", folders()[1:], ids=lambda path: path.name)
-def test_rooms_load_nothing_by_themselves(folder: Path) -> None:
+def test_rooms_load_nothing_by_themselves() -> None:
     """The walls below depend on it."""
-    body = ast.parse((folder / "__init__.py").read_text(encoding="utf-8")).body
-    assert all(isinstance(node, ast.Expr) for node in body)
-    assert len(body) == 1
+    for path in sorted(PACKAGE.rglob("*/__init__.py")):
+        (docstring,) = ast.parse(path.read_text(encoding="utf-8")).body
+        assert isinstance(docstring, ast.Expr), path
 
 
-@pytest.mark.parametrize("library", WALLS)
-def test_libraries_stay_in_their_rooms(library: str) -> None:
+def test_libraries_stay_in_their_rooms() -> None:
     strangers = {
-        module
+        (module, library)
+        for library, places in WALLS.items()
         for module in MODULE_NAMES
-        if not any(f"{module}.".startswith(f"{place}.") for place in WALLS[library])
+        if not any(f"{module}.".startswith(f"{place}.") for place in places)
         and library in libraries_of(module, types=(module, library) not in NAMES_TYPES)
     }
     assert not strangers
 
 
-@pytest.mark.parametrize("module", READERS)
-def test_reading_data_loads_numpy_and_h5py_only(module: str) -> None:
-    assert loaded_by(f"drakegrasp.{module}", HEAVY) == "[]"
-
-
-@pytest.mark.parametrize("module", CHECKERS)
-def test_checking_data_loads_no_drake_and_no_dask(module: str) -> None:
-    assert loaded_by(f"drakegrasp.{module}", ("pydrake", "dask", "distributed")) == "[]"
-
-
-def test_importing_the_package_loads_nothing_heavy() -> None:
-    assert loaded_by("drakegrasp", (*HEAVY, "numpy", "h5py")) == "[]"
+@pytest.mark.parametrize(
+    ("modules", "names"),
+    [
+        ((), (*HEAVY, "numpy", "h5py")),
+        (READERS, HEAVY),
+        (CHECKERS, ("pydrake", "dask", "distributed")),
+    ],
+    ids=["the package", "readers: NumPy and h5py only", "checkers: no Drake and no Dask"],
+)
+def test_imports_load_nothing_heavy(modules: tuple[str, ...], names: tuple[str, ...]) -> None:
+    assert loaded_by(modules, names) == "[]"
 
 
 def test_no_package_hides_a_public_name() -> None:
@@ -236,12 +237,15 @@ def test_public_names_are_sorted_and_exist() -> None:
         _ = drakegrasp.magic
 
 
-@pytest.mark.parametrize("module", MODULE_NAMES)
-def test_code_names_a_hand_only_as_a_default(module: str) -> None:
-    tree = ast.parse(MODULE_NAMES[module].read_text(encoding="utf-8"))
-    texts = [n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)]
-    named = [t for t in texts if isinstance(t, str) and t.lower().startswith("barrett")]
-    assert named == (["barrett"] if module in ("config", "hand.description") else [])
+def test_code_names_a_hand_only_as_a_default() -> None:
+    texts = [
+        (module, node.value)
+        for module in MODULE_NAMES
+        for node in ast.walk(tree_of(module))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    ]
+    named = [(module, text) for module, text in texts if text.lower().startswith("barrett")]
+    assert named == [("config", "barrett"), ("hand.description", "barrett")]
 
 
 def statements_of(function: ast.FunctionDef) -> list[ast.stmt]:
@@ -258,13 +262,14 @@ def has_paragraphs(function: ast.FunctionDef, lines: list[str]) -> bool:
     return len(text) < LONG_BODY or any(not line or line.startswith("#") for line in text)
 
 
-@pytest.mark.parametrize("module", MODULE_NAMES)
-def test_long_bodies_have_paragraphs(module: str) -> None:
+def test_long_bodies_have_paragraphs() -> None:
     """A reader sees the steps: a line of intent, or at least a blank line, between them."""
-    source = MODULE_NAMES[module].read_text(encoding="utf-8")
-    functions = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
-    lines = source.splitlines()
-    assert not {f"{module}.{f.name}" for f in functions if not has_paragraphs(f, lines)}
+    bare = []
+    for module, path in MODULE_NAMES.items():
+        lines = path.read_text(encoding="utf-8").splitlines()
+        functions = [n for n in ast.walk(tree_of(module)) if isinstance(n, ast.FunctionDef)]
+        bare += [f"{module}.{f.name}" for f in functions if not has_paragraphs(f, lines)]
+    assert not bare
 
 
 def test_a_body_without_paragraphs_is_noticed() -> None:

@@ -133,7 +133,7 @@ def test_demo_installs_the_package_and_the_others_what_they_need_beside_it(path:
 
     assert added("demo") == [package]
     assert added("demo") == []
-    for target in ("install", "test", "test-fast", "lint", "format", "docs"):
+    for target in ("install", "test", "test-fast", "test-nightly", "lint", "format", "docs"):
         (path.parent / "venv" / ".installed-dev").unlink(missing_ok=True)
         assert added(target) == [rest]
         assert added(target) == added("demo") == []

@@ -138,7 +138,7 @@ def _run(folder: Path, tests: list[str], timeout: float, output: int) -> None:
     sys.path[:0] = [str(folder), str(folder / "tests")]
     os.environ["PYTHONPATH"] = f"{folder}:{folder / 'tests'}"
     options = ["-x", "-q", "--no-header", "--tb=no", "-p", "no:cacheprovider"]
-    options += [f"--timeout={timeout:g}", "--hypothesis-seed=0", "-m", "not server"]
+    options += [f"--timeout={timeout:g}", "--hypothesis-seed=0"]
     sys.exit(pytest.main([*options, *tests]))
 
 

@@ -38,7 +38,6 @@ from drakegrasp.vision import rendering
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
 UNITS = 28
-KILLS = 20
 
 
 @pytest.fixture(scope="module")
@@ -85,8 +84,11 @@ def assert_clean(out: Path, *patterns: str) -> None:
 
 
 @pytest.mark.cluster
-def test_random_kills_change_nothing(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
-    """All of four workers are killed while objects are prepared, and twenty times one of them.
+@pytest.mark.parametrize("kills", [3, pytest.param(20, marks=pytest.mark.nightly)])
+def test_random_kills_change_nothing(
+    meshes: Path, undisturbed: Path, tmp_path: Path, kills: int
+) -> None:
+    """All of four workers are killed while objects are prepared, and some times one of them.
 
     However quick they are: at the latest with the next shard.
     """
@@ -101,14 +103,14 @@ def test_random_kills_change_nothing(meshes: Path, undisturbed: Path, tmp_path: 
     # A journal outlives its process: preparing was interrupted.
     assert workers and list(out.glob("objects/*.journal"))
     wait_for_shards(out, 1)
-    while process.poll() is None and killed < KILLS:
+    while process.poll() is None and killed < kills:
         wait_for_shards(out, 2 + killed, patience=0.8)
         workers = workers_of(process.pid)
         if workers:
             os.kill(rng.choice(workers), signal.SIGKILL)
             killed += 1
     said, _ = finish(process)
-    assert killed == KILLS
+    assert killed == kills
     assert f"{UNITS} work units simulated\n" in said
     assert_same_dataset(undisturbed, out)
     assert_clean(out)
@@ -116,6 +118,7 @@ def test_random_kills_change_nothing(meshes: Path, undisturbed: Path, tmp_path: 
     assert len(done) == len(set(done)) == UNITS
 
 
+@pytest.mark.nightly
 @pytest.mark.cluster
 def test_client_that_is_stopped_goes_on(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
     """One that is killed: test_interruptions.py."""
@@ -158,6 +161,7 @@ def test_objects_are_prepared_once_whatever_died(
     assert_same_dataset(undisturbed, out)
 
 
+@pytest.mark.nightly
 @pytest.mark.cluster
 def test_fault_costs_what_is_guilty_and_nothing_else(
     meshes: Path, undisturbed: Path, tmp_path: Path
@@ -191,6 +195,7 @@ def test_fault_costs_what_is_guilty_and_nothing_else(
     assert_clean(out)
 
 
+@pytest.mark.nightly
 @pytest.mark.cluster
 def test_suspended_worker_changes_no_label(meshes: Path, tmp_path: Path) -> None:
     """As SLURM suspends a job: for longer than an attempt may take."""
@@ -210,6 +215,7 @@ def test_suspended_worker_changes_no_label(meshes: Path, tmp_path: Path) -> None
     assert not set(outcomes) & {Outcome.TIMEOUT, Outcome.CRASHED}
 
 
+@pytest.mark.nightly
 @pytest.mark.cluster
 def test_mesh_that_takes_too_much_memory_is_refused_and_the_others_go_on(
     meshes: Path, tmp_path: Path
@@ -294,6 +300,7 @@ def test_what_is_harmed_is_named_and_run_again(
     assert_same_dataset(undisturbed, out)
 
 
+@pytest.mark.nightly
 def test_full_disk_stops_and_goes_on(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
     """A limit on the size of files is what a full disk is to a shard with images."""
     out = tmp_path / "out"
@@ -346,6 +353,7 @@ def test_blank_image_never_becomes_data(
     assert_same_dataset(undisturbed, out)
 
 
+@pytest.mark.nightly
 @pytest.mark.cluster
 def test_second_build_is_refused_before_it_starts(
     meshes: Path, undisturbed: Path, tmp_path: Path

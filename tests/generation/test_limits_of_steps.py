@@ -22,7 +22,7 @@ from drakegrasp.objects.sources import MeshSource, find_meshes, source_sha256
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.journal import HUNG_DEATHS, PREPARE_DEATHS, VARIABLE
 
-pytestmark = [pytest.mark.sim, pytest.mark.slow]
+pytestmark = [pytest.mark.sim, pytest.mark.slow, pytest.mark.nightly]
 
 #: Runs a task some times as workers do, each in a process of its own; prints how each ended. The
 #: limits are some seconds of computing, and ten times as many on the wall.
