@@ -1,8 +1,13 @@
-"""How an attempt can end, and how far it got: the enums that all files share."""
+"""How an attempt can end, and how far it got: the enums that all files share.
+
+All that is known of an outcome by itself is here. `drakegrasp.simulation.verdict` and
+`drakegrasp.simulation.trial` say when an attempt has it.
+"""
 
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Self
 
 
 class Stage(IntEnum):
@@ -13,39 +18,76 @@ class Stage(IntEnum):
     LIFTED = 2  # the object was freed, lifted and judged again
 
 
-class Outcome(IntEnum):
-    """The verdict on one attempt. Values are stored in files: never renumber them."""
+#: What becomes of attempts, in the order of the funnel, with the stage that they have reached at
+#: least. What is in no group is of verification only: no file of a dataset holds it.
+GROUPS = {
+    "no ray": Stage.PLACED,
+    "collis.": Stage.PLACED,
+    "no grip": Stage.CLOSED,
+    "left": Stage.CLOSED,
+    "lost": Stage.LIFTED,
+    "moved": Stage.LIFTED,
+    "errors": Stage.PLACED,
+    "success": Stage.LIFTED,
+}
 
-    SUCCESS = 0  # every fingertip holds the object at the lift's target, clear of the table
-    BELOW_TABLE = 1  # the palm's origin would lie below the table
-    RAY_MISS = 2  # the palm ray does not meet the object
-    START_COLLISION = 3  # the open hand collides with the object or the table at the start pose
-    SCREENED = 4  # geometry shows that not every fingertip can reach the object
-    MISSING_FINGERTIP = 5  # after closing, a fingertip does not touch the object
-    HAND_CONTACT = 6  # after closing, a hand link other than a fingertip touches the object
-    # After closing the hand touches the table, or after the lift the object does; or the hand came
-    # too far below the table's top on its way (`close.scrape_depth`).
-    TABLE_CONTACT = 7
-    # A fingertip lost contact during the lift, and none holds the object off the table; in datasets
-    # of older versions, also what is PARTLY_HELD now.
-    SLIPPED = 8
-    DROPPED = 9  # the object fell during the lift
-    SOLVER_ERROR = 10  # Drake failed or the state diverged; says nothing about the grasp
-    TIMEOUT = 11  # the attempt's limit of computing time passed; says nothing about the grasp
-    CRASHED = 12  # the attempt killed its process; says nothing about the grasp
-    # Result files of older versions: no wrist pose brought the fingertips to the contacts.
-    UNREACHABLE = 13
-    OFF_SURFACE = 14  # verification by forces only: a contact, or its normal, is off the surface
-    # The lift was ended early because the object moved more in the hand than a sample may: it is
-    # no sample, but whether the hand would have held it is unknown.
-    MOVED = 15
-    # The closed hand might lift, but its chance of a sample was below `lift.least_chance`, or its
-    # image is too flat for one: whether it would have held the object is unknown.
-    NOT_LIFTED = 16
-    INVALID = 17  # verification only: the row of numbers is no grasp; it counts as a failure
-    # A fingertip lost contact during the lift; at its end, which may be early, others still hold
-    # the object off the table.
-    PARTLY_HELD = 18
+
+class Outcome(IntEnum):
+    """The verdict on one attempt. Values are stored in files: never renumber them.
+
+    Attributes:
+        group: One of `GROUPS`, or empty.
+        text: What happened, as a part of a sentence.
+    """
+
+    group: str
+    text: str
+
+    def __new__(cls, value: int, group: str, text: str) -> Self:
+        """Make a member that equals its value."""
+        member = int.__new__(cls, value)
+        member._value_, member.group, member.text = value, group, text
+        return member
+
+    SUCCESS = 0, "success", "every fingertip touches it at the end of the lift, clear of the table"
+    BELOW_TABLE = 1, "no ray", "the palm would be below the table"
+    RAY_MISS = 2, "no ray", "the palm does not face the object"
+    START_COLLISION = 3, "collis.", "the opened hand would be inside the object or the table"
+    SCREENED = 4, "collis.", "geometry shows that not every fingertip can reach the object"
+    MISSING_FINGERTIP = 5, "no grip", "a fingertip closes without touching the object"
+    HAND_CONTACT = 6, "no grip", "a part of the hand that is not a fingertip touches the object"
+    # So is a hand that came too far below the table's top on its way (`close.scrape_depth`).
+    TABLE_CONTACT = (
+        7,
+        "no grip",
+        "the closing or lifting hand, or the lifted object, touches the table",
+    )
+    # In datasets of older versions, also what is PARTLY_HELD now.
+    SLIPPED = (
+        8,
+        "lost",
+        "a fingertip loses contact during the lift, and no other holds the object",
+    )
+    DROPPED = 9, "lost", "the hand loses the object during the lift"
+    SOLVER_ERROR = 10, "errors", "the simulation failed, which says nothing about the grasp"
+    TIMEOUT = (
+        11,
+        "errors",
+        "the limit of computing time passed, which says nothing about the grasp",
+    )
+    CRASHED = 12, "errors", "its process was killed, which says nothing about the grasp"
+    # Result files of older versions.
+    UNREACHABLE = 13, "", "no wrist pose brings the fingertips to the contacts"
+    OFF_SURFACE = 14, "", "a contact, or its normal, is off the surface"  # by forces only
+    # Whether the hand would have held it is unknown, of this one and the next.
+    MOVED = 15, "moved", "the object moved more in the hand than a sample may"
+    NOT_LIFTED = 16, "left", "closed with a small chance or a flat image"
+    INVALID = 17, "", "the row of numbers is no grasp"  # it counts as a failure
+    PARTLY_HELD = (
+        18,
+        "lost",
+        "a fingertip loses contact during the lift; others still hold the object",
+    )
 
     @property
     def label(self) -> str:
@@ -55,42 +97,23 @@ class Outcome(IntEnum):
     @property
     def inconclusive(self) -> bool:
         """Whether the simulator failed rather than the grasp: never count it as a negative."""
-        return self in (Outcome.SOLVER_ERROR, Outcome.TIMEOUT, Outcome.CRASHED)
+        return self.group == "errors"
 
     @property
     def verification_only(self) -> bool:
         """Whether only verification gives this outcome; no file of a dataset holds it."""
-        return self in (Outcome.UNREACHABLE, Outcome.OFF_SURFACE, Outcome.INVALID)
+        return not self.group
 
     @property
     def dataset_only(self) -> bool:
         """Whether only attempts of a dataset have this outcome: verification tries whole lifts."""
-        return self in (Outcome.MOVED, Outcome.NOT_LIFTED)
+        return self.group in ("left", "moved")
 
     @property
     def stage(self) -> Stage:
         """The stage that every attempt with this outcome has reached, at least."""
-        return _STAGE[self]
+        return GROUPS.get(self.group, Stage.PLACED)
 
 
-_STAGE = {
-    Outcome.SUCCESS: Stage.LIFTED,
-    Outcome.BELOW_TABLE: Stage.PLACED,
-    Outcome.RAY_MISS: Stage.PLACED,
-    Outcome.START_COLLISION: Stage.PLACED,
-    Outcome.SCREENED: Stage.PLACED,
-    Outcome.MISSING_FINGERTIP: Stage.CLOSED,
-    Outcome.HAND_CONTACT: Stage.CLOSED,
-    Outcome.TABLE_CONTACT: Stage.CLOSED,
-    Outcome.SLIPPED: Stage.LIFTED,
-    Outcome.DROPPED: Stage.LIFTED,
-    Outcome.SOLVER_ERROR: Stage.PLACED,
-    Outcome.TIMEOUT: Stage.PLACED,
-    Outcome.CRASHED: Stage.PLACED,
-    Outcome.UNREACHABLE: Stage.PLACED,
-    Outcome.OFF_SURFACE: Stage.PLACED,
-    Outcome.MOVED: Stage.LIFTED,
-    Outcome.NOT_LIFTED: Stage.CLOSED,
-    Outcome.INVALID: Stage.PLACED,
-    Outcome.PARTLY_HELD: Stage.LIFTED,
-}
+#: Outcomes of lifts in which fingertips lost the object.
+LOST = tuple(outcome for outcome in Outcome if outcome.group == "lost")

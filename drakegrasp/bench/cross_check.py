@@ -26,7 +26,7 @@ from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.description import load_hand
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import LOST, Outcome
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream, object_key
@@ -40,7 +40,7 @@ Group = Literal["sample", "removed", "lost"]
 GROUPS: tuple[Group, ...] = get_args(Group)
 #: Outcomes of lifts that were lost; after closing, `table_contact` is no lift. What `moved` has no
 #: verdict to compare, and is in no group.
-LOST = (Outcome.SLIPPED, Outcome.PARTLY_HELD, Outcome.DROPPED, Outcome.TABLE_CONTACT)
+ENDS = (*LOST, Outcome.TABLE_CONTACT)
 #: Last number of the place of the stream that draws lifts: the split's is 1.
 _PLACE = 2
 
@@ -170,7 +170,7 @@ def _share(hits: int, count: int) -> dict[str, float] | None:
 def _read_lifts(out: Path) -> list[StoredLift]:
     """Return all lifts of a dataset, in the order of its rows: objects are together."""
     # Only what was lifted has the time of a lift.
-    trials = Trials(out).where(outcome=[Outcome.SUCCESS, *LOST])
+    trials = Trials(out).where(outcome=[Outcome.SUCCESS, *ENDS])
     # A hand with a motor for each joint is not in MuJoCo.
     trials = trials[np.isfinite(trials["time_lift"]) & ~trials["own_motors"]]
     names = [field.name for field in fields(Materials)]

@@ -38,41 +38,14 @@ from drakegrasp.errors import counted, printable
 from drakegrasp.filters import Removal
 from drakegrasp.objects.audit import AuditRow
 from drakegrasp.objects.model import needed_limit
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import GROUPS, Outcome
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
 
-#: Short heads of the outcomes, in the order of the funnel.
-_OUTCOME_HEADS = {
-    Outcome.RAY_MISS: "ray\nmiss",
-    Outcome.BELOW_TABLE: "below\ntable",
-    Outcome.START_COLLISION: "start\ncollis.",
-    Outcome.SCREENED: "screened",
-    Outcome.MISSING_FINGERTIP: "missing\ntip",
-    Outcome.HAND_CONTACT: "hand\ncontact",
-    Outcome.TABLE_CONTACT: "table\ncontact",
-    Outcome.NOT_LIFTED: "not\nlifted",
-    Outcome.DROPPED: "dropped",
-    Outcome.SLIPPED: "slipped",
-    Outcome.PARTLY_HELD: "partly\nheld",
-    Outcome.MOVED: "moved",
-    Outcome.SOLVER_ERROR: "solver\nerror",
-    Outcome.TIMEOUT: "timeout",
-    Outcome.CRASHED: "crashed",
-    Outcome.SUCCESS: "success",
-}
-#: Groups of outcomes, for terminals that are too narrow for a column of each.
-_COMPACT_HEADS = {
-    "no ray": (Outcome.RAY_MISS, Outcome.BELOW_TABLE),
-    "collis.": (Outcome.START_COLLISION, Outcome.SCREENED),
-    "no grip": (Outcome.MISSING_FINGERTIP, Outcome.HAND_CONTACT, Outcome.TABLE_CONTACT),
-    "left": (Outcome.NOT_LIFTED,),
-    "lost": (Outcome.DROPPED, Outcome.SLIPPED, Outcome.PARTLY_HELD),
-    "moved": (Outcome.MOVED,),
-    "errors": (Outcome.SOLVER_ERROR, Outcome.TIMEOUT, Outcome.CRASHED),
-    "success": (Outcome.SUCCESS,),
-}
+#: Outcomes in the order of the funnel, and their groups for terminals that are too narrow for a
+#: column of each; in verdicts alone are others.
+_FUNNEL = [o for group in GROUPS for o in Outcome if o.group == group]
 _RARE = ("left", "moved")
 #: Objects without samples of which it is said why.
 BARREN = 10
@@ -141,6 +114,12 @@ def _table_of_objects(
     return make_table(title, heads, rows, [cells("all", slice(None))], caption=caption)
 
 
+def _head(outcome: Outcome) -> str:
+    """Return the short head of an outcome's column."""
+    short = outcome.label.replace("collision", "collis.").replace("fingertip", "tip")
+    return short.replace("_", "\n")
+
+
 def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
     """Return the funnel, a row per object and one of all.
 
@@ -148,13 +127,14 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
         funnel: The counts.
         compact: Whether to group outcomes; otherwise columns that are all zero are left out.
     """
-    shown = [o for o in _OUTCOME_HEADS if funnel.outcomes[:, o].any() or o is Outcome.SUCCESS]
-    groups: dict[str, tuple[Outcome, ...]] = {_OUTCOME_HEADS[o]: (o,) for o in shown}
+    shown = [o for o in _FUNNEL if funnel.outcomes[:, o].any() or o is Outcome.SUCCESS]
+    groups = {_head(o): [o] for o in shown}
     removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
     if compact:
         # Room is scarce, and few datasets have lifts that were ended or left out.
         there, removed = funnel.outcomes.sum(axis=0), []
-        groups = {h: g for h, g in _COMPACT_HEADS.items() if h not in _RARE or there[g[0]]}
+        groups = {name: [o for o in _FUNNEL if o.group == name] for name in GROUPS}
+        groups = {h: g for h, g in groups.items() if h not in _RARE or there[g].any()}
     heads = ["poses", "attempts", *groups]
     heads += [f"- {r.label}".replace("_", "\n") for r in removed]
 
@@ -391,9 +371,7 @@ def bench_table(report: Mapping[str, Any]) -> Table:
 def bench_lines(report: Mapping[str, Any]) -> list[str]:
     """Return the funnel, the memory and the machine of a report as lines."""
     outcomes = Counter(report["all"]["outcomes"])
-    funnel = ", ".join(
-        f"{outcomes[o.label]:,} {o.label}" for o in _OUTCOME_HEADS if outcomes[o.label]
-    )
+    funnel = ", ".join(f"{outcomes[o.label]:,} {o.label}" for o in _FUNNEL if outcomes[o.label])
     return [
         f"outcomes: {funnel}",
         f"peak memory: {report['peak_memory'] / 1e6:,.0f} MB",

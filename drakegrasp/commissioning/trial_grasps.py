@@ -35,7 +35,7 @@ from drakegrasp.hand.finger_sweep import Pinch, find_opposition, find_pinch, rea
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.objects.model import ObjectModel, make_object
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import LOST, Outcome
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.construction import build_scene
@@ -96,7 +96,7 @@ _MENDS = {
     "back (p_BG)",
     Outcome.START_COLLISION.label: "the open hand is in its way; keep fingers that do not grasp "
     "away with preshape",
-    **{o.label: _LOST for o in (Outcome.SLIPPED, Outcome.PARTLY_HELD, Outcome.DROPPED)},
+    **{o.label: _LOST for o in LOST},
     MOVED: _LOST,
 }
 

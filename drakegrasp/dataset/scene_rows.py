@@ -27,16 +27,13 @@ from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.frames import X_WT, invert_pose, pack_pose, unpack_pose
 from drakegrasp.grasp import pack_grasp
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import LOST, Outcome
 from drakegrasp.seeding import Stream
 
 Columns = dict[str, AnyArray]
 
 #: Outcomes of lifts to a verdict; `table_contact` after closing is none.
-LIFTED = (
-    *(Outcome.SUCCESS, Outcome.SLIPPED, Outcome.PARTLY_HELD, Outcome.DROPPED),
-    Outcome.TABLE_CONTACT,
-)
+LIFTED = (Outcome.SUCCESS, *LOST, Outcome.TABLE_CONTACT)
 #: Fields of /grasps that are columns of /trials, by their names here.
 _COPIED = {f.name: f.of for f in SCENE_GRASP_FIELDS if f.of} | {
     name: name for name in ("trial_id", "outcome", "precision", "stable", "preshape", "unused")

@@ -16,17 +16,6 @@ from drakegrasp.dataset.statistics import Funnel, SplitCount
 from drakegrasp.filters import Removal
 from drakegrasp.outcomes import Outcome, Stage
 
-#: What attempts with an outcome met, in words.
-_MET = {
-    Outcome.BELOW_TABLE: "the palm would be below the table",
-    Outcome.RAY_MISS: "the palm does not face the object",
-    Outcome.START_COLLISION: "the open hand meets the object or the table",
-    Outcome.SCREENED: "not every fingertip can reach the object",
-    Outcome.MISSING_FINGERTIP: "a fingertip does not touch",
-    Outcome.HAND_CONTACT: "more than fingertips touch",
-    Outcome.TABLE_CONTACT: "the hand touches the table, or the lifted object does",
-    Outcome.NOT_LIFTED: "closed with a small chance or a flat image",
-}
 #: A share of the samples differs much from the one asked for beyond this factor.
 MUCH = 2.0
 
@@ -71,7 +60,7 @@ def why_no_sample(outcomes: AnyArray, removals: AnyArray, config: Config) -> Sho
         return Shortfall(reason, "more palm poses (--candidates), or other limits in `filters`")
 
     most = Outcome(int(np.argmax(outcomes)))
-    met = f", {_MET[most]}" if most in _MET else ""
+    met = "" if most.inconclusive else f", {most.text}"
     reason = f"{outcomes[most]:,} of {total:,} attempts ({outcomes[most] / total:.0%}) end in "
     reason += f"{most.label}{met}"
     by_stage = {

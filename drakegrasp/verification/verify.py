@@ -47,21 +47,6 @@ POINT_DIGITS, NORMAL_DIGITS = 4, 3
 #: Shares of `verify.open_margin_deg` by which the fingers are opened, in turn, until the hand is
 #: clear of object and table.
 MARGINS = (1.0, 0.5)
-#: The reason that a person reads, by the outcome of the trial.
-_REASONS = {
-    Outcome.SUCCESS: "every fingertip touches it at the end of the lift, clear of the table",
-    Outcome.BELOW_TABLE: "the palm would be below the table",
-    Outcome.START_COLLISION: "the opened hand would be inside the object or the table",
-    Outcome.SCREENED: "geometry shows that not every fingertip can reach the object",
-    Outcome.MISSING_FINGERTIP: "a fingertip closes without touching the object",
-    Outcome.HAND_CONTACT: "a part of the hand that is not a fingertip touches the object",
-    Outcome.TABLE_CONTACT: "the closing or lifting hand, or the lifted object, touches the table",
-    Outcome.DROPPED: "the hand loses the object during the lift",
-    Outcome.SLIPPED: "a fingertip loses contact during the lift, and no other holds the object",
-    Outcome.PARTLY_HELD: "a fingertip loses contact during the lift; others still hold the object",
-    Outcome.SOLVER_ERROR: "the simulation failed, which says nothing about the grasp",
-    Outcome.TIMEOUT: "the limit of computing time passed, which says nothing about the grasp",
-}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -267,7 +252,7 @@ def _of_all_fingers(trial: TrialRecord, unused: int, fingers: int) -> TrialRecor
 def _judged(base: Verification, tries: tuple[PoseTrial, ...]) -> Verification:
     """Return the verdict of the first trial, which decides."""
     trial = tries[0].trial
-    reason = _REASONS[trial.outcome] + (f": {trial.message}" if trial.message else "")
+    reason = trial.outcome.text + (f": {trial.message}" if trial.message else "")
     return replace(base, outcome=trial.outcome, reason=reason, tries=tries)
 
 

@@ -25,12 +25,16 @@ from drakegrasp.outcomes import Outcome
         (
             {Outcome.START_COLLISION: 842, Outcome.SCREENED: 358},
             {},
-            "842 of 1,200 attempts (70%) end in start_collision, the open hand meets the object or "
-            "the table; the hand never closed on it",
+            "842 of 1,200 attempts (70%) end in start_collision, "
+            f"{Outcome.START_COLLISION.text}; the hand never closed on it",
         ),
         ({Outcome.SCREENED: 9, Outcome.HAND_CONTACT: 1}, {}, "; 1 closed, none lifted"),
         ({Outcome.START_COLLISION: 9, Outcome.MOVED: 3}, {}, "; 3 were lifted, none held"),
-        ({Outcome.DROPPED: 9, Outcome.SCREENED: 3}, {}, "9 of 12 attempts (75%) end in dropped"),
+        (
+            {Outcome.DROPPED: 9, Outcome.SCREENED: 3},
+            {},
+            "9 of 12 attempts (75%) end in dropped, the hand loses the object during the lift",
+        ),
         ({Outcome.DROPPED: 9, Outcome.SUCCESS: 2}, {Removal.TURNED: 2}, "mostly turned (2)"),
     ],
 )
