@@ -43,7 +43,7 @@ class Outcome(IntEnum):
     group: str
     text: str
 
-    def __new__(cls, value: int, group: str, text: str) -> Self:
+    def __new__(cls, value: int, group: str = "", text: str = "") -> Self:
         """Make a member that equals its value."""
         member = int.__new__(cls, value)
         member._value_, member.group, member.text = value, group, text
