@@ -187,6 +187,6 @@ def _try_by_protocol(
             )
         with progress_bar("score", "grasps", show=show) as report:
             found = verify_postures(files, prepare_trials(protocol, path, Path(folder)), execute)
-            for done, (grasp, result) in enumerate(zip(grasps, found, strict=True), start=1):
-                deliver(grasp.index, protocol_verdict(grasp, result.verdict))
+            for done, (grasp, (verdict, _)) in enumerate(zip(grasps, found, strict=True), start=1):
+                deliver(grasp.index, protocol_verdict(grasp, verdict))
                 report(done, len(grasps))

@@ -6,7 +6,6 @@ import json
 import shlex
 import sys
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -280,11 +279,11 @@ def _verify_by_protocol(
         ):
             for index, result in enumerate(verify_postures(files, trials, execute)):
                 name = read if folder == Path(scratch) else files[index]
-                line = json_line(index, replace(result, file=Path(name)), trials)
+                line = json_line(index, name, result, trials)
                 write(line)
                 if as_json and out is not None:
                     print_line(line)
-                held += result.verdict.success
+                held += result[0].success
                 report(index + 1, len(files), holding=held)
     if out is not None and not as_json:
         say(str(result_paths(out)[0]))

@@ -113,7 +113,8 @@ class BenchFiles:
         from drakegrasp.mjcf.links import make_hand_model, write_hand_model
 
         model = make_hand_model(hand)
-        self.posed, self._joints = StillScene(hand), model.joints
+        self.posed = StillScene(hand)
+        self._joints = tuple(joint.name for joint in model.joints)
         self.hand_path = folder / ASSETS / "hand" / "hand.xml"
         write_hand_model(model, self.hand_path)
 

@@ -23,7 +23,7 @@ from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import Hand, load_plain_hand
 from drakegrasp.mesh.wavefront import hull_text
-from drakegrasp.mjcf.links import MEMORY, HandModel, make_hand_model, pair_friction, set_inertia
+from drakegrasp.mjcf.links import MEMORY, make_hand_model, pair_friction, set_inertia
 from drakegrasp.mjcf.scene import convex_parts
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.pictures.still_scene import StillScene
@@ -90,7 +90,7 @@ class ObjectScenes:
 
         # The hand, whose palm each grasp moves, and the object.
         model = make_hand_model(hand, physics.friction_hand)
-        self._joints = model.joints
+        self._joints = [joint.name for joint in model.joints]
         self._frame = self._attach(model)
         self._add_object(thing, physics.friction_hand)
         self._key = self._spec.add_key(name="grasp")
@@ -116,12 +116,12 @@ class ObjectScenes:
         """Return the joints of the motors."""
         return [motor.target.removeprefix(f"{HAND}/") for motor in self._spec.actuators]
 
-    def _attach(self, model: HandModel) -> mujoco.MjsFrame:
+    def _attach(self, model: mujoco.MjSpec) -> mujoco.MjsFrame:
         """Add the hand; return the frame that carries its palm."""
-        for mesh in model.spec.meshes:
-            mesh.file = self._write(HAND, mesh.file, model.meshes[mesh.file])
+        for mesh in model.meshes:
+            mesh.file = self._write(HAND, mesh.file, model.assets[mesh.file].decode())
         frame = self._spec.worldbody.add_frame()
-        frame.attach_body(model.spec.body(self._hand.palm_link), f"{HAND}/", "")
+        frame.attach_body(model.body(self._hand.palm_link), f"{HAND}/", "")
         return frame
 
     def _add_object(self, thing: ObjectModel, friction: float) -> None:

@@ -1,16 +1,16 @@
 """Links of a hand as bodies of MuJoCo: inertia, collision shapes and their contacts.
 
-In: a hand that Drake has read. Out: bodies, added to a specification; or a `HandModel`, the hand
-alone as an MJCF, whose world is the palm link: for tools that move the root themselves. In it each
-joint that a motor moves has a position actuator, coupled joints follow. The root has no joint;
-joints that a preshape keeps are none.
+In: a hand that Drake has read. Out: bodies, added to a specification; or the hand alone as an MJCF,
+whose world is the palm link: for tools that move the root themselves. In it each joint that a motor
+moves has a position actuator, coupled joints follow. The root has no joint; joints that a preshape
+keeps are none.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
@@ -50,39 +50,9 @@ RIGID = (0.999, 0.9999, 0.001, 0.5, 2.0)
 TORSION_RADIUS = 0.0029
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MovingJoint:
-    """A joint of a hand, which is to be added to its body.
-
-    Attributes:
-        name: Of the joint.
-        body: The link that it moves.
-        axis, point: Where it is, (3,), in the body's frame.
-        limits: Lower and upper position [rad or m].
-        slides: Whether it slides.
-        damping: [N m s/rad or N s/m].
-    """
-
-    name: str
-    body: mujoco.MjsBody
-    axis: Array
-    point: Array
-    limits: tuple[float, float]
-    slides: bool
-    damping: float
-
-    def add(self, **attributes: object) -> mujoco.MjsJoint:
-        """Add it with its limits and other attributes of MuJoCo."""
-        kinds = mujoco.mjtJoint
-        return self.body.add_joint(
-            name=self.name,
-            type=kinds.mjJNT_SLIDE if self.slides else kinds.mjJNT_HINGE,
-            axis=self.axis,
-            pos=self.point,
-            limited=True,
-            range=self.limits,
-            **attributes,
-        )
+#: A joint of Drake that moves in MuJoCo, the body of its link, and attributes of `add_joint`: its
+#: name, kind and limits, and where it is in the body's frame.
+MovingJoint: TypeAlias = tuple[Joint, mujoco.MjsBody, dict[str, Any]]
 
 
 def add_links(
@@ -93,7 +63,7 @@ def add_links(
     *,
     touches: tuple[int, int],
 ) -> Iterator[MovingJoint]:
-    """Add the links of a hand; yield each joint that moves, which the caller adds.
+    """Add the links of a hand; yield each joint that moves, which the caller adds to its body.
 
     A joint of the preshape is none in MuJoCo: its body stands where the joint would put it.
 
@@ -124,15 +94,16 @@ def add_links(
         X_PC = X_PF @ _fixed_motion(joint, hand) @ X_CM.inverse()
         body = bodies[child.name()] = add(bodies[joint.parent_body().name()], child, X_PC)
         if moving_joint(joint) and joint.name() not in hand.preshape:
-            yield MovingJoint(
-                name=joint.name(),
-                body=body,
-                axis=X_CM.rotation().matrix() @ joint_axis(joint),
-                point=X_CM.translation(),
-                limits=(joint.position_lower_limit(), joint.position_upper_limit()),
-                slides=joint_slides(joint),
-                damping=joint.default_damping(),
-            )
+            slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+            attributes = {
+                "name": joint.name(),
+                "type": slide if joint_slides(joint) else hinge,
+                "axis": X_CM.rotation().matrix() @ joint_axis(joint),
+                "pos": X_CM.translation(),
+                "limited": True,
+                "range": (joint.position_lower_limit(), joint.position_upper_limit()),
+            }
+            yield joint, body, attributes
 
 
 def _fixed_motion(joint: Joint, hand: Hand) -> RigidTransform:
@@ -256,23 +227,10 @@ _FRICTION = 1.0
 MESHES = "meshes"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class HandModel:
-    """A hand as a specification of MuJoCo.
+def make_hand_model(hand: Hand, friction: float = _FRICTION) -> mujoco.MjSpec:
+    """Return a hand as a specification of MuJoCo; its assets are the meshes that it names.
 
-    Attributes:
-        spec: With a mesh file for each shape that is no primitive.
-        joints: Names of the joints in the order of its positions.
-        meshes: Text of each mesh file, by its name.
-    """
-
-    spec: mujoco.MjSpec
-    joints: tuple[str, ...]
-    meshes: dict[str, str]
-
-
-def make_hand_model(hand: Hand, friction: float = _FRICTION) -> HandModel:
-    """Return a hand as a specification of MuJoCo.
+    Its joints are in the order of its positions.
 
     Args:
         hand: The hand.
@@ -283,14 +241,16 @@ def make_hand_model(hand: Hand, friction: float = _FRICTION) -> HandModel:
     spec.compiler.degree = False
     spec.compiler.balanceinertia = True
     coupled = {c.joint for i in hand.motor_fingers for c in hand.followers(i)}
-    for joint in add_links(spec, hand, spec.worldbody, friction, touches=_TOUCHES):
-        unit = SLIDE if joint.slides else 1.0
-        joint.add(damping=DAMPING / unit**2, armature=ARMATURE / unit**2)
-        if joint.name not in coupled:
+    for joint, body, attributes in add_links(
+        spec, hand, spec.worldbody, friction, touches=_TOUCHES
+    ):
+        unit, name = SLIDE if joint_slides(joint) else 1.0, joint.name()
+        body.add_joint(**attributes, damping=DAMPING / unit**2, armature=ARMATURE / unit**2)
+        if name not in coupled:
             motor = spec.add_actuator(
-                name=joint.name,
+                name=name,
                 trntype=mujoco.mjtTrn.mjTRN_JOINT,
-                target=joint.name,
+                target=name,
                 forcelimited=True,
                 forcerange=[-TORQUE / unit, TORQUE / unit],
             )
@@ -301,28 +261,21 @@ def make_hand_model(hand: Hand, friction: float = _FRICTION) -> HandModel:
     add_couplings(spec, hand)
 
     # Corners become mesh files, which other tools can read.
-    meshes = {}
+    texts = {}
     for number, mesh in enumerate(spec.meshes):
-        name = f"link_{number}.obj"
-        meshes[name] = hull_text(np.array(mesh.uservert).reshape(-1, 3))
-        mesh.uservert, mesh.file = [], name
-    model = _compile(spec, meshes)
-    joints = tuple(model.joint(i).name for i in range(model.njnt))
-    return HandModel(spec=spec, joints=joints, meshes=meshes)
+        mesh.file = f"link_{number}.obj"
+        texts[mesh.file] = hull_text(np.array(mesh.uservert).reshape(-1, 3)).encode()
+        mesh.uservert = []
+    spec.assets = texts
+    spec.compile()
+    return spec
 
 
-def write_hand_model(hand: HandModel, path: Path) -> None:
+def write_hand_model(spec: mujoco.MjSpec, path: Path) -> None:
     """Write the MJCF of a hand, and its meshes in a folder beside it."""
     (path.parent / MESHES).mkdir(parents=True, exist_ok=True)
-    for name, text in hand.meshes.items():
-        (path.parent / MESHES / name).write_text(text, encoding="utf-8")
-    _compile(hand.spec, hand.meshes)
-    hand.spec.meshdir = MESHES
-    path.write_text(hand.spec.to_xml(), encoding="utf-8")
-    hand.spec.meshdir = ""
-
-
-def _compile(spec: mujoco.MjSpec, meshes: dict[str, str]) -> mujoco.MjModel:
-    """Compile a specification whose mesh files are texts in memory."""
-    spec.assets = {name: text.encode() for name, text in meshes.items()}
-    return spec.compile()
+    for name, text in spec.assets.items():
+        (path.parent / MESHES / name).write_bytes(text)
+    spec.meshdir = MESHES
+    path.write_text(spec.to_xml(), encoding="utf-8")
+    spec.meshdir = ""

@@ -21,6 +21,7 @@ from drakegrasp.config import Config
 from drakegrasp.foreign_files import read_content
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import SLIDE, Hand
+from drakegrasp.hand.parsing import joint_slides
 from drakegrasp.mjcf.links import (
     MEMORY,
     RIGID,
@@ -216,14 +217,16 @@ def _add_object(
 def _add_hand(spec: mujoco.MjSpec, hand: Hand, config: Config) -> list[SpreadJoint]:
     """Add the hand on its wrist; return its spread joints."""
     wrist, spreads = _add_wrist(spec), []
-    for joint in add_links(spec, hand, wrist, config.physics.friction_hand, touches=_ON_HAND):
-        if joint.name in hand.spread.joints:
-            body, start = joint.body.name, joint.body.quat.copy()
-            spreads.append(SpreadJoint(body=body, axis=joint.axis, quaternion=start))
+    links = add_links(spec, hand, wrist, config.physics.friction_hand, touches=_ON_HAND)
+    for joint, body, attributes in links:
+        if joint.name() in hand.spread.joints:
+            start = body.quat.copy()
+            spreads.append(SpreadJoint(body=body.name, axis=attributes["axis"], quaternion=start))
             continue
-        unit = SLIDE if joint.slides else 1.0
-        joint.add(
-            damping=joint.damping,
+        unit = SLIDE if joint_slides(joint) else 1.0
+        body.add_joint(
+            **attributes,
+            damping=joint.default_damping(),
             armature=ARMATURE / unit**2,
             solref_limit=STIFF,
             solimp_limit=RIGID,

@@ -1,19 +1,19 @@
 """Verdicts on stored postures under a protocol, one line of JSON each.
 
-In: grasp files of DexGraspBench's format, the MJCF of a hand and a protocol by name. Out: a
-`PostureResult` per file, in order. A file that is no grasp has a verdict, too: `invalid`.
+In: grasp files of DexGraspBench's format, the MJCF of a hand and a protocol by name. Out: a verdict
+per file, in order. A file that is no grasp has a verdict, too: `invalid`.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from importlib import metadata
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -40,7 +40,7 @@ class PostureTrials:
 
     Attributes:
         protocol: Its stored name.
-        code: Text of a user's own protocol, by that name.
+        code: Text of the file of a user's own protocol.
         hand: MJCF of the hand.
         objects: Folder to which the paths of objects in the files are relative.
     """
@@ -48,28 +48,24 @@ class PostureTrials:
     protocol: str
     hand: Path
     objects: Path
-    code: Mapping[str, str] = field(default_factory=dict)
+    code: str | None = None
+
+    def rules(self) -> MujocoProtocol:
+        """Return the protocol."""
+        code = None if self.code is None else {self.protocol: self.code}
+        found, _ = find_protocol(self.protocol, code)
+        assert isinstance(found, MujocoProtocol)
+        return found
 
 
-@dataclass(frozen=True, kw_only=True)
-class PostureResult:
-    """The verdict on a file.
-
-    Attributes:
-        file: The file.
-        verdict: What was measured.
-        digests: 16 digits of the SHA-256 of hand and object.
-    """
-
-    file: Path
-    verdict: PostureVerdict
-    digests: Mapping[str, str]
+#: What a trial measured, and 16 digits of the SHA-256 of hand and object.
+PostureResult: TypeAlias = tuple[PostureVerdict, dict[str, str]]
 
 
 def verify_postures(
     files: Sequence[Path | str], trials: PostureTrials, execute: Executor = run_here
 ) -> Iterator[PostureResult]:
-    """Yield the verdicts on files, in their order.
+    """Yield the verdicts on files, in their order, each with the digests of hand and object.
 
     Args:
         files: Of DexGraspBench's format; a text says why a grasp is none.
@@ -103,7 +99,7 @@ def prepare_trials(name: str, hand: Path, objects: Path) -> PostureTrials:
     from drakegrasp.protocols.scene import hand_digest
 
     hand_digest(hand)
-    code = {} if stored == name else {stored: read_class(name)[1]}
+    code = None if stored == name else read_class(name)[1]
     return PostureTrials(protocol=stored, code=code, hand=hand, objects=objects)
 
 
@@ -111,55 +107,39 @@ def _verify_one(task: tuple[Path | str, PostureTrials]) -> PostureResult:
     """Return the verdict on one file."""
     path, trials = task
     if isinstance(path, str):
-        return _invalid(Path(), path)
+        return _invalid(path)
     try:
         stored = read_grasp_file(path)
         motion, folder = one_motion(stored), inner_path(stored.object_path)
-        scene, digests = _scene(trials, folder, float(stored.object_scale[0]))
+        protocol, scene, digests = _scene(trials, folder, float(stored.object_scale[0]))
     except (DataError, MeshError) as error:
-        return _invalid(path, str(error))
-
+        return _invalid(str(error))
     if len(motion.grasp) != 7 + scene.joints:
         got = len(motion.grasp)
-        return _invalid(path, f"a posture must be {7 + scene.joints} numbers, got {got}")
-    protocol = _protocol(trials)
-    if "@" in trials.protocol:
-        verdict = run_own(trials.protocol, protocol.run, scene, motion)
-    else:
+        return _invalid(f"a posture must be {7 + scene.joints} numbers, got {got}")
+    if trials.code is None:
         verdict = protocol.run(scene, motion)
+    else:
+        verdict = run_own(trials.protocol, protocol.run, scene, motion)
     if not isinstance(verdict, PostureVerdict):
         raise ConfigError(f"{trials.protocol}: run must return a PostureVerdict, got {verdict!r}")
-    return PostureResult(file=path, verdict=verdict, digests=digests)
+    return verdict, digests
 
 
-def _invalid(path: Path, what: str) -> PostureResult:
-    verdict = PostureVerdict(success=False, reason=f"invalid: {what}")
-    return PostureResult(file=path, verdict=verdict, digests={})
-
-
-def _protocol(trials: PostureTrials) -> MujocoProtocol:
-    found, _ = find_protocol(trials.protocol, trials.code)
-    assert isinstance(found, MujocoProtocol)
-    return found
-
-
-def _scene(trials: PostureTrials, path: Path, scale: float) -> tuple[ProtocolScene, dict[str, str]]:
-    """Return the scene of an object, and the digests of hand and object."""
-    key = json.dumps(dict(trials.code), sort_keys=True)
-    return _kept_scene(trials.protocol, key, trials.hand, trials.objects / path, scale)
+def _invalid(what: str) -> PostureResult:
+    return PostureVerdict(success=False, reason=f"invalid: {what}"), {}
 
 
 @lru_cache(maxsize=_SCENES)
-def _kept_scene(
-    name: str, code: str, hand: Path, folder: Path, scale: float
-) -> tuple[ProtocolScene, dict[str, str]]:
+def _scene(
+    trials: PostureTrials, path: Path, scale: float
+) -> tuple[MujocoProtocol, ProtocolScene, dict[str, str]]:
+    """Return the protocol, the scene of an object, and the digests of hand and object."""
     from drakegrasp.protocols.scene import ProtocolScene, hand_digest
 
-    protocol, _ = find_protocol(name, json.loads(code))
-    assert isinstance(protocol, MujocoProtocol)
-    thing = read_object_folder(folder, scale)
-    scene = ProtocolScene(protocol, hand, thing)
-    return scene, {"hand": hand_digest(hand), "object": thing.digest}
+    protocol, thing = trials.rules(), read_object_folder(trials.objects / path, scale)
+    scene = ProtocolScene(protocol, trials.hand, thing)
+    return protocol, scene, {"hand": hand_digest(trials.hand), "object": thing.digest}
 
 
 def describe(protocol: Protocol, stored: str) -> dict[str, Any]:
@@ -167,19 +147,19 @@ def describe(protocol: Protocol, stored: str) -> dict[str, Any]:
     return {"protocol": stored, "source": protocol.source, "numbers": protocol.numbers()}
 
 
-def json_line(index: int, result: PostureResult, trials: PostureTrials) -> str:
+def json_line(index: int, file: Path | str, result: PostureResult, trials: PostureTrials) -> str:
     """Return a result as a line of strict JSON; what was not measured is null."""
-    verdict = {k: _plain(v) for k, v in asdict(result.verdict).items()}
+    verdict, digests = result
     line = {
         "index": index,
-        "file": str(result.file),
-        **verdict,
-        **_plain(describe(_protocol(trials), trials.protocol)),
+        "file": str(file),
+        **asdict(verdict),
+        **describe(trials.rules(), trials.protocol),
         "simulator": "mujoco",
         "versions": versions(),
-        "digests": dict(result.digests),
+        "digests": digests,
     }
-    return json.dumps(line, allow_nan=False)
+    return json.dumps(_plain(line), allow_nan=False)
 
 
 def versions() -> dict[str, str]:

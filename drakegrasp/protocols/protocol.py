@@ -3,15 +3,16 @@
 In: the numbers of a field's benchmark. Out: `MujocoProtocol`, the base of those that run in MuJoCo,
 and of a user's own; the protocols by name. A trial moves the hand through three postures (pregrasp,
 grasp, squeeze), each a `GraspMotion` in the order of the hand's MJCF, and then pushes the object or
-lifts it. MuJoCo is loaded with the scene only, `drakegrasp.protocols.scene`. Each class says what a
-paper would say of it.
+lifts it. MuJoCo is loaded with the scene only: a `scene` here is a `protocols.scene.ProtocolScene`.
+Each class says what a paper would say of it.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -20,10 +21,6 @@ from drakegrasp.errors import ConfigError, listed
 from drakegrasp.frames import Array
 from drakegrasp.registry import own_class, read_class, run_own
 
-if TYPE_CHECKING:
-    from drakegrasp.protocols.scene import ProtocolScene
-
-Simulator = Literal["drake", "mujoco"]
 #: Unit vectors of the six pushes in {W}, in the order of DexGraspBench.
 AXES = ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
 
@@ -70,12 +67,11 @@ class PostureVerdict:
     push: int | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class MujocoProtocol:
     """A protocol that runs in MuJoCo; without changes the numbers of DexGraspBench.
 
-    A protocol of your own is a subclass, a frozen dataclass as this one, with a name, a source and
-    other numbers, or with another `run`.
+    A protocol of your own is a subclass with a name, a source and other numbers, or with another
+    `run`.
 
     Attributes:
         name: By which it is asked for.
@@ -101,6 +97,7 @@ class MujocoProtocol:
         max_turned: Its angle from there must be smaller [rad]; None if it is not asked.
     """
 
+    simulator = "mujoco"
     name: str
     source: str
     mass: float | None = 0.1
@@ -123,24 +120,11 @@ class MujocoProtocol:
     max_moved: float = 0.05
     max_turned: float | None = float(np.deg2rad(15.0))
 
-    def __post_init__(self) -> None:
-        """Refuse an object of two masses, or of none."""
-        if (self.mass is None) == (self.density is None):
-            raise ConfigError(
-                f"{self.name}: mass or density must be None, and only one of them, "
-                f"got {self.mass} and {self.density}"
-            )
-
-    @property
-    def simulator(self) -> Simulator:
-        """Where it runs."""
-        return "mujoco"
-
     def object_mass(self, volume: float) -> float:
         """Return the mass of an object of a volume [m^3] in [kg]."""
         return self.density * volume if self.mass is None else self.mass  # type: ignore[operator]
 
-    def run(self, scene: ProtocolScene, motion: GraspMotion) -> PostureVerdict:
+    def run(self, scene: Any, motion: GraspMotion) -> PostureVerdict:
         """Return the verdict on a grasp.
 
         Args:
@@ -162,9 +146,7 @@ class MujocoProtocol:
             verdict = self.judge_lift(scene, motion, goal)
         return replace(verdict, penetration=penetration)
 
-    def judge_pushes(
-        self, scene: ProtocolScene, motion: GraspMotion, goal: Array
-    ) -> PostureVerdict:
+    def judge_pushes(self, scene: Any, motion: GraspMotion, goal: Array) -> PostureVerdict:
         """Return the verdict on an object that each push finds as the trial began."""
         verdict = PostureVerdict(success=False)
         for number, direction in enumerate(self.directions):
@@ -178,7 +160,7 @@ class MujocoProtocol:
                     return verdict
         return verdict
 
-    def judge_lift(self, scene: ProtocolScene, motion: GraspMotion, goal: Array) -> PostureVerdict:
+    def judge_lift(self, scene: Any, motion: GraspMotion, goal: Array) -> PostureVerdict:
         """Return the verdict on an object that weighs from the start and is lifted."""
         raised, height = motion.squeeze.copy(), np.array([0.0, 0.0, self.lift])
         raised[:3] += height
@@ -187,16 +169,16 @@ class MujocoProtocol:
         scene.move(motion.squeeze, raised, *self.stage)
         return self.judge(scene, np.concatenate([goal[:3] + height, goal[3:]]))
 
-    def squeeze(self, scene: ProtocolScene, motion: GraspMotion) -> None:
+    def squeeze(self, scene: Any, motion: GraspMotion) -> None:
         """Move the hand from the pregrasp to the grasp and on to the squeeze."""
         scene.move(motion.pregrasp, motion.grasp, *self.stage)
         scene.move(motion.grasp, motion.squeeze, *self.stage)
 
-    def apply(self, scene: ProtocolScene, direction: Array) -> None:
+    def apply(self, scene: Any, direction: Array) -> None:
         """Push the object from now on, at its centre of mass."""
         scene.push(self.acceleration * scene.mass * direction)
 
-    def judge(self, scene: ProtocolScene, goal: Array) -> PostureVerdict:
+    def judge(self, scene: Any, goal: Array) -> PostureVerdict:
         """Return the verdict on where the object is now; it should be in a pose (7,)."""
         moved, turned = displacement(goal, scene.object_pose())
         reason = ""
@@ -210,7 +192,8 @@ class MujocoProtocol:
 
     def numbers(self) -> dict[str, Any]:
         """Return all numbers by name, for a result."""
-        return {k: v for k, v in asdict(self).items() if k not in ("name", "source")}
+        names = [n for cls in reversed(type(self).__mro__) for n in inspect.get_annotations(cls)]
+        return {n: getattr(self, n) for n in names if n not in ("name", "source")}
 
 
 def displacement(one: Array, other: Array) -> tuple[float, float]:
@@ -226,7 +209,6 @@ DEXGRASPBENCH = "github JYChen18/DexGraspBench, commit 1e7a5a6 (2025-06-05), con
 DEXONOMY = "github JYChen18/Dexonomy, commit d561ff9 (2026-03-26), dexonomy/config/op/eval.yaml"
 
 
-@dataclass(frozen=True, kw_only=True)
 class Lift:
     """The object rests on a table under gravity; the hand closes on it and lifts it.
 
@@ -237,20 +219,15 @@ class Lift:
     result names; by default 1 kg and 0.71.
     """
 
-    name: str = "lift"
-    source: str = "drakegrasp, docs/explanation/physics.md"
-
-    @property
-    def simulator(self) -> Simulator:
-        """Where it runs."""
-        return "drake"
+    simulator = "drake"
+    name = "lift"
+    source = "drakegrasp, docs/explanation/physics.md"
 
     def numbers(self) -> dict[str, Any]:
         """Return nothing: the numbers are those of the configuration."""
         return {}
 
 
-@dataclass(frozen=True, kw_only=True)
 class DexGraspBench(MujocoProtocol):
     """Pushes along six axes without gravity, of DexGraspBench (BODex, Chen et al., ICRA 2025).
 
@@ -263,11 +240,10 @@ class DexGraspBench(MujocoProtocol):
     MJCF: 5 N m/rad and 3 N m in the benchmark's.
     """
 
-    name: str = "dexgraspbench"
-    source: str = DEXGRASPBENCH
+    name = "dexgraspbench"
+    source = DEXGRASPBENCH
 
 
-@dataclass(frozen=True, kw_only=True)
 class DexGraspBenchTabletop(MujocoProtocol):
     """A lift by 10 cm from a table, of DexGraspBench with `setting=tabletop`.
 
@@ -277,12 +253,11 @@ class DexGraspBenchTabletop(MujocoProtocol):
     first pose raised by 10 cm.
     """
 
-    name: str = "dexgraspbench-tabletop"
-    source: str = DEXGRASPBENCH
-    lift: float | None = 0.1
+    name = "dexgraspbench-tabletop"
+    source = DEXGRASPBENCH
+    lift = 0.1
 
 
-@dataclass(frozen=True, kw_only=True)
 class DexonomyHard(MujocoProtocol):
     """Pushes along six axes with half the friction, of Dexonomy (Chen et al., RSS 2025), `hard`.
 
@@ -296,35 +271,34 @@ class DexonomyHard(MujocoProtocol):
     halves the friction, but keeps 2 iterations and impratio 10: `dexonomy-hard-as-run`.
     """
 
-    name: str = "dexonomy-hard"
-    source: str = DEXONOMY
-    friction: tuple[float, float] = (0.3, 0.002)
-    noslip_iterations: int = 0
-    impratio: float = 1.0
-    joint_margin: float = 0.1
-    stage: tuple[int, int] = (5, 5)
-    acceleration: float = 9.8
-    directions: tuple[tuple[float, float, float], ...] = (
+    name = "dexonomy-hard"
+    source = DEXONOMY
+    friction = (0.3, 0.002)
+    noslip_iterations = 0
+    impratio = 1.0
+    joint_margin = 0.1
+    stage = (5, 5)
+    acceleration = 9.8
+    directions = (
         *((1, 0, 0), (-1, 0, 0), (0, 1, 0)),
         *((0, -1, 0), (0, 0, 1), (0, 0, -1)),
     )
-    max_penetration: float | None = None
+    max_penetration = None
 
     def apply(self, scene: Any, direction: Array) -> None:
         """Push with the weight that the model has, where the centre of mass is now."""
         scene.push_where_it_is(self.acceleration * scene.modelled_mass * direction)
 
 
-@dataclass(frozen=True, kw_only=True)
 class DexonomyHardAsRun(DexonomyHard):
     """`dexonomy-hard` with the solver's settings that the code of the commit has.
 
     2 iterations against slip, and impratio 10.
     """
 
-    name: str = "dexonomy-hard-as-run"
-    noslip_iterations: int = 2
-    impratio: float = 10.0
+    name = "dexonomy-hard-as-run"
+    noslip_iterations = 2
+    impratio = 10.0
 
 
 Protocol = Lift | MujocoProtocol
@@ -351,13 +325,19 @@ def find_protocol(name: str, code: Mapping[str, str] | None = None) -> tuple[Pro
         raise ConfigError(f"protocol must be one of {known}, or FILE.py:NAME, got {name!r}")
 
     # A user's own comes from a file that is given now, never from a dataset.
+    stored = name
     if code is None:
         stored, text = read_class(name)
         code = {stored: text}
-    else:
-        stored = name
     found = own_class(stored, code, key="protocol", method="run", takes=("scene", "motion"))
     made = run_own(stored, found)
     if not isinstance(made, MujocoProtocol):
         raise ConfigError(f"{name}: must be a subclass of MujocoProtocol, got {found.__name__}")
+    if not (hasattr(made, "name") and hasattr(made, "source")):
+        raise ConfigError(f"{name}: must have a name and a source, got none")
+    if (made.mass is None) == (made.density is None):
+        raise ConfigError(
+            f"{made.name}: mass or density must be None, and only one of them, "
+            f"got {made.mass} and {made.density}"
+        )
     return made, stored

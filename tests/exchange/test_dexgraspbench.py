@@ -68,7 +68,7 @@ def test_fingers_open_and_press_by_equal_steps(folder: Path, grasps: list[Closed
 def test_fingers_that_slide_have_lengths(grasps: list[ClosedGrasp]) -> None:
     hand, q = load_hand("franka"), np.array([0.03, 0.03])
     grasp = replace(grasps[0], q=q, spread=0.0)
-    joints = make_hand_model(hand).joints
+    joints = tuple(joint.name for joint in make_hand_model(hand).joints)
     content = grasp_dictionary(hand, StillScene(hand), joints, grasp)
     assert content["joint_units"] == ["m", "m"]
     moved = content["squeeze_qpos"][7:] - content["grasp_qpos"][7:]

@@ -11,7 +11,7 @@ import trimesh
 
 from drakegrasp.exchange.dexgraspbench import write_object
 from drakegrasp.protocols.files import ObjectFolder, read_object_folder
-from drakegrasp.protocols.protocol import GraspMotion
+from drakegrasp.protocols.protocol import DexGraspBench, GraspMotion, MujocoProtocol
 
 #: Edge of the box [m].
 EDGE = 0.04
@@ -59,3 +59,8 @@ def jaws(opening: float, **changes: Any) -> GraspMotion:
         object_pose=np.array(HERE),
     )
     return replace(motion, **changes)
+
+
+def changed(protocol: type[MujocoProtocol] = DexGraspBench, **numbers: Any) -> MujocoProtocol:
+    """Return a protocol with other numbers."""
+    return type("Changed", (protocol,), numbers)()

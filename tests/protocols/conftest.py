@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.jaws import EDGE, HAND, box_folder, jaws
+from helpers.jaws import EDGE, HAND, box_folder, changed, jaws
 
 pytest.importorskip("mujoco")
 
 from drakegrasp.protocols.files import ObjectFolder
-from drakegrasp.protocols.protocol import DexGraspBench, GraspMotion, MujocoProtocol, PostureVerdict
+from drakegrasp.protocols.protocol import GraspMotion, PostureVerdict
 from drakegrasp.protocols.scene import ProtocolScene
 
 
@@ -36,10 +35,9 @@ def judge(hand: Path, box: ObjectFolder) -> Callable[..., PostureVerdict]:
     def run(
         motion: GraspMotion | None = None,
         thing: ObjectFolder = box,
-        protocol: MujocoProtocol | None = None,
         **numbers: Any,
     ) -> PostureVerdict:
-        rules = replace(protocol or DexGraspBench(), **numbers)
+        rules = changed(**numbers)
         return rules.run(ProtocolScene(rules, hand, thing), motion or jaws(0.01))
 
     return run
