@@ -18,13 +18,6 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from drakegrasp.bench.fidelity import (
-    Simulated,
-    compare_labels,
-    sum_drive,
-    sum_fidelity,
-    variants,
-)
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import installed_versions
 from drakegrasp.dataset.prepared_objects import PreparedObject
@@ -38,7 +31,6 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.allocator import allocator
 from drakegrasp.runtime.environment import one_thread, timed
 from drakegrasp.runtime.progress import Report, silent
-from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.trial import TrialRecord
@@ -53,7 +45,6 @@ def measure(
     sources: Sequence[MeshSource],
     config: Config,
     *,
-    sample: int = 0,
     mujoco: bool = False,
     progress: Report = silent,
 ) -> Iterator[dict[str, Any]]:
@@ -62,31 +53,28 @@ def measure(
     Args:
         sources: The meshes.
         config: What to run; `candidates.max` says how much.
-        sample: Attempts per object that are simulated again by each variant, drawn with the
-            seed from those whose palm ray meets the object.
         mujoco: Whether to run all attempts in MuJoCo as well; needs the extra `[peer]`.
         progress: Called with the number of attempts done and the estimated number in all.
 
     Raises:
         MeshError: If a mesh cannot be prepared.
     """
-    counter = _Counter(progress, len(sources), (2 if mujoco else 1), len(variants(config)), sample)
+    counter = _Counter(progress, len(sources), 2 if mujoco else 1)
     for source in sources:
-        yield _measure_object(source, config, sample, mujoco, counter)
+        yield _measure_object(source, config, mujoco, counter)
 
 
 class _Counter:
     """Counts attempts for the progress bar; estimates the total from the objects so far."""
 
-    def __init__(self, progress: Report, objects: int, runs: int, ways: int, sample: int) -> None:
+    def __init__(self, progress: Report, objects: int, runs: int) -> None:
         self._progress, self._objects, self._runs = progress, objects, runs
-        self._ways, self._sample = ways, sample
         self._done = self._begun = self._known = self._grasps = 0
 
-    def begin(self, attempts: int, hits: int) -> None:
+    def begin(self, attempts: int) -> None:
         """Add the attempts of the next object."""
         self._begun += 1
-        self._known += self._runs * attempts + self._ways * min(self._sample, hits)
+        self._known += self._runs * attempts
 
     def add(self, outcome: Outcome) -> None:
         """Count an attempt."""
@@ -100,9 +88,6 @@ class _Counter:
 def summarize(objects: Sequence[dict[str, Any]], config: Config) -> dict[str, Any]:
     """Return the whole report: machine, versions, each object and all together."""
     total = {"objects": len(objects), **_sum_rates(objects)}
-    if any("fidelity" in report for report in objects):
-        total["fidelity"] = sum_fidelity([report["fidelity"] for report in objects])
-        total["drive"] = sum_drive([report["drive"] for report in objects])
     if any("peer" in report for report in objects):
         total["peer"] = _sum_baseline([report["peer"] for report in objects])
 
@@ -135,7 +120,7 @@ def compare(now: dict[str, Any], then: dict[str, Any]) -> dict[str, float | None
 
 @one_thread
 def _measure_object(
-    source: MeshSource, config: Config, sample: int, mujoco: bool, counter: _Counter
+    source: MeshSource, config: Config, mujoco: bool, counter: _Counter
 ) -> dict[str, Any]:
     """Return the measurements of one object."""
     # Prepare the object and list its attempts, as a build does.
@@ -143,8 +128,7 @@ def _measure_object(
     with _cpu_timed(seconds, "prepare"):
         prepared = prepare(source, config)
     attempts = list_attempts(prepared, range(len(prepared.candidates)), config)
-    hits = [row for row, attempt in enumerate(attempts) if attempt.ray_hits]
-    counter.begin(len(attempts), len(hits))
+    counter.begin(len(attempts))
 
     # Build what all attempts share, and screen them by geometry.
     with _cpu_timed(seconds, "scene"):
@@ -172,16 +156,12 @@ def _measure_object(
         "peak_memory": _peak_memory(),
     }
 
-    # Run the same attempts in MuJoCo, and some of them by the variants.
+    # Run the same attempts in MuJoCo.
     if mujoco:
         baseline = _run_baseline(prepared, attempts, config, counter)
         theirs = baseline["grasps_per_core_hour"]
         ratio = report["grasps_per_core_hour"] / theirs if theirs else None
         report["peer"] = {**baseline, "ratio": ratio}
-    if sample:
-        rows = [hits[k] for k in Stream(config.seed).permutation(len(hits))[:sample]]
-        simulated = [Simulated(attempts[k], records[k], predictions[k]) for k in rows]
-        report.update(compare_labels(bench, simulated, counter.add))
     return report
 
 

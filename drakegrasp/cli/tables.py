@@ -372,86 +372,12 @@ def bench_lines(report: Mapping[str, Any]) -> list[str]:
     """Return the funnel, the memory and the machine of a report as lines."""
     outcomes = Counter(report["all"]["outcomes"])
     funnel = ", ".join(f"{outcomes[o.label]:,} {o.label}" for o in _FUNNEL if outcomes[o.label])
+    versions = ", ".join(f"{name} {version}" for name, version in report["versions"].items())
     return [
         f"outcomes: {funnel}",
         f"peak memory: {report['peak_memory'] / 1e6:,.0f} MB",
-        f"on {report['cpu']}; {_versions(report)}",
+        f"on {report['cpu']}; {versions}",
     ]
-
-
-def fidelity_table(counts_by_variant: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return how labels differ where variants simulate the same attempts."""
-    columns = {
-        "attempts": "attempts",
-        "simulated": "simulated",
-        "flips": "other\nlabels",
-        "flip_share_of_simulated": "of the\nsimulated",
-        "lifted": "lifts",
-        "lifted_flips": "other\nverdicts",
-        "flip_share_of_lifted": "of the\nlifts",
-        "successes": "grasps",
-        "successes_other": "variant's\ngrasps",
-    }
-    rows = (
-        [name.replace("_", " "), *(f"{n[k]:{'.1%' if 'share' in k else ','}}" for k in columns)]
-        for name, n in counts_by_variant.items()
-    )
-
-    # Without the screen, the variant's grasps show what the screen loses.
-    off = counts_by_variant["screen_off"]
-    lost, successes = off["successes_lost_by_screen"], off["successes_other"]
-    counted = f"{lost:,} of {successes:,}" if successes else "unknown, as there are no grasps"
-    caption = f"grasps that the screen removed: {counted}"
-    title = "The same attempts, simulated in other ways"
-    return make_table(title, ("variant", *columns.values()), rows, caption=caption)
-
-
-def drive_line(counts: Mapping[str, Any]) -> str:
-    """Return how many labels another drive of the fingers changes, as a line."""
-    return (
-        f"labels that depend on the drive: {counts['flips']:,} of {counts['attempts']:,} attempts "
-        f"({counts['flip_share']:.1%}), of {counts['lifted']:,} lifts "
-        f"({counts['flip_share_of_lifted']:.1%})"
-    )
-
-
-#: What a group of lifts is in the dataset.
-_GROUP_HEADS = {"sample": "samples", "removed": "held, no samples", "lost": "lost"}
-
-
-def cross_check_table(groups: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return how many stored lifts hold in MuJoCo, of all and of those lifted there, by group."""
-
-    def shares(share: Mapping[str, float] | None) -> list[str]:
-        if share is None:
-            return ["-", "-"]
-        return [f"{share['share']:.1%}", f"{share['low']:.1%} to {share['high']:.1%}"]
-
-    lifts = ("lifts", "hold\nthere", "share", "95 %\nconfidence")
-    heads = ("in the dataset", *lifts, "lifted\nthere", "share\nof these", "95 %\nconfidence")
-    rows = (
-        [
-            *(_GROUP_HEADS[group], _count(n["drawn"]), _count(n["held"]), *shares(n["of_all"])),
-            *(_count(n["lifted"]), *shares(n["of_lifted"])),
-        ]
-        for group, n in groups.items()
-    )
-    return make_table("Stored lifts, tried again in MuJoCo", heads, rows)
-
-
-def cross_check_lines(report: Mapping[str, Any]) -> list[str]:
-    """Return the drive, why lifts are not lifted in MuJoCo, and the versions, as lines."""
-    lines = [f"drive of the fingers: {report['drive']}"]
-    for group, counts in report["groups"].items():
-        if counts["not_lifted"]:
-            found = Counter(counts["not_lifted"]).most_common()
-            reasons = ", ".join(f"{n:,} {label}" for label, n in found)
-            lines.append(f"{_GROUP_HEADS[group]} not lifted there: {reasons}")
-    return [*lines, f"with {_versions(report)}"]
-
-
-def _versions(report: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {version}" for name, version in report["versions"].items())
 
 
 def score_table(card: Mapping[str, Any], seconds: Mapping[str, float]) -> Table:

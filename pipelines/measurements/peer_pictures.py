@@ -22,10 +22,10 @@ from unittest import mock
 
 import mujoco
 import numpy as np
+from cross_check import StoredLift, draw_lifts
 from PIL import Image, ImageDraw
 
 from drakegrasp.arithmetic import norm
-from drakegrasp.bench.cross_check import StoredLift, draw_lifts
 from drakegrasp.bench.mujoco_baseline import MujocoBaseline, PeerContacts
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared

@@ -22,8 +22,9 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+from cross_check import Group, StoredLift, draw_lifts
+
 from drakegrasp.bench import mujoco_baseline
-from drakegrasp.bench.cross_check import Group, StoredLift, draw_lifts
 from drakegrasp.bench.mujoco_baseline import MujocoBaseline
 from drakegrasp.dataset.holding import wilson_interval
 from drakegrasp.dataset.manifest import read_manifest

@@ -53,7 +53,6 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "export dexgraspbench": ("export", "{out}", "{to}/dex", "--to", "dexgraspbench", "--quiet"),
     "export glb": ("export", "{out}", "{to}/glb", "--to", "glb", "--quiet"),
     "verify": ("verify", f"{{out}}/{OTO}", "--out", "{to}/verdicts", "--workers", "1", "--quiet"),
-    "bench": ("bench", "--cross-check", "{out}", "1", "--out", "{to}/report.json", "--quiet"),
     "build": _BUILD,
     "build --plan": (*_BUILD, "--plan"),
 }
@@ -194,14 +193,14 @@ FILES: dict[str, tuple[Sequence[Kind], tuple[str, ...]]] = {
         manifests.MANIFEST,
         (
             *("replay", "stats", "assemble", "check", "figures", "export glb"),
-            *("export dexgraspbench", "verify", "bench", "build"),
+            *("export dexgraspbench", "verify", "build"),
         ),
     ),
     TRIALS: (
         hdf5_kinds.TRIALS,
         (
             *("stats", "check", "check FILE", "replay", "figures", "inspect", "export glb"),
-            *("export dexgraspbench", "bench"),
+            "export dexgraspbench",
         ),
     ),
     OTO: (

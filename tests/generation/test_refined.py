@@ -12,11 +12,11 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+from cross_check import cross_check
 from helpers.assertions import assert_same_dataset
 from helpers.meshes import write_fixed
 from helpers.objects import CUBE
 
-from drakegrasp.bench.cross_check import cross_check
 from drakegrasp.config import CloseConfig, Config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.assembly.split import rank_in_split, split_samples
