@@ -247,7 +247,7 @@ def check_geometry(hand: Hand) -> Iterator[Finding]:
 def check_palm(hand: Hand) -> Finding:
     """Return whether +Gz leaves the hand at the palm, towards where the fingertips close."""
     # How much of the ray from the origin of {G} along +Gz is within the open hand.
-    opened, shapes, faults = np.zeros(hand.num_fingers), link_shapes(hand), []
+    opened, shapes, faults = np.zeros(hand.num_fingers), link_shapes(hand.model), []
     depths = [(0.0, "")]
     for link in hand.link_chains:
         X_GL = link_poses(hand, link, spread=0.0, closing=opened)
@@ -312,9 +312,11 @@ def check_order(hand: Hand) -> Finding:
 def check_pads(hand: Hand) -> Finding:
     """Return whether each pad lies on its fingertip's surface and faces where the finger closes."""
     # Distance of the pad points from the surface.
-    shapes, faults, areas = link_shapes(hand), [], []
+    shapes, faults, areas = link_shapes(hand.model), [], []
     facing = _facing(hand)
-    for i, (finger, pad) in enumerate(zip(hand.fingers, pad_surfaces(hand), strict=True)):
+    for i, (finger, pad) in enumerate(
+        zip(hand.fingers, pad_surfaces(hand.model, hand.fingers), strict=True)
+    ):
         parts = [hull_triangles(corners) for corners in shapes[finger.fingertip]]
         if not parts:
             faults.append(f"link {finger.fingertip!r} must have a collision shape, got none")
@@ -391,9 +393,9 @@ def _facing(hand: Hand) -> Array:
     motion = pad_points_at(hand, half + step) - pad_points_at(hand, half)
 
     # Mean normal of each pad's surface, out of the fingertip.
-    X_GF, shapes = fingertip_poses(hand, spread=0.0, closing=half), link_shapes(hand)
+    X_GF, shapes = fingertip_poses(hand, spread=0.0, closing=half), link_shapes(hand.model)
     cosines = np.zeros(hand.num_fingers)
-    for i, pad in enumerate(pad_surfaces(hand)):
+    for i, pad in enumerate(pad_surfaces(hand.model, hand.fingers)):
         corners = shapes[hand.fingers[i].fingertip]
         if not len(pad) or not corners:
             continue

@@ -280,7 +280,7 @@ def _findings(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
     # The files: without them there is no hand.
     try:
         hand = load_hand(name_or_yaml)
-        count = sum(map(len, link_shapes(hand).values()))
+        count = sum(map(len, link_shapes(hand.model).values()))
     except HandError as error:
         yield judge("files", [str(error)], "")
         return

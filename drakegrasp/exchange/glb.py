@@ -81,7 +81,7 @@ def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, X_TB: Array) ->
 def link_meshes(hand: Hand) -> dict[str, trimesh.Trimesh]:
     """Return the links that have shapes, each as one mesh in its link's frame."""
     meshes = {}
-    for link, shapes in link_shapes(hand).items():
+    for link, shapes in link_shapes(hand.model).items():
         parts = [trimesh.Trimesh(**_indexed(hull_triangles(corners))) for corners in shapes]
         if parts:
             mesh = trimesh.util.concatenate(parts)

@@ -47,9 +47,8 @@ from drakegrasp.hand.parsing import (
     add_model,
     find_drives,
     find_joints,
-    is_carried,
     joint_slides,
-    make_chain,
+    make_chains,
     moving_joint,
     refuse_joints_of_others,
 )
@@ -286,10 +285,18 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
     # The chain from the palm to each fingertip; the finger's own closing joint must be in it.
     bodies = {body.name(): body for body in map(plant.get_body, plant.GetBodyIndices(instance))}
     base = _body(bodies, palm.link, "palm.link")
-    chains = []
+    carried, chains = make_chains(joints, base, drives, invert_pose(X_BG)), []
     for i, finger in enumerate(described.fingers):
         tip = _body(bodies, finger.fingertip, f"fingers.{i}.fingertip")
-        chain = make_chain(joints, tip, base, drives, invert_pose(X_BG))
+        if tip.name() not in carried:
+            above, end = {j.child_body().name(): j.parent_body().name() for j in joints}, tip.name()
+            while end in above:
+                end = above.pop(end)
+            raise HandError(
+                f"model: link {tip.name()!r} must be joined to the palm link {base.name()!r}, "
+                f"got a chain that ends at {end!r}"
+            )
+        chain = carried[tip.name()]
         if not chain.gain[:, 1 + i].any():
             raise HandError(
                 f"fingers.{i}.closing_joint: must lie between the palm link and the fingertip, "
@@ -318,11 +325,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         joint_offset=np.array([drives[joint][1] for joint in moving]),
         joint_limits=limits,
         chains=tuple(chains),
-        link_chains={
-            name: make_chain(joints, body, base, drives, invert_pose(X_BG))
-            for name, body in bodies.items()
-            if is_carried(joints, body, base)
-        },
+        link_chains={name: carried[name] for name in bodies if name in carried},
         lift_chance=None,
     )
 
@@ -352,7 +355,9 @@ def _refuse_empty_pads(hand: Hand) -> None:
     """Refuse a pad region that holds nothing of its fingertip's surface: nothing could touch."""
     if not any(finger.pad_region for finger in hand.fingers):
         return
-    for i, (finger, triangles) in enumerate(zip(hand.fingers, pad_surfaces(hand), strict=True)):
+    for i, (finger, triangles) in enumerate(
+        zip(hand.fingers, pad_surfaces(hand.model, hand.fingers), strict=True)
+    ):
         if not len(triangles):
             raise HandError(
                 f"fingers.{i}.pad_region: must hold a part of the surface of link "

@@ -189,7 +189,7 @@ def _gap(field: DistanceField, X_FbG: Array, p_GQ: Points) -> npt.NDArray[np.flo
 @lru_cache(maxsize=KEPT_HANDS)
 def _tip_fields(hand: Hand) -> tuple[DistanceField, ...]:
     """Return the distance field of each fingertip in its own frame."""
-    shapes, fields = link_shapes(hand), []
+    shapes, fields = link_shapes(hand.model), []
     for finger in hand.fingers:
         triangles = np.concatenate([_triangles(c) for c in shapes[finger.fingertip]])
         faces = np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3)
@@ -201,7 +201,7 @@ def _tip_fields(hand: Hand) -> tuple[DistanceField, ...]:
 def link_points(hand: Hand) -> dict[str, Array]:
     """Return points on the surface of each link (n, 3) in its own frame [m]."""
     points = {}
-    for link, shapes in link_shapes(hand).items():
+    for link, shapes in link_shapes(hand.model).items():
         spacing = TIP_SPACING if link in hand.fingertip_links else LINK_SPACING
         found = [even_points(corners, spacing) for corners in shapes]
         points[link] = np.concatenate([np.zeros((0, 3)), *found])

@@ -152,7 +152,9 @@ def opening(hand: Hand) -> float:
         HandError: See `hand.shapes.link_shapes`.
     """
     low, high = coordinate_limits(hand).T
-    corners = [np.unique(pad.reshape(-1, 3), axis=0) for pad in pad_surfaces(hand)]
+    corners = [
+        np.unique(pad.reshape(-1, 3), axis=0) for pad in pad_surfaces(hand.model, hand.fingers)
+    ]
     share = np.linspace(0.0, 1.0, OPENING_STEPS)
     closing, largest = low[1:] + share[:, None] * (high - low)[1:], 0.0
     for spread in low[0] + share * (high - low)[0]:
@@ -179,7 +181,7 @@ def flat_limits(hand: Hand) -> tuple[float, float]:
     ahead, spread, closing = _reach(hand)
     height = min((ahead - s for s in hand.standoffs if s < ahead), default=0.0)
     tips = fingertip_poses(hand, spread=spread, closing=closing)
-    pads = [pad.reshape(-1, 3) for pad in pad_surfaces(hand)]
+    pads = [pad.reshape(-1, 3) for pad in pad_surfaces(hand.model, hand.fingers)]
     points = [transform_points(X, pad) for X, pad in zip(tips, pads, strict=True) if len(pad)]
     return height, max((float(cdist(p, q).min()) for p, q in combinations(points, 2)), default=0.0)
 
@@ -193,7 +195,7 @@ def _reach(hand: Hand) -> tuple[float, float, Array]:
         The distance along +Gz, the spread [rad] and the closing positions (k,) [rad or m].
     """
     closing = np.linspace(0.0, closed_positions(hand), REACH_STEPS)
-    corners = {link: parts for link, parts in link_shapes(hand).items() if parts}
+    corners = {link: parts for link, parts in link_shapes(hand.model).items() if parts}
     farthest, at = 0.0, (0.0, closing[0])
     for spread in coordinate_limits(hand)[0].tolist():
         for link in corners.keys() & hand.link_chains.keys():

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -323,66 +323,55 @@ def find_drives(described: HandFile, joints: Sequence[str]) -> dict[str, JointDr
     return drives
 
 
-def is_carried(joints: Sequence[Any], body: RigidBody, base: RigidBody) -> bool:
-    """Return whether a link is the palm link or is joined to it."""
-    parents = {joint.child_body().index(): joint.parent_body().index() for joint in joints}
-    index = body.index()
-    while index != base.index() and index in parents:
-        index = parents.pop(index)
-    return bool(index == base.index())
+def make_chains(
+    joints: Sequence[Any], base: RigidBody, drives: Mapping[str, JointDrive], X_GB: Array
+) -> dict[str, Chain]:
+    """Return the chain of joints from the palm to each link that it carries, the palm included.
 
-
-def make_chain(
-    joints: Sequence[Any],
-    tip: RigidBody,
-    base: RigidBody,
-    drives: Mapping[str, JointDrive],
-    X_GB: Array,
-) -> Chain:
-    """Return the chain of joints from the palm to a link.
-
-    Raises:
-        HandError: If no chain of joints connects them.
+    A palm that a wrist carries begins its own: what carries it is left out.
     """
-    # Collect the joints on the way from the link up to the palm link.
-    by_child = {joint.child_body().index(): joint for joint in joints}
-    path: list[Any] = []
-    body = tip
-    while body.index() != base.index():
-        # Remove each joint that was used, so that a closed loop of links ends, too.
-        joint = by_child.pop(body.index(), None)
-        if joint is None:
-            raise HandError(
-                f"model: link {tip.name()!r} must be joined to the palm link {base.name()!r}, "
-                f"got a chain that ends at {body.name()!r}"
-            )
-        path.insert(0, joint)
-        body = joint.parent_body()
-
-    # Multiply the constant poses between two moving joints into one.
-    X, X_PJ, axes = X_GB, [], []
-    for joint in path:
-        X = multiply(X, joint.frame_on_parent().GetFixedPoseInBodyFrame().GetAsMatrix4())
-        if moving_joint(joint):
-            X_PJ.append(X)
-            axes.append(joint_axis(joint))
-            X = np.eye(4)
-        else:
-            X = multiply(X, joint.X_FM().GetAsMatrix4())
-        X = multiply(
-            X, invert_pose(joint.frame_on_child().GetFixedPoseInBodyFrame().GetAsMatrix4())
-        )
-
-    moving = [joint for joint in path if moving_joint(joint)]
     k = len(next(iter(drives.values()))[0])
+    chains = {
+        base.name(): Chain(
+            joints=(),
+            X_PJ=np.zeros((0, 4, 4)),
+            axis=np.zeros((0, 3)),
+            slides=np.zeros(0, dtype=np.bool_),
+            gain=np.zeros((0, k)),
+            offset=np.zeros(0),
+            X_JFi=X_GB,
+        )
+    }
+    # Each link has one joint that carries it, so no link is met twice.
+    carriers = {joint.child_body().name(): joint for joint in joints}
+    carriers.pop(base.name(), None)
+    links = [base.name()]
+    for link in links:
+        for child, joint in carriers.items():
+            if joint.parent_body().name() == link:
+                chains[child] = _extended(chains[link], joint, drives)
+                links.append(child)
+    return chains
+
+
+def _extended(chain: Chain, joint: Any, drives: Mapping[str, JointDrive]) -> Chain:
+    """Return the chain to the link that a joint carries, from that to the link before.
+
+    The constant poses between two joints that move are multiplied into one.
+    """
+    X_JF = multiply(chain.X_JFi, joint.frame_on_parent().GetFixedPoseInBodyFrame().GetAsMatrix4())
+    X_MC = invert_pose(joint.frame_on_child().GetFixedPoseInBodyFrame().GetAsMatrix4())
+    if not moving_joint(joint):
+        return replace(chain, X_JFi=multiply(multiply(X_JF, joint.X_FM().GetAsMatrix4()), X_MC))
+    gain, offset = drives[joint.name()]
     return Chain(
-        joints=tuple(joint.name() for joint in moving),
-        X_PJ=np.reshape(X_PJ, (-1, 4, 4)),
-        axis=np.reshape(axes, (-1, 3)),
-        slides=np.array([joint_slides(joint) for joint in moving], dtype=np.bool_),
-        gain=np.reshape([drives[joint.name()][0] for joint in moving], (-1, k)),
-        offset=np.array([drives[joint.name()][1] for joint in moving], dtype=float),
-        X_JFi=X,
+        joints=(*chain.joints, joint.name()),
+        X_PJ=np.concatenate([chain.X_PJ, X_JF[None]]),
+        axis=np.concatenate([chain.axis, joint_axis(joint)[None]]),
+        slides=np.append(chain.slides, joint_slides(joint)),
+        gain=np.concatenate([chain.gain, gain[None]]),
+        offset=np.append(chain.offset, offset),
+        X_JFi=multiply(np.eye(4), X_MC),
     )
 
 

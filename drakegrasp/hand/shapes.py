@@ -1,13 +1,13 @@
 """The collision shapes of a hand's links, as convex sets of points.
 
-In: a `Hand`. Out: for each link the corners of its collision shapes, in the link's frame.
+In: a hand's model. Out: for each link the corners of its collision shapes, in the link's frame.
 Every shape of a hand is convex (`models/README.md`), so its corners describe it fully.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.geometry import (
@@ -26,11 +26,8 @@ from scipy.spatial import ConvexHull
 from drakegrasp.arithmetic import dot, norm, sin_cos
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, transform_points
-from drakegrasp.hand.file_format import HalfSpace
+from drakegrasp.hand.file_format import Finger, HalfSpace
 from drakegrasp.hand.parsing import KEPT_HANDS, ModelFile, add_model
-
-if TYPE_CHECKING:
-    from drakegrasp.hand.description import Hand
 
 #: Corners of the polygon that replaces a circle and encloses it.
 CIRCLE = 16
@@ -42,57 +39,49 @@ FARTHEST = 3.0
 SLIVER = 1e-12
 
 
-def link_shapes(hand: Hand) -> dict[str, tuple[Array, ...]]:
+@lru_cache(maxsize=KEPT_HANDS)
+def link_shapes(model: ModelFile) -> dict[str, tuple[Array, ...]]:
     """Return the corners (n, 3) [m] of each collision shape of each link, in the link's frame.
 
     Raises:
         HandError: If a shape is not a box, cylinder, capsule, sphere or convex mesh, or too large.
     """
-    return _link_shapes(hand.model)
-
-
-@lru_cache(maxsize=KEPT_HANDS)
-def _link_shapes(model: ModelFile) -> dict[str, tuple[Array, ...]]:
-    plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
-    plant.RegisterAsSourceForSceneGraph(scene_graph)
-    instance = add_model(plant, model)
-    inspector = scene_graph.model_inspector()
     shapes = {}
-    for index in plant.GetBodyIndices(instance):
-        body = plant.get_body(index)
-        geometries = plant.GetCollisionGeometriesForBody(body)
+    for link, inspector, geometries in _links(model):
         found = tuple(_corners(inspector, geometry) for geometry in geometries)
         reach = max((float(np.abs(corners).max()) for corners in found), default=0.0)
         if not reach <= FARTHEST:
             raise HandError(
-                f"shapes of link {body.name()!r} must be within {FARTHEST:g} m of it, got one that "
+                f"shapes of link {link!r} must be within {FARTHEST:g} m of it, got one that "
                 f"reaches {reach:.3g} m: check units and scales of its meshes"
             )
-        shapes[body.name()] = found
+        shapes[link] = found
     return shapes
 
 
-def link_rims(hand: Hand) -> dict[str, Array]:
+@lru_cache(maxsize=KEPT_HANDS)
+def link_rims(model: ModelFile) -> dict[str, Array]:
     """Return what a link's collision shapes are the convex hulls of, exactly, in the link's frame.
 
     A row (p, a, r) of the result (n, 7) is the corner p [m] if the radius r is 0 [m], a ball about
     p if the axis a is zero, and else the disc about p across the unit axis a.
     """
-    return _link_rims(hand.model)
+    return {
+        link: np.concatenate([np.zeros((0, 7)), *[_rims(inspector, g) for g in geometries]])
+        for link, inspector, geometries in _links(model)
+    }
 
 
-@lru_cache(maxsize=KEPT_HANDS)
-def _link_rims(model: ModelFile) -> dict[str, Array]:
+def _links(
+    model: ModelFile,
+) -> Iterator[tuple[str, SceneGraphInspector, Sequence[GeometryId]]]:
+    """Yield the links of a model, each with what describes shapes, and its collision shapes."""
     plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     instance = add_model(plant, model)
-    inspector, rims = scene_graph.model_inspector(), {}
-    for index in plant.GetBodyIndices(instance):
-        body = plant.get_body(index)
+    for body in map(plant.get_body, plant.GetBodyIndices(instance)):
         geometries = plant.GetCollisionGeometriesForBody(body)
-        found = [_rims(inspector, geometry) for geometry in geometries]
-        rims[body.name()] = np.concatenate([np.zeros((0, 7)), *found])
-    return rims
+        yield body.name(), scene_graph.model_inspector(), geometries
 
 
 def _rims(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
@@ -108,7 +97,7 @@ def _rims(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
     return np.column_stack([ends, np.tile([*axis, shape.radius()], (2, 1))])
 
 
-def pad_surfaces(hand: Hand) -> tuple[Array, ...]:
+def pad_surfaces(model: ModelFile, fingers: Sequence[Finger]) -> tuple[Array, ...]:
     """Return the surface (t, 3, 3) [m] of each fingertip's pad as triangles, in its link's frame.
 
     The surface is that of the convex hull of the link's shapes, as far as it is in the hand file's
@@ -118,8 +107,8 @@ def pad_surfaces(hand: Hand) -> tuple[Array, ...]:
     Raises:
         HandError: See `link_shapes`.
     """
-    surfaces, shapes = [], link_shapes(hand)
-    for finger in hand.fingers:
+    surfaces, shapes = [], link_shapes(model)
+    for finger in fingers:
         parts = shapes[finger.fingertip]
         triangles = hull_triangles(np.concatenate(parts)) if parts else np.zeros((0, 3, 3))
         for half_space in finger.pad_region:

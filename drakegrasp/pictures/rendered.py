@@ -166,7 +166,9 @@ def _colour(finger: int) -> str:
 def _add_marks(plant: MultibodyPlant, instance: ModelInstanceIndex, hand: Hand) -> None:
     """Add the pads to the fingertips, and the axes of the palm frame to the world."""
     # The pads, a little in front of their surfaces.
-    for i, (finger, pad) in enumerate(zip(hand.fingers, pad_surfaces(hand), strict=True)):
+    for i, (finger, pad) in enumerate(
+        zip(hand.fingers, pad_surfaces(hand.model, hand.fingers), strict=True)
+    ):
         body = plant.GetBodyByName(finger.fingertip, instance)
         mesh = drawn_mesh(*_lifted(pad), f"pad {i}")
         colour = np.array(to_rgba(_colour(i)))

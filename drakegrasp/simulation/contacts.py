@@ -390,7 +390,7 @@ def least_height(hand: Hand, names: list[str], q: Array, up_G: Array) -> float:
         q: Their positions (n, j) [rad or m].
         up_G: The third rows (n, 4) of the palm's poses X_TG.
     """
-    lowest, rims = np.inf, link_rims(hand)
+    lowest, rims = np.inf, link_rims(hand.model)
     for link, X_GL in posed_links(hand, dict(zip(names, q.T, strict=True))).items():
         if not len(rims[link]):
             continue

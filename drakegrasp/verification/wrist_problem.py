@@ -256,7 +256,7 @@ def hand_constants(hand: Hand) -> HandConstants:
         HandError: If its palm or a fingertip has no shape, or one that is not convex.
     """
     # The palm and the fingertips need shapes; those of a palm may be on links fixed to it.
-    shapes = link_shapes(hand)
+    shapes = link_shapes(hand.model)
     still = [link for link in still_links(hand) if shapes[link]]
     missing = [] if still else [hand.palm_link]
     missing += [link for link in hand.fingertip_links if not shapes[link]]
@@ -286,7 +286,11 @@ def hand_constants(hand: Hand) -> HandConstants:
     moved = [0, *(1 + i for i in hand.motor_fingers)]
     return HandConstants(
         **chains,
-        pads=make_pads(corners, [finger.pad_region for finger in hand.fingers], pad_surfaces(hand)),
+        pads=make_pads(
+            corners,
+            [finger.pad_region for finger in hand.fingers],
+            pad_surfaces(hand.model, hand.fingers),
+        ),
         pad_points=np.array([finger.p_FiP for finger in hand.fingers]),
         limits=coordinate_limits(hand)[moved],
         units=np.r_[1.0, hand.closing_unit][moved],

@@ -355,7 +355,7 @@ def check(folder: Path) -> None:
             write_urdf(model, Path(out) / "hand.urdf", ())
         return
     hand = load_hand(folder / "hand.yaml")
-    link_shapes(hand)
+    link_shapes(hand.model)
     limits = check_limits(hand)
     for finding in (limits, *(check_geometry(hand) if limits.ok else ())):
         sys.stdout.write(f"{finding.name}: {finding.text}\n")

@@ -213,12 +213,14 @@ def test_a_hand_whose_files_have_changed_is_another(tmp_path: Path) -> None:
     path = write_pincer(tmp_path)
     first = load_hand(path)
     assert load_hand(path) is first
-    before = link_shapes(first)["right"][0]
+    before = link_shapes(first.model)["right"][0]
     write_pincer(tmp_path, sdf=PINCER_SDF.replace("0.02 0.02 0.09", "0.02 0.03 0.09"))
     second = load_hand(path)
     assert second is not first
     assert np.ptp(before, axis=0) == pytest.approx([0.02, 0.02, 0.09])
-    assert np.ptp(link_shapes(second)["right"][0], axis=0) == pytest.approx([0.02, 0.03, 0.09])
+    assert np.ptp(link_shapes(second.model)["right"][0], axis=0) == pytest.approx(
+        [0.02, 0.03, 0.09]
+    )
 
     mesh = "<mesh><uri>bar.obj</uri><drake:declare_convex/></mesh>"
     sdf = PINCER_SDF.replace("<box><size>0.02 0.02 0.09</size></box>", mesh)
@@ -226,7 +228,7 @@ def test_a_hand_whose_files_have_changed_is_another(tmp_path: Path) -> None:
     write_pincer(tmp_path, sdf=sdf)
     for edge in (0.02, 0.025):
         trimesh.creation.box([0.02, edge, 0.09]).export(tmp_path / "bar.obj")
-        shape = link_shapes(load_hand(path))["right"][0]
+        shape = link_shapes(load_hand(path).model)["right"][0]
         assert np.ptp(shape, axis=0) == pytest.approx([0.02, edge, 0.09])
 
 

@@ -89,7 +89,7 @@ def test_a_mesh_in_a_package_is_found(tmp_path: Path, named: bool) -> None:
         path = write_slider(tmp_path, urdf, packages={"grip": "somewhere"})
     else:
         path = write_slider(folder.parent, urdf)
-    assert len(link_shapes(load_hand(path))["left"][0]) == 24
+    assert len(link_shapes(load_hand(path).model)["left"][0]) == 24
 
     # The mesh is part of the hand.
     before = hand_digest(path)
@@ -101,7 +101,7 @@ def test_a_mesh_that_is_missing_is_named(tmp_path: Path) -> None:
     urdf = SLIDER.replace('<box size="0.02 0.02 0.09"/>', '<mesh filename="gone.obj"/>', 1)
     hand = load_hand(write_slider(tmp_path, urdf))
     with pytest.raises(HandError, match=r"model: .*gone\.obj"):
-        link_shapes(hand)
+        link_shapes(hand.model)
 
 
 def test_a_rated_load_of_the_package_is_of_its_own_hand_file(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ def test_points_of_a_finger_move_with_it(hand):
         closing = np.zeros(hand.num_fingers)
         closing[i] = path.angles[k]
         X_GF = fingertip_poses(hand, spread=spread, closing=closing)[i]
-        corners = transform_points(X_GF, np.concatenate(link_shapes(hand)[finger.fingertip]))
+        corners = transform_points(X_GF, np.concatenate(link_shapes(hand.model)[finger.fingertip]))
         tips = path.points[k, : path.tip]
         distance = np.linalg.norm(corners[:, None] - tips, axis=2).min(axis=1)
         assert distance.max() < 1e-6
@@ -48,7 +48,7 @@ def test_points_of_a_finger_move_with_it(hand):
             if chain.gain[:, 1 + i].any() and name != finger.fingertip
         )
         X_GL = link_poses(hand, link, spread=spread, closing=closing)
-        corners = transform_points(X_GL, np.concatenate(link_shapes(hand)[link]))
+        corners = transform_points(X_GL, np.concatenate(link_shapes(hand.model)[link]))
         others = path.points[k, path.tip :]
         assert np.all(others > corners.min(axis=0) - 1e-6)
         assert np.all(others < corners.max(axis=0) + 1e-6)

@@ -248,4 +248,4 @@ def test_spoilt_file_of_a_hand_is_refused(
     else:
         (tmp_path / name).write_text(re.sub(*spoil, text, count=1))
     with pytest.raises(HandError, match=said):
-        link_shapes(load_hand(tmp_path / f"{hand}_hand.yaml"))
+        link_shapes(load_hand(tmp_path / f"{hand}_hand.yaml").model)

@@ -33,7 +33,7 @@ def test_fingertips_are_where_the_kinematics_put_them(scene: StillScene) -> None
 
 def test_each_link_fills_its_collision_shapes(scene: StillScene) -> None:
     """The Barrett Hand is shown as it collides, so the boxes around both are equal."""
-    shapes, surfaces = link_shapes(HAND), link_surfaces(scene)
+    shapes, surfaces = link_shapes(HAND.model), link_surfaces(scene)
     assert set(surfaces) == {link for link, parts in shapes.items() if parts}
     for link, content in surfaces.items():
         corners = np.concatenate(shapes[link])

@@ -205,7 +205,7 @@ def test_depth_of_a_fingertip_is_how_far_it_is_in_the_cube(closed: Scene) -> Non
     """A convex shape is deepest at a corner. Drake's field of pressure is not quite a distance."""
     found, hand = read_contacts(closed), closed.hand
     for k, tip in enumerate(closed.fingertips):
-        corners = np.concatenate(link_shapes(hand)[hand.fingers[k].fingertip])
+        corners = np.concatenate(link_shapes(hand.model)[hand.fingers[k].fingertip])
         X_OF = invert_pose(closed.pose(closed.object)) @ closed.pose(tip)
         y = np.abs(transform_points(X_OF, corners)[:, 1])
         assert found.penetration[k] == pytest.approx(CUBE / 2.0 - y.min(), rel=0.3)

@@ -36,7 +36,7 @@ def bodies() -> list[Array]:
     """Return corners of a box, a tetrahedron and a Barrett fingertip: few planes and many."""
     hand = load_hand()
     tetrahedron = np.array([[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, 0.02, 0.0], [0.0, 0.0, 0.04]])
-    fingertip = np.concatenate(link_shapes(hand)[hand.fingertip_links[0]])
+    fingertip = np.concatenate(link_shapes(hand.model)[hand.fingertip_links[0]])
     return [trimesh.creation.box(2.0 * HALF).vertices, tetrahedron, fingertip]
 
 
@@ -203,7 +203,7 @@ def test_point_outside_the_region_is_told_by_how_much() -> None:
 
 def test_pads_of_the_barrett_hand_are_in_their_region() -> None:
     hand = load_hand()
-    for finger, triangles in zip(hand.fingers, pad_surfaces(hand), strict=True):
+    for finger, triangles in zip(hand.fingers, pad_surfaces(hand.model, hand.fingers), strict=True):
         corners = triangles.reshape(-1, 3)
         assert finger.on_pad(corners + 1e-9).all()
         assert np.allclose(corners.min(axis=0)[:2], [0.018, -0.0035], atol=1e-4)
@@ -219,7 +219,7 @@ def hand() -> Hand:
 
 
 def test_every_link_of_the_barrett_hand_has_shapes_that_are_solids(hand: Hand) -> None:
-    links = link_shapes(hand)
+    links = link_shapes(hand.model)
     assert len(links) == 9
     assert {hand.palm_link, *hand.fingertip_links} <= set(links)
     for parts in links.values():
@@ -231,7 +231,7 @@ def test_every_link_of_the_barrett_hand_has_shapes_that_are_solids(hand: Hand) -
 
 def test_barretts_pad_points_are_on_their_fingertips(hand: Hand) -> None:
     """The median of contacts on a rounded pad is a little below its surface."""
-    corners = [np.concatenate(link_shapes(hand)[link]) for link in hand.fingertip_links]
+    corners = [np.concatenate(link_shapes(hand.model)[link]) for link in hand.fingertip_links]
     p_FiP = np.array([finger.p_FiP for finger in hand.fingers])
     off = np.linalg.norm(nearest_on_pads(whole_pads(corners), p_FiP) - p_FiP, axis=1)
     assert off.max() < 2.5e-3
@@ -264,7 +264,7 @@ SHAPES = {
 @pytest.mark.parametrize("kind", SHAPES)
 def test_shapes_have_the_volume_and_place_of_their_formula(tmp_path: Path, kind: str) -> None:
     sdf, volume, tolerance = SHAPES[kind]
-    links = link_shapes(load_hand(with_shape(tmp_path, sdf)))
+    links = link_shapes(load_hand(with_shape(tmp_path, sdf)).model)
     assert links["mount"] == ()
     (corners,) = links["left"]
     assert ConvexHull(corners).volume == pytest.approx(volume, rel=tolerance)
@@ -296,7 +296,7 @@ def assert_reaches_as_far_as_drakes(hand: Hand, *, atol: float) -> None:
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
     query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
-    for link, parts in link_shapes(hand).items():
+    for link, parts in link_shapes(hand.model).items():
         body = plant.GetBodyByName(link)
         own = set(plant.GetCollisionGeometriesForBody(body))
         assert len(own) == len(parts)
@@ -323,5 +323,5 @@ def test_other_shapes_are_refused(tmp_path: Path, shape: str, got: str) -> None:
     hand = load_hand(with_shape(tmp_path, shape))
     message = rf"rod: must be a box, cylinder, capsule, sphere or convex mesh, got {got}"
     with pytest.raises(HandError, match=message) as caught:
-        link_shapes(hand)
+        link_shapes(hand.model)
     assert "\n" not in str(caught.value)

@@ -193,7 +193,7 @@ def test_closing_direction_is_how_the_fingertip_moves_at_the_point(name: str, se
 def test_clearance_is_the_lowest_corners_height_within_the_rounding(name: str, seed: int) -> None:
     problem, x = random_problem(name, seed)
     at, hand = evaluate(problem, x), hand_of(name)
-    shapes = link_shapes(hand)
+    shapes = link_shapes(hand.model)
     X_GF = fingertip_poses(hand, spread=x[POSE], closing=hand.closing_ratio @ x[POSE + 1 :])
     # The palm is all that no finger and no spread moves.
     still = [link for link in still_links(hand) if shapes[link]]

@@ -91,7 +91,7 @@ def lowest(name: str, fit: WristFit, up_O: Array, height: float) -> float:
     poses = [fit.X_OG @ invert_pose(hand.X_BG), *X_OF]
     links = [hand.palm_link, *hand.fingertip_links]
     corners = [
-        transform_points(X, np.concatenate(link_shapes(hand)[link]))
+        transform_points(X, np.concatenate(link_shapes(hand.model)[link]))
         for X, link in zip(poses, links, strict=True)
     ]
     return float((np.concatenate(corners) @ up_O).min()) + height
