@@ -867,3 +867,26 @@ def _siblings(place: tuple[Any, ...]) -> list[str]:
     inside = len(place) > 1 and _is_section(place[0])
     section: Any = Config.model_fields[place[0]].annotation if inside else Config
     return list(section.model_fields)
+
+
+#: Stand-offs at which a hand that faces the table closes on flat objects, see
+#: docs/explanation/sampling.md.
+FLAT_STANDOFFS = "candidates.standoffs=[0.095,0.1,0.105]"
+
+
+def ways_to_grasps(config: Config | None = None) -> str:
+    """Return what gives grasps of an object that has none, what helps most first.
+
+    Args:
+        config: What it says already is left out; None: nothing is known.
+    """
+    ways = []
+    rules = None if config is None else config.candidates
+    if rules is None or ("normals" not in rules.methods and rules.postures is None):
+        ways.append("palm poses that face the surface (--set candidates.method=normals)")
+    if config is None or config.objects.resting_poses == 1:
+        ways.append("more resting poses (--set objects.resting_poses=4)")
+    else:
+        ways.append("more palm poses (--candidates)")
+    ways.append(f"for what lies flat other stand-offs (--set {FLAT_STANDOFFS})")
+    return ", or ".join([*ways, "another hand (--set hand=NAME)"])

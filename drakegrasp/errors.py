@@ -18,6 +18,7 @@ texts of strangers safe to show.
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Sequence
 
 #: A line that lists many names has this many of them.
@@ -71,7 +72,15 @@ def printable(text: str) -> str:
 
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message, or its type if the message is empty."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return (_said(error).splitlines() or [type(error).__name__])[0]
+
+
+def _said(error: BaseException) -> str:
+    """Return an error's message; Python's own about a text in another encoding helps nobody."""
+    if isinstance(error, UnicodeDecodeError) and error.encoding.startswith("utf-8"):
+        wide = error.object.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        return f"text in {'UTF-16' if wide else 'another encoding'}: save it in UTF-8"
+    return str(error).strip()
 
 
 def one_line(error: BaseException) -> str:
@@ -79,7 +88,7 @@ def one_line(error: BaseException) -> str:
 
     For parsers, which say on later lines where in the file the mistake is.
     """
-    return " ".join(str(error).split())[:LONGEST_MESSAGE] or type(error).__name__
+    return " ".join(_said(error).split())[:LONGEST_MESSAGE] or type(error).__name__
 
 
 def counted(count: int, noun: str, plural: str | None = None) -> str:

@@ -29,6 +29,11 @@ P_WT = np.array([0.0, 0.0, 0.65])
 
 #: How far a rotation matrix may be from orthogonal: files hold them in single precision.
 ROTATION_TOLERANCE = 1e-4
+#: Why numbers in the frame of a mesh file cannot be used.
+NO_MESH_FRAME = (
+    "frame must not be mesh where the frame of the mesh file is not known, as on a dataset, got "
+    "mesh: give the mesh itself (drakegrasp verify FILE --object MESH)"
+)
 #: What is farther from the origin of its frame is no contact and no palm [m].
 FARTHEST = 1e3
 #: Other kinds of array, by NumPy's letter, as errors name them.

@@ -90,8 +90,8 @@ def verify_grasp(
             a tensor of torch.
         on: What the grasp is on, see `verify_grasps`.
         row: The grasp's row, if `on` is a `GraspDataset`.
-        frame: Of the grasp, "object", "camera" or "table"; `verify_grasps` says more of this and
-            the next ones.
+        frame: Of the grasp, "object", "camera", "table" or "mesh"; `verify_grasps` says more of
+            this and the next ones.
         X_TC: With frame "camera" on an object: pose (4, 4) of the camera in {T}.
         units: Of a mesh: m, cm or mm.
         X_TO: Pose (4, 4) of an object on the table.
@@ -167,7 +167,8 @@ def verify_grasps(
         rows: Only of a `GraspDataset`: the row of its split for each grasp; all rows, in order, if
             None.
         frame: The frame of the grasps: "object" {O}, whose origin is the centre of the bounding
-            box, "camera" {C} or "table" {T}, the centre of the table top. The default if None.
+            box, "camera" {C}, "table" {T}, the centre of the table top, or for a mesh also
+            "mesh" {M}, the axes and origin of the file. The default if None.
         X_TC: Only of an object, with frame "camera": pose of the camera in {T}, (4, 4), or one
             per grasp (n, 4, 4). Rows have their own.
         units: Only of a mesh: unit of its lengths, m, cm or mm; metres if None. An `objects.yaml`
@@ -231,7 +232,7 @@ def _place_on_rows(
     # The object of a verdict can verify more grasps.
     things = {id(grasp.placed): grasp.placed for grasp in placed}
     doors = {
-        key: PlacedObject(model=thing.model, X_TO=thing.X_TO, config=thing.config)
+        key: PlacedObject(model=thing.model, X_TO=thing.X_TO, config=thing.config, X_OM=thing.X_OM)
         for key, thing in things.items()
     }
     return [replace(grasp, placed=doors[id(grasp.placed)]) for grasp in placed]
@@ -295,7 +296,9 @@ def place_object(
     if hand is not None:
         used = override_config(used, [], hand=str(hand))
     placed = put_on_table(mesh, units=units, X_TO=X_TO, config=used)
-    return PlacedObject(model=placed.model, X_TO=placed.X_TO, config=placed.config)
+    return PlacedObject(
+        model=placed.model, X_TO=placed.X_TO, config=placed.config, X_OM=placed.X_OM
+    )
 
 
 def verify_rows(

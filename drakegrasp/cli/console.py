@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
+from difflib import get_close_matches
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 _UTF8, _STREAMS = "PYTHONUTF8", "PYTHONIOENCODING"
 #: A signal that comes while a module is imported is sent again after this time [s].
 AGAIN_SECONDS = 0.05
+#: An option that is not known is told like another if its name is [ratio of `difflib`].
+ALIKE = 0.75
 #: Commands that go on where they were stopped.
 RESUMABLE = ("build", "score")
 #: Errors in what the user asked for. All other errors are failures of the work.
@@ -152,6 +155,11 @@ def one_line_errors(resumable: Callable[[], bool] = lambda: False) -> Iterator[N
     except click.exceptions.NoArgsIsHelpError:
         raise
     except click.UsageError as error:
+        if isinstance(error, click.NoSuchOption):
+            # Click compares the dashes, too: any two short names are alike then.
+            names = {each.lstrip("-"): each for each in error.possibilities or ()}
+            near = get_close_matches(error.option_name.lstrip("-"), names, cutoff=ALIKE)
+            error.possibilities = [names[name] for name in near]
         _end(f"error: {_one_line(error.format_message())}", 2)
     except DrakegraspError as error:
         code = 2 if isinstance(error, WRONG_USAGE) else 1

@@ -20,11 +20,12 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, GraspError, listed
 from drakegrasp.exchange.attempts import has_rows, holds_postures, read_attempts
 from drakegrasp.frames import Array
-from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.settings import load_config, override_config
-from drakegrasp.objects.sources import file_frame, find_mesh
+from drakegrasp.objects.sources import find_mesh
+from drakegrasp.simulation.attempts import Attempts
 from drakegrasp.simulation.placement import place_object
 from drakegrasp.verification.placing import (
     dataset_config,
@@ -208,16 +209,43 @@ def _place_postures(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
 
     # All are tried on the one object, which they need not name.
     assert request.mesh is not None
-    source = find_mesh(request.mesh, units=request.units or "m")
-    name = source.name
-    table = read_attempts(request.grasps, load_hand(config.hand_source), of=name)
+    name = find_mesh(request.mesh, units=request.units or "m").name
+    table = _of_object(request.grasps, name, load_hand(config.hand_source))
     thing = place_object(request.mesh, units=request.units, config=config)
-    others = sorted({each for each in table.objects if each not in ("", name)})
-    if others:
-        told = f"postures of {listed(others)} are tried on {name}, the --object"
-        say(f"{request.grasps}: {told}", err=True)
-    X_OM = file_frame(source) if table.frame == "mesh" else None
-    return place_on_object(table, thing, overrides=request.overrides, X_OM=X_OM), config
+    _say_nameless(table)
+    return place_on_object(table, thing, overrides=request.overrides), config
+
+
+def _of_object(path: Path, name: str, hand: Hand) -> Attempts:
+    """Return the postures of a file or a folder that are of an object, and say which are not.
+
+    A file of one other object is for this one: nothing else can be meant.
+
+    Raises:
+        GraspError: If none is of it.
+    """
+    table = read_attempts(path, hand, of=name)
+    own = [i for i, each in enumerate(table.objects) if each in ("", name)]
+    others = sorted(set(table.objects) - {"", name})
+    if not others:
+        return table
+    if not all(table.invalid[i] for i in own):
+        left = len(table) - len(own)
+        say(
+            f"{path}: {left:,} postures of {listed(others)} are left out, as --object is {name}",
+            err=True,
+        )
+        return table.at(own)
+    if path.is_dir() or len(others) > 1:
+        raise GraspError(f"{path}: postures must be of {name}, the --object, got {listed(others)}")
+    say(f"{path}: postures of {others[0]} are tried on {name}, the --object", err=True)
+    return table
+
+
+def _say_nameless(table: Attempts) -> None:
+    """Say how many postures name no resting pose."""
+    if table.nameless:
+        say(table.nameless, err=True)
 
 
 def _postures_on(dataset: Path, request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
@@ -234,6 +262,7 @@ def _postures_on(dataset: Path, request: VerifyRequest) -> tuple[list[PlacedGras
     out = dataset.parent if dataset.is_file() else dataset
     config = override_config(read_manifest(out).config, request.overrides)
     table = read_attempts(request.grasps, load_hand(config.hand_source))
+    _say_nameless(table)
     own = config if request.overrides else None
     return place_on_dataset(table, out, own, overrides=request.overrides), config
 

@@ -67,8 +67,9 @@ class _Frame(click.Choice[str]):
 @option(
     "--frame",
     None,
-    "Frame of the grasps.  [default: object; with --dataset camera]",
-    type=_Frame(["object", "camera", "table"]),
+    "Frame of the grasps; mesh, with --object, has the axes and the origin of the file.  [default: "
+    "object; with --dataset camera]",
+    type=_Frame(["object", "camera", "table", "mesh"]),
 )
 @option(
     "--camera",

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drakegrasp.config import Config, SplitConfig
+from drakegrasp.config import Config, SplitConfig, ways_to_grasps
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.statistics import Funnel, SplitCount
 from drakegrasp.filters import Removal
@@ -74,19 +74,7 @@ def why_no_sample(outcomes: AnyArray, removals: AnyArray, config: Config) -> Sho
         reason += f"; {by_stage[Stage.CLOSED]:,} closed, none lifted"
     elif not by_stage[Stage.CLOSED] and not by_stage[Stage.LIFTED]:
         reason += "; the hand never closed on it"
-    return Shortfall(reason, _advice(config))
-
-
-def _advice(config: Config) -> str:
-    """Return what a configuration has not tried yet and would help most, first."""
-    ways = []
-    if "normals" not in config.candidates.methods and config.candidates.postures is None:
-        ways.append("palm poses that face the surface (--set candidates.method=normals)")
-    if config.objects.resting_poses == 1:
-        ways.append("more resting poses (--set objects.resting_poses=4)")
-    else:
-        ways.append("more palm poses (--candidates)")
-    return ", or ".join([*ways, "another hand (--set hand=NAME)"])
+    return Shortfall(reason, ways_to_grasps(config))
 
 
 def split_shortfall(counts: Sequence[SplitCount], rule: str, config: SplitConfig) -> str:

@@ -36,6 +36,7 @@ from drakegrasp.simulation.attempts import (
     make_attempts,
     quaternion_poses,
     taken,
+    xyzw_poses,
 )
 from drakegrasp.verification.placing import choose_rows
 
@@ -305,11 +306,12 @@ def _of_arrays(arrays: Mapping[str, Any], nameless: bool) -> dict[str, Any]:
     texts = {name: _texts(arrays[name], name) for name in _TEXTS if name in arrays}
 
     # The palm's poses, in either form.
-    invalid = None
+    invalid = xyzw = None
     if "X_FG" in arrays:
         X_FG = _stacked(arrays["X_FG"], "X_FG")
     else:
-        X_FG, invalid = quaternion_poses(arrays["position"], arrays["quaternion"])
+        place = arrays["position"], arrays["quaternion"]
+        (X_FG, invalid), xyzw = quaternion_poses(*place), xyzw_poses(*place)
     numbers = {name: arrays[name] for name in _SCALARS if name in arrays}
     if "X_TO" in arrays:
         numbers["X_TO"] = _stacked(arrays["X_TO"], "X_TO")
@@ -318,6 +320,7 @@ def _of_arrays(arrays: Mapping[str, Any], nameless: bool) -> dict[str, Any]:
     return {
         "objects": texts["object"] if "object" in texts else [""] * len(X_FG),
         "X_FG": X_FG,
+        "X_FG_xyzw": xyzw,
         "link": _link(texts.get("link")),
         "frame": _only(texts.get("frame"), "frame") or "object",
         **{name: arrays[name] for name in stages if name in arrays},

@@ -255,9 +255,11 @@ def _build(
     write_manifest(manifest, out)
     if warning := too_heavy(manifest):
         job.events.warn(warning)
-    if job.postures is not None and (refused := _refused_postures(job.postures, manifest)):
-        job.events.warn(refused)
-        notices.append(refused)
+    if job.postures is not None:
+        refused, nameless = _refused_postures(job.postures, manifest), job.postures.nameless
+        for told in filter(None, (refused, nameless)):
+            job.events.warn(told)
+            notices.append(told)
 
     # Simulate the work units that are not done; killed workers leave temporary files.
     with progress_bar("simulate", "attempts", show=job.show) as report:

@@ -220,6 +220,40 @@ def declared_mimics(root: Element) -> list[Mimic]:
     return found
 
 
+def refuse_impossible(root: Element) -> None:
+    """Refuse limits and mimics of URDF or SDFormat of which a parser says where in it they fail.
+
+    Raises:
+        HandError: If a lower limit is above its upper one, or a joint follows what is none.
+    """
+    joints = {joint.get("name", ""): joint for joint in root.iter("joint")}
+    for name, joint in joints.items():
+        for tag in joint.iter("limit"):
+            lower, upper = (
+                _number(_value(tag, key, default), f"{key} limit")
+                for key, default in (("lower", "-inf"), ("upper", "inf"))
+            )
+            refuse_limits(name, lower, upper)
+    for mimic in declared_mimics(root):
+        if mimic.leader not in joints:
+            raise HandError(
+                f"model: joint {mimic.joint!r} must follow a joint that moves, got {mimic.leader!r}"
+            )
+
+
+def refuse_limits(name: str, lower: float, upper: float) -> None:
+    """Refuse a joint whose lower limit is above its upper one.
+
+    Raises:
+        HandError: If it is.
+    """
+    if not lower <= upper:
+        raise HandError(
+            f"model: joint {name!r} must have a lower limit below its upper one, got "
+            f"{lower:g}..{upper:g}"
+        )
+
+
 def _value(tag: Element, name: str, default: str) -> str:
     return tag.get(name) or tag.findtext(name) or default
 

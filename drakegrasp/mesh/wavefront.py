@@ -82,6 +82,8 @@ def declared_obj(content: bytes) -> Declared:
     Raises:
         ValueError: If a line cannot be read; it gives the line.
     """
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise ValueError("text in UTF-16: save it in UTF-8")
     positions, corners, counts = array("d"), array("q"), array("q")
     for number, line in _lines(content):
         words = line.split()

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
+from drakegrasp.config import ways_to_grasps
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import face_components, pair_half_edges
@@ -301,6 +302,5 @@ def _too_low(row: AuditRow, height: float, width: float) -> Iterator[str]:
     if row.extents is not None and row.extents[2] < least and min(row.extents[:2]) < width:
         yield (
             f"its height must be {least * 1e3:.0f} mm for a hand that faces the table, got "
-            f"{row.extents[2] * 1e3:.0f} mm: another resting pose, other stand-offs "
-            "(candidates.standoffs), or another hand"
+            f"{row.extents[2] * 1e3:.0f} mm: {ways_to_grasps()}"
         )

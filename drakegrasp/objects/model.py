@@ -218,7 +218,8 @@ def make_object(
         raise MeshError(
             f"the diagonal of the bounding box must be {config.min_diagonal:g} m to "
             f"{config.max_diagonal:g} m, got {size:.4g} m{unit}: give the "
-            f"file's unit with --units ({', '.join(UNITS)}) or for this mesh in {MANIFEST_NAME}"
+            f"file's unit with units ({', '.join(UNITS)}; --units on the command line) or for this "
+            f"mesh in {MANIFEST_NAME}"
         )
 
     # One watertight solid, with no more faces than mending has memory for.

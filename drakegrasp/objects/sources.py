@@ -185,7 +185,7 @@ def find_meshes(
     """
     # The mesh files.
     directory = Path(directory)
-    _refuse_units(units)
+    refuse_units(units)
     try:
         paths = [
             path
@@ -228,7 +228,7 @@ def find_mesh(path: str | Path, *, units: str = "m") -> MeshSource:
         MeshError: If it is no mesh file, or the manifest beside it is wrong.
     """
     path = Path(path)
-    _refuse_units(units)
+    refuse_units(units)
     if path.suffix.lower() not in SUFFIXES or not path.is_file():
         got = repr(path.suffix) if path.is_file() else "none"
         raise MeshError(f"{path}: must be a mesh file ({', '.join(SUFFIXES)}), got {got}")
@@ -250,9 +250,14 @@ def _source(path: Path, stem: str, table: _Manifest, units: str) -> MeshSource:
     return MeshSource(path=path.absolute(), scale=scale, **(usual | said))
 
 
-def _refuse_units(units: str) -> None:
+def refuse_units(units: str) -> None:
+    """Refuse a unit of length that is not known.
+
+    Raises:
+        MeshError: If it is.
+    """
     if units not in UNITS:
-        raise MeshError(f"--units must be one of {', '.join(UNITS)}, got {units!r}")
+        raise MeshError(f"units must be one of {', '.join(UNITS)}, got {units!r}")
 
 
 def _refuse_twins(directory: Path, names: dict[Path, str]) -> None:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.errors import NAMED, GraspError, listed
-from drakegrasp.frames import FARTHEST, X_WT, Array, invert_pose, make_pose
+from drakegrasp.frames import FARTHEST, NO_MESH_FRAME, X_WT, Array, invert_pose, make_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
@@ -50,6 +50,8 @@ MOST_POSES = 1e6
 UNTOLD = -1
 #: How far the length of a quaternion may be from one.
 UNIT_TOLERANCE = 1e-3
+#: What of a table decides nothing of a build.
+_UNDECIDING = ("invalid", "conditions", "of_row", "confidence", "link", "X_FG_xyzw")
 #: What an attempt may have drawn, in the order of `Attempts.conditions`.
 CONDITIONS = ("friction_hand", "friction_table", "mass")
 
@@ -78,6 +80,8 @@ class Attempts:
         invalid: (n,), why a row is no posture; empty where it is one.
         of_row: (n,), of predictions: the row of a dataset's split that each is for.
         confidence: (n,), of predictions: greater is better.
+        link: Whether the file speaks of the palm link, as is told in hints.
+        X_FG_xyzw: (n, 4, 4), likewise: X_FG if its quaternions were meant x, y, z, w.
     """
 
     objects: tuple[str, ...]
@@ -98,6 +102,8 @@ class Attempts:
     invalid: tuple[str, ...]
     of_row: Any = None
     confidence: Any = None
+    link: bool = False
+    X_FG_xyzw: Array | None = None
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -105,7 +111,7 @@ class Attempts:
     def __iter__(self) -> Iterator[tuple[str, Any]]:
         """Yield name and values of each column that the table has."""
         for f in fields(self):
-            if f.name != "frame" and (value := getattr(self, f.name)) is not None:
+            if f.name not in ("frame", "link") and (value := getattr(self, f.name)) is not None:
                 yield f.name, value
 
     def of_object(self, name: str) -> Attempts:
@@ -139,15 +145,27 @@ class Attempts:
             return np.eye(4)
         if self.frame == "mesh":
             if X_OM is None:
-                raise GraspError(
-                    "frame must be object, table, camera or world on a dataset, which does not "
-                    "know the frames of its mesh files, got mesh: the mesh itself does (--object)"
-                )
+                raise GraspError(NO_MESH_FRAME)
             return X_OM
         X_OT = invert_pose(X_TO)
         if self.frame == "table":
             return X_OT
         return multiply(X_OT, invert_pose(X_WT) if self.X_TC is None else self.X_TC[i])
+
+    def names_pose(self, i: int) -> bool:
+        """Return whether a row names the resting pose that it is for."""
+        return bool(np.isfinite(self.X_TO[i]).all() or self.resting[i] != UNTOLD)
+
+    @property
+    def nameless(self) -> str:
+        """How many rows name no resting pose, and what becomes of them; empty if none."""
+        rows = [i for i in range(len(self)) if not (self.invalid[i] or self.names_pose(i))]
+        if not rows:
+            return ""
+        return (
+            f"{len(rows):,} of {len(self):,} rows of the postures name no resting pose: each is "
+            "tried in all that are known of its object (objects.resting_poses drops more)"
+        )
 
     def stands(self, i: int, poses: Array) -> list[int]:
         """Return which resting poses (r, 4, 4) of its object a row is for, as indices.
@@ -194,7 +212,7 @@ class Attempts:
             # Why a row is none follows from the others, and from the meshes; a build draws its own
             # conditions. A table without preshapes or poses is as before there were any.
             value = getattr(self, f.name)
-            if f.name in ("invalid", "conditions", "of_row", "confidence"):
+            if f.name in _UNDECIDING:
                 continue
             if f.name == "preshape" and not any(value):
                 continue
@@ -234,6 +252,7 @@ def make_attempts(
     conditions: npt.ArrayLike | None = None,
     of_row: Any = None,
     confidence: Any = None,
+    X_FG_xyzw: Array | None = None,
 ) -> Attempts:
     """Return a table of postures, after checking every row by itself.
 
@@ -259,6 +278,7 @@ def make_attempts(
         conditions: (n, 3), `CONDITIONS`; NaN: those of the object and of the configuration.
         of_row: (n,), of predictions.
         confidence: (n,), of predictions.
+        X_FG_xyzw: (n, 4, 4), X_FG if its quaternions were meant x, y, z, w.
 
     Raises:
         GraspError: If there is no row, the arrays differ in length, or the joints or the link are
@@ -295,6 +315,8 @@ def make_attempts(
         _numbers(q.get(name), size, name, bad, some=True) for name in ("q_pregrasp", "q_squeeze")
     )
     X = np.asarray(X_FG) if link is None else multiply(np.asarray(X_FG), hand.X_BG)
+    if link is not None and X_FG_xyzw is not None:
+        X_FG_xyzw = multiply(X_FG_xyzw, hand.X_BG)
     return Attempts(
         objects=tuple(objects),
         X_FG=_poses(X, count, "the palm's pose", bad),
@@ -314,6 +336,8 @@ def make_attempts(
         invalid=tuple(bad),
         of_row=of_row,
         confidence=confidence,
+        link=link is not None,
+        X_FG_xyzw=X_FG_xyzw,
     )
 
 
@@ -498,6 +522,11 @@ def quaternion_poses(
         R = Rotation.from_quat(wxyz[good] / length[good, None], scalar_first=True).as_matrix()
         X[good] = [make_pose(*each) for each in zip(R, p[good], strict=True)]
     return X, reasons
+
+
+def xyzw_poses(positions: npt.ArrayLike, quaternions: npt.ArrayLike) -> Array:
+    """Return the poses (n, 4, 4) of `quaternion_poses` if the numbers were meant x, y, z, w."""
+    return quaternion_poses(positions, np.roll(np.asarray(quaternions, dtype=float), 1, axis=1))[0]
 
 
 def _poses(

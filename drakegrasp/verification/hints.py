@@ -115,7 +115,10 @@ Reading: TypeAlias = Callable[[Array, float], tuple[Array, Array | None]]
 
 
 def known_frames(
-    X_TO: Array, cameras: Mapping[str, Array] | None = None, X_TC: Array | None = None
+    X_TO: Array,
+    cameras: Mapping[str, Array] | None = None,
+    X_TC: Array | None = None,
+    X_OM: Array | None = None,
 ) -> dict[str, Array]:
     """Return the poses X_OF (4, 4) of the frames that numbers could be in, by what to call each.
 
@@ -123,6 +126,7 @@ def known_frames(
         X_TO: (4, 4), pose of the object.
         cameras: (4, 4), poses in {T} of cameras, by what to call the frame of each.
         X_TC: (4, 4), the camera's pose that the caller states, which may be another pose.
+        X_OM: (4, 4), pose of the mesh file's frame in {O}, if it is known.
     """
     X_OT = invert_pose(X_TO)
     frames = {
@@ -130,6 +134,7 @@ def known_frames(
         "the table's frame (table)": X_OT,
         "the world's frame": multiply(X_OT, invert_pose(X_WT)),
     }
+    frames |= {} if X_OM is None else {"the mesh file's frame (mesh)": X_OM}
     frames |= {name: multiply(X_OT, X) for name, X in (cameras or {}).items()}
     if X_TC is not None:
         X_CT = invert_pose(X_TC)
@@ -178,7 +183,14 @@ def find_hints(
 
 
 def find_posture_hints(
-    model: ObjectModel, hand: Hand, posture: Posture, *, X_OA: Array, frames: Mapping[str, Array]
+    model: ObjectModel,
+    hand: Hand,
+    posture: Posture,
+    *,
+    X_OA: Array,
+    frames: Mapping[str, Array],
+    link: bool = False,
+    poses: Mapping[str, Array] | None = None,
 ) -> tuple[tuple[str, ...], Array]:
     """Return what would bring the fingertips of a posture much closer to the object.
 
@@ -188,6 +200,8 @@ def find_posture_hints(
         posture: Wrist and joints, in {O}.
         X_OA: (4, 4), pose of the frame in which the palm's pose was given.
         frames: (4, 4), poses X_OF of other frames by their names, see `known_frames`.
+        link: Whether the pose that was given is that of the palm link.
+        poses: (4, 4), other poses X_AG that may have been meant, by what to call them.
 
     Returns:
         The hints, and how far the fingertips that it closes are from the surface (m,) [m]; none if
@@ -198,14 +212,22 @@ def find_posture_hints(
     except HandError:
         return (), np.zeros(0)
     X_AG = multiply(invert_pose(X_OA), posture.X_OG)
+    # Where the given pose is: lengths in another unit move the palm with it.
+    p_AL = multiply(X_AG, invert_pose(hand.X_BG))[:3, 3] if link else X_AG[:3, 3]
 
     def read(X_OF: Array, factor: float) -> tuple[Array, Array | None]:
         X = X_AG.copy()
-        X[:3, 3] *= factor
+        X[:3, 3] += (factor - 1.0) * p_AL
         return transform_points(multiply(X_OF, X), p_GQ), None
 
-    fit = _fit(model, read(X_OA, 1.0))
-    place = _better_place(model, fit, read, X_OA, frames) if fit.distance.mean() > FAR else ""
+    fit, place = _fit(model, read(X_OA, 1.0)), ""
+    if fit.distance.mean() > FAR:
+        others = {
+            name: (transform_points(multiply(X_OA, X), p_GQ), None)
+            for name, X in (poses or {}).items()
+            if np.isfinite(X).all()
+        }
+        place = _better_place(model, fit, read, X_OA, frames, others)
     place = place.replace("points", "positions of the palm")
     return (place,) if place else (), fit.distance
 
@@ -221,13 +243,19 @@ def _better_place(
     read: Reading,
     X_OA: Array,
     frames: Mapping[str, Array],
+    others: Mapping[str, tuple[Array, None]] | None = None,
 ) -> str:
     """Return the frame and unit in which far points are near the surface; empty if none is.
 
-    Of several, one that changes only frame or unit wins, then the one that is nearest.
+    Of several, one that changes only frame or unit wins, then the one that is nearest. `others` are
+    contacts of other readings, by their names.
     """
     limit = min(MUCH_NEARER * fit.distance.mean(), FAR)
     found = list[tuple[bool, float, str]]()
+    for text, other in (others or {}).items():
+        there = _fit(model, other)
+        if there.distance.mean() <= limit:
+            found.append((False, float(there.distance.max()), text))
     for frame, X_OF in {"": X_OA, **frames}.items():
         for factor, unit in {1.0: "", **_UNITS}.items():
             contacts = read(X_OF, factor)

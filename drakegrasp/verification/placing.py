@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
@@ -66,17 +67,14 @@ def place_on_object(
     method: str = "hand",
     snap_points: bool = False,
     overrides: Sequence[str] = (),
-    X_OM: Array | None = None,
 ) -> list[PlacedGrasp]:
     """Return grasps in {O} of one object, in their order; see `drakegrasp.verify_grasps`.
 
     Postures are of it, whatever they call it. Those that name no resting pose are for all of a
-    build. `overrides` is what the caller sets, which is stronger than the conditions of a posture;
-    `X_OM` is the pose (4, 4) of the mesh file's frame in {O}, if it is known.
+    build. `overrides` is what the caller sets, which is stronger than the conditions of a posture.
 
     Raises:
-        GraspError: If postures are in the frame of a mesh file that is not known, or as
-            `drakegrasp.verify_grasps`.
+        GraspError: As `drakegrasp.verify_grasps`.
     """
     if not isinstance(grasps, Attempts):
         rows = _read(grasps, method, placed.config)
@@ -98,7 +96,7 @@ def place_on_object(
     if config.objects.resting_poses > 1:
         others = find_resting_poses(placed.model, config)[1:]
         things += [replace(placed, X_TO=resting.X_TO) for resting in others]
-    return _placed_postures(named, range(len(named)), things, config, overrides, X_OM=X_OM)
+    return _placed_postures(named, range(len(named)), things, config, overrides)
 
 
 def place_on_rows(
@@ -289,12 +287,13 @@ def _placed(
     """
     # The frame of the numbers in {O}, and others that they could be in.
     count = len(indices)
-    X_OA = frame_poses(frame=frame, X_TC=X_TC, X_TO=placed.X_TO, count=count)
+    X_OM = placed.X_OM
+    X_OA = frame_poses(frame=frame, X_TC=X_TC, X_TO=placed.X_TO, count=count, X_OM=X_OM)
     poses = None if stated is None else np.broadcast_to(stated, (count, 4, 4))
 
     def others(i: int) -> dict[str, Array]:
         own = {name: X[i] for name, X in (cameras or {}).items()}
-        return known_frames(placed.X_TO, own, None if poses is None else poses[i])
+        return known_frames(placed.X_TO, own, None if poses is None else poses[i], X_OM)
 
     return [
         PlacedGrasp(
@@ -427,12 +426,10 @@ def _placed_postures(
     config: Config,
     overrides: Sequence[str] = (),
     cameras: Mapping[str, Array] | None = None,
-    X_OM: Array | None = None,
 ) -> list[PlacedGrasp]:
     """Return some rows of a table on one object, which is there in each of its resting poses.
 
-    `cameras` are poses X_TC (n, 4, 4) for the rows of the table, by their frames; `X_OM` is the
-    pose (4, 4) of the mesh file's frame, if it is known.
+    `cameras` are poses X_TC (n, 4, 4) for the rows of the table, by their frames.
     """
     # The cameras that are known, and what no posture has.
     model, found = things[0].model, list[PlacedGrasp]()
@@ -444,7 +441,8 @@ def _placed_postures(
     anywhere = replace(table, X_TO=np.full_like(table.X_TO, np.nan))
     poses = np.array([thing.X_TO for thing in things])
     table = table.refuse(misfits(anywhere, model.name, model.scale, poses))
-    nothing = np.full((load_hand(config.hand_source).num_fingers, 3), np.nan)
+    hand, X_OM = load_hand(config.hand_source), things[0].X_OM
+    nothing = np.full((hand.num_fingers, 3), np.nan)
     stands, known = _Stands(things), overridden_keys(overrides)
     for i in rows:
         tried, used, reason = list[tuple[PlacedObject, Posture]](), config, table.invalid[i]
@@ -461,6 +459,13 @@ def _placed_postures(
         first = tried[0][1] if tried else None
         stood = tried[0][0] if tried else things[0]
         own = {name: X_TC[i] for name, X_TC in known_cameras.items()}
+        # What else the wrist's numbers may mean.
+        meant = dict[str, Array]()
+        if table.X_FG_xyzw is not None:
+            meant["quaternions x, y, z, w instead of w, x, y, z"] = table.X_FG_xyzw[i]
+        if not table.link:
+            at_link = f"poses of the palm link instead of the palm (link: {hand.palm_link})"
+            meant[at_link] = multiply(table.X_FG[i], hand.X_BG)
         found.append(
             PlacedGrasp(
                 index=i,
@@ -473,7 +478,10 @@ def _placed_postures(
                 posture=first,
                 others=tuple(tried[1:]),
                 X_OA=None if first is None else first.X_OG @ invert_pose(table.X_FG[i]),
-                frames=known_frames(stood.X_TO, own),
+                frames=known_frames(stood.X_TO, own, X_OM=X_OM),
+                pose_named=table.names_pose(i),
+                link=table.link,
+                poses=meant,
             )
         )
     return found

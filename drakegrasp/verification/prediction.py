@@ -19,9 +19,9 @@ from drakegrasp.config import LARGEST
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.errors import GraspError, MachineError, first_line
 from drakegrasp.foreign_files import read_text, refuse_irregular
-from drakegrasp.frames import FARTHEST, Array, as_numbers, invert_pose, without_torch
+from drakegrasp.frames import FARTHEST, NO_MESH_FRAME, Array, as_numbers, invert_pose, without_torch
 
-Frame = Literal["object", "camera", "table"]
+Frame = Literal["object", "camera", "table", "mesh"]
 FRAMES: tuple[str, ...] = get_args(Frame)
 #: An earlier name of the frame "table", which is read still.
 WORKSPACE = "workspace"
@@ -132,18 +132,21 @@ def _shape(row: Any) -> tuple[int, ...] | None:
         return None
 
 
-def frame_poses(*, frame: str, X_TC: Array | None, X_TO: Array, count: int) -> Array:
+def frame_poses(
+    *, frame: str, X_TC: Array | None, X_TO: Array, count: int, X_OM: Array | None = None
+) -> Array:
     """Return the poses X_OA (n, 4, 4) of the frame {A} of n grasps in {O} of the object.
 
     Args:
-        frame: "object" {O}, "camera" {C} or "table" {T}.
+        frame: "object" {O}, "camera" {C}, "table" {T} or "mesh" {M}.
         X_TC: With the frame "camera": pose of the camera, (4, 4), or one per grasp (n, 4, 4).
         X_TO: (4, 4), pose of the object.
         count: Number of grasps, n.
+        X_OM: (4, 4), pose of the mesh file's frame; None if it is not known.
 
     Raises:
-        GraspError: If the frame is unknown, a camera's pose is missing, or one is given for
-            another frame, or not one per grasp.
+        GraspError: If the frame or its pose is unknown, a camera's pose is missing, or one is given
+            for another frame, or not one per grasp.
     """
     frame = "table" if frame == WORKSPACE else frame
     if frame not in FRAMES:
@@ -157,6 +160,10 @@ def frame_poses(*, frame: str, X_TC: Array | None, X_TO: Array, count: int) -> A
         raise GraspError(f"X_TC must be None if frame is {frame}, got a pose")
     if frame == "object":
         return np.tile(np.eye(4), (count, 1, 1))
+    if frame == "mesh":
+        if X_OM is None:
+            raise GraspError(NO_MESH_FRAME)
+        return np.tile(X_OM, (count, 1, 1))
 
     X_OT = invert_pose(X_TO)
     X_OA = X_OT if X_TC is None else X_OT @ X_TC

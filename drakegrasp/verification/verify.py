@@ -70,6 +70,8 @@ class PlacedGrasp:
         posture: With method "posture": wrist and joints, in place of contacts; None if invalid.
         others: Of a posture that names no resting pose: the object in the others, and the same
             posture in {O} there.
+        pose_named: Whether the caller named the resting pose in which a posture is tried.
+        link, poses: Of a posture, see `hints.find_posture_hints`.
     """
 
     index: int
@@ -85,6 +87,9 @@ class PlacedGrasp:
     frames: Mapping[str, Array] = field(default_factory=dict)
     posture: Posture | None = None
     others: tuple[tuple[PlacedObject, Posture], ...] = ()
+    pose_named: bool = True
+    link: bool = False
+    poses: Mapping[str, Array] = field(default_factory=dict)
 
 
 @one_thread
@@ -190,12 +195,15 @@ def _best_stand(base: Verification, grasp: PlacedGrasp, posture: Posture) -> Ver
         X_OA = None
         if grasp.X_OA is not None:
             X_OA = each.X_OG @ invert_pose(posture.X_OG) @ grasp.X_OA
-        there = replace(grasp, X_OA=X_OA, frames=known_frames(placed.X_TO, {}))
+        frames = known_frames(placed.X_TO, X_OM=placed.X_OM)
+        there = replace(grasp, X_OA=X_OA, frames=frames)
         found.append(replace(_try_posture(replace(base, placed=placed), there, each), stand=k))
     best = max(found, key=lambda v: (v.held, v.stable, v.precision, v.outcome.stage, -v.stand))
-    if len(found) == 1:
+    if grasp.pose_named:
         return best
-    told = f"the best of {len(found)} resting poses, as none is named: {best.stand}"
+    told = "in the one resting pose that is known, as none is named"
+    if len(found) > 1:
+        told = f"the best of {len(found)} resting poses, as none is named: {best.stand}"
     return replace(best, reason=f"{best.reason} ({told})")
 
 
@@ -225,6 +233,8 @@ def _try_posture(base: Verification, grasp: PlacedGrasp, posture: Posture) -> Ve
             posture,
             X_OA=np.eye(4) if grasp.X_OA is None else grasp.X_OA,
             frames=grasp.frames,
+            link=grasp.link,
+            poses=grasp.poses,
         )
     return replace(result, hints=hints, fingertip_distance=distance)
 

@@ -120,6 +120,8 @@ def test_examples_in_help_texts_are_taken(sound: Path, tmp_path: Path) -> None:
 #: `a.npy`, a grasp, `other.h5`, which has one, and nothing else.
 REFUSED = [
     ("--fly", "No such option"),
+    ("verify --seed 3", "No such option '--seed'."),
+    ("verify --methode hand", "Did you mean '--method'?"),
     ("fly", "No such command"),
     ("build", "Missing option"),
     ("objects fly", "No such command"),

@@ -7,6 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import trimesh
 from helpers.commands import run
 from helpers.datasets import OTO, make_dataset
 from helpers.hands import write_with_optional_fingers
@@ -114,6 +115,32 @@ def test_postures_without_rows_are_tried_on_the_objects_that_they_name(
     assert [found[i].placed.model.name for i in range(len(data))] == names
     assert found[0].invalid.startswith("object must be one of 1_box_a, 2_box_b, 3_brick, got 'cup'")
     assert not any(found[i].invalid for i in range(1, len(data)))
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize(
+    ("names", "words", "count"),
+    [
+        (["box", "mug", "box"], "1 postures of mug are left out, as --object is box", 2),
+        (["mug"] * 2, "postures of mug are tried on box, the --object", 2),
+        (["mug", "can"], "postures must be of box, the --object, got can, mug", 0),
+    ],
+)
+def test_postures_of_a_mesh_are_those_that_name_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], names: list[str], words: str, count: int
+) -> None:
+    trimesh.creation.box([0.06] * 3).export(tmp_path / "box.obj")
+    q, X = np.zeros((len(names), len(load_hand().joint_names))), [np.eye(4)] * len(names)
+    np.savez(tmp_path / "p.npz", X_FG=X, q_grasp=q, object=names)
+    given = VerifyRequest(grasps=tmp_path / "p.npz", mesh=tmp_path / "box.obj")
+    if not count:
+        with pytest.raises(GraspError, match=words):
+            place_requested(given)
+        return
+    grasps, _ = place_requested(given)
+    assert [grasp.index for grasp in grasps] == list(range(count))
+    told = capsys.readouterr().err
+    assert words in told and f"{count} of {count} rows of the postures name no resting" in told
 
 
 @pytest.mark.parametrize(

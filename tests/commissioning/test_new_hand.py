@@ -15,7 +15,9 @@ from helpers.vendors import JAWS, JAWS_MJCF, MITTEN, box, joint, link, write_mod
 
 from drakegrasp.cli.main import main
 from drakegrasp.commissioning.draft.fingers import Answers
+from drakegrasp.commissioning.draft.model import doubtful_units, read_model
 from drakegrasp.commissioning.draft.run import NewHand, draft_hand
+from drakegrasp.commissioning.draft.source import read_source
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.file_format import DrivenBy
@@ -57,6 +59,28 @@ def test_jaws_that_open_at_positive_positions_are_turned_round(
     # One motor moves both jaws with 60 N each.
     driver, driven = hand.fingers
     assert (driver.force_limit, driven.driven_by) == (120.0, DrivenBy(finger=driver.name))
+
+
+@pytest.mark.parametrize(
+    ("pattern", "factor", "doubt"),
+    [
+        ('(mass value=")(.*?)(")', 1e3, r"its masses are .* kg in all: are they in another unit"),
+        ('(mass value=")(.*?)(")', 1e-3, r"its masses are .* kg in all: are they in another unit"),
+        ('((?:lower|upper)=")(.*?)(")', 57.3, r"its joints turn up to .* limits in degrees\?"),
+        ('((?:lower|upper)=")(.*?)(")', 1e-2, r"its joints turn up to .* angles in radians\?"),
+        ("( )()()", 1.0, None),
+    ],
+)
+def test_units_that_no_hand_has_are_told(
+    tmp_path: Path, pattern: str, factor: float, doubt: str | None
+) -> None:
+    def scaled(found: re.Match[str]) -> str:
+        number = found[2] and str(factor * float(found[2]))
+        return f"{found[1]}{number}{found[3]}"
+
+    model = read_model(read_source(write_model(tmp_path, re.sub(pattern, scaled, MITTEN)), {}))
+    doubts = list(doubtful_units(model))
+    assert doubts == [] if doubt is None else re.match(doubt, doubts[0]) and len(doubts) == 1
 
 
 def test_fingers_oppose_a_thumb_whose_base_is_turned(tmp_path: Path) -> None:

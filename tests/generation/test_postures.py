@@ -32,7 +32,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config
 from drakegrasp.mesh.wavefront import obj_text
-from drakegrasp.objects.sources import file_frame, find_meshes
+from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.files import seal
@@ -333,10 +333,10 @@ def test_postures_in_the_frame_of_the_mesh_file_are_moved_to_the_object(tmp_path
 
     # On a mesh its frame is known, on an object alone it is not.
     placed = place_object(tmp_path / f"{NAME}.obj", units="cm", X_TO=standing(box))
-    own, again = (place_on_object(each, placed, X_OM=file_frame(source)) for each in (table, moved))
+    own, again = (place_on_object(each, placed) for each in (table, moved))
     assert not any(grasp.invalid for grasp in (*own, *again))
     for one, other in zip(own, again, strict=True):
         assert one.posture is not None and other.posture is not None
         np.testing.assert_allclose(other.posture.X_OG, one.posture.X_OG, atol=1e-9)
-    with pytest.raises(GraspError, match=r"the mesh itself does \(--object\)"):
-        place_on_object(moved, placed)
+    with pytest.raises(GraspError, match=r"\(drakegrasp verify FILE --object MESH\)"):
+        place_on_object(moved, replace(placed, X_OM=None))

@@ -128,7 +128,7 @@ def test_wrong_directories_are_refused(tmp_path):
         write(tmp_path / name, box())
     with pytest.raises(MeshError, match=r"unique, got 'mug' for mug\.obj, mug\.stl"):
         find_meshes(tmp_path)
-    with pytest.raises(MeshError, match="--units must be one of m, cm, mm, got 'inch'"):
+    with pytest.raises(MeshError, match="units must be one of m, cm, mm, got 'inch'"):
         find_meshes(tmp_path, units="inch")
     (tmp_path / "mug.stl").unlink()
     (tmp_path / "objects.yaml").write_text("objects: {mug: {name: b}}")
@@ -179,7 +179,7 @@ def test_one_mesh_is_found_whatever_lies_beside_it(tmp_path):
     for name, got in (("a.txt", "'.txt'"), ("gone.obj", "none")):
         with pytest.raises(MeshError, match=rf"{name}: must be a mesh file .*, got {got}"):
             find_mesh(tmp_path / name)
-    with pytest.raises(MeshError, match="--units must be one of m, cm, mm, got 'inch'"):
+    with pytest.raises(MeshError, match="units must be one of m, cm, mm, got 'inch'"):
         find_mesh(tmp_path / "b.obj", units="inch")
 
 

@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import drakegrasp as dg
 from drakegrasp.config import Config
+from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
@@ -24,11 +25,13 @@ from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.samplers import R_OG0
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification import verify as verifying
+from drakegrasp.verification.placing import place_on_object
 from drakegrasp.verification.verify import PlacedGrasp, verify_placed
 
 pytestmark = pytest.mark.sim
 
 CONFIG = load_config()
+HAND = load_hand()
 
 
 @pytest.fixture(scope="module")
@@ -255,6 +258,55 @@ def test_posture_in_another_frame_or_unit_is_told(
     assert found.hints == (hint or next(iter(frames)),)
     assert found.explain().startswith("The posture's fingertips are ")
     assert f"This would fit much better: {found.hint_text}." in found.explain()
+
+
+@pytest.mark.parametrize(
+    ("how", "hint"),
+    [
+        ("mm of the link", "positions of the palm in millimetres instead of metres"),
+        ("x y z w", "quaternions x, y, z, w instead of w, x, y, z"),
+        ("no link", f"poses of the palm link instead of the palm (link: {HAND.palm_link})"),
+        ("mesh", "the mesh file's frame (mesh)"),
+    ],
+)
+def test_posture_of_a_file_that_is_read_otherwise_is_told(
+    held: dg.Verification, cube: PlacedObject, tmp_path: Path, how: str, hint: str
+) -> None:
+    assert held.trial is not None and held.trial.closed is not None
+    X_OM = make_pose(Rotation.from_euler("y", 1.0).as_matrix(), [0.0, 0.2, 0.0])
+    X, content = held.trial.X_OG.copy(), {"q_grasp": [held.trial.closed.q]}
+    if how == "mesh":
+        X = invert_pose(X_OM) @ X
+    elif how != "x y z w":
+        X = X @ invert_pose(HAND.X_BG)
+    if how == "mm of the link":
+        X[:3, 3] *= 1e3
+        content["link"] = HAND.palm_link
+    if how == "x y z w":
+        content["quaternion"] = [Rotation.from_matrix(X[:3, :3]).as_quat()]
+        content["position"] = [X[:3, 3]]
+    else:
+        content["X_FG"] = [X]
+    np.savez(tmp_path / "p.npz", **content)
+    table = read_attempts(tmp_path / "p.npz", HAND, of=cube.model.name)
+    (asked,) = place_on_object(table, replace(cube, X_OM=X_OM))
+    found = verify_placed(asked)
+    assert found.misplaced and found.hints == (hint,)
+    assert found.reason.endswith("(in the one resting pose that is known, as none is named)")
+
+
+def test_contacts_in_the_frame_of_the_mesh_are_known_on_a_mesh(
+    held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+) -> None:
+    mesh = cube.model.visual.copy()
+    mesh.apply_translation([0.0, 0.3, 0.1])
+    there = dg.transform_grasp(make_pose(np.eye(3), [0.0, 0.3, 0.1]), dg.pack_grasp(*grasp))
+    verdict = dg.verify_grasp(there, mesh, frame="mesh", method="forces")
+    np.testing.assert_allclose(verdict.p_OQ, held.p_OQ, atol=1e-4)
+    lost = dg.verify_grasp(there, mesh, method="forces")
+    assert lost.hints == ("the mesh file's frame (mesh)",)
+    with pytest.raises(dg.GraspError, match=r"verify FILE --object MESH"):
+        dg.verify_grasp(there, cube, frame="mesh")
 
 
 @pytest.mark.parametrize("method", ["hand", "forces"])

@@ -44,12 +44,17 @@ from drakegrasp.hand.parsing import (
     joint_slides,
     make_parser,
     moving_joint,
+    refuse_impossible,
+    refuse_limits,
 )
 
 #: A joint that follows has room if its limits leave it this share of its leader's way.
 ROOM = 0.5
 #: A hand is so large [m], with its arm if it has one; else its units are others.
 SIZES = (0.03, 3.0)
+#: Limits of hands' turning joints are within [rad], and masses of hands [kg], with an arm if there
+#: is one; else their units are others.
+SMALLEST_TURN, LARGEST_TURN, MASSES = 0.1, 2.0 * np.pi, (0.01, 60.0)
 #: A hull that reaches farther beyond its mesh [m] is told of: own choice, half of a fingertip.
 HOLLOW = 0.01
 #: Mass [kg] and radius [m] of a link that has neither mass nor shape but moves.
@@ -205,6 +210,8 @@ def read_model(source: Source) -> VendorModel:
         if not 0.0 <= mass < np.inf:
             raise HandError(f"model: link {name!r} must have a mass of 0 kg or more, got {mass:g}")
     impossible = {} if is_mjcf else impossible_inertias(root)
+    if not is_mjcf:
+        refuse_impossible(root)
 
     # What Drake makes of it, and of MJCF MuJoCo.
     with tempfile.TemporaryDirectory() as scratch:
@@ -451,11 +458,7 @@ def _joints(
         name, (head, X_LP) = joint.name(), places[joint.parent_body().index()]
         drakes = np.array([joint.position_lower_limit(), joint.position_upper_limit()])
         limits = ranges.get(name, drakes)
-        if not limits[0] <= limits[1]:
-            raise HandError(
-                f"model: joint {name!r} must have a lower limit below its upper one, got "
-                f"{limits[0]:g}..{limits[1]:g}"
-            )
+        refuse_limits(name, *limits)
 
         # Efforts without end say nothing.
         effort = efforts.get(name, 0.0)
@@ -517,6 +520,25 @@ def make_room(joints: dict[str, VendorJoint], mimics: Mapping[str, Mimic]) -> It
                 f"joint {name}: its limits {lower:g}..{upper:g} bar the way of its mimic; now "
                 f"{led[0]:g}..{led[1]:g}"
             )
+
+
+def doubtful_units(model: VendorModel) -> Iterator[str]:
+    """Yield that angles or masses of a model are such as no hand has: its units may be others."""
+    turning = [joint.limits for joint in model.joints.values() if not joint.slides]
+    angles = np.abs([limits for limits in turning if np.isfinite(limits).all()])
+    if angles.size and np.median(angles.max(axis=1)) > LARGEST_TURN:
+        yield (
+            f"its joints turn up to {angles.max():.4g} rad: are its limits in degrees? They must "
+            "be in radians"
+        )
+    if angles.size and angles.max() < SMALLEST_TURN:
+        yield (
+            f"its joints turn up to {np.rad2deg(angles.max()):.2g} degrees: are its angles in "
+            'radians? MJCF says so by <compiler angle="radian"/>'
+        )
+    mass = sum(link.inertia.get_mass() for link in model.links.values())
+    if not MASSES[0] <= mass <= MASSES[1]:
+        yield f"its masses are {mass:.3g} kg in all: are they in another unit? They must be in kg"
 
 
 def _refuse_size(model: VendorModel) -> None:

@@ -33,7 +33,13 @@ from drakegrasp.commissioning.checks import (
 )
 from drakegrasp.commissioning.draft.fingers import Answers, find_fingers, find_palm
 from drakegrasp.commissioning.draft.grips import Clearance, find_grips, find_members
-from drakegrasp.commissioning.draft.model import Link, VendorJoint, VendorModel, read_model
+from drakegrasp.commissioning.draft.model import (
+    Link,
+    VendorJoint,
+    VendorModel,
+    doubtful_units,
+    read_model,
+)
 from drakegrasp.commissioning.draft.palm import find_palm_frames
 from drakegrasp.commissioning.draft.shapes import Shape
 from drakegrasp.commissioning.draft.source import read_source
@@ -256,7 +262,11 @@ def draft_hand(
     model = read_model(read_source(path, packages or {}, roots))
     _refuse_unknown(model, answers)
 
-    best, findings = _find_best(model, path, answers, config)
+    doubts = tuple(doubtful_units(model))
+    try:
+        best, findings = _find_best(model, path, answers, config)
+    except HandError as error:
+        raise HandError("; ".join((str(error), *doubts))) from None
     if out.exists():
         out.rmdir()
     with atomic_folder(out) as folder:
@@ -266,7 +276,7 @@ def draft_hand(
             shutil.copyfile(licence, folder / licence.name)
     far = {str(each) for each in licences if each.parent != path.resolve().parent}
     notes = [f"{each} is copied: see that the model is under it" for each in sorted(far)]
-    notes = [*model.notes, *unused_parts(model, best.grip, answers), *notes]
+    notes = [*doubts, *model.notes, *unused_parts(model, best.grip, answers), *notes]
     return NewHand(path=out / written.name, notes=tuple(notes), findings=findings)
 
 
