@@ -1,4 +1,4 @@
-"""What may be handed in to be verified: rows that are no grasp say why, and three equal frames."""
+"""What may be handed in to be verified: rows that are no grasp say why, and equal frames."""
 
 from __future__ import annotations
 
@@ -150,8 +150,12 @@ def test_what_is_no_numbers_is_refused(value: Any, got: str) -> None:
 
 @pytest.mark.parametrize("single", [False, True], ids=["float64", "float32 rows"])
 @pytest.mark.parametrize("cameras", [1, 4], ids=["one camera", "one per grasp"])
-def test_the_three_frames_agree(single: bool, cameras: int) -> None:
-    X_TO, X_TC = random_pose(1), np.array([random_pose(10 + i) for i in range(cameras)])
+def test_the_frames_agree(single: bool, cameras: int) -> None:
+    X_TO, X_OM, X_TC = (
+        random_pose(1),
+        random_pose(2),
+        np.array([random_pose(10 + i) for i in range(cameras)]),
+    )
     grasps_O = np.array([one_grasp(i) for i in range(4)])
     given: npt.ArrayLike = X_TC[0] if cameras == 1 else X_TC
     if single:
@@ -162,6 +166,7 @@ def test_the_three_frames_agree(single: bool, cameras: int) -> None:
     grasps = {
         "object": grasps_O,
         "table": np.array([transform_grasp(X_TO, g) for g in grasps_O]),
+        "mesh": np.array([transform_grasp(invert_pose(X_OM), g) for g in grasps_O]),
         "camera": np.array(
             [transform_grasp(invert_pose(C) @ X_TO, g) for C, g in zip(each, grasps_O, strict=True)]
         ),
@@ -171,7 +176,11 @@ def test_the_three_frames_agree(single: bool, cameras: int) -> None:
     for frame, values in grasps.items():
         read = read_grasps(values, 3)
         poses = frame_poses(
-            frame=frame, X_TC=X if frame == "camera" else None, X_TO=X_TO, count=len(values)
+            frame=frame,
+            X_TC=X if frame == "camera" else None,
+            X_TO=X_TO,
+            count=len(values),
+            X_OM=X_OM,
         )
         for i, X_OA in enumerate(poses):
             p_OQ = transform_points(X_OA, read.points[i])
@@ -187,15 +196,17 @@ def test_no_grasps_have_no_contacts_in_any_frame(frame: str) -> None:
     read = read_grasps(np.zeros((0, 18)), 3)
     assert read.points.shape == read.normals.shape == (0, 3, 3)
     for X in [np.eye(4), np.zeros((0, 4, 4))] if frame == "camera" else [None]:
-        assert frame_poses(frame=frame, X_TC=X, X_TO=np.eye(4), count=0).shape == (0, 4, 4)
+        X_OA = frame_poses(frame=frame, X_TC=X, X_TO=np.eye(4), count=0, X_OM=np.eye(4))
+        assert X_OA.shape == (0, 4, 4)
 
 
 @pytest.mark.parametrize(
     ("frame", "X", "message"),
     [
-        ("world", None, "frame must be one of object, camera, table, got 'world'"),
-        ("", None, "frame must be one of object, camera, table, got ''"),
-        (None, None, "frame must be one of object, camera, table, got None"),
+        ("world", None, "frame must be one of object, camera, table, mesh, got 'world'"),
+        ("", None, "frame must be one of object, camera, table, mesh, got ''"),
+        (None, None, "frame must be one of object, camera, table, mesh, got None"),
+        ("mesh", None, "frame must not be mesh where the frame of the mesh file is not known"),
         ("camera", None, "X_TC must be the camera's pose in the table-top frame"),
         ("object", np.eye(4), "X_TC must be None if frame is object, got a pose"),
         ("table", np.eye(4), "X_TC must be None if frame is table, got a pose"),
