@@ -159,7 +159,7 @@ def one_line_errors(resumable: Callable[[], bool] = lambda: False) -> Iterator[N
             # Click compares the dashes, too: any two short names are alike then.
             names = {each.lstrip("-"): each for each in error.possibilities or ()}
             near = get_close_matches(error.option_name.lstrip("-"), names, cutoff=ALIKE)
-            error.possibilities = [names[name] for name in near]
+            error = click.NoSuchOption(error.option_name, possibilities=[names[n] for n in near])
         _end(f"error: {_one_line(error.format_message())}", 2)
     except DrakegraspError as error:
         code = 2 if isinstance(error, WRONG_USAGE) else 1
