@@ -229,7 +229,7 @@ class Rotations:
         self._poses = poses[stream.permutation(len(poses))]
         self._counts = combinations, valid, len(poses)
         self.limit: int | None = len(poses)
-        self.log_density = _rounded(-math.log(max(len(poses), 1)))
+        self.log_density = rounded_density(-math.log(max(len(poses), 1)))
 
     def poses(self, count: int) -> Array:
         """Return the first poses (count, 4, 4)."""
@@ -250,7 +250,7 @@ class Normals:
         self._model, self._X_TO, self._stream = model, X_TO, stream
         self._poses, self._numbers, self._drawn = np.zeros((0, 4, 4)), np.zeros(0, dtype=int), 0
         self.limit: int | None = None
-        self.log_density = _rounded(-math.log(model.visual.area * 2.0 * math.pi))
+        self.log_density = rounded_density(-math.log(model.visual.area * 2.0 * math.pi))
 
     def poses(self, count: int) -> Array:
         """Return the first poses (count, 4, 4)."""
@@ -520,7 +520,7 @@ def _child(parent: Attempt, number: int, config: RefineConfig, *, name: str, see
         ray_hits=True,
         seed=stream.key,
         source=Source.REFINE,
-        log_density=_rounded(density),
+        log_density=rounded_density(density),
         child=number,
         parent=parent.child,
         generation=parent.generation + 1,
@@ -547,5 +547,6 @@ def palm_motion(numbers: Array, shift: float, turn: float) -> Array:
     return make_pose(rotation_about(axis, angle), shift * numbers[:3])
 
 
-def _rounded(log_density: float) -> float:
+def rounded_density(log_density: float) -> float:
+    """Return a log-density without the last bits, which depend on the machine."""
     return round(log_density / _DENSITY_GRID) * _DENSITY_GRID

@@ -327,14 +327,14 @@ def test_jitter_moves_every_angle_by_whole_degrees_below_its_bound() -> None:
 
 
 def test_same_seed_draws_the_same(box: ObjectModel) -> None:
-    for method in ("rotations", "normals"):
+    for method in ("rotations", "normals", "above"):
         config = COARSE.model_copy(update={"method": method, "max": 200})
         one, two = (sample_candidates(box, BOX_X_TO, config, 3) for _ in range(2))
         np.testing.assert_array_equal(one.X_OG, two.X_OG)
         np.testing.assert_array_equal(one.distance, two.distance)
 
 
-@pytest.mark.parametrize("method", ["rotations", "normals"])
+@pytest.mark.parametrize("method", ["rotations", "normals", "above"])
 def test_other_seed_or_other_name_draws_others(
     box: ObjectModel, make_object: Callable[..., ObjectModel], method: str
 ) -> None:
@@ -351,7 +351,7 @@ def test_other_seed_or_other_name_draws_others(
 
 @pytest.mark.parametrize(
     ("method", "most"),
-    [("rotations", 150), ("normals", 1500), (("normals", "normals", "rotations"), 1500)],
+    [("rotations", 150), ("above", 1500), (("normals", "normals", "rotations"), 1500)],
 )
 def test_smaller_number_of_turns_is_a_prefix(box: ObjectModel, method: str, most: int) -> None:
     """So more candidates can be tried later without losing the shards of the first."""

@@ -1,0 +1,118 @@
+"""The sampler `above`: palms that look down on the object and close across its narrow side.
+
+Seen from above, the object has a major and a minor axis. A palm looks at a point near the major
+axis, from within `TILT` of the vertical. A hand's closing direction is its own affair, so the palm
+is turned by a multiple of 90 degrees from the minor axis and by up to `YAW` more. Each stand-off of
+`candidates.standoffs` gives a height.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
+from drakegrasp.config import CandidateConfig
+from drakegrasp.mesh.surfaces import even_points, on_faces
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.seeding import Stream
+from drakegrasp.simulation.candidates import rounded_density
+from drakegrasp.simulation.samplers import make_poses
+
+#: Points of the surface from which the axes follow.
+POINTS = 2048
+#: Targets lie within these shares of the half extents along the major and the minor axis.
+ALONG, ACROSS = 0.6, 0.2
+#: Most that a palm is turned from the axes, and tilted from the vertical [degree].
+YAW, TILT = 20.0, 25.0
+#: Random numbers of a pose: two of the target, the quarter, the turn, and two of the tilt.
+NUMBERS = 6
+
+
+class Above:
+    """Poses of the palm above the object, looking down.
+
+    Attributes:
+        log_density: Of the uniform draw: per m^2 of target, per rad of turn, per steradian.
+        limit: None, as any number of poses can be drawn.
+    """
+
+    def __init__(
+        self, model: ObjectModel, X_TO: Array, config: CandidateConfig, stream: Stream
+    ) -> None:
+        """Find the axes of the object as it rests; `config` decides nothing here."""
+        self._stream, self._poses = stream, np.zeros((0, 4, 4))
+        self.limit: int | None = None
+        self._X_TO, self._far = X_TO, 2.0 * float(norm(model.half_extents))
+
+        # Points that fill the surface evenly, over the table.
+        faces = model.visual_faces.astype(np.int64)
+        points, _ = on_faces(model.visual_vertices, faces, even_points(POINTS))
+        p_TQ = dot(points[:, None], X_TO[:3, :3]) + X_TO[:3, 3]
+        self._major = _major_axis(p_TQ[:, :2])
+        minor = np.array([-self._major[1], self._major[0]])
+
+        # The middle and the half extents along both axes, at half the object's height.
+        axes = np.stack([self._major, minor])
+        reach = dot(p_TQ[:, None, :2], axes)
+        low, high = reach.min(axis=0), reach.max(axis=0)
+        self._half = np.array([ALONG, ACROSS]) * (high - low) / 2.0
+        self._axes, self._middle = axes, (low + high) / 2.0
+        self._height = float(p_TQ[:, 2].max()) / 2.0
+        area = 4.0 * float(self._half[0] * self._half[1])
+        cap = 2.0 * math.pi * (1.0 - math.cos(math.radians(TILT)))
+        turns = 4.0 * math.radians(2.0 * YAW)
+        self.log_density = rounded_density(-math.log(area * turns * cap))
+
+    def poses(self, count: int) -> Array:
+        """Return the first poses (count, 4, 4)."""
+        missing = count - len(self._poses)
+        if missing > 0:
+            numbers = self._stream.uniform(NUMBERS * missing).reshape(missing, NUMBERS)
+            self._poses = np.concatenate([self._poses, self._draw(numbers)])
+        return self._poses[:count]
+
+    def counts(self, count: int) -> tuple[int, int, int]:
+        """Return the number of poses three times: each draw is one."""
+        return count, count, count
+
+    def _draw(self, numbers: Array) -> Array:
+        """Return the poses X_OG (n, 4, 4) of random numbers (n, NUMBERS)."""
+        # Where the palm looks at, and from where: uniform over the cap about the vertical.
+        target = self._middle + (2.0 * numbers[:, :2] - 1.0) * self._half
+        p_TQ = np.column_stack([multiply(target, self._axes), np.full(len(target), self._height)])
+        sine, cosine = sin_cos_deg(360.0 * numbers[:, 4])
+        least = float(sin_cos_deg(TILT)[1])
+        down = 1.0 - numbers[:, 5] * (1.0 - least)
+        aside = np.sqrt(1.0 - down * down)
+        z = np.column_stack([aside * cosine, aside * sine, -down])
+
+        # Gx at right angles to the minor axis or along it, in the plane across Gz.
+        quarter = np.minimum(np.floor(4.0 * numbers[:, 2]), 3.0)
+        sine, cosine = sin_cos_deg(90.0 * quarter + YAW * (2.0 * numbers[:, 3] - 1.0))
+        a, b = self._major
+        x = np.column_stack([cosine * a - sine * b, sine * a + cosine * b, np.zeros(len(z))])
+        x -= dot(x, z)[:, None] * z
+        x /= norm(x)[:, None]
+        X_TG = make_poses(np.stack([x, np.cross(z, x), z], axis=2), p_TQ - self._far * z)
+        R_OT = self._X_TO[:3, :3].T
+        p_OT = -multiply(R_OT, self._X_TO[:3, 3])
+        R_OG = multiply(R_OT, X_TG[:, :3, :3])
+        return make_poses(R_OG, dot(X_TG[:, None, :3, 3], R_OT) + p_OT)
+
+
+def _major_axis(points: Array) -> Array:
+    """Return the direction (2,) of the greatest variance of points (n, 2)."""
+    centred = points - np.cumsum(points, axis=0)[-1] / len(points)
+    x, y = centred.T
+    xx, xy, yy = (float(np.cumsum(product)[-1]) for product in (x * x, x * y, y * y))
+
+    # The double angle of the axis has the direction (xx - yy, 2 xy); half of it by half-angles.
+    along, across = xx - yy, 2.0 * xy
+    length = math.sqrt(along * along + across * across)
+    if length == 0.0:
+        return np.array([1.0, 0.0])
+    cosine = math.sqrt(max(0.0, (1.0 + along / length) / 2.0))
+    sine = math.copysign(math.sqrt(max(0.0, (1.0 - along / length) / 2.0)), across)
+    return np.array([cosine, sine])
