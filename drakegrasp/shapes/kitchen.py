@@ -26,6 +26,8 @@ from drakegrasp.shapes.curves import (
     spread_evenly,
 )
 from drakegrasp.shapes.parts import (
+    CORNERS,
+    SIDES,
     ball,
     block,
     lathe,
@@ -42,60 +44,42 @@ from drakegrasp.shapes.parts import (
 )
 from drakegrasp.shapes.solids import bar, cut, extrude, fuse, grid_box, revolve, solid, sweep
 
+#: Thickness of a wall, and of a thin one [m].
+WALL, THIN = 0.005, 0.0045
 
-def mug(
-    *,
-    radius: float,
-    height: float,
-    handle_reach: float,
-    handle_radius: float,
-    wall: float = 0.005,
-) -> Trimesh:
+
+def mug(*, radius: float, height: float, handle_reach: float, handle_radius: float) -> Trimesh:
     """Return a hollow straight mug with a handle at +x; `handle_reach` is how far it stands out."""
-    shell, core = vessel(
-        resample(foot_and_wall(radius, height, 0.004), EDGE), wall=wall, floor=0.007
-    )
-    handle = loop_handle(
-        x=radius - wall / 2.0,
-        top=0.84 * height,
-        bottom=0.2 * height,
-        reach=handle_reach - handle_radius + wall / 2.0,
-        radius=handle_radius,
-    )
+    side = resample(foot_and_wall(radius, height, 0.004), EDGE)
+    shell, core = vessel(side, wall=WALL, floor=0.007)
+    reach = handle_reach - handle_radius + WALL / 2.0
+    handle = loop_handle(radius - WALL / 2.0, 0.2 * height, 0.84 * height, reach, handle_radius)
     return fuse(shell, trimmed(handle, core))
 
 
-def cup(*, top_radius: float, bottom_radius: float, height: float, wall: float = 0.0045) -> Trimesh:
+def cup(*, top_radius: float, bottom_radius: float, height: float) -> Trimesh:
     """Return a hollow tapered cup without a handle."""
     side = resample([(bottom_radius, 0.0), (top_radius, height)], EDGE)
-    return vessel(side, wall=wall, floor=0.006)[0]
+    return vessel(side, wall=THIN, floor=0.006)[0]
 
 
-def bowl(*, radius: float, height: float, foot_radius: float, wall: float = 0.005) -> Trimesh:
+def bowl(*, radius: float, height: float, foot_radius: float) -> Trimesh:
     """Return a hollow bowl on a ring foot."""
     side = smooth([
         (foot_radius, 0.0), (foot_radius + 0.001, 0.005), (0.72 * radius, 0.22 * height),
         (0.92 * radius, 0.58 * height), (radius, height),
     ], EDGE)  # fmt: skip
-    return vessel(side, wall=wall, floor=0.008)[0]
+    return vessel(side, wall=WALL, floor=0.008)[0]
 
 
 def vase(
-    *,
-    foot_radius: float,
-    belly_radius: float,
-    neck_radius: float,
-    lip_radius: float,
-    height: float,
-    wall: float = 0.005,
-    edge: float = 0.007,
+    *, foot_radius: float, belly_radius: float, neck_radius: float, lip_radius: float, height: float
 ) -> Trimesh:
     """Return a hollow vase with a belly, a neck and a lip."""
-    side = smooth([
-        (foot_radius, 0.0), (belly_radius, 0.4 * height), (neck_radius, 0.82 * height),
-        (lip_radius, height),
-    ], edge)  # fmt: skip
-    return vessel(side, wall=wall, floor=0.008, edge=edge)[0]
+    radii = (foot_radius, belly_radius, neck_radius, lip_radius)
+    levels = scaled([0.0, 0.4, 0.82, 1.0], height)
+    side = smooth(np.column_stack([radii, levels]), 0.007)
+    return vessel(side, wall=WALL, floor=0.008, edge=0.007)[0]
 
 
 def wineglass(
@@ -106,7 +90,6 @@ def wineglass(
     rim_radius: float,
     height: float,
     stem_height: float,
-    wall: float = 0.0045,
 ) -> Trimesh:
     """Return a wineglass: a solid foot and stem, a hollow cup."""
     # The cup, outside and inside.
@@ -116,7 +99,7 @@ def wineglass(
         (belly_radius, stem_height + 0.42 * cup_height), (rim_radius, height),
     ], EDGE)  # fmt: skip
     floor = stem_height + 0.012
-    inner = spread_evenly(inset(outer, wall, floor=floor), COARSE * EDGE)[::-1]
+    inner = spread_evenly(inset(outer, THIN, floor=floor), COARSE * EDGE)[::-1]
 
     # Foot and stem.
     foot = resample([(0.0, 0.0), (foot_radius, 0.0), (foot_radius, 0.005)], EDGE)
@@ -127,10 +110,9 @@ def wineglass(
 
     # One outline, with longer edges inside.
     bottom = resample([inner[-1], (0.0, floor)], COARSE * EDGE)[1:]
-    profile = np.vstack([foot, stem[1:], outer[1:], inner, bottom])
-    edges = np.full(len(profile), EDGE)
-    edges[len(profile) - len(inner) - len(bottom) :] *= COARSE
-    return revolve(profile, edge=edges)
+    outside, inside = np.vstack([foot, stem[1:], outer[1:]]), np.vstack([inner, bottom])
+    edges = np.repeat([EDGE, COARSE * EDGE], [len(outside), len(inside)])
+    return revolve(np.vstack([outside, inside]), edge=edges)
 
 
 def pitcher(
@@ -143,23 +125,13 @@ def pitcher(
     handle_reach: float,
     handle_radius: float,
     lip: float,
-    wall: float = 0.005,
-    edge: float = 0.008,
 ) -> Trimesh:
     """Return a hollow pitcher with a handle at +x and a lip pulled out by `lip` at -x."""
-    side = smooth([
-        (foot_radius, 0.0), (belly_radius, 0.35 * height), (neck_radius, 0.8 * height),
-        (rim_radius, height),
-    ], edge)  # fmt: skip
-    shell, core = vessel(side, wall=wall, floor=0.008, edge=edge)
-    handle = loop_handle(
-        x=neck_radius - wall / 2.0,
-        top=0.85 * height,
-        bottom=0.3 * height,
-        reach=belly_radius - neck_radius + handle_reach,
-        radius=handle_radius,
-        edge=edge,
-    )
+    edge, radii = 0.008, (foot_radius, belly_radius, neck_radius, rim_radius)
+    side = smooth(np.column_stack([radii, scaled([0.0, 0.35, 0.8, 1.0], height)]), edge)
+    shell, core = vessel(side, wall=WALL, floor=0.008, edge=edge)
+    x, reach = neck_radius - WALL / 2.0, belly_radius - neck_radius + handle_reach
+    handle = loop_handle(x, 0.3 * height, 0.85 * height, reach, handle_radius, edge=edge)
     body = fuse(shell, trimmed(handle, core))
 
     # The lip: points near the rim on the far side move outwards, the wall with them.
@@ -169,85 +141,54 @@ def pitcher(
     return solid(np.column_stack([x - pull, y, z]), body.faces)
 
 
-def saucepan(*, radius: float, height: float, handle_length: float, wall: float = 0.005) -> Trimesh:
+def saucepan(*, radius: float, height: float, handle_length: float) -> Trimesh:
     """Return a hollow saucepan with a straight handle along +x."""
-    edge = 1.2 * EDGE
-    shell, core = vessel(
-        resample(foot_and_wall(radius, height, 0.005), edge), wall=wall, floor=0.007, edge=edge
-    )
-    z = 0.78 * height
-    handle = bar(
-        (radius - wall, 0.0, z),
-        (radius + handle_length, 0.0, z),
-        ellipse(0.008, 0.011, edge=edge),
-        normal=(0.0, 1.0, 0.0),
-        scale=((0.0, 0.9), (0.4, 0.8), (1.0, 1.0)),
-        edge=edge,
-    )
+    edge, z = 1.2 * EDGE, 0.78 * height
+    side = resample(foot_and_wall(radius, height, 0.005), edge)
+    shell, core = vessel(side, wall=WALL, floor=0.007, edge=edge)
+    start, end = (radius - WALL, 0.0, z), (radius + handle_length, 0.0, z)
+    scale = ((0.0, 0.9), (0.4, 0.8), (1.0, 1.0))
+    handle = bar(start, end, ellipse(0.008, 0.011, edge=edge), scale=scale, edge=edge)
     return fuse(shell, trimmed(handle, core))
 
 
-def funnel(
-    *,
-    radius: float,
-    spout_radius: float,
-    cone_height: float,
-    height: float,
-    wall: float = 0.0045,
-) -> Trimesh:
+def funnel(*, radius: float, spout_radius: float, cone_height: float, height: float) -> Trimesh:
     """Return a funnel, open at both ends, that stands on its wide end."""
-    outer = resample([
-        (radius, 0.0), (radius, 0.008), (spout_radius + 0.002, cone_height), (spout_radius, height),
-    ], EDGE)  # fmt: skip
+    neck = (spout_radius + 0.002, cone_height)
+    outer = resample([(radius, 0.0), (radius, 0.008), neck, (spout_radius, height)], EDGE)
     # Across a sloping wall the thickness is measured along r: wall / sin(slope).
     slope = np.arctan2(cone_height - 0.008, radius - spout_radius)
-    step = wall / np.sin(slope)
+    step = THIN / np.sin(slope)
     inner = resample([
-        (spout_radius - wall, height), (spout_radius + 0.002 - wall, cone_height),
+        (spout_radius - THIN, height), (spout_radius + 0.002 - THIN, cone_height),
         (radius - step, 0.008), (radius - step, 0.0),
     ], COARSE * EDGE)  # fmt: skip
-    profile = np.vstack([outer, inner])
-    edges = np.r_[np.full(len(outer), EDGE), np.full(len(inner), COARSE * EDGE)]
-    return revolve(profile, edge=edges, closed=True)
+    edges = np.repeat([EDGE, COARSE * EDGE], [len(outer), len(inner)])
+    return revolve(np.vstack([outer, inner]), edge=edges, closed=True)
 
 
 def toaster(*, length: float, width: float, height: float) -> Trimesh:
     """Return a toaster with two slots along x and a lever at +x."""
-    foot = 0.006
+    foot, half = 0.006, length / 2.0
     across = rounded_rectangle(height - foot, width, 0.2 * width, edge=LARGE)
-    half = length / 2.0
     stations = spaced(LARGE, -half, 0.004 - half, half - 0.004, half)
     middle = (height + foot) / 2.0
     path = np.column_stack([stations, 0.0 * stations, np.full_like(stations, middle)])
     scale = np.ones(len(stations))
     scale[[0, -1]] = 0.94
-    body = sweep(path, across, normal=(0.0, 1.0, 0.0), scale=scale)
+    body = sweep(path, across, scale=scale)
+    size = (0.014, 0.014, 2.0 * foot + 0.016)
     feet = [
-        block(
-            (0.014, 0.014, 2.0 * foot + 0.016),
-            (0.36 * x * length, 0.24 * y * width, foot + 0.008),
-            edge=LARGE,
-        )
-        for x in (-1.0, 1.0)
-        for y in (-1.0, 1.0)
+        block(size, (0.36 * x * length, 0.24 * y * width, foot + 0.008), edge=LARGE)
+        for x, y in CORNERS
     ]
 
-    slots = [
-        block(
-            (0.78 * length, 0.17 * width, 0.11),
-            (0.0, 0.19 * side * width, 0.42 * height + 0.055),
-            edge=LARGE,
-        )
-        for side in (-1.0, 1.0)
-    ]
-    groove = block((0.02, 0.009, 0.5 * height), (length / 2.0 + 0.005, 0.0, 0.56 * height))
-    lever = block((0.03, 0.30 * width, 0.011), (length / 2.0 + 0.004, 0.0, 0.72 * height))
-    dial = rod(
-        (length / 2.0 - 0.01, 0.3 * width, 0.3 * height),
-        (length / 2.0 + 0.008, 0.3 * width, 0.3 * height),
-        0.0085,
-        edge=0.7 * EDGE,
-    )
+    size, z = (0.78 * length, 0.17 * width, 0.11), 0.42 * height + 0.055
+    slots = [block(size, (0.0, 0.19 * side * width, z), edge=LARGE) for side in SIDES]
+    groove = block((0.02, 0.009, 0.5 * height), (half + 0.005, 0.0, 0.56 * height))
+    lever = block((0.03, 0.30 * width, 0.011), (half + 0.004, 0.0, 0.72 * height))
+    y, z = 0.3 * width, 0.3 * height
+    dial = rod((half - 0.01, y, z), (half + 0.008, y, z), 0.0085, edge=0.7 * EDGE)
     return fuse(cut(fuse(body, *feet), *slots, groove), lever, dial)
 
 
@@ -255,57 +196,36 @@ def coffeemaker(*, width: float, depth: float, height: float) -> Trimesh:
     """Return a coffee machine with its tank at -x and its jug in front, towards +x."""
     tank = 0.36 * depth
     jug, floor, head = 0.36 * width, 0.020, 0.24 * height
-    x = 0.5 * depth - 0.42 * width
+    x, edge = 0.5 * depth - 0.42 * width, 2.0 * BROAD
     # Base, tank, head, and the filter under it.
+    back, roof = ((tank - depth) / 2.0, 0.0, height / 2.0), height - head
+    levels = [(roof, 0.86 * depth, 0.94 * width), (height, depth, width)]
+    cone = lathe(resample([(0.45 * jug, 0.0), (0.8 * jug, 0.02)], BROAD), edge=LARGE)
     parts = [
-        block((depth, width, floor), (0.0, 0.0, floor / 2.0), corner=0.01, edge=2.0 * BROAD),
-        block(
-            (tank, width, height),
-            ((tank - depth) / 2.0, 0.0, height / 2.0),
-            corner=0.01,
-            edge=2.0 * BROAD,
-        ),
-        pillar(
-            [(height - head, 0.86 * depth, 0.94 * width), (height, depth, width)],
-            corner=0.012,
-            edge=2.0 * BROAD,
-        ),
-        moved(
-            lathe(resample([(0.45 * jug, 0.0), (0.8 * jug, 0.02)], BROAD), edge=LARGE),
-            (x, 0.0, height - head - 0.014),
-        ),
+        block((depth, width, floor), (0.0, 0.0, floor / 2.0), corner=0.01, edge=edge),
+        block((tank, width, height), back, corner=0.01, edge=edge),
+        pillar(levels, corner=0.012, edge=edge),
+        moved(cone, (x, 0.0, height - head - 0.014)),
     ]
 
     # The jug on its plate, with a handle.
     top = 0.52 * height
-    side = smooth(
-        scaled([(0.8, 0.0), (1.0, 0.3), (0.9, 0.65), (0.62, 0.9), (0.68, 1.0)], jug, top - floor),
-        LARGE,
-    )
+    knots = [(0.8, 0.0), (1.0, 0.3), (0.9, 0.65), (0.62, 0.9), (0.68, 1.0)]
+    side = smooth(scaled(knots, jug, top - floor), LARGE)
     body = moved(lathe(side, edge=LARGE), (x, 0.0, floor - 0.002))
-    handle = loop_handle(
-        x=x + 0.6 * jug,
-        top=0.92 * top,
-        bottom=floor + 0.22 * (top - floor),
-        reach=0.78 * jug,
-        radius=0.0045,
-        edge=LARGE,
-    )
+    low, reach = floor + 0.22 * (top - floor), 0.78 * jug
+    handle = loop_handle(x + 0.6 * jug, low, 0.92 * top, reach, 0.0045, edge=LARGE)
     lamp = ball((0.5 * depth, 0.25 * width, height - 0.5 * head), 0.006, edge=0.6 * EDGE)
     return fuse(*parts, body, handle, lamp)
 
 
 def teapot(*, radius: float, height: float, spout: float) -> Trimesh:
     """Return a teapot with its lid on: spout towards +x by `spout`, handle at -x."""
-    body = lathe(smooth(scaled([(0.58, 0.0), (0.62, 0.03), (1.0, 0.42), (0.78, 0.76), (0.46, 0.86)],
-        radius, height), BROAD), edge=BROAD)  # fmt: skip
-    lid = lathe(
-        [
-            *resample([(0.5 * radius, 0.84 * height), (0.5 * radius, 0.88 * height)], BROAD),
-            *smooth([(0.4 * radius, 0.93 * height), (0.12 * radius, height)], BROAD),
-        ],
-        edge=BROAD,
-    )
+    knots = [(0.58, 0.0), (0.62, 0.03), (1.0, 0.42), (0.78, 0.76), (0.46, 0.86)]
+    body = lathe(smooth(scaled(knots, radius, height), BROAD), edge=BROAD)
+    rim = resample([(0.5 * radius, 0.84 * height), (0.5 * radius, 0.88 * height)], BROAD)
+    dome = smooth([(0.4 * radius, 0.93 * height), (0.12 * radius, height)], BROAD)
+    lid = lathe([*rim, *dome], edge=BROAD)
     button = ball((0.0, 0.0, 1.06 * height), (0.17 * radius, 0.17 * radius, 0.09 * height))
 
     # An S-shaped spout that narrows, and a round handle.
@@ -313,58 +233,33 @@ def teapot(*, radius: float, height: float, spout: float) -> Trimesh:
         (0.7 * radius, 0.0, 0.3 * height), (radius + 0.35 * spout, 0.0, 0.4 * height),
         (radius + 0.65 * spout, 0.0, 0.66 * height), (radius + spout, 0.0, 0.86 * height),
     ], EDGE)  # fmt: skip
-    size = np.linspace(0.24 * radius, 0.11 * radius, len(path))
-    handle = loop_handle(
-        x=0.72 * radius,
-        top=0.76 * height,
-        bottom=0.24 * height,
-        reach=0.78 * radius,
-        radius=0.11 * radius,
-        edge=BROAD,
-    )
-    pipe = tube(path, size, edge=0.9 * EDGE)
+    pipe = tube(path, np.linspace(0.24 * radius, 0.11 * radius, len(path)), edge=0.9 * EDGE)
+    x, low, top, reach = 0.72 * radius, 0.24 * height, 0.76 * height, 0.78 * radius
+    handle = loop_handle(x, low, top, reach, 0.11 * radius, edge=BROAD)
     return fuse(body, lid, button, pipe, rotated(handle, "z", 180.0))
 
 
 def juicer(*, radius: float, rim: float, cone: float) -> Trimesh:
     """Return a citrus juicer: a dish with a rim of height `rim`, and in it a ribbed `cone`."""
-    wall = 0.005
     side = smooth(scaled([(0.7, 0.0), (0.92, 0.3), (1.0, 1.0)], radius, rim), BROAD)
-    inner = smooth(
-        [(radius - wall, rim), (0.86 * radius, 0.5 * rim), (0.62 * radius, 0.32 * rim)], BROAD
-    )
-    dish = revolve(
-        joined(
-            resample([(0.0, 0.0), side[0]], 1.5 * BROAD),
-            side,
-            inner,
-            resample([inner[-1], (0.0, 0.3 * rim)], 1.5 * BROAD),
-        ),
-        edge=BROAD,
-    )
+    hollow = [(radius - WALL, rim), (0.86 * radius, 0.5 * rim), (0.62 * radius, 0.32 * rim)]
+    inner = smooth(hollow, BROAD)
+    under = resample([(0.0, 0.0), side[0]], 1.5 * BROAD)
+    bottom = resample([inner[-1], (0.0, 0.3 * rim)], 1.5 * BROAD)
+    dish = revolve(joined(under, side, inner, bottom), edge=BROAD)
     ribs = scalloped(0.5 * radius, 0.07 * radius, 10, edge=BROAD)
-    heights = np.linspace(0.0, 1.0, max(5, round(cone / BROAD)) + 1)
-    profile = [
-        *((0.9 * share, 0.2 * rim) for share in (0.0, 0.5)),
-        *(
-            (float(np.sqrt(max(0.0, 1.0 - h**1.6))), 0.2 * rim + h * (cone - 0.2 * rim))
-            for h in heights
-        ),
-    ]
+    h = np.linspace(0.0, 1.0, max(5, round(cone / BROAD)) + 1)
+    low = 0.2 * rim
+    dome = np.column_stack([np.sqrt(np.maximum(0.0, 1.0 - h**1.6)), low + h * (cone - low)])
+    cone_body = extrude(ribs, [(0.0, low), (0.9 * 0.5, low), *dome])
 
-    handle = block(
-        (0.5 * radius, 0.36 * radius, 0.008),
-        (-1.15 * radius, 0.0, rim - 0.006),
-        corner=0.12 * radius,
-    )
-    lip = pillar(
-        [
-            (rim - 0.015, 0.1 * radius, 0.12 * radius, 0.93 * radius, 0.0),
-            (rim, 0.3 * radius, 0.3 * radius, 1.03 * radius, 0.0),
-        ],
-        corner=0.04 * radius,
-    )
-    return fuse(dish, extrude(ribs, profile), handle, lip)
+    size, place = (0.5 * radius, 0.36 * radius, 0.008), (-1.15 * radius, 0.0, rim - 0.006)
+    handle = block(size, place, corner=0.12 * radius)
+    lip = pillar([
+        (rim - 0.015, 0.1 * radius, 0.12 * radius, 0.93 * radius, 0.0),
+        (rim, 0.3 * radius, 0.3 * radius, 1.03 * radius, 0.0),
+    ], corner=0.04 * radius)  # fmt: skip
+    return fuse(dish, cone_body, handle, lip)
 
 
 def pepper_mill(*, radius: float, waist: float, height: float) -> Trimesh:
@@ -376,13 +271,12 @@ def pepper_mill(*, radius: float, waist: float, height: float) -> Trimesh:
         (0.92 * radius, 0.8 * height), (0.66 * radius, 0.89 * height),
         (0.16 * radius, 0.915 * height),
     ], 0.8 * EDGE)  # fmt: skip
-    button = ball((0.0, 0.0, 0.945 * height), 0.055 * height)
-    return fuse(lathe(side), button)
+    return fuse(lathe(side), ball((0.0, 0.0, 0.945 * height), 0.055 * height))
 
 
-def box(*, width: float, depth: float, height: float, edge: float = 1.2 * EDGE) -> Trimesh:
+def box(*, width: float, depth: float, height: float) -> Trimesh:
     """Return an upright box: `width` along x, `depth` along y."""
-    return grid_box((width, depth, height), centre=(0.0, 0.0, height / 2.0), edge=edge)
+    return grid_box((width, depth, height), centre=(0.0, 0.0, height / 2.0), edge=1.2 * EDGE)
 
 
 def can(*, radius: float, height: float) -> Trimesh:
@@ -392,35 +286,33 @@ def can(*, radius: float, height: float) -> Trimesh:
 
 def bottle(*, radius: float, height: float, neck_radius: float) -> Trimesh:
     """Return a closed bottle, solid, with a shoulder, a neck and a cap."""
-    shoulder, neck, cap = 0.58 * height, 0.78 * height, 0.9 * height
+    low, neck, cap = 0.58 * height, 0.78 * height, 0.9 * height
+    wide = neck_radius + 0.003
 
     # From the bottom up: body, shoulder, neck and cap.
-    wide = neck_radius + 0.003
-    return lathe(joined(
-        resample(foot_and_wall(radius, shoulder, 0.004), BROAD),
-        smooth([(radius, shoulder), (0.8 * radius, 0.66 * height), (neck_radius, neck)], BROAD),
-        resample([
-            (neck_radius, neck), (neck_radius, cap), (wide, cap), (wide, height - 0.003),
-            (neck_radius, height),
-        ], BROAD)))  # fmt: skip
+    body = resample(foot_and_wall(radius, low, 0.004), BROAD)
+    shoulder = smooth([(radius, low), (0.8 * radius, 0.66 * height), (neck_radius, neck)], BROAD)
+    head = resample([
+        (neck_radius, neck), (neck_radius, cap), (wide, cap), (wide, height - 0.003),
+        (neck_radius, height),
+    ], BROAD)  # fmt: skip
+    return lathe(joined(body, shoulder, head))
 
 
 def jar(*, radius: float, height: float, lid_radius: float, lid_height: float) -> Trimesh:
     """Return a closed jar, solid: a body, a short neck and a lid."""
-    shoulder = height - lid_height - 0.018
+    low, under = height - lid_height - 0.018, height - lid_height
     neck = min(lid_radius - 0.004, radius - 0.008)
 
     # From the bottom up: body, shoulder, lid.
-    return lathe(joined(
-        resample(foot_and_wall(radius, shoulder, 0.005), EDGE),
-        smooth([
-            (radius, shoulder), (radius - 0.25 * (radius - neck), shoulder + 0.006),
-            (neck, shoulder + 0.013),
-        ], EDGE / 2.0),
-        resample([
-            (neck, height - lid_height), (lid_radius, height - lid_height),
-            (lid_radius, height - 0.003), (lid_radius - 0.003, height),
-        ], EDGE)))  # fmt: skip
+    body = resample(foot_and_wall(radius, low, 0.005), EDGE)
+    middle = (radius - 0.25 * (radius - neck), low + 0.006)
+    shoulder = smooth([(radius, low), middle, (neck, low + 0.013)], EDGE / 2.0)
+    lid = resample([
+        (neck, under), (lid_radius, under), (lid_radius, height - 0.003),
+        (lid_radius - 0.003, height),
+    ], EDGE)  # fmt: skip
+    return lathe(joined(body, shoulder, lid))
 
 
 def carton(*, width: float, height: float, roof: float) -> Trimesh:
@@ -432,51 +324,35 @@ def carton(*, width: float, height: float, roof: float) -> Trimesh:
     ], corner=0.003, edge=LARGE)  # fmt: skip
     # The gable's ends are folded inwards.
     fold = pillar([(height + 0.004, 0.0105, 0.86 * width), (height + 0.86 * roof, 0.024, 0.005)])
-    folds = [moved(fold, (0.5 * side * width, 0.0, 0.0)) for side in (-1.0, 1.0)]
+    folds = [moved(fold, (0.5 * side * width, 0.0, 0.0)) for side in SIDES]
     slope = np.degrees(np.arctan2(roof, 0.5 * width - 0.004))
     cap = post(-0.006, 0.011, 0.15 * width + 0.003)
     place = (0.0, -0.27 * width, height + 0.48 * roof)
     return fuse(cut(shell, *folds), moved(cap, place, x=slope))
 
 
-def spray_bottle(*, width: float, depth: float, height: float, edge: float = 0.007) -> Trimesh:
+def spray_bottle(*, width: float, depth: float, height: float) -> Trimesh:
     """Return a spray bottle, solid: an oval body, a neck, a head and a trigger towards +x."""
-    body_height = 0.68 * height
+    edge, top, half = 0.007, 0.68 * height, width / 2.0
     neck, section = 0.013, rounded_rectangle(width, depth, 0.45 * depth, edge=edge)
     foot = [(0.0, 0.0), (0.5, 0.0), (0.94, 0.0), (1.0, 0.004)]
-    heights = spaced(edge, 0.004, 0.72 * body_height)[1:]
-    shoulder = smooth(
-        [
-            (width / 2.0, 0.72 * body_height),
-            (0.42 * width, 0.85 * body_height),
-            (neck, body_height),
-        ],
-        edge,
-    )[1:]
-    shoulder = shoulder / [width / 2.0, 1.0]
-    profile = [*foot, *((1.0, z) for z in heights), *shoulder, (0.0, body_height)]
+    heights = spaced(edge, 0.004, 0.72 * top)[1:]
+    shoulder = smooth([(half, 0.72 * top), (0.42 * width, 0.85 * top), (neck, top)], edge)[1:]
+    profile = [*foot, *((1.0, z) for z in heights), *(shoulder / [half, 1.0]), (0.0, top)]
     body = extrude(section, profile)
 
-    head_z = height - 0.014
+    z = height - 0.014
     collar = revolve(resample([
-        (0.0, body_height - 0.01), (neck + 0.002, body_height - 0.01),
-        (neck + 0.002, body_height + 0.014), (0.011, body_height + 0.018), (0.011, head_z),
-        (0.0, head_z),
+        (0.0, top - 0.01), (neck + 0.002, top - 0.01), (neck + 0.002, top + 0.014),
+        (0.011, top + 0.018), (0.011, z), (0.0, z),
     ], edge))  # fmt: skip
-    head = bar((-0.028, 0.0, head_z), (0.048, 0.0, head_z),
-        rounded_rectangle(0.028, 0.024, 0.007, edge=edge), normal=(0.0, 1.0, 0.0),
-        scale=((0.0, 0.75), (0.35, 1.0), (0.75, 0.9), (1.0, 0.55)))  # fmt: skip
+    scale = ((0.0, 0.75), (0.35, 1.0), (0.75, 0.9), (1.0, 0.55))
+    section = rounded_rectangle(0.028, 0.024, 0.007, edge=edge)
+    head = bar((-0.028, 0.0, z), (0.048, 0.0, z), section, scale=scale)
     reach = np.linspace(0.0, 1.0, 50)
-    bend = np.column_stack(
-        [0.026 + 0.014 * np.sin(1.6 * reach), 0.0 * reach, head_z - 0.055 * reach]
-    )
-    trigger = sweep(
-        spread_evenly(bend, edge),
-        rounded_rectangle(0.008, 0.014, 0.003, edge=edge),
-        normal=(0.0, 1.0, 0.0),
-        scale=1.0,
-    )
-    return fuse(body, collar, head, trigger)
+    bend = np.column_stack([0.026 + 0.014 * np.sin(1.6 * reach), 0.0 * reach, z - 0.055 * reach])
+    section = rounded_rectangle(0.008, 0.014, 0.003, edge=edge)
+    return fuse(body, collar, head, sweep(spread_evenly(bend, edge), section))
 
 
 def soap_dispenser(*, width: float, depth: float, height: float) -> Trimesh:
@@ -486,37 +362,23 @@ def soap_dispenser(*, width: float, depth: float, height: float) -> Trimesh:
         (0.0, 0.94, 0.94), (0.3, 1.0, 1.0), (0.75, 1.0, 1.0), (0.93, 0.72, 0.76), (1.0, 0.42, 0.52),
     ], body, width, depth), corner=0.48 * depth, edge=BROAD)  # fmt: skip
 
-    # The pump: collar, stem and spout.
-    collar, stem = 0.25 * depth + 0.004, 0.006
+    # The pump: collar, stem, head and spout.
     z = height - 0.012
     spout = tube(smooth([
         (-0.012, 0.0, z), (0.2 * width, 0.0, z), (0.46 * width, 0.0, z - 0.001),
         (0.56 * width, 0.0, z - 0.011),
     ], EDGE), 0.0062)  # fmt: skip
-    return fuse(
-        bottle,
-        post(body - 0.006, body + 0.016, collar),
-        post(body, z, stem),
-        post(z - 0.01, height, 0.013, 0.0125),
-        spout,
-    )
+    collar = post(body - 0.006, body + 0.016, 0.25 * depth + 0.004)
+    head = post(z - 0.01, height, 0.013, 0.0125)
+    return fuse(bottle, collar, post(body, z, 0.006), head, spout)
 
 
 def towel_roll(*, radius: float, height: float, core: float) -> Trimesh:
     """Return a paper towel roll that stands, with an open `core` and a loose sheet at +y."""
-    paper = revolve(
-        joined(
-            resample(bevelled(radius, height, 0.002), BROAD),
-            resample([(core, height), (core, 0.0)], 1.5 * BROAD),
-            resample([(core, 0.0), (radius - 0.002, 0.0)], 2.0 * BROAD)[:-1],
-        ),
-        edge=BROAD,
-        closed=True,
-    )
-    sheet = block(
-        (0.62 * radius, 0.005, height - 0.004),
-        (0.36 * radius, radius - 0.0035, height / 2.0),
-        corner=0.0015,
-        edge=BROAD,
-    )
+    outside = resample(bevelled(radius, height, 0.002), BROAD)
+    inside = resample([(core, height), (core, 0.0)], 1.5 * BROAD)
+    bottom = resample([(core, 0.0), (radius - 0.002, 0.0)], 2.0 * BROAD)[:-1]
+    paper = revolve(joined(outside, inside, bottom), edge=BROAD, closed=True)
+    size, place = (0.62 * radius, 0.005, height - 0.004), (0.36 * radius, radius - 0.0035)
+    sheet = block(size, (*place, height / 2.0), corner=0.0015, edge=BROAD)
     return fuse(paper, sheet)

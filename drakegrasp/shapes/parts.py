@@ -6,6 +6,8 @@ Parts overlap where they are to be joined.
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import numpy.typing as npt
 import trimesh
@@ -24,7 +26,11 @@ from drakegrasp.shapes.curves import (
     rounded_rectangle,
     spread_evenly,
 )
-from drakegrasp.shapes.solids import cut, extrude, fanned, revolve, skin, solid, sweep
+from drakegrasp.shapes.solids import at_height, cut, extrude, fanned, revolve, skin, solid, sweep
+
+#: Signs of the two sides, and of the four corners, of what is symmetrical.
+SIDES = (-1.0, 1.0)
+CORNERS = tuple(product(SIDES, SIDES))
 
 #: Rings of a flat end, as shares of its outline: the triangles at the centre stay plump.
 FLAT_END = (0.0, 0.5, 0.93)
@@ -179,10 +185,7 @@ def pillar(
         row[1:3] -= np.minimum(2.0 * BEVEL, 0.3 * row[1:3])
 
     def ring(row: Array, share: float = 1.0) -> Array:
-        if share == 0.0:
-            return np.array([[row[3], row[4], row[0]]])
-        flat = share * outline * row[1:3] + row[3:]
-        return np.column_stack([flat, np.full(len(flat), row[0])])
+        return at_height(share * outline * row[1:3], row[0], row[3:])
 
     low = [ring(first, share) for share in FLAT_END]
     high = [ring(last, share) for share in FLAT_END[::-1]]
@@ -284,30 +287,26 @@ def vessel(
 
 
 def loop_handle(
-    *, x: float, top: float, bottom: float, reach: float, radius: float, edge: float = EDGE
+    x: float, bottom: float, top: float, reach: float, radius: float, *, edge: float = EDGE
 ) -> trimesh.Trimesh:
     """Return a D-shaped handle in the plane y = 0, open towards -x.
 
     Args:
         x: Where both ends lie, inside the body's wall [m].
-        top: Height of the upper end's centre line [m].
         bottom: Height of the lower end's centre line [m].
+        top: Height of the upper end's centre line [m].
         reach: How far the centre line goes beyond `x` [m].
         radius: Half the thickness in the plane; the handle is 1.3 times as wide [m].
         edge: Edge length [m].
     """
     angles = np.linspace(0.0, np.pi, 200)
+    s, c = np.sin(angles), np.cos(angles)
     middle, half = (top + bottom) / 2.0, (top - bottom) / 2.0
     # A power below one makes the half ellipse squarer, like a real handle.
-    curve = np.column_stack(
-        [
-            x + reach * np.sin(angles) ** 0.7,
-            np.zeros_like(angles),
-            middle + half * np.sign(np.cos(angles)) * np.abs(np.cos(angles)) ** 0.85,
-        ]
-    )
+    z = middle + half * np.sign(c) * np.abs(c) ** 0.85
+    curve = np.column_stack([x + reach * s**0.7, np.zeros_like(angles), z])
     section = ellipse(radius, 1.3 * radius, edge=edge * 0.7)
-    return sweep(spread_evenly(curve, edge), section, normal=(0.0, 1.0, 0.0), scale=1.0)
+    return sweep(spread_evenly(curve, edge), section)
 
 
 def trimmed(part: trimesh.Trimesh, core: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -11,6 +11,8 @@ random.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import numpy.typing as npt
 import trimesh
@@ -18,7 +20,7 @@ import trimesh
 from drakegrasp.arithmetic import dot, norm
 from drakegrasp.frames import Array
 from drakegrasp.mesh.surfaces import Faces
-from drakegrasp.shapes.curves import EDGE, arc_length, between, ring_angles, ring_size
+from drakegrasp.shapes.curves import EDGE, arc_length, between, ellipse
 
 #: Vertices are rounded to this many decimals [m], in files too. This also hides the rounding
 #: errors by which machines differ.
@@ -26,6 +28,9 @@ DECIMALS = 7
 
 #: A point nearer to the axis than this lies on it, and no edge is shorter [m].
 ON_AXIS = 1e-9
+
+#: Normal of a plane y = 0.
+ACROSS = (0.0, 1.0, 0.0)
 
 
 def solid(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> trimesh.Trimesh:
@@ -53,7 +58,7 @@ def solid(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices[order], ranked, process=False)
 
 
-# From curves.
+# Of curves
 
 
 def revolve(
@@ -69,20 +74,19 @@ def revolve(
     """
     points = np.asarray(profile, dtype=float)
     edges = np.broadcast_to(np.asarray(edge, dtype=float), len(points))
-    rings: list[Array] = []
+    rings = []
     for (r, z), length in zip(points, edges, strict=True):
-        if r < ON_AXIS:
-            rings.append(np.array([[0.0, 0.0, z]]))
-            continue
-        angles = ring_angles(ring_size(float(r), float(length)))
-        rings.append(
-            np.column_stack([r * np.cos(angles), r * np.sin(angles), np.full(len(angles), z)])
-        )
+        circle = ellipse(r, r, edge=length) if r >= ON_AXIS else np.zeros((1, 2))
+        rings.append(at_height(circle, z))
     return skin(rings, closed=closed)
 
 
 def sweep(
-    path: npt.ArrayLike, section: npt.ArrayLike, *, normal: npt.ArrayLike, scale: npt.ArrayLike
+    path: npt.ArrayLike,
+    section: npt.ArrayLike,
+    *,
+    normal: npt.ArrayLike = ACROSS,
+    scale: npt.ArrayLike = 1.0,
 ) -> trimesh.Trimesh:
     """Return the solid of a section moved along a plane path, with flat ends.
 
@@ -115,7 +119,7 @@ def bar(
     end: npt.ArrayLike,
     section: npt.ArrayLike,
     *,
-    normal: npt.ArrayLike,
+    normal: npt.ArrayLike = ACROSS,
     scale: npt.ArrayLike = ((0.0, 1.0), (1.0, 1.0)),
     edge: float = EDGE,
 ) -> trimesh.Trimesh:
@@ -141,11 +145,20 @@ def bar(
 def extrude(section: npt.ArrayLike, profile: npt.ArrayLike) -> trimesh.Trimesh:
     """Return a section (n, 2) [m] raised along z by a profile (k, 2) of points (scale, z [m])."""
     outline = np.asarray(section, dtype=float)
-    rings = []
-    for scale, z in np.asarray(profile, dtype=float):
-        ring = np.column_stack([scale * outline, np.full(len(outline), z)])
-        rings.append(ring if scale > 0.0 else np.array([[0.0, 0.0, z]]))
-    return skin(rings)
+    levels = np.asarray(profile, dtype=float)
+    return skin([at_height(scale * outline, z) for scale, z in levels])
+
+
+def at_height(outline: Array, z: float, middle: npt.ArrayLike = (0.0, 0.0)) -> Array:
+    """Return an outline (n, 2) [m] as a ring (n, 3) at a height [m]; one point if it has no size.
+
+    Args:
+        outline: Round its origin.
+        z: The height [m].
+        middle: Where its origin is, (2,) [m].
+    """
+    flat = outline if outline.any() else outline[:1]
+    return np.column_stack([flat + middle, np.full(len(flat), z)])
 
 
 def grid_box(extents: npt.ArrayLike, *, centre: npt.ArrayLike, edge: float) -> trimesh.Trimesh:
@@ -192,35 +205,31 @@ def skin(rings: list[Array], *, closed: bool = False) -> trimesh.Trimesh:
         rings: In order.
         closed: Whether the last ring is joined to the first.
     """
-    starts = np.cumsum([0, *(len(ring) for ring in rings)])
+    points = np.concatenate(rings)
+    numbers = np.split(np.arange(len(points)), np.cumsum([len(ring) for ring in rings])[:-1])
     faces: list[tuple[int, int, int]] = []
-    pairs = [(k, k + 1) for k in range(len(rings) - 1)]
-    if closed:
-        pairs.append((len(rings) - 1, 0))
-    for lower, upper in pairs:
-        faces += _zip_rings(
-            int(starts[lower]), len(rings[lower]), int(starts[upper]), len(rings[upper])
-        )
-    return solid(np.concatenate(rings), np.array(faces))
+    for lower, upper in pairwise([*numbers, *numbers[:1]] if closed else numbers):
+        faces += _zip_rings(lower.tolist(), upper.tolist())
+    return solid(points, np.array(faces))
 
 
-def _zip_rings(a0: int, a_size: int, b0: int, b_size: int) -> list[tuple[int, int, int]]:
+def _zip_rings(a: list[int], b: list[int]) -> list[tuple[int, int, int]]:
     """Return the triangles between two rings of vertex numbers, stepping on the one behind."""
-    a_steps, b_steps = (size if size > 1 else 0 for size in (a_size, b_size))
+    a_steps, b_steps = (len(ring) if len(ring) > 1 else 0 for ring in (a, b))
     faces = []
     i = j = 0
     while i < a_steps or j < b_steps:
-        a, b = a0 + i % a_size, b0 + j % b_size
-        if j == b_steps or (i < a_steps and (2 * i + 1) * b_size <= (2 * j + 1) * a_size):
-            faces.append((a, a0 + (i + 1) % a_size, b))
+        low, high = a[i % len(a)], b[j % len(b)]
+        if j == b_steps or (i < a_steps and (2 * i + 1) * len(b) <= (2 * j + 1) * len(a)):
             i += 1
+            faces.append((low, a[i % len(a)], high))
         else:
-            faces.append((a, b0 + (j + 1) % b_size, b))
             j += 1
+            faces.append((low, b[j % len(b)], high))
     return faces
 
 
-# From solids.
+# What several solids make
 
 #: Triangles lower than this [m] are removed after a Boolean operation: their normals mean little.
 SLIVER = 0.0005
@@ -398,15 +407,8 @@ def _collapse(points: Array, faces: Faces, a: int, b: int) -> Faces | None:
 def _flip(points: Array, faces: Faces, a: int, b: int) -> Faces | None:
     """Return the faces with the edge from `a` to `b` turned, None if that does not help."""
     pair = np.flatnonzero((faces == a).any(axis=1) & (faces == b).any(axis=1))
-    left, right = (
-        next(
-            int(face[(i + 2) % 3])
-            for face in faces[pair]
-            for i in range(3)
-            if face[i] == start and face[(i + 1) % 3] == end
-        )
-        for start, end in ((a, b), (b, a))
-    )
+    start, end, apex = (np.roll(faces[pair], -k, axis=1) for k in range(3))
+    left, right = (int(apex[(start == p) & (end == q)][0]) for p, q in ((a, b), (b, a)))
     if ((faces == left).any(axis=1) & (faces == right).any(axis=1)).any():
         return None
 

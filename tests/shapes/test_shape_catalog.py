@@ -150,9 +150,7 @@ def test_can_volume_is_that_of_a_cylinder() -> None:
 
 def test_mug_is_a_shell_with_a_handle() -> None:
     radius, height, wall, floor = 0.044, 0.1, 0.005, 0.007
-    mesh = kitchen.mug(
-        radius=radius, height=height, handle_reach=0.034, handle_radius=0.006, wall=wall
-    )
+    mesh = kitchen.mug(radius=radius, height=height, handle_reach=0.034, handle_radius=0.006)
     shell = np.pi * (radius**2 * height - (radius - wall) ** 2 * (height - floor))
     # The handle: an ellipse of 0.006 x 0.0078 along half an ellipse from wall to wall.
     a, b = 0.034 - 0.006, 0.32 * height
