@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,18 +22,20 @@ _CORNERS = ("vertex_indices", "vertex_index")
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-@dataclass
-class _Property:
+class _Property(NamedTuple):
     name: str
     dtype: np.dtype
     length: np.dtype | None  # of a list: the type of its length
 
 
-@dataclass
-class _Element:
+class _Element(NamedTuple):
     name: str
-    count: int
-    properties: list[_Property] = field(default_factory=list)
+    rows: int
+    properties: list[_Property]
+
+
+#: Values of properties by name, and for lists the length of each, else None.
+_Columns = dict[str, tuple[np.ndarray, Faces | None]]
 
 
 def declared_ply(content: bytes) -> Declared:
@@ -52,11 +53,11 @@ def declared_ply(content: bytes) -> Declared:
         columns = source.read(element)
         if element.name == "vertex":
             missing = [axis for axis in "xyz" if axis not in columns]
-            if missing and element.count:
+            if missing and element.rows:
                 raise ValueError(f"vertices without {missing[0]}")
-            if element.count:
+            if element.rows:
                 vertices = np.stack([columns[axis][0] for axis in "xyz"], axis=1, dtype=np.float64)
-        elif element.name in ("face", "tristrips") and element.count:
+        elif element.name in ("face", "tristrips") and element.rows:
             more, their = _polygons(element, columns)
             corners, counts = np.concatenate((corners, more)), np.concatenate((counts, their))
     source.finish()
@@ -80,10 +81,10 @@ def _read_header(content: bytes) -> tuple[list[_Element], str, bytes]:
             case ["format", name, *_] if name in _FORMATS:
                 order = _FORMATS[name]
             case ["element", name, count]:
-                elements.append(_Element(name, int(count)))
+                elements.append(_Element(name, int(count), []))
             case ["property", "list", length, kind, name] if elements:
-                types = [np.dtype((order or "") + _TYPES[t]) for t in (length, kind)]
-                elements[-1].properties.append(_Property(name, types[1], types[0]))
+                types = [np.dtype((order or "") + _TYPES[t]) for t in (kind, length)]
+                elements[-1].properties.append(_Property(name, *types))
             case ["property", kind, name] if elements and kind in _TYPES:
                 dtype = np.dtype((order or "") + _TYPES[kind])
                 elements[-1].properties.append(_Property(name, dtype, None))
@@ -94,10 +95,6 @@ def _read_header(content: bytes) -> tuple[list[_Element], str, bytes]:
     if order is None:
         raise ValueError("a header without format")
     return elements, order, rest
-
-
-#: Values of properties by name, and for lists the length of each, else None.
-_Columns = dict[str, tuple[np.ndarray, Faces | None]]
 
 
 class _Binary:
@@ -133,7 +130,7 @@ class _Binary:
             if one.length is not None:
                 row = np.dtype(fields).itemsize if fields else 0
                 self._at = start + row
-                lengths[k] = int(self._take(one.length, 1)[0]) if element.count else 0
+                lengths[k] = int(self._take(one.length, 1)[0]) if element.rows else 0
                 fields.append((f"n{k}", one.length))
                 if not 0 <= lengths[k] <= len(self._data):
                     raise ValueError(f"a list of {lengths[k]} numbers")
@@ -142,25 +139,25 @@ class _Binary:
 
         self._at = start
         dtype = np.dtype(fields)
-        if start + dtype.itemsize * element.count > len(self._data):
+        if start + dtype.itemsize * element.rows > len(self._data):
             if not lengths:
                 raise ValueError("fewer bytes than its header declares")
             return None
-        rows = self._take(dtype, element.count)
+        rows = self._take(dtype, element.rows)
         if any((rows[f"n{k}"] != length).any() for k, length in lengths.items()):
             self._at = start
             return None
         return {
             one.name: (
                 rows[f"v{k}"].reshape(-1),
-                np.full(element.count, lengths[k]) if k in lengths else None,
+                np.full(element.rows, lengths[k]) if k in lengths else None,
             )
             for k, one in enumerate(element.properties)
         }
 
     def _any_rows(self, element: _Element) -> _Columns:
         values: list[list[np.ndarray]] = [[] for _ in element.properties]
-        for _ in range(element.count):
+        for _ in range(element.rows):
             for one, column in zip(element.properties, values, strict=True):
                 count = 1 if one.length is None else int(self._take(one.length, 1)[0])
                 column.append(self._take(one.dtype, count))
@@ -182,10 +179,10 @@ class _Text:
 
     def read(self, element: _Element) -> _Columns:
         """Return the values of the next element."""
-        lines = self._lines[self._at : self._at + element.count]
-        if len(lines) < element.count:
-            raise ValueError(f"{len(lines):,} of {element.count:,} lines of {element.name!r}")
-        self._at += element.count
+        lines = self._lines[self._at : self._at + element.rows]
+        if len(lines) < element.rows:
+            raise ValueError(f"{len(lines):,} of {element.rows:,} lines of {element.name!r}")
+        self._at += element.rows
 
         # One property after the other, along each line.
         values: list[list[float]] = [[] for _ in element.properties]

@@ -183,12 +183,12 @@ def _audit_one(source: MeshSource, opening: float, flat: tuple[float, float]) ->
         model = prepare_object(source)
     except MeshError as error:
         row = AuditRow(**known, status="refused", notes=(str(error),))
-        return replace(row, warnings=tuple(_warnings(row)))
-    known |= _measures(model, vertices, faces)
-    known["units_guess"] = guess_units(diagonal(model.visual_vertices), source.scale)
-    status: Status = "repaired" if model.notes else "fit"
-    row = AuditRow(**known, status=status, notes=model.notes, model=model)
-    return replace(row, warnings=(*_warnings(row), *_too_wide(row, opening), *_too_low(row, *flat)))
+    else:
+        known |= _measures(model, vertices, faces)
+        known["units_guess"] = guess_units(diagonal(model.visual_vertices), source.scale)
+        status: Status = "repaired" if model.notes else "fit"
+        row = AuditRow(**known, status=status, notes=model.notes, model=model)
+    return replace(row, warnings=tuple(_warnings(row, opening, *flat)))
 
 
 def guess_units(size: float, scale: float) -> str | None:
@@ -267,37 +267,38 @@ def _measures(model: ObjectModel, vertices: Array, faces: Faces) -> dict[str, An
     }
 
 
-def _warnings(row: AuditRow) -> list[str]:
-    """Return what may be wrong with an object that a build would take."""
-    warnings = []
+def _warnings(row: AuditRow, opening: float, height: float, width: float) -> Iterator[str]:
+    """Yield what may be wrong with an object that a build would take.
+
+    Args:
+        row: The object; what is not known of it gives no warning.
+        opening: Largest distance of the hand's fingertips [m].
+        height: Least height for a hand that faces the table [m].
+        width: Of what may be lower [m].
+    """
     if row.units_guess is not None:
-        warnings.append(f"its lengths may be in {row.units_guess}")
+        yield f"its lengths may be in {row.units_guess}"
+    if row.model is None:
+        return
     if row.wall is not None and row.wall < THIN_WALL:
-        warnings.append(
+        yield (
             f"walls of {row.wall * 1e3:.1f} mm, thin for a fingertip (below {THIN_WALL * 1e3:g} mm)"
         )
     if row.density is not None and not DENSITIES[0] <= row.density <= DENSITIES[1]:
-        warnings.append(f"{row.mass:g} kg make {row.density:,.0f} kg/m^3: give its mass or density")
+        yield f"{row.mass:g} kg make {row.density:,.0f} kg/m^3: give its mass or density"
     if row.gyration is not None and not GYRATION[0] <= row.gyration <= GYRATION[1]:
-        warnings.append(f"its inertia is {row.gyration**2:.2g} times that of its hull")
+        yield f"its inertia is {row.gyration**2:.2g} times that of its hull"
     if row.crossing:
-        warnings.append(f"{row.crossing} faces pass through others")
+        yield f"{row.crossing} faces pass through others"
     if row.volume_change is not None and abs(row.volume_change) > NOTED_CHANGE:
-        warnings.append(f"repair changed the volume by {row.volume_change:+.0%}")
-    return warnings
+        yield f"repair changed the volume by {row.volume_change:+.0%}"
 
-
-def _too_wide(row: AuditRow, opening: float) -> Iterator[str]:
-    """Yield that the fingertips cannot meet two opposed sides of an object, if so."""
+    # The fingertips cannot meet two opposed sides, or fingers come beside it above the table.
     if row.width is not None and row.width > SIDE_SLACK * opening:
         yield (
             f"its opposed sides are at least {row.width * 1e3:.0f} mm apart, and the hand opens "
             f"{opening * 1e3:.0f} mm: another unit, or a larger hand"
         )
-
-
-def _too_low(row: AuditRow, height: float, width: float) -> Iterator[str]:
-    """Yield that fingers cannot come beside an object above the table, if so."""
     least = LOW_SHARE * height
     if row.extents is not None and row.extents[2] < least and min(row.extents[:2]) < width:
         yield (

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import yaml
 
 from drakegrasp.arithmetic import norm
@@ -63,19 +64,6 @@ DECIMALS = 7
 MIN_EXTENT = 2e-3  # [m]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Morph:
-    """One draw.
-
-    Attributes:
-        axis: 0, 1 or 2 for x, y or z.
-        c: The five coefficients c1 .. c5.
-    """
-
-    axis: int
-    c: tuple[float, ...]
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Original:
     """An object to make morphs of.
@@ -91,16 +79,20 @@ class Original:
     crossing: int
 
 
-def draw_morph(stream: Stream) -> Morph:
-    """Return the next draw of a stream."""
+def draw_morph(stream: Stream) -> tuple[int, Array]:
+    """Return the next draw of a stream: the axis, 0 to 2 for x to z, and c1 .. c5 (5,)."""
     (axis,) = stream.integers(3, 1).tolist()
-    low = np.array([SCALE[0], CURVE[0], CURVE[0], SCALE[0], CURVE[0]])
-    high = np.array([SCALE[1], CURVE[1], CURVE[1], SCALE[1], CURVE[1]])
-    return Morph(axis=axis, c=tuple((low + (high - low) * stream.uniform(5)).tolist()))
+    low, high = np.array([SCALE, CURVE, CURVE, SCALE, CURVE]).T
+    return axis, low + (high - low) * stream.uniform(5)
 
 
-def morph_points(points: Array, morph: Morph) -> Array | None:
+def morph_points(points: Array, axis: int, c: npt.ArrayLike) -> Array | None:
     """Return where a morph puts the vertices of an object (n, 3) [m].
+
+    Args:
+        points: (n, 3) [m].
+        axis: 0, 1 or 2 for x, y or z.
+        c: The coefficients c1 .. c5.
 
     Returns:
         The points (n, 3) [m], or None if the morph turns a part of space inside out.
@@ -109,13 +101,13 @@ def morph_points(points: Array, morph: Morph) -> Array | None:
     low, high = points.min(axis=0), points.max(axis=0)
     origin = np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, low[2]])
     local = points - origin
-    across = [k for k in range(3) if k != morph.axis]
-    along, r = local[:, morph.axis], norm(local[:, across])
+    across = [k for k in range(3) if k != axis]
+    along, r = local[:, axis], norm(local[:, across])
     p = along / max(float(np.abs(along).max()), 1e-300)
     share = (r / max(float(r.max()), 1e-300)) ** 2
 
     # The two scales; space keeps its sides where the determinant is positive.
-    c1, c2, c3, c4, c5 = morph.c
+    c1, c2, c3, c4, c5 = np.asarray(c, dtype=float).tolist()
     radial, axial = c1 + c2 * p + c3 * p * p, c4 + c5 * share
     slope = np.where(radial > LEAST_SCALE, c2 + 2.0 * c3 * p, 0.0)
     radial = np.maximum(LEAST_SCALE, radial)
@@ -124,7 +116,7 @@ def morph_points(points: Array, morph: Morph) -> Array | None:
 
     moved = np.empty_like(local)
     moved[:, across] = local[:, across] * radial[:, None]
-    moved[:, morph.axis] = along * axial
+    moved[:, axis] = along * axial
     return moved + origin
 
 
@@ -171,25 +163,21 @@ def morph_object(original: Original, name: str, number: int, seed: int) -> tuple
     """
     stream = Stream(seed, object_key(name), number)
     for draw in range(1, MAX_DRAWS + 1):
-        points = morph_points(original.vertices, draw_morph(stream))
+        points = morph_points(original.vertices, *draw_morph(stream))
         if points is None:
             continue
-        vertices = np.round(points, DECIMALS) + 0.0
-        if _is_sound(vertices, original):
+        vertices, faces = np.round(points, DECIMALS) + 0.0, original.faces
+        # It bounds a solid, and crosses itself no more than the original.
+        if (
+            is_solid_surface(faces)
+            and signed_volume(vertices, faces) > 0.0
+            and float(np.ptp(vertices, axis=0).min()) > MIN_EXTENT
+            and len(crossing_faces(vertices, faces)) <= SLACK * original.crossing
+        ):
             return vertices, draw
     raise MeshError(
         f"{name}: one of {MAX_DRAWS} draws must give a morph that does not pass through itself, "
         "got none"
-    )
-
-
-def _is_sound(vertices: Array, original: Original) -> bool:
-    """Return whether a morph's surface bounds a solid and crosses no more than the original's."""
-    return (
-        is_solid_surface(original.faces)
-        and signed_volume(vertices, original.faces) > 0.0
-        and float(np.ptp(vertices, axis=0).min()) > MIN_EXTENT
-        and len(crossing_faces(vertices, original.faces)) <= SLACK * original.crossing
     )
 
 
@@ -245,20 +233,28 @@ def morph_meshes(
         # Mesh by mesh; one that has no morphs costs no other.
         for source in sources:
             try:
-                original = load_original(source)
-                morphs = _morphs_of(source, original, per_mesh, seed)
-                _refuse_known(source, {name for name, _, _ in morphs} & entries.keys())
-                for name, text, count in morphs:
-                    (folder / f"{name}.obj").write_text(text, encoding="ascii")
-                    entries[name] = _entry(source)
-                    draws.append(count)
-                    progress(len(draws), total)
+                texts, tries, faces = _morphs_of(source, per_mesh, seed)
+                if known := texts.keys() & entries.keys():
+                    raise MeshError(
+                        f"{source.name} of class {source.class_name}: its morphs must have names "
+                        f"of their own, got {min(known)}, which another mesh has; rename it"
+                    )
             except MeshError as reason:
                 refused.append(str(reason))
                 total -= per_mesh
                 continue
-            if original.crossing:
-                crossing[source.name] = original.crossing
+            entry: dict[str, Any] = {"class": source.class_name}
+            entry["group"] = source.group or source.name
+            for key in ("mass", "density", "friction", "licence"):
+                if (value := getattr(source, key)) is not None:
+                    entry[key] = value
+            for (name, text), count in zip(texts.items(), tries, strict=True):
+                (folder / f"{name}.obj").write_text(text, encoding="ascii")
+                entries[name] = dict(entry)
+                draws.append(count)
+                progress(len(draws), total)
+            if faces:
+                crossing[source.name] = faces
 
         # The manifest, which keeps their classes and groups.
         if not draws:
@@ -272,33 +268,23 @@ def morph_meshes(
 
 
 def _morphs_of(
-    source: MeshSource, original: Original, per_mesh: int, seed: int
-) -> list[tuple[str, str, int]]:
-    """Return name, Wavefront text and number of draws of each morph of a mesh."""
-    made = []
+    source: MeshSource, per_mesh: int, seed: int
+) -> tuple[dict[str, str], list[int], int]:
+    """Return the Wavefront texts of a mesh's morphs by name, their draws, and its crossing faces.
+
+    Raises:
+        MeshError: If it has no morphs.
+    """
+    original = load_original(source)
+    texts, draws = dict[str, str](), list[int]()
     for number in range(1, per_mesh + 1):
         # Also checks the name, which is that of a file.
         name = f"{source.class_name}_{source.name}_m{number}"
         MeshSource(name=name, class_name=source.class_name, path=source.path)
-        vertices, draws = morph_object(original, source.name, number, seed)
-        made.append((name, obj_text(vertices, original.faces, normals=False), draws))
-    return made
-
-
-def _refuse_known(source: MeshSource, names: set[str]) -> None:
-    """Refuse a mesh if any morphs of another one have these names."""
-    if names:
-        raise MeshError(
-            f"{source.name} of class {source.class_name}: its morphs must have names of their own, "
-            f"got {min(names)}, which another mesh has; rename it"
-        )
-
-
-def _entry(source: MeshSource) -> dict[str, Any]:
-    """Return what the manifest says of a morph: what is known of its original."""
-    keys = ("mass", "density", "friction", "licence")
-    said = {key: getattr(source, key) for key in keys if getattr(source, key) is not None}
-    return {"class": source.class_name, "group": source.group or source.name, **said}
+        vertices, draw = morph_object(original, source.name, number, seed)
+        texts[name] = obj_text(vertices, original.faces, normals=False)
+        draws.append(draw)
+    return texts, draws, original.crossing
 
 
 @contextmanager

@@ -158,7 +158,7 @@ def at_height(outline: Array, z: float, middle: npt.ArrayLike = (0.0, 0.0)) -> A
         middle: Where its origin is, (2,) [m].
     """
     flat = outline if outline.any() else outline[:1]
-    return np.column_stack([flat + middle, np.full(len(flat), z)])
+    return np.column_stack([flat + np.asarray(middle, dtype=float), np.full(len(flat), z)])
 
 
 def grid_box(extents: npt.ArrayLike, *, centre: npt.ArrayLike, edge: float) -> trimesh.Trimesh:

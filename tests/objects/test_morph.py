@@ -14,7 +14,6 @@ from drakegrasp.mesh.crossings import crossing_faces
 from drakegrasp.objects import morph as morph_module
 from drakegrasp.objects.model import prepare_object
 from drakegrasp.objects.morph import (
-    Morph,
     draw_morph,
     load_original,
     morph_meshes,
@@ -34,7 +33,7 @@ def stool(folder: Path, name: str = "3_stool_a") -> Path:
 
 def test_formula_is_the_databases() -> None:
     points = np.array([[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [-0.03, 0.0, 0.0], [0.015, 0.0, 0.1]])
-    found = morph_points(points, Morph(axis=2, c=(1.1, 0.2, -0.1, 0.9, 0.25)))
+    found = morph_points(points, 2, (1.1, 0.2, -0.1, 0.9, 0.25))
     assert found is not None
     # p is 0 at the base and 1 at the top; r / r_max there is one half.
     np.testing.assert_allclose(found[1], [0.033, 0.0, 0.0], atol=1e-15)
@@ -43,22 +42,22 @@ def test_formula_is_the_databases() -> None:
 
 def test_radius_shrinks_to_a_quarter_at_most() -> None:
     points = np.array([[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0], [0.03, 0.0, 0.1]])
-    found = morph_points(points, Morph(axis=2, c=(0.3, -0.2, -0.2, 1.0, 0.0)))
+    found = morph_points(points, 2, (0.3, -0.2, -0.2, 1.0, 0.0))
     assert found is not None
     np.testing.assert_allclose(found[:, 0], [0.009, -0.009, 0.0075])
 
 
 def test_morph_that_turns_space_inside_out_is_not_used() -> None:
     points = np.array([[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0], [0.03, 0.0, 0.1]])
-    assert morph_points(points, Morph(axis=2, c=(0.75, -0.25, -0.25, 0.75, -0.25))) is not None
-    assert morph_points(points, Morph(axis=2, c=(0.3, 1.0, 1.0, 0.2, 0.25))) is None
+    assert morph_points(points, 2, (0.75, -0.25, -0.25, 0.75, -0.25)) is not None
+    assert morph_points(points, 2, (0.3, 1.0, 1.0, 0.2, 0.25)) is None
 
 
 def test_draws_are_within_the_databases_bounds() -> None:
     stream = Stream(0)
     drawn = [draw_morph(stream) for _ in range(500)]
-    c = np.array([morph.c for morph in drawn])
-    assert {morph.axis for morph in drawn} == {0, 1, 2}
+    c = np.array([c for _, c in drawn])
+    assert {axis for axis, _ in drawn} == {0, 1, 2}
     for column, (low, high) in zip(
         c.T, [(0.75, 1.5), (-0.25, 0.25), (-0.25, 0.25), (0.75, 1.5), (-0.25, 0.25)], strict=True
     ):
