@@ -288,6 +288,15 @@ def moving_joint(joint: Any) -> bool:
     return isinstance(joint, RevoluteJoint | PrismaticJoint)
 
 
+def refuse_other_joint(joint: Any) -> None:
+    """Refuse a joint that neither turns nor slides nor is fixed."""
+    if not (moving_joint(joint) or isinstance(joint, WeldJoint)):
+        raise HandError(
+            f"model: joint {joint.name()!r} must be revolute, prismatic or fixed, "
+            f"got {type(joint).__name__}"
+        )
+
+
 def joint_slides(joint: Any) -> bool:
     """Return whether a joint slides."""
     return isinstance(joint, PrismaticJoint)
@@ -307,11 +316,7 @@ def find_joints(plant: MultibodyPlant, instance: ModelInstanceIndex) -> list[Any
     """
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
     for joint in joints:
-        if not (moving_joint(joint) or isinstance(joint, WeldJoint)):
-            raise HandError(
-                f"model: joint {joint.name()!r} must be revolute, prismatic or fixed, "
-                f"got {type(joint).__name__}"
-            )
+        refuse_other_joint(joint)
         if joint.parent_body().index() == plant.world_body().index():
             raise HandError(
                 f"model: joint {joint.name()!r} must join two links of the hand, got the world"

@@ -2,15 +2,17 @@
 
 In: the joints of a model's fingers, and how they may close. Out: `Grip`s, the best first: a finger,
 often a thumb, and one or two that it meets. Every way to close of every finger is compared with
-those of every other one. The `Pad` of a fingertip is the part of its surface that faces the closing
+those of every other one. The pad of a fingertip is the part of its surface that faces the closing
 motion.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
+from typing import TypeAlias
 
 import numpy as np
 
@@ -50,23 +52,7 @@ GRIPS = 40
 FINGERS = 3
 #: Links other than fingertips overlap by less [m]: points miss a part of what Drake sees.
 SUNK = 2e-4
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Pad:
-    """A pad in its link's frame.
-
-    Attributes:
-        point: (3,), where contacts usually are [m].
-        normal: (3,), unit, out of the link.
-        along: (3,), unit, towards the end of the finger.
-        region: Half-spaces of the hand file's `pad_region`.
-    """
-
-    point: Array
-    normal: Array
-    along: Array
-    region: list[list[float]]
+_Ball: TypeAlias = tuple[Array, float]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,7 +62,11 @@ class Member:
     Attributes:
         joints: Of the finger, from the palm.
         closing: How it closes.
-        pad: Of its last link.
+        joint: What the motor drives: the first joint that closes, in the vendor's positions.
+        sign: Sense of that joint's positions in which it closes.
+        zero: That joint's position in the open hand [rad or m].
+        pad_point: (3,), where contacts usually are, in the fingertip link [m].
+        pad_region: Half-spaces of the hand file, in the fingertip link.
         points: (s, 3), of the pad in the palm link, from open to closed [m].
         moves: (s, 3), unit directions in which it moves.
         normals: (r, s, 3), where it faces: a fingertip's end is round.
@@ -84,7 +74,11 @@ class Member:
 
     joints: list[VendorJoint]
     closing: Closing
-    pad: Pad
+    joint: VendorJoint
+    sign: float
+    zero: float
+    pad_point: Array
+    pad_region: list[list[float]]
     points: Array
     moves: Array
     normals: Array
@@ -93,26 +87,6 @@ class Member:
     def tip(self) -> str:
         """The fingertip link."""
         return self.joints[-1].child
-
-    @property
-    def first(self) -> int:
-        """The number of the joint that the motor drives: the first that closes."""
-        return int(np.flatnonzero(self.closing.gain)[0])
-
-    @property
-    def joint(self) -> VendorJoint:
-        """That joint, in the vendor's positions."""
-        return self.joints[self.first]
-
-    @property
-    def sign(self) -> float:
-        """Sense of that joint's positions in which it closes."""
-        return float(np.sign(self.closing.gain[self.first]))
-
-    @property
-    def zero(self) -> float:
-        """That joint's position in the open hand [rad or m]."""
-        return float(self.closing.q0[self.first])
 
     def followers(self) -> dict[str, tuple[float, float]]:
         """Return ratio and offset, to the driven joint, of the finger's joints that follow it."""
@@ -128,29 +102,15 @@ class Grip:
         members: The fingers; the last one opposes the others.
         step: Of each, at which a thing of `WIDTH` is pinched.
         cost: How far the pinch is from a straight and even one.
+        axis: (3,), unit, from the fingers to the last one in the pinch, in the palm link.
+        middle: (3,), between the fingers and the last one [m].
     """
 
     members: tuple[Member, ...]
     step: tuple[int, ...]
     cost: float
-
-    def ends(self) -> tuple[Array, Array]:
-        """Return the pad point (3,) of the last finger in the pinch, and the others' mean."""
-        points = np.array([m.points[s] for m, s in zip(self.members, self.step, strict=True)])
-        return points[-1], points[:-1].mean(axis=0)
-
-    @property
-    def axis(self) -> Array:
-        """(3,), unit, from the fingers to the last one, in the palm link."""
-        last, others = self.ends()
-        line = last - others
-        return np.asarray(line / np.linalg.norm(line))
-
-    @property
-    def middle(self) -> Array:
-        """(3,), between the fingers and the last one."""
-        last, others = self.ends()
-        return np.asarray((last + others) / 2.0)
+    axis: Array
+    middle: Array
 
 
 def find_members(
@@ -173,17 +133,20 @@ def find_members(
     sides = {sign: _find_pad(parts, surface, sign * front, along) for sign in (1.0, -1.0)}
     members = []
     for moved, X_BF, closing in zip(inside, X, closings, strict=True):
-        pad = sides[1.0 if moved @ front >= 0.0 else -1.0]
-        normal, towards, place = (
-            (X_BF[:, :3, :3] @ v[:, None])[..., 0] for v in (pad.normal, pad.along, pad.point)
-        )
+        *pad, region = sides[1.0 if moved @ front >= 0.0 else -1.0]
+        place, normal, towards = ((X_BF[:, :3, :3] @ v[:, None])[..., 0] for v in pad)
         points = place + X_BF[:, :3, 3]
         moves = np.gradient(points, axis=0)
+        first = int(np.flatnonzero(closing.gain)[0])
         members.append(
             Member(
                 joints=joints,
                 closing=closing,
-                pad=pad,
+                joint=joints[first],
+                sign=float(np.sign(closing.gain[first])),
+                zero=float(closing.q0[first]),
+                pad_point=pad[0],
+                pad_region=region,
                 points=points,
                 moves=moves / np.linalg.norm(moves, axis=-1, keepdims=True),
                 normals=np.stack([np.cos(r) * normal + np.sin(r) * towards for r in ROUND]),
@@ -224,8 +187,13 @@ def _end_of(points: Array, along: Array | None) -> tuple[Array, Array]:
     return points[heights > heights.max() - 0.003].mean(axis=0), along
 
 
-def _find_pad(parts: Sequence[Array], points: Array, normal: Array, along: Array) -> Pad:
+def _find_pad(
+    parts: Sequence[Array], points: Array, normal: Array, along: Array
+) -> tuple[Array, Array, Array, list[list[float]]]:
     """Return the pad of a link of convex parts (n, 3) [m], in its frame.
+
+    That is its point, the unit directions out of the link and towards the finger's end, (3,) each,
+    and the half-spaces of the hand file's `pad_region`.
 
     Args:
         parts: Corners of each.
@@ -259,7 +227,7 @@ def _find_pad(parts: Sequence[Array], points: Array, normal: Array, along: Array
     for direction, space in ((normal, depth), (along, back)):
         n = np.round(direction, 4) + 0.0
         region.append([*n.tolist(), round(float(n @ point) - space, 5) + 0.0])
-    return Pad(point=point, normal=normal, along=along, region=region)
+    return point, normal, along, region
 
 
 def _snapped(direction: Array) -> Array:
@@ -373,74 +341,81 @@ def _grip(others: Sequence[Member], last: Member, cost: float) -> Grip:
     costs = [_costs(last, m.points[None], m.moves[None], m.normals[:, None])[0] for m in others]
     at = int(np.stack(costs).min(axis=1).sum(axis=0).argmin())
     steps = [int(table[:, at].argmin()) for table in costs]
-    return Grip(members=(*others, last), step=(*steps, at), cost=cost)
+
+    # The pad points in the pinch: that of the last finger, and the others' mean.
+    points = np.array([m.points[s] for m, s in zip(others, steps, strict=True)])
+    end, start = last.points[at], points.mean(axis=0)
+    return Grip(
+        members=(*others, last),
+        step=(*steps, at),
+        cost=cost,
+        axis=(end - start) / np.linalg.norm(end - start),
+        middle=(end + start) / 2.0,
+    )
 
 
-class Clearance:
-    """The shapes of a model, as planes and points, for comparing many grips."""
+def clear_grips(
+    model: VendorModel,
+    palm: str,
+    grips: Iterable[Grip],
+    postures: Callable[[Grip], Iterable[Mapping[str, float]]],
+) -> Iterator[Grip]:
+    """Yield the grips in which no links of two fingers overlap before their fingertips meet.
 
-    def __init__(self, model: VendorModel, palm: str) -> None:
-        self._model, self._palm = model, palm
-        self._links: dict[str, tuple[Array, float, list[tuple[Array, Array, Array, float]]]] = {}
+    Args:
+        model: The model.
+        palm: Link B.
+        grips: The grips.
+        postures: Returns positions of all joints, from the open hand of a grip to the closed one.
+    """
 
-    def is_clear(self, grip: Grip, postures: Iterable[Mapping[str, float]]) -> bool:
-        """Return whether no links of two fingers overlap before their fingertips meet.
+    @cache
+    def shapes_of(link: str) -> tuple[_Ball, list[tuple[Array, Array, _Ball]]]:
+        """Return the ball around a link, and planes, points and the ball of each of its shapes."""
+        clouds = [even_points(s.corners(), COMPARED) for s in model.links[link].collisions]
+        whole = np.concatenate([np.zeros((1, 3)), *clouds])
+        return _ball(whole), [(hull_planes(points), points, _ball(points)) for points in clouds]
 
-        Args:
-            grip: The fingers.
-            postures: Positions of all joints, from the open hand to the closed one.
-        """
-        fingers = [[joint.child for joint in member.joints] for member in grip.members]
-        tips = {member.tip for member in grip.members}
-        pairs = [(a, b) for own, other in combinations(fingers, 2) for a in own for b in other]
-        for posture in postures:
-            X = {
-                name: self._model.pose(name, posture, self._palm)
-                for finger in fingers
-                for name in finger
-            }
-            if any(self._overlap(a, b, X, 0.0) for a, b in pairs if {a, b} <= tips):
-                return True
-            if any(self._overlap(a, b, X, SUNK) for a, b in pairs if not {a, b} <= tips):
-                return False
-        return True
-
-    def _overlap(self, a: str, b: str, X: Mapping[str, Array], depth: float) -> bool:
+    def overlap(a: str, b: str, X: Mapping[str, Array], depth: float) -> bool:
         """Return whether points of one link are so deep [m] in another, or the other way round."""
         # Balls around whole links tell most pairs apart.
         X_AB = invert_pose(X[a]) @ X[b]
         X_BA = invert_pose(X_AB)
-        (near_a, far_a, parts_a), (near_b, far_b, parts_b) = self._of(a), self._of(b)
-        if _apart(X_AB, near_b, near_a, far_a + far_b):
-            return False
-        return any(
+        (around_a, parts_a), (around_b, parts_b) = shapes_of(a), shapes_of(b)
+        return not _apart(X_AB, around_b, around_a) and any(
             _inside(planes_a, transform_points(X_AB, points_b), depth)
             or _inside(planes_b, transform_points(X_BA, points_a), depth)
-            for planes_a, points_a, centre_a, radius_a in parts_a
-            for planes_b, points_b, centre_b, radius_b in parts_b
-            if not _apart(X_AB, centre_b, centre_a, radius_a + radius_b)
+            for planes_a, points_a, ball_a in parts_a
+            for planes_b, points_b, ball_b in parts_b
+            if not _apart(X_AB, ball_b, ball_a)
         )
 
-    def _of(self, link: str) -> tuple[Array, float, list[tuple[Array, Array, Array, float]]]:
-        """Return the ball around a link, and planes, points and the ball of each of its shapes."""
-        if link not in self._links:
-            clouds = [
-                even_points(s.corners(), COMPARED) for s in self._model.links[link].collisions
-            ]
-            parts = [(hull_planes(points), points, *_ball(points)) for points in clouds]
-            self._links[link] = *_ball(np.concatenate([np.zeros((1, 3)), *clouds])), parts
-        return self._links[link]
+    def is_clear(grip: Grip) -> bool:
+        fingers = [[joint.child for joint in member.joints] for member in grip.members]
+        tips = {member.tip for member in grip.members}
+        pairs = [(a, b) for own, other in combinations(fingers, 2) for a in own for b in other]
+        for posture in postures(grip):
+            X = {name: model.pose(name, posture, palm) for finger in fingers for name in finger}
+            if any(overlap(a, b, X, 0.0) for a, b in pairs if {a, b} <= tips):
+                return True
+            if any(overlap(a, b, X, SUNK) for a, b in pairs if not {a, b} <= tips):
+                return False
+        return True
+
+    return filter(is_clear, grips)
 
 
-def _ball(points: Array) -> tuple[Array, float]:
+def _ball(points: Array) -> _Ball:
     """Return the centre (3,) and the radius of a ball around points (n, 3) [m]."""
     centre = (points.min(axis=0) + points.max(axis=0)) / 2.0
     return centre, float(np.linalg.norm(points - centre, axis=1).max())
 
 
-def _apart(X_AB: Array, p_BQ: Array, p_AP: Array, distance: float) -> bool:
-    """Return whether two points (3,) are farther apart than a distance [m]."""
-    return bool(np.linalg.norm(X_AB[:3, :3] @ p_BQ + X_AB[:3, 3] - p_AP) > distance)
+def _apart(X_AB: Array, ball_B: _Ball, ball_A: _Ball) -> bool:
+    """Return whether two balls do not meet."""
+    (p_BQ, radius_b), (p_AP, radius_a) = ball_B, ball_A
+    distance = np.linalg.norm(X_AB[:3, :3] @ p_BQ + X_AB[:3, 3] - p_AP)
+    return bool(distance > radius_a + radius_b)
 
 
 def _inside(planes: Array, points: Array, depth: float) -> bool:

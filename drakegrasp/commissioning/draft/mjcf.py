@@ -7,9 +7,8 @@ joints, couplings, efforts and inertias as MuJoCo compiles them, which Drake rea
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -112,23 +111,12 @@ def _inherit(default: Element, above: _Defaults) -> _Defaults:
     return given
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Compiled:
-    """What MuJoCo makes of an MJCF file.
-
-    Attributes:
-        limits: (2,) of each joint that turns or slides [rad or m].
-        efforts: Largest effort of each joint that has one [N m or N].
-        mimics: Joints that follow others.
-        inertias: M_BBo_B of each body with a mass.
-        notes: What was left out, a line each.
-    """
-
-    limits: dict[str, Array]
-    efforts: dict[str, float]
-    mimics: list[Mimic]
-    inertias: dict[str, SpatialInertia]
-    notes: list[str]
+#: What MuJoCo makes of a file: M_BBo_B of each body with a mass; limits (2,) of each joint that
+#: moves [rad or m]; the largest effort of each that has one [N m or N]; joints that follow others;
+#: and what was left out, a line each.
+Compiled: TypeAlias = tuple[
+    dict[str, SpatialInertia], dict[str, Array], dict[str, float], list[Mimic], list[str]
+]
 
 
 def compile_model(path: Path) -> Compiled:
@@ -157,13 +145,7 @@ def compile_model(path: Path) -> Compiled:
         if kind in kinds
     }
     mimics, notes = _mimics(mujoco, model)
-    return Compiled(
-        limits=limits,
-        efforts=_efforts(mujoco, model),
-        mimics=mimics,
-        inertias=_inertias(model),
-        notes=notes,
-    )
+    return _inertias(model), limits, _efforts(mujoco, model), mimics, notes
 
 
 def _mimics(mujoco: Any, model: Any) -> tuple[list[Mimic], list[str]]:

@@ -10,8 +10,7 @@ from __future__ import annotations
 import logging
 import re
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,9 +20,9 @@ import numpy as np
 from pydrake.geometry import Role, SceneGraph
 from pydrake.math import RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import SpatialInertia, UnitInertia, WeldJoint
+from pydrake.multibody.tree import SpatialInertia, UnitInertia
 
-from drakegrasp.commissioning.draft.mjcf import Compiled, compile_model, spell_out, trim
+from drakegrasp.commissioning.draft.mjcf import compile_model, spell_out, trim
 from drakegrasp.commissioning.draft.shapes import (
     Shape,
     added,
@@ -46,6 +45,7 @@ from drakegrasp.hand.parsing import (
     moving_joint,
     refuse_impossible,
     refuse_limits,
+    refuse_other_joint,
 )
 
 #: A joint that follows has room if its limits leave it this share of its leader's way.
@@ -203,7 +203,7 @@ def read_model(source: Source) -> VendorModel:
         HandError: If it is no tree of rigid links with meshes that can be read, in one line.
     """
     # What the text says and Drake does not keep.
-    root, compiled = source.root, None
+    root = source.root
     is_mjcf = root.tag == "mujoco"
     masses = {} if is_mjcf else declared_masses(root)
     for name, mass in masses.items():
@@ -219,31 +219,33 @@ def read_model(source: Source) -> VendorModel:
         if is_mjcf:
             trim(root)
         meshes, notes = replace_meshes(source, path.parent)
+        inertias, limits, said = None, dict[str, Array](), list[str]()
         if is_mjcf:
             ElementTree.ElementTree(root).write(path, encoding="utf-8")
-            compiled = compile_model(path)
+            inertias, limits, efforts, mimics, said = compile_model(path)
             spell_out(root)
+        else:
+            efforts, mimics = declared_efforts(root), declared_mimics(root)
         ElementTree.ElementTree(root).write(path, encoding="utf-8")
         plant, graph = MultibodyPlant(1e-3), SceneGraph()
         plant.RegisterAsSourceForSceneGraph(graph)
-        instance, said = _parse(plant, path)
-        bodies = _bodies(plant, graph, instance, masses, meshes, compiled)
-    if compiled is None:
-        efforts, mimics = declared_efforts(root), declared_mimics(root)
-        for index in plant.GetJointActuatorIndices():
-            motor = plant.get_joint_actuator(index)
-            efforts.setdefault(motor.joint().name(), motor.effort_limit())
+        instance, warned = _parse(plant, path)
+        bodies = _bodies(plant, graph, instance, masses, meshes, inertias)
+    moved = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
+    if is_mjcf:
+        _refuse_lost("joint", limits, {joint.name() for joint in moved})
+        _refuse_lost("body", inertias or (), {body.name for body in bodies.values()})
     else:
-        efforts, mimics, said = compiled.efforts, compiled.mimics, [*compiled.notes, *said]
+        for motor in map(plant.get_joint_actuator, plant.GetJointActuatorIndices()):
+            efforts.setdefault(motor.joint().name(), motor.effort_limit())
 
     # Links and joints, and what follows what.
-    carriers = _carriers(plant, instance, bodies)
+    carriers = _carriers(plant, moved, bodies)
     places, links = _places(bodies, carriers), {}
     for head in dict.fromkeys(head for head, _ in places.values()):
         members = [(bodies[i], X_LB) for i, (at, X_LB) in places.items() if at == head]
         links[head], remarks = _weld(members, impossible)
-        said += remarks
-    limits = {} if compiled is None else compiled.limits
+        warned += remarks
     joints = _joints(carriers, places, links, efforts, limits)
     leaders = find_leaders(mimics, joints)
     widened = list(make_room(joints, leaders))
@@ -253,7 +255,7 @@ def read_model(source: Source) -> VendorModel:
         links={link.name: link for link in links.values()},
         joints=joints,
         mimics=leaders,
-        notes=(*notes, *said, *widened),
+        notes=(*notes, *said, *warned, *widened),
     )
     _refuse_size(model)
     return model
@@ -261,21 +263,7 @@ def read_model(source: Source) -> VendorModel:
 
 def _parse(plant: MultibodyPlant, path: Path) -> tuple[Any, list[str]]:
     """Let Drake parse a model file; return its model instance, and notes of what it left out."""
-    parser = make_parser(plant)
-    with _heard() as messages:
-        try:
-            (instance,) = parser.AddModels(path)
-        except (RuntimeError, ValueError, SystemExit) as error:
-            text = first_line(error).replace(str(path.parent) + "/", "")
-            raise HandError(f"model: must be a file of one model, got {text}") from None
-    lines = (" ".join(m.split()).partition(" warning: ")[2] for m in messages)
-    return instance, [f"Drake: {t}" for t in dict.fromkeys(lines) if t and not _ASIDE.search(t)]
-
-
-@contextmanager
-def _heard() -> Iterator[list[str]]:
-    """Collect Drake's warnings in place of printing them."""
-    logger, messages = logging.getLogger("drake"), []
+    parser, logger, messages = make_parser(plant), logging.getLogger("drake"), list[str]()
 
     def hear(record: logging.LogRecord) -> bool:
         if record.levelno == logging.WARNING:
@@ -284,9 +272,14 @@ def _heard() -> Iterator[list[str]]:
 
     logger.addFilter(hear)
     try:
-        yield messages
+        (instance,) = parser.AddModels(path)
+    except (RuntimeError, ValueError, SystemExit) as error:
+        text = first_line(error).replace(str(path.parent) + "/", "")
+        raise HandError(f"model: must be a file of one model, got {text}") from None
     finally:
         logger.removeFilter(hear)
+    lines = (" ".join(m.split()).partition(" warning: ")[2] for m in messages)
+    return instance, [f"Drake: {t}" for t in dict.fromkeys(lines) if t and not _ASIDE.search(t)]
 
 
 def _bodies(
@@ -295,7 +288,7 @@ def _bodies(
     instance: Any,
     masses: Mapping[str, float],
     meshes: Mapping[str, Shape],
-    compiled: Compiled | None,
+    inertias: Mapping[str, SpatialInertia] | None,
 ) -> dict[Any, Link]:
     """Return the bodies that Drake parsed, before they are joined with those welded to them."""
     found = {}
@@ -312,37 +305,33 @@ def _bodies(
 
         # Drake replaces a mass of zero by one of its own. Shapes without bounds are no part.
         inertia = SpatialInertia.Zero()
-        if compiled is not None:
-            inertia = compiled.inertias.get(name, inertia)
+        if inertias is not None:
+            inertia = inertias.get(name, inertia)
         elif masses.get(name, mass) != 0.0 and mass != 0.0:
             inertia = body.default_spatial_inertia()
         solids, visuals = (tuple(s for s in own if s is not None) for own in shapes)
         found[index] = Link(name=name, inertia=inertia, collisions=solids, visuals=visuals)
-
-    # Drake must read the joints and bodies that MuJoCo does.
-    if compiled is not None:
-        joints = {plant.get_joint(i).name() for i in plant.GetJointIndices(instance)}
-        lost = [("joint", name) for name in compiled.limits if name not in joints]
-        names = {link.name for link in found.values()}
-        lost += [("body", name) for name in compiled.inertias if name not in names]
-        for kind, name in lost:
-            raise HandError(f"model: {kind} {name!r} of MuJoCo must be one of Drake, got none")
     return found
 
 
-def _carriers(plant: MultibodyPlant, instance: Any, bodies: Mapping[Any, Link]) -> dict[Any, Any]:
+def _refuse_lost(kind: str, of_mujoco: Iterable[str], of_drake: Set[str]) -> None:
+    """Refuse joints or bodies that MuJoCo reads and Drake does not."""
+    for name in of_mujoco:
+        if name not in of_drake:
+            raise HandError(f"model: {kind} {name!r} of MuJoCo must be one of Drake, got none")
+
+
+def _carriers(
+    plant: MultibodyPlant, joints: Sequence[Any], bodies: Mapping[Any, Link]
+) -> dict[Any, Any]:
     """Return the joint that carries each body but the root."""
     # The hand hangs free, however the file holds it.
     found: dict[Any, Any] = {}
-    for joint in (plant.get_joint(index) for index in plant.GetJointIndices(instance)):
+    for joint in joints:
         if joint.parent_body().index() == plant.world_body().index():
             continue
+        refuse_other_joint(joint)
         child = joint.child_body()
-        if not (moving_joint(joint) or isinstance(joint, WeldJoint)):
-            raise HandError(
-                f"model: joint {joint.name()!r} must be revolute, prismatic or fixed, "
-                f"got {type(joint).__name__}"
-            )
         if child.index() in found:
             raise HandError(
                 f"model: link {child.name()!r} must be carried by one joint, got "

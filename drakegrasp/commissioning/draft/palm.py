@@ -83,11 +83,13 @@ def find_palm_frames(
     frames = []
     centre = np.concatenate(parts).mean(axis=0)
     for direction, aside in _directions(grip, centre, approach):
-        frame = _frame(grip, direction, parts)
-        if frame is None:
+        found = _origin(grip, direction, parts)
+        if found is None:
             continue
-        p_BG, beside = frame
-        X_BG = _pose(grip, direction, p_BG)
+        p_BG, beside = found
+        y = grip.axis - (grip.axis @ direction) * direction
+        y /= np.linalg.norm(y)
+        X_BG = make_pose(np.column_stack([np.cross(y, direction), y, direction]), p_BG)
         inside = [transform_points(invert_pose(X_BG), corners) for corners in opened]
         if max(map(ray_end, inside)) > PALM_DEPTH:
             continue
@@ -125,7 +127,7 @@ def _directions(grip: Grip, centre: Array, approach: Array | None) -> list[tuple
     return [(d, float(np.arccos(np.clip(d @ line, -1.0, 1.0)))) for d in found]
 
 
-def _frame(grip: Grip, direction: Array, parts: list[Array]) -> tuple[Array, bool] | None:
+def _origin(grip: Grip, direction: Array, parts: list[Array]) -> tuple[Array, bool] | None:
     """Return the origin (3,) of G on the palm below the pinch, and whether the palm is beside."""
     # Where the ray to the pinch leaves the palm, or else its foremost point.
     spans = [ray_span(corners, grip.middle, direction) for corners in parts]
@@ -136,10 +138,3 @@ def _frame(grip: Grip, direction: Array, parts: list[Array]) -> tuple[Array, boo
         ahead = max(float((corners @ direction).max()) for corners in parts)
         back = min(ahead - float(grip.middle @ direction), -2.0 * AHEAD)
     return (grip.middle + back * direction, not leaves) if back <= -AHEAD else None
-
-
-def _pose(grip: Grip, direction: Array, p_BG: Array) -> Array:
-    """Return X_BG (4, 4): Gz along a direction, Gy towards the finger that opposes."""
-    y = grip.axis - (grip.axis @ direction) * direction
-    y /= np.linalg.norm(y)
-    return make_pose(np.column_stack([np.cross(y, direction), y, direction]), p_BG)

@@ -32,7 +32,7 @@ from drakegrasp.commissioning.checks import (
     judge,
 )
 from drakegrasp.commissioning.draft.fingers import Answers, find_fingers, find_palm
-from drakegrasp.commissioning.draft.grips import Clearance, find_grips, find_members
+from drakegrasp.commissioning.draft.grips import clear_grips, find_grips, find_members
 from drakegrasp.commissioning.draft.model import (
     Link,
     VendorJoint,
@@ -355,12 +355,8 @@ def _drafts(model: VendorModel, answers: Answers, config: Config) -> Iterator[It
         )
 
     # Those whose links meet too early are left out; the first of all is better than none.
-    clearance, shares = Clearance(model, palm), np.arange(POSTURES) / (POSTURES - 1)
-    clear = (
-        grip
-        for grip in grips
-        if clearance.is_clear(grip, (positions(model, grip, share) for share in shares))
-    )
+    shares = np.arange(POSTURES) / (POSTURES - 1)
+    clear = clear_grips(model, palm, grips, lambda g: (positions(model, g, s) for s in shares))
     for grip in chain(islice(clear, GRIPS), grips[:1]):
         postures = [positions(model, grip, share) for share in SHARES]
         frames = find_palm_frames(model, palm, grip, postures, answers.approach)

@@ -189,7 +189,7 @@ def _fingers(
                 {"joint": follower, "ratio": round(ratio, 5), "offset": round(offset, 5)}
                 for follower, (ratio, offset) in coupled[i].items()
             ]
-        finger |= {"pad_region": member.pad.region, "pad_point": member.pad.point.tolist()}
+        finger |= {"pad_region": member.pad_region, "pad_point": member.pad_point.tolist()}
         fingers.append(finger)
     return fingers
 
