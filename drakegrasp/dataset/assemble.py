@@ -23,10 +23,14 @@ from drakegrasp.dataset.assembly.decisions import (
     keys_of,
     number_rows,
     object_columns,
+)
+from drakegrasp.dataset.assembly.pack import (
+    PackTask,
+    pack_rows,
     pack_tasks,
     sample_texts,
+    unpack_rows,
 )
-from drakegrasp.dataset.assembly.pack import PackTask, Part, SampleRows, pack_rows, unpack_rows
 from drakegrasp.dataset.assembly.survey import Survey, survey_object, survey_tasks
 from drakegrasp.dataset.card import card_files, content_of
 from drakegrasp.dataset.hdf5 import AnyArray, create_field, write_field
@@ -41,6 +45,7 @@ from drakegrasp.dataset.opening import open_samples, open_trials, read_codes
 from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.rejections import AttemptKey, find_keys
 from drakegrasp.dataset.schema import (
+    DATA_FIELDS,
     OBJECT_FIELDS,
     SPLITS,
     SUCCESS_FIELDS,
@@ -134,38 +139,31 @@ def assemble_locked(
         certified = manifest.config.certified
 
         # Write what is small, and room for all rows.
-        paths = {name: new(name) for name in (TRIALS_FILE, *DATA_FILES.values())}
+        paths = {camera: new(name) for camera, name in {"": TRIALS_FILE, **DATA_FILES}.items()}
         with ExitStack() as stack:
-            trials = stack.enter_context(new_hdf5(paths[TRIALS_FILE]))
-            trials.attrs.update(file_attributes(manifest, shards.seals))
-            _write_table(trials, "objects", OBJECT_FIELDS, object_columns(manifest))
-            _write_table(trials, "successes", SUCCESS_FIELDS, decisions.columns())
-            group = trials.create_group("trials")
-            columns = [
-                create_field(group, f, f.row_shape(shards.sizes), shards.count)
-                for f in stored_fields(TRIAL_FIELDS, certified=certified)
-            ]
-            rows = {}
-            for camera, name in DATA_FILES.items():
-                file = stack.enter_context(new_hdf5(paths[name]))
+            files = {c: stack.enter_context(new_hdf5(path)) for c, path in paths.items()}
+            for camera, file in files.items():
                 file.attrs.update(file_attributes(manifest, shards.seals, camera))
-                for split, ids in decisions.ids.items():
-                    rows[split, camera] = SampleRows(
-                        file, split, len(ids), shards.sizes, sample_texts(manifest), certified
-                    )
+                counts = {split: len(ids) for split, ids in decisions.ids.items()}
+                fields = stored_fields(DATA_FIELDS if camera else TRIAL_FIELDS, certified=certified)
+                for name, count in (counts if camera else {"trials": shards.count}).items():
+                    group = file.create_group(name)
+                    for f in fields:
+                        create_field(group, f, f.row_shape(shards.sizes), count)
+            _write_table(files[""], "objects", OBJECT_FIELDS, object_columns(manifest))
+            _write_table(files[""], "successes", SUCCESS_FIELDS, decisions.columns())
 
             # Rows are packed in any order, and put into the files in theirs.
             tasks = list(pack_tasks(out, shards, decisions, certified=certified))
+            texts = sample_texts(manifest)
             surveyed = len({piece.object for piece in shards.slices})
-            for done, part in enumerate(_packed(execute, tasks), start=1):
-                unpack_rows(part, columns, rows)
+            for done, task in enumerate(_packed(execute, tasks), start=1):
+                unpack_rows(task, files, texts)
                 progress(surveyed + done, surveyed + len(tasks))
-            for split_rows in rows.values():
-                split_rows.flush()
 
         # What the files hold, in words and numbers. Filters, split and rejections change with the
         # files that they made.
-        content = content_of(manifest, paths[TRIALS_FILE], paths[DATA_FILES["oto"]])
+        content = content_of(manifest, paths[""], paths["oto"])
         for name, text in card_files(content).items():
             new(name).write_bytes(text)
         new(FILE_NAME).write_bytes(manifest_text(manifest))
@@ -187,8 +185,8 @@ def _survey_all(out: Path, manifest: Manifest, execute: Executor, progress: Repo
     return surveys
 
 
-def _packed(execute: Executor, tasks: Sequence[PackTask]) -> Iterator[Part]:
-    """Yield the parts in the order of the tasks; remove those that are left at the end."""
+def _packed(execute: Executor, tasks: Sequence[PackTask]) -> Iterator[PackTask]:
+    """Yield the tasks whose parts are written, in order; remove those that are left at the end."""
     try:
         # When this generator is closed, that of the tasks is, first: none writes any more.
         yield from in_order(execute)(pack_rows, tasks)

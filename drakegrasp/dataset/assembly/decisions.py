@@ -1,24 +1,21 @@
 """What assembling decides: which successes are samples, in which split, and what each one weighs.
 
-In: the surveys of all objects and the manifest. Out: the decisions, a few numbers per success, and
-the tasks that pack the rows accordingly. `assemble` writes what is decided here; `checks` decides
-again and compares.
+In: the surveys of all objects and the manifest. Out: the decisions, a few numbers per success.
+`assembly.pack` packs the rows accordingly, and `assemble` writes them; `checks` decides again and
+compares.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import CameraConfig
-from drakegrasp.dataset.assembly.pack import TASK_ROWS, TEXTS, PackTask, ShardSlice
 from drakegrasp.dataset.assembly.split import split_samples, weigh_samples
 from drakegrasp.dataset.assembly.survey import Survey, headers_by_object, join_seals
 from drakegrasp.dataset.filtering import judge_successes
@@ -26,11 +23,28 @@ from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.manifest import Manifest, origin_attributes
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.schema import OBJECT_FIELDS, SUCCESS_FIELDS
+from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
-from drakegrasp.runtime.files import temporary_name
 from drakegrasp.table import Table, join
 from drakegrasp.vision.camera import intrinsics
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShardSlice:
+    """The rows of a shard that the dataset takes, and their ids.
+
+    Attributes:
+        header: Of the shard.
+        object: Row of its object in /objects.
+        first: Id of the trial in its first row.
+        rows: Number of rows taken, from the first.
+    """
+
+    header: ShardHeader
+    object: int
+    first: int
+    rows: int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -175,14 +189,6 @@ def object_columns(manifest: Manifest) -> dict[str, AnyArray]:
     return columns
 
 
-def sample_texts(manifest: Manifest) -> dict[str, list[str]]:
-    """Return by the names of TEXTS the text of each object, by row of /objects."""
-    return {
-        name: [getattr(entry, attribute) for entry in manifest.objects]
-        for name, attribute in TEXTS.items()
-    }
-
-
 def file_attributes(manifest: Manifest, seals: str, camera: str = "") -> dict[str, Any]:
     """Return the attributes of a file.
 
@@ -204,28 +210,3 @@ def file_attributes(manifest: Manifest, seals: str, camera: str = "") -> dict[st
 def lens_attributes(camera: CameraConfig) -> dict[str, Any]:
     """Return what the attributes of a file say of the cameras."""
     return {"K": intrinsics(camera), "near": camera.near, "far": camera.far}
-
-
-def pack_tasks(
-    out: Path, shards: Shards, decisions: Decisions, *, certified: bool
-) -> Iterator[PackTask]:
-    """Yield the tasks that pack the rows, from the first to the last."""
-    slices, ids = shards.slices, decisions.ids
-    firsts = [piece.first for piece in slices]
-    weights = {split: decisions.weights[rows] for split, rows in decisions.splits.items()}
-    for start in range(0, shards.count, TASK_ROWS):
-        stop = min(start + TASK_ROWS, shards.count)
-        # From the shard in which the range begins to that in which it ends.
-        within = slices[bisect_right(firsts, start) - 1 : bisect_left(firsts, stop)]
-        bounds = {split: np.searchsorted(rows, (start, stop)) for split, rows in ids.items()}
-        yield PackTask(
-            out=str(out),
-            part=str(temporary_name(out / f"rows-{start}")),
-            start=start,
-            stop=stop,
-            slices=tuple(within),
-            ids={split: ids[split][a:b] for split, (a, b) in bounds.items()},
-            weights={split: weights[split][a:b] for split, (a, b) in bounds.items()},
-            sizes=shards.sizes,
-            certified=certified,
-        )

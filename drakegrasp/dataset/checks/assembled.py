@@ -27,15 +27,13 @@ from drakegrasp.dataset.assembly.decisions import (
     file_attributes,
     number_rows,
     object_columns,
-    pack_tasks,
-    sample_texts,
 )
 from drakegrasp.dataset.assembly.pack import (
-    IMAGES,
     TASK_ROWS,
     PackTask,
-    SplitSamples,
+    pack_tasks,
     read_rows,
+    sample_texts,
 )
 from drakegrasp.dataset.assembly.survey import Survey, SurveyTask, survey_object, survey_tasks
 from drakegrasp.dataset.checks.rows import (
@@ -57,7 +55,7 @@ from drakegrasp.dataset.paths import (
     recorded_model,
     refuse_changed_model,
 )
-from drakegrasp.dataset.schema import CAMERAS, SPLITS
+from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.dataset.shards import read_trials
 from drakegrasp.errors import DataError, HandError, MeshError, first_line
 from drakegrasp.filters import Removal
@@ -268,17 +266,10 @@ def trials_tasks(
         certified = dataset.manifest.config.certified
         packs = pack_tasks(dataset.out, *again, certified=certified)
     data = {camera: files[camera] for camera in CAMERAS if camera in compared}
-    firsts = dict.fromkeys(SPLITS, 0)
     for start, pack in zip_longest(range(0, count, TASK_ROWS), packs):
         first = pack.start if start is None else start
         rows = np.arange(first, max(first, min(first + TASK_ROWS, count)))
-        own = pack if "" in compared else None
-        yield (
-            len(rows),
-            partial(_judge, trials, rows, dataset, pack, own is not None, data, dict(firsts)),
-        )
-        for split, ids in {} if pack is None else pack.ids.items():
-            firsts[split] += len(ids)
+        yield len(rows), partial(_judge, trials, rows, dataset, pack, "" in compared, data)
 
 
 def _judge(
@@ -288,7 +279,6 @@ def _judge(
     pack: PackTask | None,
     compared: bool,
     data: Mapping[str, CheckedFile],
-    firsts: Mapping[str, int],
 ) -> Findings:
     """Apply every rule to a range of attempts, and compare the samples among them.
 
@@ -299,15 +289,14 @@ def _judge(
         pack: Derives the rows again; None where they cannot be compared.
         compared: Whether the attempts are compared, too.
         data: The data files that are compared, by camera.
-        firsts: Row of the first sample of the range in each split.
     """
     findings = Findings()
-    columns, samples = ({}, {}) if pack is None else read_rows(pack)
+    columns, records, images = ({}, {}, {}) if pack is None else read_rows(pack)
     if trials is not None and len(rows):
         groups = trial_rules(trials, dataset)
         with trials.opened() as file:
             for batch in trials.batches(file, "trials", rows, TRIAL_ROWS, findings):
-                if compared:
+                if compared and pack is not None:
                     own = {name: v[batch.rows - rows[0]] for name, v in columns.items()}
                     batch = batch.judge(
                         findings, partial(Batch.follow, columns=own, what="its shard")
@@ -315,40 +304,36 @@ def _judge(
                 for rules in groups:
                     batch = batch.judge(findings, *rules)
 
-    if dataset is not None:
+    if dataset is not None and pack is not None:
         texts = sample_texts(dataset.manifest)
-        for camera, of_camera in data.items():
-            for split, due in samples.items():
-                if split in of_camera.counts:
-                    first = firsts[split]
-                    _compare_samples(of_camera, camera, split, first, due, texts, findings)
+        for (split, camera), due in records.items():
+            if camera in data and split in data[camera].counts:
+                columns = {name: due[name] for name in due.dtype.names or () if name != "object"}
+                columns |= {n: np.array(t, dtype=object)[due["object"]] for n, t in texts.items()}
+                first, stored = pack.firsts[split], images[split, camera]
+                _compare_samples(data[camera], split, first, columns, stored, findings)
     return findings
 
 
 def _compare_samples(
     data: CheckedFile,
-    camera: str,
     split: str,
     first: int,
-    samples: SplitSamples,
-    texts: Mapping[str, Sequence[str]],
+    due: Mapping[str, AnyArray],
+    images: Mapping[str, Sequence[tuple[bytes, int]]],
     findings: Findings,
 ) -> None:
     """Compare some samples of a data file with those that are derived again.
 
     Args:
         data: The file.
-        camera: `oto` or `otm`.
         split: Name of the split.
         first: Row of the first sample.
-        samples: What is derived again.
-        texts: See `sample_texts`.
+        due: Their columns but for images.
+        images: See `assembly.pack.Images`.
         findings: Takes the violations.
     """
-    records, rows = samples.numbers(camera), np.arange(first, first + len(samples.objects))
-    due: dict[str, AnyArray] = {name: records[name] for name in records.dtype.names or ()}
-    for name, of_objects in texts.items():
-        due[name] = np.array([of_objects[i] for i in samples.objects], dtype=object)
+    rows = np.arange(first, first + len(due["trial_id"]))
     with data.opened() as file:
         for batch in data.batches(file, split, rows, max(len(rows), 1), findings, list(due)):
             # A sample of another trial differs in all else.
@@ -356,8 +341,7 @@ def _compare_samples(
             for own, of in zip(names, ("shards and manifest", "its trial"), strict=True):
                 columns = {name: due[name][batch.rows - first] for name in own}
                 batch = batch.judge(findings, partial(Batch.follow, columns=columns, what=of))
-            for name in IMAGES:
-                stored = samples.images[camera, name]
+            for name, stored in images.items():
                 differs = partial(_differs, file[split][name])
                 bad = [differs(row, *stored[row - first]) for row in batch.rows.tolist()]
                 what = f"{name} must be what the shard holds"
