@@ -10,6 +10,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -180,22 +181,7 @@ def _read_seals(task: SurveyTask) -> tuple[int, bytes]:
     return task.object, digest.digest()
 
 
-@dataclass(frozen=True)
-class _Derived:
-    """Columns of successes that follow from those of the files.
-
-    Attributes:
-        names: Of the columns.
-        needs: Columns of `/trials` and `/looks` that they follow from.
-        derive: Given these and the camera, the arrays (n, ...) of the columns.
-    """
-
-    names: tuple[str, ...]
-    needs: tuple[str, ...]
-    derive: Callable[[Table, CameraConfig], tuple[AnyArray, ...]]
-
-
-def _fingers(t: Table) -> tuple[AnyArray, ...]:
+def _fingers(t: Table, camera: CameraConfig | None = None) -> tuple[AnyArray, ...]:
     """Return which fingers the preshape leaves out, and whether all others touch both times."""
     unused = unused_fingers(t["unused"], t["closed_touching"].shape[1])
     return unused, np.all(t["closed_touching"] & t["lifted_touching"] | unused, axis=1)
@@ -214,7 +200,7 @@ def _held_O(t: Table) -> Array:
     return np.concatenate(parts, axis=1).reshape(t.count, 6 * parts[0].shape[1])
 
 
-def _all_in_view(t: Table, camera: CameraConfig) -> tuple[AnyArray]:
+def _all_in_view(t: Table, camera: CameraConfig) -> AnyArray:
     """Return whether both cameras see all contacts of each grasp."""
     unused, _ = _fingers(t)
     K, poses = intrinsics(camera), [t[f"X_TC_{name}"] for name in CAMERAS]
@@ -223,7 +209,7 @@ def _all_in_view(t: Table, camera: CameraConfig) -> tuple[AnyArray]:
         all(_in_view(K, camera.size, X_TC, grasp, lacking) for X_TC in X_TCs)
         for grasp, lacking, *X_TCs in rows
     ]
-    return (np.array(seen, dtype=bool),)
+    return np.array(seen, dtype=bool)
 
 
 def _in_view(K: Array, size: int, X_TC: Array, grasp_T: Array, unused: AnyArray) -> bool:
@@ -234,14 +220,14 @@ def _in_view(K: Array, size: int, X_TC: Array, grasp_T: Array, unused: AnyArray)
     return bool(np.all(p_CQ[:, 2] > 0.0) and np.all(uv >= 0.0) and np.all(uv <= size - 1))
 
 
-def _largest(t: Table) -> tuple[AnyArray, ...]:
-    """Return the largest distance and angle (n,) of the fingers that are used."""
+def _largest(t: Table, name: str) -> AnyArray:
+    """Return the largest value (n,) of the fingers that are used."""
     unused, _ = _fingers(t)
-    names = "surface_distance", "normal_angle"
-    return tuple(np.where(unused, 0.0, t[name]).max(axis=1, initial=0.0) for name in names)
+    largest: AnyArray = np.where(unused, 0.0, t[name]).max(axis=1, initial=0.0)
+    return largest
 
 
-def _doubts(t: Table) -> tuple[AnyArray, ...]:
+def _doubts(t: Table, camera: CameraConfig) -> tuple[AnyArray, ...]:
     """Return the suspicion score and parts of it, (n,) each."""
     doubts = suspicion(t)
     parts = "penetration", "imbalance", "normal_sum"
@@ -250,72 +236,61 @@ def _doubts(t: Table) -> tuple[AnyArray, ...]:
 
 _TOUCHING = ("unused", "closed_touching", "lifted_touching")
 _IN_T = ("X_TO", "closed_p_OQ", "closed_nhat_Q_O", "closed_touching")
+_MASKS, _CAMERAS = (tuple(f"{name}_{c}" for c in CAMERAS) for name in ("mask", "X_TC"))
+#: Columns of successes that follow from those of the files: names, what they need of `/trials` and
+#: `/looks`, and what gives the columns, given these and the camera.
+_DERIVED: tuple[tuple[tuple[str, ...], tuple[str, ...], Callable[[Table, CameraConfig], Any]], ...]
 _DERIVED = (
     # (n, k) bool, the fingers that the preshape leaves out; and whether all others touch, after
     # closing and after the lift.
-    _Derived(("unused", "complete"), _TOUCHING, lambda t, camera: _fingers(t)),
-    _Derived(("grasp_T",), _IN_T, lambda t, camera: (_grasp_T(t),)),
-    _Derived(("held_O",), ("lifted_p_OQ", "lifted_nhat_Q_O"), lambda t, camera: (_held_O(t),)),
-    _Derived(
-        ("other_links",), ("lifted_other_links",), lambda t, camera: (t["lifted_other_links"],)
-    ),
+    (("unused", "complete"), _TOUCHING, _fingers),
+    (("grasp_T",), _IN_T, lambda t, camera: [_grasp_T(t)]),
+    (("held_O",), ("lifted_p_OQ", "lifted_nhat_Q_O"), lambda t, camera: [_held_O(t)]),
+    (("other_links",), ("lifted_other_links",), lambda t, camera: [t["lifted_other_links"]]),
     # Whether both masks have object pixels.
-    _Derived(
+    (
         ("seen",),
-        tuple(f"mask_{name}" for name in CAMERAS),
-        lambda t, camera: (
-            np.all([t[f"mask_{name}"].any(axis=(1, 2)) for name in CAMERAS], axis=0),
-        ),
+        _MASKS,
+        lambda t, camera: [
+            np.all([t[f"mask_{name}"].any(axis=(1, 2)) for name in CAMERAS], axis=0)
+        ],
     ),
-    _Derived(
-        ("in_view",),
-        tuple({*_IN_T, *_TOUCHING, *(f"X_TC_{name}" for name in CAMERAS)}),
-        _all_in_view,
-    ),
+    (("in_view",), (*_IN_T, *_TOUCHING, *_CAMERAS), lambda t, c: [_all_in_view(t, c)]),
     # [m] above the table; both cameras are at the same point.
-    _Derived(
-        ("camera_height",),
-        ("X_TC_otm",),
-        lambda t, camera: (unpack_pose(t["X_TC_otm"])[:, 2, 3],),
-    ),
+    (("camera_height",), ("X_TC_otm",), lambda t, c: [unpack_pose(t["X_TC_otm"])[:, 2, 3]]),
     # [m^2], of the otm depth image.
-    _Derived(
+    (
         ("depth_variance",),
         ("depth_otm",),
-        lambda t, camera: (t["depth_otm"].astype(float).var(axis=(1, 2)),),
+        lambda t, camera: [t["depth_otm"].astype(float).var(axis=(1, 2))],
     ),
     # The largest of the contacts [m], [rad].
-    _Derived(
-        ("surface_distance", "normal_angle"),
-        (*_TOUCHING, "surface_distance", "normal_angle"),
-        lambda t, camera: _largest(t),
+    *(
+        ((name,), (*_TOUCHING, name), lambda t, c, name=name: [_largest(t, name)])
+        for name in ("surface_distance", "normal_angle")
     ),
-    _Derived(
-        ("suspicion", "penetration", "imbalance", "normal_sum"),
-        COLUMNS,
-        lambda t, camera: _doubts(t),
-    ),
-    _Derived(("X_OG",), ("X_OG",), lambda t, camera: (unpack_pose(t["X_OG"]),)),
+    (("suspicion", "penetration", "imbalance", "normal_sum"), COLUMNS, _doubts),
+    (("X_OG",), ("X_OG",), lambda t, camera: [unpack_pose(t["X_OG"])]),
 )
-_DERIVED_NAMES = {name for each in _DERIVED for name in each.names}
 #: Columns of successes as the files hold them: which attempt each one is, what rules need, and what
 #: is copied to /successes.
 _COPIED = tuple(
     dict.fromkeys(
         name
         for name in ("candidate", "standoff_index", "child", "resting", "slip", "turn", *NEEDED)
-        if name not in _DERIVED_NAMES
+        if not any(name in names for names, *_ in _DERIVED)
     )
 )
 #: Columns of `/looks`, besides the depths of the otm image.
 LOOK_COLUMNS = (
-    *(f"{name}_{camera}" for name in ("mask", "X_TC") for camera in CAMERAS),
+    *_MASKS,
+    *_CAMERAS,
     *(field.name for field in CERTIFICATE_FIELDS),
 )
 #: Columns of `/trials` from which those of successes follow.
 TRIAL_COLUMNS = sources_of(
     name
-    for name in (*_COPIED, *(name for each in _DERIVED for name in each.needs))
+    for name in (*_COPIED, *(name for _, needs, _ in _DERIVED for name in needs))
     if name not in (*LOOK_COLUMNS, "depth_otm")
 )
 
@@ -339,7 +314,7 @@ def successes_of(rows: Table, camera: CameraConfig, *, object: int = 0) -> Table
     rows = Table(with_derived(rows))
     certificates = (field.name for field in CERTIFICATE_FIELDS)
     found |= rows.only(*_COPIED, *certificates)
-    for each in _DERIVED:
-        if rows.has(*each.needs):
-            found |= zip(each.names, each.derive(rows, camera), strict=True)
+    for names, needs, derive in _DERIVED:
+        if rows.has(*needs):
+            found |= zip(names, derive(rows, camera), strict=True)
     return Table(found)
