@@ -7,33 +7,21 @@
 
 from __future__ import annotations
 
+import copy
 import operator
+import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.hdf5 import AnyArray
-from drakegrasp.dataset.schema import SPLITS
-from drakegrasp.errors import DataError, MachineError
-from drakegrasp.filters import Removal
-from drakegrasp.frames import X_WT, Array, invert_pose, unpack_pose
-from drakegrasp.outcomes import Outcome
-
-if TYPE_CHECKING:
-    import pandas
-import os
-from contextlib import contextmanager
-from dataclasses import field
-from functools import cached_property
-
-import h5py
-
-from drakegrasp.dataset.hdf5 import read_names, read_texts
+from drakegrasp.dataset.hdf5 import AnyArray, read_names, read_texts
 from drakegrasp.dataset.opening import (
     open_samples,
     open_trials,
@@ -42,28 +30,47 @@ from drakegrasp.dataset.opening import (
     refuse_other_codes,
 )
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
-from drakegrasp.dataset.schema import CAMERAS, OBJECT_FIELDS, TRIAL_FIELDS
+from drakegrasp.dataset.schema import CAMERAS, OBJECT_FIELDS, SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.shards import ASSEMBLED_FIELDS, ShardHeader, open_shard, trial_columns
+from drakegrasp.errors import DataError, MachineError
+from drakegrasp.filters import Removal
+from drakegrasp.frames import X_WT, invert_pose, unpack_pose
+from drakegrasp.outcomes import Outcome
+from drakegrasp.table import Table
+
+if TYPE_CHECKING:
+    import pandas
 
 #: Frames in which contacts can be given: object, table top, palm, world.
 Frame = Literal["O", "T", "G", "W"]
+#: Number of a removal or a split that an attempt does not have.
+NONE = 255
+#: Rows that are read at once: 8 chunks of a column.
+BLOCK = 16_384
+#: Columns besides those of `/trials`: names of the row's object, why a success is no sample
+#: (`removal` in the schema), and the split of a sample (index into SPLITS); NONE for all others.
+DERIVED = ("object_name", "class_name", "removal", "split")
+#: The fields of `/trials` by name.
+FIELDS = {f.name: f for f in TRIAL_FIELDS}
+#: What changes when a file is replaced; None if it is not there.
+Stamp = tuple[int, ...] | None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TrialContacts:
-    """The contacts of n attempts with k fingers, in one frame.
+class TrialPart:
+    """The rows of one file: all of trials.hdf5, or the first of a shard while a build runs.
 
     Attributes:
-        touching: (n, k) bool, whether the fingertip touches the object.
-        points: (n, k, 3), contact points [m]; NaN for a finger that does not touch.
-        normals: (n, k, 3), unit normals out of the object; NaN likewise.
-        forces: (n, k, 3), of the fingertips on the object [N].
+        path: Of the file.
+        count: Number of rows.
+        header: Identity of the shard; None for trials.hdf5.
+        object: Row of the shard's object among the objects.
     """
 
-    touching: npt.NDArray[np.bool_]
-    points: Array
-    normals: Array
-    forces: Array
+    path: Path
+    count: int
+    header: ShardHeader | None = None
+    object: int = 0
 
 
 class Trials:
@@ -76,13 +83,37 @@ class Trials:
         out: Directory of an assembled dataset, or its trials.hdf5.
         any_name: Whether objects may have names that no file can have: enough to show them.
 
+    Attributes:
+        path: The directory of the dataset, or its trials.hdf5, absolute.
+        objects: Columns of `/objects` by the names of the schema; texts are str.
+        attributes: What trials.hdf5 says of its dataset, e.g. `config` as JSON; nothing without it.
+
     Raises:
         DataError: If the file is missing, damaged or differs from the schema.
     """
 
     def __init__(self, out: str | Path, *, any_name: bool = False) -> None:
-        self._files = whole_file(Path(out).absolute(), any_name)
+        self.path = Path(out).absolute()
+        path = self.path if self.path.is_file() else self.path / TRIALS_FILE
+        with open_trials(path) as file:
+            group = file["objects"]
+            if not any_name:
+                read_names(group["name"])
+            self.objects: Mapping[str, AnyArray] = {
+                f.name: np.array(read_texts(group[f.name]), dtype=object)
+                if f.dtype == "str"
+                else group[f.name][:]
+                for f in OBJECT_FIELDS
+            }
+            self._parts: tuple[TrialPart, ...] = (
+                TrialPart(path=path, count=len(file["trials/outcome"])),
+            )
+            self.attributes: Mapping[str, Any] = dict(file.attrs)
+        self._stamp = stamp(path)
+        self._count = self._parts[0].count
+        # The attempts that were chosen, and of all attempts, for every choice, what `_of_all` read.
         self._rows: npt.NDArray[np.int64] | None = None
+        self._known: dict[str, npt.NDArray[np.uint8]] = {}
 
     @classmethod
     def of_parts(
@@ -95,28 +126,17 @@ class Trials:
             objects: Columns of its objects, `name` and `class_name` at least.
             parts: In the order of the rows.
         """
-        return cls._of(TrialFiles(out=out, objects=objects, parts=tuple(parts)), None)
-
-    @classmethod
-    def _of(cls, files: TrialFiles, rows: npt.NDArray[np.int64] | None) -> Trials:
         trials = cls.__new__(cls)
-        trials._files, trials._rows = files, rows
+        trials.path, trials.objects, trials.attributes = out, objects, {}
+        trials._parts, trials._stamp, trials._rows = tuple(parts), None, None
+        trials._count, trials._known = sum(part.count for part in parts), {}
         return trials
 
-    @property
-    def path(self) -> Path:
-        """The directory of the dataset, or its trials.hdf5, absolute."""
-        return self._files.out
-
-    @property
-    def objects(self) -> Mapping[str, AnyArray]:
-        """Columns of `/objects` by the names of the schema; texts are str."""
-        return self._files.objects
-
-    @property
-    def attributes(self) -> Mapping[str, Any]:
-        """What trials.hdf5 says of its dataset, e.g. `config` as JSON; nothing without the file."""
-        return self._files.attributes
+    def _chosen(self, rows: npt.NDArray[np.int64]) -> Trials:
+        """Return the attempts of some rows of all."""
+        trials = copy.copy(self)
+        trials._rows = rows
+        return trials
 
     def part_of(self, trial_id: int) -> tuple[TrialPart, int]:
         """Return the file that holds an attempt, and its row there.
@@ -124,13 +144,13 @@ class Trials:
         Raises:
             IndexError: If there is no such attempt.
         """
-        for part, start in self._files.starts():
+        for part, start in self._starts():
             if trial_id < start + part.count:
                 return part, trial_id - start
-        raise IndexError(f"trial must be below {self._files.count}, got {trial_id}")
+        raise IndexError(f"trial must be below {self._count}, got {trial_id}")
 
     def __len__(self) -> int:
-        return self._files.count if self._rows is None else len(self._rows)
+        return self._count if self._rows is None else len(self._rows)
 
     def __repr__(self) -> str:
         return f"Trials({str(self.path)!r}): {len(self):,} attempts"
@@ -138,7 +158,7 @@ class Trials:
     @property
     def trial_ids(self) -> npt.NDArray[np.int64]:
         """Rows (n,) of the attempts in trials.hdf5."""
-        return np.arange(self._files.count) if self._rows is None else self._rows
+        return np.arange(self._count) if self._rows is None else self._rows
 
     @overload
     def __getitem__(self, key: str) -> AnyArray: ...
@@ -165,7 +185,7 @@ class Trials:
         if isinstance(key, slice | np.ndarray | list | tuple | range):
             if not isinstance(key, slice):
                 key = np.asarray(key) if len(key) else np.zeros(0, dtype=np.int64)
-            return self._of(self._files, self.trial_ids[key])
+            return self._chosen(self.trial_ids[key])
         index = operator.index(key)
         if not -len(self) <= index < len(self):
             raise IndexError(f"index must be below {len(self)}, got {index}")
@@ -177,10 +197,10 @@ class Trials:
         Raises:
             DataError: If there is no such row.
         """
-        if not 0 <= trial_id < self._files.count:
-            file, last = self._files.parts[0].path, self._files.count - 1
+        if not 0 <= trial_id < self._count:
+            file, last = self._parts[0].path, self._count - 1
             raise DataError(f"{file}: trial must be 0 to {last}, got {trial_id}")
-        return self._of(self._files, np.array([trial_id]))[0]
+        return self._chosen(np.array([trial_id]))[0]
 
     def where(
         self,
@@ -231,16 +251,15 @@ class Trials:
             DataError: If there is no such column, or a file was replaced.
         """
         names = [*FIELDS, *DERIVED[:-1]] if names is None else names
-        if not self._rising:
+        if not self._is_rising():
             rows, back = np.unique(self.trial_ids, return_inverse=True)
-            columns = self._of(self._files, rows).columns(names)
+            columns = self._chosen(rows).columns(names)
             return {name: values[back] for name, values in columns.items()}
         blocks = list(self.blocks(names))
         return {name: np.concatenate([block[name] for block in blocks]) for name in names}
 
-    @property
-    def _rising(self) -> bool:
-        """Whether the attempts are in the order of the file, each once."""
+    def _is_rising(self) -> bool:
+        """Return whether the attempts are in the order of the file, each once."""
         return self._rows is None or bool((np.diff(self._rows) > 0).all())
 
     def blocks(self, names: Sequence[str]) -> Iterator[dict[str, AnyArray]]:
@@ -254,28 +273,33 @@ class Trials:
         Raises:
             DataError: See `columns`, or if the attempts are in another order.
         """
-        if not self._rising:
+        if not self._is_rising():
             raise DataError("attempts must be in rising order to be read in blocks, got another")
         for name in names:
             if name not in FIELDS and name not in DERIVED:
                 known = ", ".join([*FIELDS, *DERIVED])
                 raise DataError(f"column must be one of {known}, got {name!r}")
         empty = True
-        for part, start in self._files.starts():
+        for part, start in self._starts():
             own = np.arange(part.count)
             if self._rows is not None:
                 first, last = np.searchsorted(self._rows, [start, start + part.count])
                 own = self._rows[first:last] - start
             if len(own):
                 empty = False
-                yield from self._files.read(part, start, own, names)
+                yield from self._read(part, start, own, names)
         if empty:
-            yield self._files.nothing(names)
+            yield self._nothing(names)
 
     def contacts(
         self, when: Literal["closed", "lifted"] = "closed", *, frame: Frame = "O"
-    ) -> TrialContacts:
-        """Return the contacts of the attempts.
+    ) -> Table:
+        """Return the contacts of the n attempts, of k fingers, in one frame.
+
+        Columns: `touching` (n, k) bool, whether the fingertip touches the object; `points`
+        (n, k, 3) [m], contact points, NaN for a finger that does not touch; `normals` (n, k, 3),
+        unit normals out of the object, NaN likewise; `forces` (n, k, 3) [N], of the fingertips on
+        the object.
 
         Args:
             when: After closing, or after the lift.
@@ -300,10 +324,10 @@ class Trials:
 
         # In the frame that is wanted.
         if frame == "O":
-            return TrialContacts(touching=touching, points=points, normals=normals, forces=forces)
+            return Table(touching=touching, points=points, normals=normals, forces=forces)
         X_FO = {"T": X_TO, "G": invert_pose(X_OG), "W": multiply(X_WT, X_TO)}[frame]
         R_OF = np.swapaxes(X_FO[:, :3, :3], -1, -2)
-        return TrialContacts(
+        return Table(
             touching=touching,
             points=multiply(points, R_OF) + X_FO[:, None, :3, 3],
             normals=multiply(normals, R_OF),
@@ -343,7 +367,9 @@ class Trials:
             labels = {outcome.value: outcome.label for outcome in Outcome}
             series["outcome"] = [labels[int(value)] for value in series["outcome"]]
         if "split" in series:
-            series["split"] = [_split_name(int(value)) for value in series["split"]]
+            series["split"] = [
+                {**dict(enumerate(SPLITS)), NONE: None}[int(value)] for value in series["split"]
+            ]
         frame = pandas.DataFrame(series, index=pandas.Index(self.trial_ids, name="trial_id"))
         frame = frame.drop(columns="trial_id", errors="ignore")
         words = [
@@ -351,129 +377,73 @@ class Trials:
         ]
         return frame.astype(dict.fromkeys(words, "category"))
 
+    # Files
 
-def _outcome(outcome: Outcome | str) -> Outcome:
-    labels = {each.label: each for each in Outcome}
-    if isinstance(outcome, str) and outcome not in labels:
-        raise DataError(f"outcome must be one of {', '.join(labels)}, got {outcome!r}")
-    return labels[outcome] if isinstance(outcome, str) else outcome
-
-
-def _split_name(number: int) -> str | None:
-    return None if number == NONE else SPLITS[number]
-
-
-#: Number of a removal or a split that an attempt does not have.
-NONE = 255
-#: Rows that are read at once: 8 chunks of a column.
-BLOCK = 16_384
-#: Columns besides those of `/trials`: names of the row's object, why a success is no sample
-#: (`removal` in the schema), and the split of a sample (index into SPLITS); NONE for all others.
-DERIVED = ("object_name", "class_name", "removal", "split")
-#: The fields of `/trials` by name.
-FIELDS = {f.name: f for f in TRIAL_FIELDS}
-#: Columns whose numbers stand for something, and for what.
-_CODES = {"outcome": list(Outcome)}
-#: What changes when a file is replaced; None if it is not there.
-Stamp = tuple[int, ...] | None
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrialPart:
-    """The rows of one file: all of trials.hdf5, or the first of a shard while a build runs.
-
-    Attributes:
-        path: Of the file.
-        count: Number of rows.
-        header: Identity of the shard; None for trials.hdf5.
-        object: Row of the shard's object among the objects.
-    """
-
-    path: Path
-    count: int
-    header: ShardHeader | None = None
-    object: int = 0
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrialFiles:
-    """The files of all attempts, in the order of the rows.
-
-    Attributes:
-        out: Directory of the dataset, or its trials.hdf5.
-        objects: See `Trials.objects`.
-        parts: The files.
-        attributes: Of trials.hdf5.
-        stamp: Of trials.hdf5 when it was first opened; None for shards, which never change.
-    """
-
-    out: Path
-    objects: Mapping[str, AnyArray]
-    parts: tuple[TrialPart, ...]
-    attributes: Mapping[str, Any] = field(default_factory=dict)
-    stamp: Stamp = None
-
-    @property
-    def count(self) -> int:
-        """Number of attempts."""
-        return sum(part.count for part in self.parts)
-
-    def starts(self) -> Iterator[tuple[TrialPart, int]]:
+    def _starts(self) -> Iterator[tuple[TrialPart, int]]:
         """Yield each part with the number of rows before it."""
         start = 0
-        for part in self.parts:
+        for part in self._parts:
             yield part, start
             start += part.count
 
     @contextmanager
-    def open(self, part: TrialPart) -> Iterator[h5py.File]:
+    def _open(self, part: TrialPart) -> Iterator[h5py.File]:
         """Open a part: the file that was looked at first, or none."""
         if part.header is not None:
             with open_shard(part.path, part.header, verify_seal=False, again=True) as (file, _):
                 yield file
             return
         with opened(part.path, "the trials of a dataset", again=True) as file:
-            if stamp(part.path) != self.stamp:
+            if stamp(part.path) != self._stamp:
                 raise DataError(f"{part.path}: must stay while it is read, got another; read again")
             yield file
 
-    def read(
+    def _read(
         self, part: TrialPart, start: int, rows: npt.NDArray[np.int64], names: Sequence[str]
     ) -> Iterator[dict[str, AnyArray]]:
         """Yield columns of some rows of a part, which begins with row `start` of all."""
-        with self.open(part) as file:
+        with self._open(part) as file:
             for block in np.split(rows, np.flatnonzero(np.diff(rows // BLOCK)) + 1):
-                yield {
-                    name: self._derived(name, file["trials"], part, start, block)
-                    if name in (*DERIVED, *ASSEMBLED_FIELDS)
-                    else _stored(name, file["trials"], part, block, _CODES.get(name))
-                    for name in names
-                }
+                yield {name: self._column(name, file, part, start, block) for name in names}
 
-    def _derived(
-        self,
-        name: str,
-        trials: h5py.Group,
-        part: TrialPart,
-        start: int,
-        rows: npt.NDArray[np.int64],
+    def _column(
+        self, name: str, file: h5py.File, part: TrialPart, start: int, rows: npt.NDArray[np.int64]
     ) -> AnyArray:
-        """Return a column of rows of a part that only the whole dataset knows."""
+        """Return a column of rows of a part that lie close together."""
+        if name not in (*DERIVED, *ASSEMBLED_FIELDS):
+            codes = list(Outcome) if name == "outcome" else None
+            return _stored(name, file["trials"], rows, codes)
+        # What only the whole dataset knows.
         if name == "trial_id":
             return start + rows
         if name in ("removal", "split"):
-            return (self.removal if name == "removal" else self.split)[start + rows]
+            return self._of_all(name)[start + rows]
         if part.header is not None:
             number = np.full(len(rows), part.object, dtype=np.int32)
         else:
-            number = _stored("object", trials, part, rows, len(self.objects["name"]))
+            number = _stored("object", file["trials"], rows, len(self.objects["name"]))
         return number if name == "object" else self.objects[name.removeprefix("object_")][number]
 
-    def nothing(self, names: Sequence[str]) -> dict[str, AnyArray]:
+    def _of_all(self, name: str) -> npt.NDArray[np.uint8]:
+        """Return `removal` or `split` of all attempts; NONE where nothing is decided."""
+        if name not in self._known:
+            values = np.full(self._count, NONE, dtype=np.uint8)
+            assembled = [part for part in self._parts if part.header is None]
+            for part in assembled if name == "removal" else ():
+                with self._open(part) as file:
+                    success = read_codes(file["successes/trial_id"], self._count)
+                    values[success] = read_codes(file["successes/removal"], list(Removal))
+            if name == "split" and len(assembled) == len(self._parts):
+                for number, ids in enumerate(sample_ids(self.path).values()):
+                    values[ids[ids < len(values)]] = number
+            self._known[name] = values
+        return self._known[name]
+
+    def _nothing(self, names: Sequence[str]) -> dict[str, AnyArray]:
         """Return columns of no attempts."""
         sizes = {"k": 0, "j": 0}
-        if self.parts:
-            with self.open(self.parts[0]) as file:
+        if self._parts:
+            with self._open(self._parts[0]) as file:
                 touching, q = file["trials/closed_touching"], file["trials/closed_q"]
                 sizes = {"k": touching.shape[1], "j": q.shape[1]}
         derived = {"removal": np.uint8, "split": np.uint8}
@@ -484,31 +454,17 @@ class TrialFiles:
             for name in names
         }
 
-    @cached_property
-    def removal(self) -> npt.NDArray[np.uint8]:
-        """Why each attempt is no sample, NONE where it is no success or nothing is decided."""
-        removal = np.full(self.count, NONE, dtype=np.uint8)
-        for part in self.parts:
-            if part.header is None:
-                with self.open(part) as file:
-                    success = read_codes(file["successes/trial_id"], self.count)
-                    removal[success] = read_codes(file["successes/removal"], list(Removal))
-        return removal
 
-    @cached_property
-    def split(self) -> npt.NDArray[np.uint8]:
-        """Split of each attempt as an index into SPLITS, NONE if it is no sample."""
-        split = np.full(self.count, NONE, dtype=np.uint8)
-        if all(part.header is None for part in self.parts):
-            for number, ids in enumerate(sample_ids(self.out).values()):
-                split[ids[ids < len(split)]] = number
-        return split
+def _outcome(outcome: Outcome | str) -> Outcome:
+    labels = {each.label: each for each in Outcome}
+    if isinstance(outcome, str) and outcome not in labels:
+        raise DataError(f"outcome must be one of {', '.join(labels)}, got {outcome!r}")
+    return labels[outcome] if isinstance(outcome, str) else outcome
 
 
 def _stored(
     name: str,
     trials: h5py.Group,
-    part: TrialPart,
     rows: npt.NDArray[np.int64],
     codes: int | list[Outcome] | None = None,
 ) -> AnyArray:
@@ -517,41 +473,21 @@ def _stored(
     Args:
         name: Of the column.
         trials: The group of the part.
-        part: For messages.
         rows: In rising order.
         codes: What its numbers may stand for, see `refuse_other_codes`; None for measured values.
     """
     field, near = FIELDS[name], slice(int(rows[0]), int(rows[-1]) + 1)
+    path = Path(trials.file.filename)
     if name not in trials:
         if not field.optional:
-            raise DataError(f"{part.path}: /trials/{name} must be there, got none")
+            raise DataError(f"{path}: /trials/{name} must be there, got none")
         if field.derive is not None:
-            return field.derive({name: _stored(name, trials, part, rows) for name in field.needs})
+            return field.derive({name: _stored(name, trials, rows) for name in field.needs})
         return field.empty(len(rows), {})
     values = trials[name][near]
     if codes is not None:
-        refuse_other_codes(part.path, f"/trials/{name}", values, codes, near.start)
+        refuse_other_codes(path, f"/trials/{name}", values, codes, near.start)
     return np.asarray(values[rows - near.start])
-
-
-def whole_file(out: Path, any_name: bool) -> TrialFiles:
-    """Return the attempts of an assembled dataset, see `Trials`."""
-    path = out if out.is_file() else out / TRIALS_FILE
-    with open_trials(path) as file:
-        group = file["objects"]
-        if not any_name:
-            read_names(group["name"])
-        objects = {
-            f.name: np.array(read_texts(group[f.name]), dtype=object)
-            if f.dtype == "str"
-            else group[f.name][:]
-            for f in OBJECT_FIELDS
-        }
-        part = TrialPart(path=path, count=len(file["trials/outcome"]))
-        attributes = dict(file.attrs)
-    return TrialFiles(
-        out=out, objects=objects, parts=(part,), attributes=attributes, stamp=stamp(path)
-    )
 
 
 def shard_part(
