@@ -17,7 +17,7 @@ from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 
 from drakegrasp.dataset import hdf5, shards
 from drakegrasp.dataset.assemble import assemble, assemble_locked, summarise
-from drakegrasp.dataset.assembly import decisions, pack, survey
+from drakegrasp.dataset.assembly import pack, survey
 from drakegrasp.dataset.lock import FILE_NAME, build_lock
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.schema import CAMERAS
@@ -357,10 +357,8 @@ def backwards(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[
 @pytest.fixture
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Chunks of five rows, in tasks of ten: a task begins and ends within a shard."""
-    for module in (hdf5, pack):
-        monkeypatch.setattr(module, "COLUMN_CHUNK", 5)
-    for module in (pack, decisions):
-        monkeypatch.setattr(module, "TASK_ROWS", 10)
+    monkeypatch.setattr(hdf5, "COLUMN_CHUNK", 5)
+    monkeypatch.setattr(pack, "TASK_ROWS", 10)
 
 
 @pytest.mark.usefixtures("small_chunks")
