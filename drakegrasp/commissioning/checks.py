@@ -410,9 +410,9 @@ def _facing(hand: Hand) -> Array:
 
 def check_meeting(hand: Hand) -> Finding:
     """Return whether the pads of opposed fingers meet when the hand closes."""
-    opposition = find_opposition(hand)
+    opposition = _, group = find_opposition(hand)
     first, second = (
-        [f.name for f, is_first in zip(hand.fingers, opposition.group, strict=True)
+        [f.name for f, is_first in zip(hand.fingers, group, strict=True)
          if is_first == own] for own in (True, False)
     )  # fmt: skip
     if not first or not second:
@@ -421,7 +421,7 @@ def check_meeting(hand: Hand) -> Finding:
 
     # Some pads touch, each comes as far as those opposite, and something fits between them.
     text = f"{' and '.join(first)} against {' and '.join(second)}"
-    gap, short = _least_gap(hand, opposition.group), _shortfall(hand, opposition)
+    gap, short = _least_gap(hand, group), _shortfall(hand, opposition)
     if gap <= MEETING and (short <= MEETING).all() and find_pinch(hand, WIDTH) is not None:
         return judge("fingertips", [], f"{text} meet within {1e3 * gap:.1f} mm")
     text = f"pads of {text} must meet when they close"
@@ -467,10 +467,9 @@ def _least_gap(hand: Hand, group: npt.NDArray[np.bool_]) -> float:
 
 def _shortfall(hand: Hand, opposition: Opposition) -> Array:
     """Return by how much each pad (k,) does not come to those opposite, along their line [m]."""
-    _, front = pad_fronts(hand, opposition)
-    sign = np.where(opposition.group, 1.0, -1.0)
-    reached = (front @ opposition.axis * sign).max(axis=0)
-    opposite = [-reached[opposition.group != own].max() for own in opposition.group]
+    (axis, group), (_, front) = opposition, pad_fronts(hand, opposition)
+    reached = (front @ axis * np.where(group, 1.0, -1.0)).max(axis=0)
+    opposite = [-reached[group != own].max() for own in group]
     return np.asarray(opposite - reached)
 
 

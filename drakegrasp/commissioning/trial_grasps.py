@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import trimesh
@@ -63,23 +63,9 @@ GRASPS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrialGrasp:
-    """An object on the table, and an attempt to grasp it.
-
-    Attributes:
-        model: The object.
-        X_TO: Its pose in the table-top frame, (4, 4).
-        pregrasp: Where the hand starts.
-        width: Of the object between the fingers [m].
-    """
-
-    model: ObjectModel
-    X_TO: Array
-    pregrasp: Pregrasp
-    width: float
-
-
+#: An object, its pose X_TO (4, 4) on the table, where the hand starts, and the width of the object
+#: between the fingers [m].
+TrialGrasp: TypeAlias = tuple[ObjectModel, Array, Pregrasp, float]
 #: What is held, but moves more in the hand than a sample may.
 MOVED = "moved too far in the hand"
 #: What a drive does to the fingers.
@@ -124,9 +110,9 @@ def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> 
     locked = config.model_copy(update={"lift": config.lift.model_copy(update={"drive": rules})})
     outcomes: Counter[str] = Counter()
     missing: Counter[str] = Counter()
-    for grasp in trial_grasps(hand, shape, line):
-        scene = build_scene(grasp.model, config.physics, hand)
-        record = run_attempt(scene, grasp.X_TO, grasp.pregrasp, locked)
+    for model, X_TO, pregrasp, width in trial_grasps(hand, shape, line):
+        scene = build_scene(model, config.physics, hand)
+        record = run_attempt(scene, X_TO, pregrasp, locked)
         if not _stays(record, config):
             held = record.outcome is Outcome.SUCCESS
             outcomes[MOVED if held else record.outcome.label] += 1
@@ -135,12 +121,12 @@ def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> 
                 missing.update(finger.name for finger, touches in rows if not touches)
             continue
         text = (
-            f"holds {1e3 * grasp.width:.0f} mm and {grasp.model.mass:g} kg; {_slip(record)} with "
+            f"holds {1e3 * width:.0f} mm and {model.mass:g} kg; {_slip(record)} with "
             f"fingers that are {_HOW[rules]}"
         )
         if drive != "torque":
             return judge(name, [], text)
-        free = run_attempt(scene, grasp.X_TO, grasp.pregrasp, config)
+        free = run_attempt(scene, X_TO, pregrasp, config)
         text += f", {_slip(free)} with its own, which are pushed open"
         ok = _stays(free, config) or not LINES[line]
         return judge(name, [] if ok else [f"{text}: {_SOFT}"], text)
@@ -156,7 +142,8 @@ def _stands_wide(hand: Hand) -> bool:
     pinch = find_pinch(hand, max(WIDTHS))
     if pinch is None:
         return False
-    across = np.cross([0.0, 0.0, 1.0], find_opposition(hand).axis)
+    axis, _ = find_opposition(hand)
+    across = np.cross([0.0, 0.0, 1.0], axis)
     aside = np.abs((pinch.p_GQ - pinch.p_GM) @ across).max()
     return bool(aside > WIDEST * pinch.width)
 
@@ -207,7 +194,7 @@ def _trial_grasp(hand: Hand, shape: str, pinch: Pinch, angle: float) -> TrialGra
         angle: Of the line on which the fingers close, above the horizontal [rad].
     """
     # The object's axes: x beside the fingers, y along their line, z towards the palm.
-    axis = find_opposition(hand).axis
+    axis, _ = find_opposition(hand)
     R_OG = np.stack([np.cross([0.0, 0.0, 1.0], axis), axis, [0.0, 0.0, -1.0]])
     offsets = (pinch.p_GQ - pinch.p_GM) @ R_OG.T
     room = float(pinch.p_GM[2]) - BEFORE_PALM
@@ -243,12 +230,8 @@ def _trial_grasp(hand: Hand, shape: str, pinch: Pinch, angle: float) -> TrialGra
     down = R_OG.T @ R_TO.T @ [0.0, 0.0, -1.0]
     height = reach(hand, down) - float((R_TO @ X_OG[:3, 3])[2]) + ABOVE_TABLE
     height = max(height, float(-(mesh.vertices @ R_TO.T)[:, 2].min()) + ABOVE_TABLE)
-    return TrialGrasp(
-        model=model,
-        X_TO=make_pose(R_TO, [0.0, 0.0, height]),
-        pregrasp=Pregrasp(X_OG=X_OG, spread=0.0),
-        width=pinch.width,
-    )
+    X_TO = make_pose(R_TO, [0.0, 0.0, height])
+    return model, X_TO, Pregrasp(X_OG=X_OG, spread=0.0), pinch.width
 
 
 @one_thread

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -255,17 +256,9 @@ FLAT = 2e-4
 WIDTH_ERROR = 0.004
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Opposition:
-    """Two groups of fingers that close against each other along a line.
-
-    Attributes:
-        axis: (3,), unit, across Gz: the fingers of the group move along it, the others against it.
-        group: (k,), whether each finger is of the first group.
-    """
-
-    axis: Array
-    group: npt.NDArray[np.bool_]
+#: Two groups of fingers that close against each other: the unit axis (3,) across Gz along which
+#: those of the first move, the others against it; and whether each finger (k,) is of the first.
+Opposition: TypeAlias = tuple[Array, npt.NDArray[np.bool_]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -299,25 +292,25 @@ def find_opposition(hand: Hand) -> Opposition:
     moved = (paths[-1] - paths[0]) @ axis
     if moved[-1] > 0.0:
         axis, moved = -axis, -moved
-    return Opposition(axis=axis, group=moved > 0.0)
+    return axis, moved > 0.0
 
 
 def find_pinch(hand: Hand, width: float) -> Pinch | None:
     """Return the straightest pinch of a width [m]; None if the fingers have none."""
     # The foremost point of each pad along the opposition, at each posture.
-    opposition = find_opposition(hand)
-    if opposition.group.all() or not opposition.group.any():
+    axis, group = find_opposition(hand)
+    if group.all() or not group.any():
         return None
-    closing, front = pad_fronts(hand, opposition)
+    closing, front = pad_fronts(hand, (axis, group))
 
     # All pairs of a posture of the first group and one of the second.
-    first, second = front[:, opposition.group], front[:, ~opposition.group]
-    along_first = (first @ opposition.axis).max(axis=1)
-    along_second = (second @ opposition.axis).min(axis=1)
+    first, second = front[:, group], front[:, ~group]
+    along_first = (first @ axis).max(axis=1)
+    along_second = (second @ axis).min(axis=1)
     gap = along_second[None, :] - along_first[:, None]
     line = second.mean(axis=1)[None] - first.mean(axis=1)[:, None]
-    along = line @ opposition.axis
-    across = np.linalg.norm(line - along[..., None] * opposition.axis, axis=-1)
+    along = line @ axis
+    across = np.linalg.norm(line - along[..., None] * axis, axis=-1)
     tilt = np.arctan2(across, np.maximum(along, 1e-6))
 
     # Of those with the width, in front of the palm, the straightest in which all fingers have
@@ -326,7 +319,7 @@ def find_pinch(hand: Hand, width: float) -> Pinch | None:
     cost = tilt + UNEVEN * np.abs(share[:, None] - share)
     cost[np.abs(gap - width) > WIDTH_ERROR] = np.inf
     motors = hand.motor_of
-    if set(motors[opposition.group]) & set(motors[~opposition.group]):
+    if set(motors[group]) & set(motors[~group]):
         # Groups that share a motor close together.
         cost[~np.eye(STEPS, dtype=np.bool_)] = np.inf
     cost[(first[..., 2].min(axis=1) <= 0.0)] = np.inf
@@ -335,15 +328,13 @@ def find_pinch(hand: Hand, width: float) -> Pinch | None:
     if not np.isfinite(cost[i, j]):
         return None
 
-    p_GQ = np.where(opposition.group[:, None], front[i], front[j])
-    middle = (
-        front[i][opposition.group].mean(axis=0) + front[j][~opposition.group].mean(axis=0)
-    ) / 2
-    shift = (along_first[i] + along_second[j]) / 2.0 - middle @ opposition.axis
+    p_GQ = np.where(group[:, None], front[i], front[j])
+    middle = (front[i][group].mean(axis=0) + front[j][~group].mean(axis=0)) / 2
+    shift = (along_first[i] + along_second[j]) / 2.0 - middle @ axis
     return Pinch(
-        closing=np.where(opposition.group, closing[i], closing[j]),
+        closing=np.where(group, closing[i], closing[j]),
         p_GQ=p_GQ,
-        p_GM=middle + shift * opposition.axis,
+        p_GM=middle + shift * axis,
         width=float(gap[i, j]),
         tilt=float(tilt[i, j]),
     )
@@ -386,14 +377,14 @@ def pad_fronts(hand: Hand, opposition: Opposition) -> tuple[Array, Array]:
 
     The positions go from the open hand to the limits; foremost is along the opposition, in {G}.
     """
-    closing = closing_path(hand, STEPS)
+    closing, (axis, group) = closing_path(hand, STEPS), opposition
     X_GF = fingertip_poses(hand, spread=0.0, closing=closing)
     front = np.zeros((len(closing), hand.num_fingers, 3))
     for i, points in enumerate(pad_points(hand)):
-        sign = 1.0 if opposition.group[i] else -1.0
+        sign = 1.0 if group[i] else -1.0
         for n, X in enumerate(X_GF[:, i]):
             p_GQ = transform_points(X, points)
-            along = sign * p_GQ @ opposition.axis
+            along = sign * p_GQ @ axis
             # A flat pad has many foremost points: their middle counts.
             front[n, i] = p_GQ[along >= along.max() - FLAT].mean(axis=0)
     return closing, front
@@ -401,5 +392,5 @@ def pad_fronts(hand: Hand, opposition: Opposition) -> tuple[Array, Array]:
 
 def across_angle(hand: Hand) -> float:
     """Return the direction across the opposition, as an angle about Gz from Gx [rad]."""
-    axis = find_opposition(hand).axis
+    axis, _ = find_opposition(hand)
     return float(np.arctan2(-axis[0], axis[1]))

@@ -21,8 +21,8 @@ pytestmark = [pytest.mark.sim, pytest.mark.slow]
 @pytest.mark.parametrize("name", ["allegro", "franka"])
 def test_fingertips_are_where_drake_has_them(name: str) -> None:
     hand, config = load_hand(name), load_config(hand=name)
-    grasp = next(trial_grasps(hand, "box"))
-    peer = MujocoBaseline(grasp.model, grasp.X_TO, config)
+    model, X_TO, *_ = next(trial_grasps(hand, "box"))
+    peer = MujocoBaseline(model, X_TO, config)
 
     # Its fingertips are where Drake's are, in the posture in which all fingers have closed a bit.
     m, d = peer._model, peer._data

@@ -21,8 +21,9 @@ from drakegrasp.simulation.trial import TrialRecord, run_attempt
 def test_a_pinch_is_where_the_pads_leave_its_width(tmp_path) -> None:
     """Fingers slide along y from 40 mm to the middle; pads end 110 mm above the palm link."""
     hand = load_hand(write_slider(tmp_path))
-    np.testing.assert_allclose(find_opposition(hand).axis, [0.0, 1.0, 0.0], atol=1e-9)
-    assert find_opposition(hand).group.tolist() == [True, False]
+    axis, group = find_opposition(hand)
+    np.testing.assert_allclose(axis, [0.0, 1.0, 0.0], atol=1e-9)
+    assert group.tolist() == [True, False]
     pinch = find_pinch(hand, 0.05)
     assert pinch is not None
     np.testing.assert_allclose(pinch.closing, 0.015, atol=0.002)
@@ -40,10 +41,10 @@ def test_a_pinch_is_where_the_pads_leave_its_width(tmp_path) -> None:
 def test_a_pinched_box_slips_by_less_than_a_millimetre(name: str, drive: str) -> None:
     """Within the payload; joints of the preshape keep their positions."""
     hand, config = load_hand(name), load_config(overrides=[f"lift.drive={drive}"])
-    grasp = next(trial_grasps(hand, "box"))
-    assert grasp.model.mass <= hand.payload
-    scene = build_scene(grasp.model, config.physics, hand)
-    record = run_attempt(scene, grasp.X_TO, grasp.pregrasp, config)
+    model, X_TO, pregrasp, _ = next(trial_grasps(hand, "box"))
+    assert model.mass <= hand.payload
+    scene = build_scene(model, config.physics, hand)
+    record = run_attempt(scene, X_TO, pregrasp, config)
     assert record.outcome is Outcome.SUCCESS
     assert record.closed.contacts.touching.all()
     assert record.lift.slip < 1e-3

@@ -393,8 +393,10 @@ def _weld(
     """
     # Shapes; what only is drawn collides, too, if nothing else does.
     name, notes = max((body for body, _ in members), key=lambda body: body.weight).name, []
-    solids = [s.carried(X) for body, X in members for s in body.collisions]
-    visuals = [s.carried(X) for body, X in members for s in body.visuals]
+    solids, visuals = (
+        [replace(s, X_LS=X_LB @ s.X_LS) for body, X_LB in members for s in getattr(body, kind)]
+        for kind in ("collisions", "visuals")
+    )
     if not solids and visuals:
         solids = visuals
         notes.append(f"link {name}: the model has no collision shapes; hulls of its pictures")

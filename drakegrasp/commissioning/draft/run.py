@@ -172,34 +172,31 @@ def hand_text(tree: Mapping[str, Any], reasons: Mapping[str, str], head: list[st
     """
     lines = [f"# {line}" for line in head]
     for key, value in tree.items():
+        # A mapping, or a list of them, is a block of a line per key: its start, value and path.
+        rows: list[tuple[str, Any, str]] = []
         if isinstance(value, dict):
-            lines += ["", *_line(0, f"{key}:", reasons.get(key))]
-            for name, item in value.items():
-                lines += _line(2, f"{_flow(name)}: {_flow(item)}", reasons.get(f"{key}.{name}"))
+            rows = [(f"  {_flow(n)}:", item, f"{key}.{n}") for n, item in value.items()]
         elif isinstance(value, list) and value and isinstance(value[0], dict):
-            lines += ["", *_line(0, f"{key}:", reasons.get(key))]
-            for i, entry in enumerate(value):
-                for n, (name, item) in enumerate(entry.items()):
-                    start = "- " if n == 0 else "  "
-                    why = reasons.get(f"{key}.{i}.{name}")
-                    lines += _entry(f"{start}{name}:", item, why)
-        else:
+            rows = [
+                (f"  {'-' if n == 0 else ' '} {name}:", item, f"{key}.{i}.{name}")
+                for i, entry in enumerate(value)
+                for n, (name, item) in enumerate(entry.items())
+            ]
+        if not rows:
             # What comes after a block stands apart from it.
             lines += [""] if lines[-1].startswith(" ") else []
-            lines += _line(0, f"{key}: {_flow(value)}", reasons.get(key))
+            lines.append(_line(f"{key}: {_flow(value)}", reasons.get(key)))
+            continue
+        lines += ["", _line(f"{key}:", reasons.get(key))]
+        for start, item, path in rows:
+            nested = isinstance(item, list) and bool(item) and isinstance(item[0], dict)
+            lines.append(_line(start if nested else f"{start} {_flow(item)}", reasons.get(path)))
+            lines += [f"      - {_flow(part)}" for part in item] if nested else []
     return "\n".join(lines) + "\n"
 
 
-def _entry(start: str, item: Any, why: str | None) -> list[str]:
-    """Return the lines of a key of a list's entry; a list of mappings takes one each."""
-    if isinstance(item, list) and item and isinstance(item[0], dict):
-        return [*_line(2, start, why), *(f"      - {_flow(part)}" for part in item)]
-    return _line(2, f"{start} {_flow(item)}", why)
-
-
-def _line(indent: int, text: str, why: str | None) -> list[str]:
-    text = " " * indent + text
-    return [text if why is None else f"{text:<{COLUMN}} # {why}"]
+def _line(text: str, why: str | None) -> str:
+    return text if why is None else f"{text:<{COLUMN}} # {why}"
 
 
 def _flow(value: Any) -> str:
@@ -311,8 +308,10 @@ def _find_best(
                 file = _write(draft, next(folders), path, drawn=False)
                 findings = _findings(file, config)
                 sound = all(finding.ok for finding in findings)
-                if sound:
-                    findings = (*findings, *_grasps(file, config))
+                for shape, line in GRASPS if sound else ():
+                    findings = *findings, check_grasp(load_hand(file), config, shape, line)
+                    if not findings[-1].ok:
+                        break
                 passed = sum(finding.ok for finding in findings)
                 if best is None or passed > best[0]:
                     best = passed, draft, findings
@@ -398,12 +397,3 @@ def _findings(file: Path, config: Config) -> tuple[Finding, ...]:
     if not limits.ok:
         return (limits,)
     return limits, check_couplings(hand), check_efforts(hand, config), *check_geometry(hand)
-
-
-def _grasps(file: Path, config: Config) -> Iterator[Finding]:
-    """Yield what trial grasps say, up to the first that fails."""
-    for shape, line in GRASPS:
-        finding = check_grasp(load_hand(file), config, shape, line)
-        yield finding
-        if not finding.ok:
-            return

@@ -81,10 +81,6 @@ class Shape:
         assert own is not None
         return transform_points(self.X_LS, own)
 
-    def carried(self, X_AL: Array) -> Shape:
-        """Return the shape on a link A that the link is part of."""
-        return replace(self, X_LS=X_AL @ self.X_LS)
-
     def hull(self) -> Shape:
         """Return a mesh as its convex hull of few corners; other shapes as they are."""
         if self.vertices is None:
