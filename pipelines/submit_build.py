@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
 from distributed import Client
@@ -26,12 +26,10 @@ from drakegrasp.api.building import build_on, find_sources
 from drakegrasp.cli.console import OneCommand
 from drakegrasp.cli.datasets import print_plan, print_report
 from drakegrasp.cli.options import (
-    BUILD,
-    TLS,
     Named,
     chosen_tls,
+    described,
     parse_request,
-    shared,
 )
 from drakegrasp.cluster.connect import dashboard_line
 from drakegrasp.cluster.kinds import ClusterRequest, cluster_of, describe
@@ -42,44 +40,36 @@ from drakegrasp.hand.description import load_hand
 @click.command(
     cls=OneCommand, help=__doc__, context_settings={"help_option_names": ["-h", "--help"]}
 )
-@click.option(
-    "--cluster",
-    "kind",
-    type=Named("clusters"),
-    default="local",
-    show_default=True,
-    help="Where the work runs. Hosts follow ssh, an address follows scheduler, and a path follows "
-    "scheduler-file.",
-)
+@described
 @click.argument("where", nargs=-1, metavar="[HOST...|ADDRESS|PATH]")
-@shared(*BUILD)
-@shared("--workers", text="Processes in all.  [default with local: one per core]")
-@click.option(
-    "--cores", type=int, metavar="N", help="Cores of each SSH host or SLURM job, a worker on each."
-)
-@click.option("--memory", metavar="SIZE", help="Memory of each worker, e.g. 2GB.")
-@click.option("--walltime", metavar="TIME", help="Time limit of each SLURM job, [D-]HH:MM:SS.")
-@click.option(
-    "--interface", metavar="NAME", help="Network interface on which scheduler and workers listen."
-)
-@click.option("--host", metavar="ADDRESS", help="Address on which the scheduler listens, instead.")
-@shared(*TLS)
-@shared("--times")
-@click.option("--dry-run", is_flag=True, help="Only print what would run.")
 def main(
-    kind: str,
     where: tuple[str, ...],
-    workers: int | None,
-    cores: int | None,
-    memory: str | None,
-    walltime: str | None,
-    interface: str | None,
-    host: str | None,
     times: Path | None,
-    dry_run: bool,
+    kind: Annotated[str, Named("clusters")] = "local",
+    workers: int | None = None,
+    cores: int | None = None,
+    memory: str | None = None,
+    walltime: str | None = None,
+    interface: str | None = None,
+    host: str | None = None,
+    dry_run: bool = False,
     **options: Any,
 ) -> None:
-    """Run the script."""
+    """Run the script.
+
+    Options:
+        --cluster (kind): Where the work runs. Hosts follow ssh, an address follows scheduler, and a
+            path follows scheduler-file.
+        BUILD
+        --workers N: Processes in all. [default with local: one per core]
+        --cores N: Cores of each SSH host or SLURM job, a worker on each.
+        --memory SIZE: Memory of each worker, e.g. 2GB.
+        --walltime TIME: Time limit of each SLURM job, [D-]HH:MM:SS.
+        --interface NAME: Network interface on which scheduler and workers listen.
+        --host ADDRESS: Address on which the scheduler listens, instead.
+        TLS, --times
+        --dry-run: Only print what would run.
+    """
     tls = chosen_tls(options)
     request = parse_request(options)
     cluster = cluster_of(

@@ -4,40 +4,27 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
 
 from drakegrasp.cli.console import progress_bar, say
-from drakegrasp.cli.options import FILE, NEW_FILE, chosen_settings, option, shared
+from drakegrasp.cli.options import FILE, NEW_FILE, chosen_settings, described
 from drakegrasp.generation.request import BUILTIN
 from drakegrasp.runtime.environment import require_mujoco
 
 
 @click.command()
-@shared("--objects", required=False, default=BUILTIN, show_default=True, text="The meshes.")
-@shared("--per-class", "--objects-seed")
-@shared("--only", text="Only objects whose names begin with NAME; may be given several times.")
-@shared("--config", text="Configuration.  [default: paper]")
-@shared("--set")
-@shared("--candidates", default=100, show_default=True, text="Palm poses per object.")
-@option("--peer mujoco", None, "Run the same attempts in MuJoCo as well.", is_flag=True)
-@option("--compare", "FILE", "Print the ratios to this earlier report.", type=FILE)
-@option(
-    "--out",
-    "FILE",
-    "Where the report goes, as JSON.",
-    type=NEW_FILE,
-    default=Path("bench.json"),
-    show_default=True,
-)
-@shared("--units", "--manifest", "--quiet")
+@described
 def bench(
-    only: tuple[str, ...],
-    config: str | None,
-    mujoco: bool,
-    compare: Path | None,
-    out: Path,
+    config: str | None = None,
+    mujoco: bool = False,
+    compare: Annotated[Path | None, FILE] = None,
+    out: Annotated[Path, NEW_FILE] = Path("bench.json"),
+    objects: str = BUILTIN,
+    only: tuple[str, ...] = (),
+    candidates: int = 100,
+    *,
     units: str,
     manifest: Path | None,
     quiet: bool,
@@ -48,6 +35,18 @@ def bench(
     The command runs in one process and writes a report as JSON.
 
     With --peer (pip install 'drakegrasp[peer]'), it simulates all attempts in MuJoCo as well.
+
+    Options:
+        --objects MESH_DIR|builtin: The meshes.
+        --per-class, --objects-seed
+        --only NAME: Only objects whose names begin with NAME; may be given several times.
+        --config YAML|PRESET: Configuration. [default: paper]
+        --set
+        --candidates N: Palm poses per object.
+        --peer (mujoco): Run the same attempts in MuJoCo as well.
+        --compare FILE: Print the ratios to this earlier report.
+        --out FILE: Where the report goes, as JSON.
+        --units, --manifest, --quiet
     """
     import json
     import tempfile
@@ -65,7 +64,8 @@ def bench(
         require_mujoco("mujoco", "coacd")
     # The time of OpenGL's threads would count as this core's.
     os.environ.setdefault("LP_NUM_THREADS", "0")
-    rules, objects = load_config(config, chosen_settings(options)), options["objects"]
+    options |= {"objects": objects, "candidates": candidates}
+    rules = load_config(config, chosen_settings(options))
     earlier = None if compare is None else _read_report(compare)
 
     with tempfile.TemporaryDirectory() as folder:

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from drakegrasp import registry
 from drakegrasp.errors import (
     ConfigError,
     DrakegraspError,
@@ -72,27 +71,6 @@ def progress_bar(title: str, unit: str, *, show: bool = True) -> AbstractContext
     from drakegrasp.runtime import progress
 
     return progress.progress_bar(title, unit, show=show)
-
-
-class Option(click.Option):
-    """An option that the help lists under a heading, and that may name what the registry has."""
-
-    def __init__(
-        self,
-        *args: Any,
-        heading: str = "Options",
-        names: registry.Kind | None = None,
-        **attributes: Any,
-    ) -> None:
-        super().__init__(*args, **attributes)
-        self.heading, self.names = heading, names
-
-    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
-        """Return the words of the option and its help; called by click."""
-        if self.names is not None:
-            known = ", ".join(registry.names(self.names))
-            self.help = (self.help or "").replace("{names}", known)
-        return super().get_help_record(ctx)
 
 
 class Command(click.Command):

@@ -7,21 +7,17 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
 from drakegrasp.cli.console import Command, progress_bar, say, say_json
 from drakegrasp.cli.options import (
-    BUILD,
-    CONNECTION,
     FILE,
     PATH,
-    SET_ASSEMBLED,
-    SET_SCENES,
     chosen_workers,
     dataset_argument,
-    option,
+    described,
     parse_request,
     shared,
 )
@@ -34,15 +30,17 @@ if TYPE_CHECKING:
 
 
 @click.command(cls=Command)
-@shared(*BUILD)
-@shared(*CONNECTION)
-@option("--plan", None, "Only print the hours and bytes that the build would take.", is_flag=True)
-@shared("--times")
-def build(plan: bool, times: Path | None, **options: Any) -> None:
+@described
+def build(times: Path | None, plan: bool = False, **options: Any) -> None:
     """Build a dataset from a directory of meshes.
 
     The command simulates grasps of every object and writes trials.hdf5,
     grasping_oto.hdf5 and grasping_otm.hdf5 to DIR.
+
+    Options:
+        BUILD, CONNECTION
+        --plan: Only print the hours and bytes that the build would take.
+        --times
     """
     from drakegrasp.api.building import build_dataset
 
@@ -68,10 +66,8 @@ def build(plan: bool, times: Path | None, **options: Any) -> None:
 
 
 @click.command("bench-set", cls=Command)
+@described
 @click.argument("out", type=PATH, metavar="OUT")
-@shared("--only", "--set")
-@shared(*CONNECTION)
-@shared("--quiet")
 def bench_set(
     out: Path,
     only: tuple[str, ...],
@@ -84,6 +80,10 @@ def bench_set(
     256 built-in objects with masses and frictions of their own, all for testing. Their meshes are
     compared with the published hashes. With --only or --set it is a part of the benchmark or
     another one, and each card says so. The same command continues an interrupted build.
+
+    Options:
+        --only, --set
+        CONNECTION, --quiet
     """
     from drakegrasp.api.building import make_benchmark
 
@@ -98,23 +98,23 @@ def bench_set(
 
 
 @click.command()
+@described
 @dataset_argument()
-@option(
-    "--reject",
-    "FILE",
-    "Trials that must not become samples: the reject.json of an inspection, or a text file "
-    "with an id per line; # starts a comment.",
-    type=FILE,
-)
-@shared("--set", text=SET_ASSEMBLED)
-@shared("--workers")
 def assemble(
-    out: Path, reject: Path | None, overrides: tuple[str, ...], workers: int | None
+    out: Path,
+    overrides: tuple[str, ...],
+    workers: int | None,
+    reject: Annotated[Path | None, FILE] = None,
 ) -> None:
     """Filter and split again, without simulating.
 
     The command writes trials.hdf5 and both data files again from the shards in OUT.
     Entries of reject.json that are not successes are skipped and listed.
+
+    Options:
+        --reject FILE: Trials that must not become samples: the reject.json of an inspection, or a
+            text file with an id per line; # starts a comment.
+        ASSEMBLED, --workers
     """
     from drakegrasp.cli import tables
     from drakegrasp.dataset.assemble import assemble as assemble_files
@@ -138,14 +138,18 @@ def assemble(
 
 
 @click.command()
+@described
 @dataset_argument()
-@shared("--set", text=SET_SCENES)
-@shared("--workers", "--quiet")
-def scenes(out: Path, overrides: tuple[str, ...], workers: int | None, quiet: bool) -> None:
+def scenes(out: Path, workers: int | None, quiet: bool, overrides: tuple[str, ...] = ()) -> None:
     """Render scenes whose cameras know no grasp, to train on.
 
     The command writes OUT/scenes.hdf5: each object of OUT in each resting pose, seen by sixteen
     cameras (five fixed ones to test), with all hands that closed on it.
+
+    Options:
+        --set KEY=VALUE (overrides): Change a key of `scenes`, e.g. scenes.views=8; may be given
+            several times.
+        --workers, --quiet
     """
     from drakegrasp.dataset.paths import SCENES_FILE
 
@@ -174,10 +178,9 @@ def write_scenes(
 
 
 @click.command()
+@described
 @click.argument("into", type=PATH, metavar="INTO")
 @click.argument("outs", type=PATH, metavar="OUTS...", nargs=-1, required=True)
-@shared("--set", text=SET_ASSEMBLED)
-@shared("--workers")
 def merge(
     into: Path, outs: tuple[Path, ...], overrides: tuple[str, ...], workers: int | None
 ) -> None:
@@ -185,6 +188,9 @@ def merge(
 
     Their objects or their seeds may differ, and nothing else but what --set says for all. INTO
     must be new or empty, and appears when it is complete; OUTS stay as they are.
+
+    Options:
+        ASSEMBLED, --workers
     """
     from drakegrasp.cli import tables
     from drakegrasp.generation.merge import merge as merge_datasets
@@ -236,13 +242,16 @@ def check(path: Path, workers: int | None, as_json: bool) -> None:
 
 
 @click.command()
+@described
 @dataset_argument()
-@option("--trial", "ID", "Row of trials.hdf5.", required=True, type=int)
-@option("--html", "FILE", "Write a recording of the trial that plays in a browser.", type=PATH)
-def replay(out: Path, trial: int, html: Path | None) -> None:
+def replay(out: Path, *, trial: int, html: Path | None = None) -> None:
     """Run a trial again and compare every value.
 
     Exit code 1 if any value differs from the stored one.
+
+    Options:
+        --trial ID: Row of trials.hdf5.
+        --html FILE: Write a recording of the trial that plays in a browser.
     """
     from drakegrasp.generation.replay import record_trial, replay_trial
 

@@ -6,12 +6,12 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
 from drakegrasp.cli.console import progress_bar, say, say_finding
-from drakegrasp.cli.options import FILE, NEW_FILE, PATH, chosen_settings, option, shared
+from drakegrasp.cli.options import FILE, NEW_FILE, PATH, chosen_settings, described, shared
 from drakegrasp.errors import counted
 
 if TYPE_CHECKING:
@@ -19,28 +19,27 @@ if TYPE_CHECKING:
 
 
 @click.command()
+@described
 @click.argument("mesh_dir", type=PATH)
-@shared("--units", "--manifest")
-@option(
-    "--hand",
-    "HAND",
-    "Hand with whose opening and stand-offs sizes are compared (default: barrett).",
-)
-@option("--json json_file", "FILE", "Write all findings as JSON too.", type=PATH)
-@option("--sheet", "FILE", "Write a picture of every object with its status (.png).", type=PATH)
 def audit(
     mesh_dir: Path,
     units: str,
     manifest: Path | None,
-    hand: str | None,
-    json_file: Path | None,
-    sheet: Path | None,
+    hand: str | None = None,
+    json_file: Path | None = None,
+    sheet: Path | None = None,
 ) -> None:
     """Check which meshes are fit, repaired or refused.
 
     Meshes are prepared as in a build with the default configuration. A build also drops each
     object on the table, and refuses one that does not come to rest.
     Exit code 1 if every mesh is refused.
+
+    Options:
+        --units, --manifest
+        --hand HAND: Hand with whose opening and stand-offs sizes are compared (default: barrett).
+        --json FILE (json_file): Write all findings as JSON too.
+        --sheet FILE: Write a picture of every object with its status (.png).
     """
     from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console, memory_line
     from drakegrasp.hand.description import load_hand
@@ -106,19 +105,28 @@ def export_objects(directory: Path, **options: Any) -> None:
 
 
 @objects.command("morph")
+@described
 @click.argument("mesh_dir", type=PATH)
-@option("--per-mesh", "N", "Morphs of each mesh.", required=True, type=click.IntRange(min=1))
-@shared("--seed", type=click.IntRange(min=0), default=0, text="Seed of the draws.  [default: 0]")
-@shared("--out", text="Directory of the morphs; new or empty.")
-@shared("--units", "--manifest")
 def morph(
-    mesh_dir: Path, per_mesh: int, seed: int, out: Path, units: str, manifest: Path | None
+    mesh_dir: Path,
+    units: str,
+    manifest: Path | None,
+    *,
+    per_mesh: Annotated[int, click.IntRange(min=1)],
+    seed: Annotated[int, click.IntRange(min=0)] = 0,
+    out: Path,
 ) -> None:
     """Make objects of other proportions from meshes.
 
     Each mesh of MESH_DIR is widened, bent in and stretched along an axis at random. The morphs
     (.obj, metres, +z up) stand on the table as the mesh does, and an objects.yaml beside them
     keeps their class. The same seed gives the same files.
+
+    Options:
+        --per-mesh N: Morphs of each mesh.
+        --seed S: Seed of the draws.
+        --out DIR: Directory of the morphs; new or empty.
+        --units, --manifest
     """
     from drakegrasp.objects.morph import morph_meshes
 
@@ -156,53 +164,40 @@ def list_hands() -> None:
 
 
 @hand.command("new")
+@described
 @click.argument("model", type=FILE, metavar="MODEL")
-@option("--out", "FOLDER", "A new folder for the hand's files.", type=PATH, required=True)
-@option("--palm", "LINK", "The link that carries the fingers.")
-@option("--approach", "X,Y,Z", "Where the palm faces: +Gz, in the axes of the palm link.")
-@option("--fingers", "LINK,LINK", "The fingertip links that grasp.")
-@option(
-    "--joint joints",
-    "NAME=POSITION",
-    "The position of a joint that does not close [rad or m], as in the vendor's model.",
-    multiple=True,
-)
-@option("--reverse", "JOINT", "A joint whose positive position opens.", multiple=True)
-@option(
-    "--effort",
-    "E",
-    "What each motor gives at its joint [N m, or N].",
-    type=click.FloatRange(min=0.0, min_open=True),
-)
-@option(
-    "--set settings",
-    "KEY=VALUE",
-    "A key of the hand file, as in --set drive=torque.",
-    multiple=True,
-)
-@option("--package packages", "NAME=FOLDER", "Where package://NAME/ is.", multiple=True)
-@option(
-    "--root roots",
-    "FOLDER",
-    "A folder outside of the model's whose meshes it may use.",
-    type=PATH,
-    multiple=True,
-)
 def new_hand(
     model: Path,
+    *,
     out: Path,
-    approach: str | None,
-    fingers: str | None,
-    joints: Sequence[str],
-    packages: Sequence[str],
-    roots: Sequence[Path],
-    **said: Any,
+    palm: str | None = None,
+    approach: str | None = None,
+    fingers: str | None = None,
+    joints: tuple[str, ...] = (),
+    reverse: tuple[str, ...] = (),
+    effort: Annotated[float | None, click.FloatRange(min=0.0, min_open=True)] = None,
+    settings: tuple[str, ...] = (),
+    packages: tuple[str, ...] = (),
+    roots: tuple[Path, ...] = (),
 ) -> None:
     """Draft a hand file from a model, and draw it.
 
     MODEL is a URDF, SDFormat or MJCF file as its vendor ships it. FOLDER gets the hand file, in
     which each guess has a comment, the model, its meshes and a picture. Options override guesses.
     Exit code 1 if a check of the drafted hand fails.
+
+    Options:
+        --out FOLDER: A new folder for the hand's files.
+        --palm LINK: The link that carries the fingers.
+        --approach X,Y,Z: Where the palm faces: +Gz, in the axes of the palm link.
+        --fingers LINK,LINK: The fingertip links that grasp.
+        --joint NAME=POSITION (joints): The position of a joint that does not close [rad or m], as
+            in the vendor's model.
+        --reverse JOINT: A joint whose positive position opens.
+        --effort E: What each motor gives at its joint [N m, or N].
+        --set KEY=VALUE (settings): A key of the hand file, as in --set drive=torque.
+        --package NAME=FOLDER (packages): Where package://NAME/ is.
+        --root FOLDER (roots): A folder outside of the model's whose meshes it may use.
     """
     import numpy as np
 
@@ -214,7 +209,10 @@ def new_hand(
         approach=None if approach is None else np.array(_numbers(approach)),
         fingers=tuple(fingers.split(",")) if fingers else (),
         joints={name: _number(text) for name, text in _pairs("--joint", joints)},
-        **said,
+        palm=palm,
+        reverse=reverse,
+        effort=effort,
+        settings=settings,
     )
     folders = {name: Path(text) for name, text in _pairs("--package", packages)}
     drafted = draft_hand(model, out, answers=answers, packages=folders, roots=roots)
@@ -256,18 +254,16 @@ def _numbers(text: str) -> list[float]:
 
 
 @hand.command("check")
+@described
 @click.argument("hand_file", metavar="NAME|YAML")
-@option(
-    "--picture",
-    "PNG",
-    "Write a picture of the hand, open and closed, with pads and palm frame.",
-    type=NEW_FILE,
-)
-def check_hand_file(hand_file: str, picture: Path | None) -> None:
+def check_hand_file(hand_file: str, picture: Annotated[Path | None, NEW_FILE] = None) -> None:
     """Check a hand before it is used, with trial grasps.
 
     Files, motion, strength and trial grasps in simulation are checked. NAME is a hand that comes
     with the package, YAML a hand file. Exit code 1 if anything is wrong.
+
+    Options:
+        --picture PNG: Write a picture of the hand, open and closed, with pads and palm frame.
     """
     from drakegrasp.commissioning.trial_grasps import check_hand
 

@@ -1,23 +1,52 @@
-"""Options that several commands share, each told once in a table, and those of a build.
+"""Options of commands, made of signatures and docstrings, and what those of a build ask for.
 
 In: what click parsed. Out: a `BuildRequest`, with the configuration resolved.
+
+A command says its options in the section `Options` of its docstring, in the order of its help:
+
+    --port N: Port on this machine; 0 takes any that is free.
+    --json FILE (json_file): Write all findings as JSON, too.
+    --units, --manifest
+
+The first has a parameter `port`, whose annotation and default say the rest; the second one of
+another name; the third line names options that several commands have, which stand in `_shared`.
 """
 
 from __future__ import annotations
 
+import inspect
 import os
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 import click
 
 from drakegrasp import registry
-from drakegrasp.cli.console import Option
 from drakegrasp.errors import first_line
 from drakegrasp.generation.request import BUILTIN, BuildRequest
 
 F = TypeVar("F", bound=Callable[..., Any])
+#: An option in a docstring: its names, what stands for the value, its parameter, and its help.
+_ENTRY = re.compile(r"(--[^\s:]+(?: --[^\s:]+)*)(?: ([^()]+?))?(?: \((\w+)\))?: (.+)")
+_SECTION = "\n\nOptions:\n"
+
+
+class Option(click.Option):
+    """An option that the help lists under a heading, and that may name what the registry has."""
+
+    heading = "Options"
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Return the words of the option and its help; called by click."""
+        self.help = re.sub(
+            r"\{(\w+)\}",
+            lambda kind: ", ".join(registry.names(kind[1])),  # type: ignore[arg-type]
+            self.help or "",
+        )
+        return super().get_help_record(ctx)
 
 
 class PathType(click.Path):
@@ -49,115 +78,170 @@ class Named(click.Choice[str]):
         return registry.names(self.kind)
 
 
-#: Types of options: any path, a file to write, a file that is there.
+#: Types of options: any path, a file to write, a file that is there, any path that is.
 PATH = PathType(path_type=Path)
 NEW_FILE = PathType(path_type=Path, dir_okay=False)
 FILE = PathType(path_type=Path, exists=True, dir_okay=False)
+EXISTING = PathType(path_type=Path, exists=True)
 
 
-def _set_text(what: str, example: str) -> str:
-    """Return the help of a `--set`, with a value that its command takes."""
-    return f"Change {what}, e.g. {example}; may be given several times."
+def described(function: F, request: type | None = None) -> F:
+    """Give a command the options of its docstring, whose rest is its help.
+
+    Args:
+        function: The command.
+        request: Dataclass whose fields are more parameters of it.
+    """
+    text, _, section = inspect.cleandoc(function.__doc__ or "").partition(_SECTION)
+    function.__doc__ = text
+    own = (function,) if request is None else (function, request)
+    return _with_options(list(_options(section, *own)))(function)
 
 
-#: The options that more than one command has: metavar, help, and what else click shall know.
-_TABLE: dict[str, tuple[str | None, str, dict[str, Any]]] = {
-    # What is built.
-    "--objects": (
-        "MESH_DIR|builtin",
-        "A directory of .obj, .stl, .ply or .glb files, or the built-in objects.",
-        {"required": True},
-    ),
-    "--per-class": ("N", "Built-in objects of each class.  [default: 2]", {"type": int}),
-    "--objects-seed": (
-        "S",
-        "Seed of the sizes of the built-in objects.  [default: 0]",
-        {"type": int},
-    ),
-    "--units": ("m|cm|mm", "Unit of length of the meshes.", {"default": "m", "show_default": True}),
-    "--manifest": (
-        "FILE",
-        "YAML file with units and classes by mesh.  [default: objects.yaml beside the meshes]",
-        {"type": PATH},
-    ),
-    "--postures": (
-        "FILE|DIR",
-        "Try these postures (wrist and joints) instead of drawn palm poses, on the objects that "
-        "they name: .npz, .hdf5, .csv, .parquet, DexGraspBench .npy or isaac_grasp .yaml.",
-        {"type": PathType(path_type=Path, exists=True)},
-    ),
-    "--only": ("NAME", "Build this object only; may be given several times.", {"multiple": True}),
-    "--out": (
-        "DIR",
-        "Directory of the dataset. The same command continues an interrupted build.",
-        {"type": PATH, "required": True},
-    ),
-    # By which rules.
-    "--config": (
-        "YAML|PRESET",
-        "Configuration: a file, or the preset paper, fast, randomized or released.  [default: "
-        "paper, but with split.by=auto]",
-        {},
-    ),
-    "--set": ("KEY=VALUE", _set_text("one setting", "lift.hold_time=1"), {"multiple": True}),
-    "--candidates": ("N", "Palm poses per object.  [default: 10000]", {"type": int}),
-    "--max-grasps": ("N", "Stop an object after N successes.  [default: no limit]", {"type": int}),
-    "--samples": (
-        "N",
-        "Stop when there are N samples, which the objects share in turns; a larger N goes on from "
-        "there.  [default: no limit]",
-        {"type": int},
-    ),
-    "--samples-per-object": (
-        "N",
-        "Stop an object when it has N samples.  [default: no limit]",
-        {"type": int},
-    ),
-    "--certify": (
-        "K",
-        "Repeat each sample K times, disturbed, and store how many hold.  [default: 0]",
-        {"type": int},
-    ),
-    "--seed": ("S", "Seed of all random draws.  [default: 0]", {"type": int}),
-    # Who does the work.
-    "--workers": ("N", "Processes on this machine.  [default: one per core]", {"type": int}),
-    "--scheduler": ("ADDRESS", "Use the running Dask scheduler at this address.", {}),
-    "--scheduler-file": (
-        "FILE",
-        "Use the running Dask scheduler that wrote this file.",
-        {"type": PATH},
-    ),
-    "--tls-ca-file": (
-        "FILE",
-        "Your own certificate authority (PEM), as a running scheduler needs it; with the next two "
-        "options.",
-        {"type": FILE},
-    ),
-    "--tls-cert": (
-        "FILE",
-        "Certificate of client, scheduler and workers, signed by that authority.",
-        {"type": FILE},
-    ),
-    "--tls-key": ("FILE", "The certificate's private key.", {"type": FILE}),
-    "--tls/--no-tls": (
-        None,
-        "Whether connections need a certificate. Workers that the command starts get one that is "
-        "made for the run.",
-        {"default": True, "show_default": True},
-    ),
-    # What is said.
-    "--times": (
-        "FILE",
-        "Estimate from these times, which measure_stages.py of pipelines/measurements printed.  "
-        "[default: OUT/log.jsonl, else times measured on other meshes]",
-        {"type": FILE},
-    ),
-    "--quiet": (None, "Show no progress.", {"is_flag": True}),
-    "--json": (None, "Print one document of JSON, and nothing else.", {"is_flag": True}),
-}
-#: Words of options whose parameters have other names.
-_PARAMETERS = {"--set": "--set overrides", "--json": "--json as_json"}
-#: The options of the table that stand for `--set KEY=VALUE`, and their keys.
+def shared(*names: str) -> Callable[[F], F]:
+    """Give a command some of the options that several have; its help lists them in this order."""
+    return _with_options([_SHARED[name] for name in names])
+
+
+def _with_options(options: list[Option]) -> Callable[[F], F]:
+    def give(function: F) -> F:
+        # Click takes them as decorators come: the last one first.
+        vars(function).setdefault("__click_params__", []).extend(reversed(options))
+        return function
+
+    return give
+
+
+def _options(section: str, *signatures: Callable[..., Any]) -> Iterator[Option]:
+    """Yield the options of a section of a docstring, given what has their parameters."""
+    parameters = dict[str, inspect.Parameter]()
+    for each in signatures:
+        parameters |= inspect.signature(each, eval_str=True).parameters
+    for entry in re.split(r"\n {4}(?! )", f"\n{section}")[1:]:
+        text = " ".join(entry.split()).replace(" [default", "  [default")
+        if (match := _ENTRY.fullmatch(text)) is None:
+            for name in text.split(", "):
+                yield from GROUPS.get(name) or (_SHARED[name],)
+            continue
+        words, metavar, name, text = match.groups()
+        name = name or _parameter(words.split()[0].partition("/")[0])
+        attributes = _attributes(parameters[name])
+        yield Option([*words.split(), name], metavar=metavar, help=text, **attributes)
+
+
+def _attributes(parameter: inspect.Parameter) -> dict[str, Any]:
+    """Return what click shall know of the option of a parameter."""
+    kind, default, attributes = parameter.annotation, parameter.default, dict[str, Any]()
+    if get_origin(kind) is Annotated:
+        kind, attributes["type"] = get_args(kind)
+    if isinstance(kind, UnionType):
+        kind = get_args(kind)[0]  # the other one is None
+    if get_origin(kind) is tuple:
+        kind, attributes["multiple"] = get_args(kind)[0], True
+    if kind is bool:
+        attributes["is_flag"] = True
+    else:
+        attributes.setdefault("type", {Path: PATH}.get(kind, kind))
+    if default is parameter.empty:
+        attributes["required"] = True
+    elif not (default is None or default is False or default == ()):
+        attributes |= {"default": default, "show_default": True}
+    return attributes
+
+
+def _parameter(name: str) -> str:
+    """Return the name of the parameter that click makes of an option's name."""
+    return name.removeprefix("--").replace("-", "_")
+
+
+def _shared(
+    *,
+    objects: str,
+    per_class: int | None = None,
+    objects_seed: int | None = None,
+    units: str = "m",
+    manifest: Path | None = None,
+    postures: Annotated[Path | None, EXISTING] = None,
+    only: tuple[str, ...] = (),
+    out: Path,
+    config: str | None = None,
+    overrides: tuple[str, ...] = (),
+    candidates: int | None = None,
+    max_grasps: int | None = None,
+    samples: int | None = None,
+    samples_per_object: int | None = None,
+    certify: int | None = None,
+    seed: int | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    scheduler_file: Path | None = None,
+    tls_ca_file: Annotated[Path | None, FILE] = None,
+    tls_cert: Annotated[Path | None, FILE] = None,
+    tls_key: Annotated[Path | None, FILE] = None,
+    tls: bool = True,
+    times: Annotated[Path | None, FILE] = None,
+    quiet: bool = False,
+    as_json: bool = False,
+) -> None:
+    """Say the options that more than one command has.
+
+    Options:
+        --objects MESH_DIR|builtin: A directory of .obj, .stl, .ply or .glb files, or the built-in
+            objects.
+        --per-class N: Built-in objects of each class. [default: 2]
+        --objects-seed S: Seed of the sizes of the built-in objects. [default: 0]
+        --units m|cm|mm: Unit of length of the meshes.
+        --manifest FILE: YAML file with units and classes by mesh. [default: objects.yaml beside the
+            meshes]
+        --postures FILE|DIR: Try these postures (wrist and joints) instead of drawn palm poses, on
+            the objects that they name: .npz, .hdf5, .csv, .parquet, DexGraspBench .npy or
+            isaac_grasp .yaml.
+        --only NAME: Build this object only; may be given several times.
+        --out DIR: Directory of the dataset. The same command continues an interrupted build.
+        --config YAML|PRESET: Configuration: a file, or the preset paper, fast, randomized or
+            released. [default: paper, but with split.by=auto]
+        --set KEY=VALUE (overrides): Change one setting, e.g. lift.hold_time=1; may be given several
+            times.
+        --candidates N: Palm poses per object. [default: 10000]
+        --max-grasps N: Stop an object after N successes. [default: no limit]
+        --samples N: Stop when there are N samples, which the objects share in turns; a larger N
+            goes on from there. [default: no limit]
+        --samples-per-object N: Stop an object when it has N samples. [default: no limit]
+        --certify K: Repeat each sample K times, disturbed, and store how many hold. [default: 0]
+        --seed S: Seed of all random draws. [default: 0]
+        --workers N: Processes on this machine. [default: one per core]
+        --scheduler ADDRESS: Use the running Dask scheduler at this address.
+        --scheduler-file FILE: Use the running Dask scheduler that wrote this file.
+        --tls-ca-file FILE: Your own certificate authority (PEM), as a running scheduler needs it;
+            with the next two options.
+        --tls-cert FILE: Certificate of client, scheduler and workers, signed by that authority.
+        --tls-key FILE: The certificate's private key.
+        --tls/--no-tls: Whether connections need a certificate. Workers that the command starts get
+            one that is made for the run.
+        --times FILE: Estimate from these times, which measure_stages.py of pipelines/measurements
+            printed. [default: OUT/log.jsonl, else times measured on other meshes]
+        --quiet: Show no progress.
+        --json (as_json): Print one document of JSON, and nothing else.
+    """
+
+
+def _assembled(*, overrides: tuple[str, ...] = ()) -> None:
+    """Say the settings of what is assembled.
+
+    Options:
+        --set KEY=VALUE (overrides): Change a setting of the filters or the split, e.g.
+            filters.outlier_sigma=3; may be given several times. Filters of your own must be given
+            again: filters.own=FILE.py:NAME.
+    """
+
+
+def _said(function: Callable[..., Any]) -> tuple[Option, ...]:
+    """Return the options of a docstring that names no other ones."""
+    section = inspect.cleandoc(function.__doc__ or "").partition(_SECTION)[2]
+    return tuple(_options(section, function))
+
+
+#: The options that stand for `--set KEY=VALUE`, and their keys.
 SETTINGS = {
     "--per-class": "builtin.per_class",
     "--objects-seed": "builtin.seed",
@@ -168,7 +252,7 @@ SETTINGS = {
     "--certify": "certify.repeats",
     "--seed": "seed",
 }
-#: Groups of options: of a build, of the certificates, and of who does the work.
+#: Names of options: of a build, and of who does the work.
 BUILD = (
     *("--objects", "--per-class", "--objects-seed", "--out", "--config", "--set", "--candidates"),
     *("--max-grasps", "--samples", "--samples-per-object", "--postures", "--only", "--certify"),
@@ -177,43 +261,16 @@ BUILD = (
 _TLS_FILES = ("--tls-ca-file", "--tls-cert", "--tls-key")
 TLS = ("--tls/--no-tls", *_TLS_FILES)
 CONNECTION = ("--workers", "--scheduler", "--scheduler-file", *TLS)
-#: Help of a `--set` for some settings alone.
-SET_ASSEMBLED = (
-    f"{_set_text('a setting of the filters or the split', 'filters.outlier_sigma=3')} Filters of "
-    "your own must be given again: filters.own=FILE.py:NAME."
-)
-SET_SCENES = _set_text("a key of `scenes`", "scenes.views=8")
-
-
-def option(words: str, metavar: str | None, text: str, **attributes: Any) -> Callable[[F], F]:
-    """Give a command an option.
-
-    Args:
-        words: Its name, and after a blank the name of its parameter if that differs.
-        metavar: What stands for the value in the help.
-        text: Its help.
-        attributes: What else click shall know.
-    """
-    return click.option(*words.split(), cls=Option, metavar=metavar, help=text, **attributes)
-
-
-def shared(*names: str, **changes: Any) -> Callable[[F], F]:
-    """Give a command options of the table, which its help lists in this order.
-
-    Args:
-        names: Of the options; their parameters have the same names but for `_PARAMETERS`.
-        changes: What click shall know of them otherwise than the table says.
-    """
-
-    def give(command: F) -> F:
-        for name in reversed(names):
-            metavar, text, attributes = _TABLE[name]
-            heading = {"heading": "Cluster options"} if name in CONNECTION[1:] else {}
-            row = {"metavar": metavar, "text": text, **attributes, **heading, **changes}
-            command = option(_PARAMETERS.get(name, name), **row)(command)
-        return command
-
-    return give
+_SHARED: dict[str, Option] = {"/".join((*o.opts, *o.secondary_opts)): o for o in _said(_shared)}
+for _name in CONNECTION[1:]:
+    _SHARED[_name].heading = "Cluster options"
+#: Options that a docstring names together.
+GROUPS = {
+    "BUILD": tuple(map(_SHARED.__getitem__, BUILD)),
+    "CONNECTION": tuple(map(_SHARED.__getitem__, CONNECTION)),
+    "TLS": tuple(map(_SHARED.__getitem__, TLS)),
+    "ASSEMBLED": _said(_assembled),
+}
 
 
 def _tidied(context: click.Context, parameter: click.Parameter, out: Path) -> Path:
@@ -297,8 +354,3 @@ def chosen_settings(options: Mapping[str, Any]) -> list[str]:
             )
         chosen.append(f"{key}={value}")
     return chosen
-
-
-def _parameter(name: str) -> str:
-    """Return the name of the parameter that click makes of an option's name."""
-    return name.removeprefix("--").replace("-", "_")

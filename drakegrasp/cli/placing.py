@@ -6,8 +6,8 @@ Whatever is wrong with the files or the options is a `GraspError`, `MeshError`, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -42,30 +42,13 @@ from drakegrasp.verification.prediction import (
 from drakegrasp.verification.result_files import refuse_unwritable
 from drakegrasp.verification.verify import PlacedGrasp
 
+if TYPE_CHECKING:
+    from drakegrasp.cli.predictions import VerifyRequest
+
 #: No split has so many rows.
 MOST_ROWS = 10_000_000
 #: The split of a dataset if none is named.
 DEFAULT_SPLIT = "test"
-
-
-@dataclass(frozen=True, kw_only=True)
-class VerifyRequest:
-    """The options of the command, see its help; None for those that were not given."""
-
-    grasps: Path
-    mesh: Path | None = None
-    dataset: Path | None = None
-    split: str | None = None
-    frame: str | None = None
-    camera: Path | None = None
-    units: str | None = None
-    method: str = "hand"
-    snap_points: bool = False
-    hand: str | None = None
-    config: str | None = None
-    overrides: tuple[str, ...] = ()
-    out: Path | None = None
-    rows: str | None = None
 
 
 def place_requested(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:

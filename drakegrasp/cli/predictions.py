@@ -6,23 +6,23 @@ import json
 import shlex
 import sys
 from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import click
 
 from drakegrasp.cli.console import Command, progress_bar, say
-from drakegrasp.cli.options import CONNECTION, PATH, PathType, chosen_workers, option, shared
+from drakegrasp.cli.options import CONNECTION, EXISTING, PATH, chosen_workers, described
 from drakegrasp.runtime.executor import processes
 
 if TYPE_CHECKING:
-    from drakegrasp.cli.placing import VerifyRequest
     from drakegrasp.runtime.executor import Executor
     from drakegrasp.runtime.progress import Report
     from drakegrasp.verification.result import Verification
 
-EXISTING = PathType(path_type=Path, exists=True)
 SPLITS = click.Choice(["train", "valid", "test"])
 #: Options that say what the grasps are and where; a protocol of MuJoCo answers all others.
 PLACES = ("grasps", "mesh", "units", "dataset", "split", "frame", "camera", "hand")
@@ -41,98 +41,35 @@ class _Frame(click.Choice[str]):
         return super().convert("table" if value == "workspace" else value, param, ctx)
 
 
+@dataclass(frozen=True, kw_only=True)
+class VerifyRequest:
+    """What is verified, see the help of the command; None for options that were not given."""
+
+    grasps: Path
+    mesh: Path | None = None
+    dataset: Path | None = None
+    split: Annotated[str | None, SPLITS] = None
+    frame: Annotated[str | None, _Frame(["object", "camera", "table", "mesh"])] = None
+    camera: Path | None = None
+    units: str | None = None
+    method: Annotated[str, click.Choice(["hand", "forces"])] = "hand"
+    snap_points: bool = False
+    hand: str | None = None
+    config: str | None = None
+    overrides: tuple[str, ...] = ()
+    out: Path | None = None
+    rows: str | None = None
+
+
 @click.command(cls=Command)
+@partial(described, request=VerifyRequest)
 @click.argument("grasps", type=PATH, metavar="GRASPS")
-@option("--object mesh", "MESH", "The object: a .obj, .stl, .ply or .glb file.", type=PATH)
-@option("--units", "m|cm|mm", "Unit of length of the mesh.  [default: m]")
-@option(
-    "--dataset",
-    "FILE",
-    "Instead of --object: the data file OUT/grasping_oto.hdf5 or _otm. Each row gives the "
-    "object, its pose and the camera's pose.",
-    type=PATH,
-)
-@option(
-    "--split",
-    None,
-    "Rows of the dataset, and group in an HDF5 file of grasps.  [default: test]",
-    type=SPLITS,
-)
-@option(
-    "--rows",
-    "0,4,7-9|FILE.npy",
-    "With --dataset: the row of the split that each grasp is for, where the file does not "
-    "say.  [default: all rows]",
-)
-@option(
-    "--frame",
-    None,
-    "Frame of the grasps; mesh, with --object, has the axes and the origin of the file.  [default: "
-    "object; with --dataset camera]",
-    type=_Frame(["object", "camera", "table", "mesh"]),
-)
-@option(
-    "--camera",
-    "FILE",
-    "With --object and --frame camera: .npy file with the camera's pose in the table-top "
-    "frame X_TC, as (4, 4), or per grasp as (n, 4, 4) or (n, 12).",
-    type=PATH,
-)
-@option(
-    "--method",
-    None,
-    "hand: close a simulated hand on the contacts and lift. forces: ask "
-    "whether forces at the contacts that they select on the surface can lift the object.",
-    type=click.Choice(["hand", "forces"]),
-    default="hand",
-    show_default=True,
-)
-@option(
-    "--snap-points",
-    None,
-    "Move the points, not the normals, to the surface of the object first.",
-    is_flag=True,
-)
-@option(
-    "--protocol",
-    "NAME|FILE.py:NAME",
-    "The rule of the verdict: {names}, or a class of your own. All but lift run in MuJoCo.",
-    names="protocols",
-    default="lift",
-    show_default=True,
-)
-@option(
-    "--simulator",
-    None,
-    "Where the protocol must run.  [default: where it is at home]",
-    type=click.Choice(["drake", "mujoco"]),
-)
-@option(
-    "--assets",
-    "DIR",
-    "With files of DexGraspBench: the folder in which they name their objects.  [default: .]",
-    type=PATH,
-)
-@option("--hand", "NAME|YAML|XML", "The hand.  [default: that of the configuration]")
-@option(
-    "--config",
-    "YAML|PRESET",
-    "Configuration: a file, or the preset paper, fast, randomized or released.  [default: "
-    "that of the dataset, else the defaults]",
-)
-@shared("--set")
-@option(
-    "--out", "NAME", "Write NAME.jsonl and NAME.h5 instead of printing lines of JSON.", type=PATH
-)
-@shared(*CONNECTION)
-@shared("--quiet", text="Show neither progress nor the table.")
-@shared("--json", text="Print the lines of JSON also with --out, and nothing else.")
 def verify(
-    quiet: bool,
-    as_json: bool,
-    protocol: str,
-    simulator: str | None,
-    assets: Path | None,
+    quiet: bool = False,
+    as_json: bool = False,
+    protocol: str = "lift",
+    simulator: Annotated[str | None, click.Choice(["drake", "mujoco"])] = None,
+    assets: Path | None = None,
     **options: Any,
 ) -> None:
     """Try predicted grasps in the simulator.
@@ -158,8 +95,36 @@ def verify(
     One line of JSON per grasp goes to standard output or NAME.jsonl, a table of the outcomes to
     standard error. A row that is no grasp has the outcome `invalid`. Exit code: 0 if every grasp
     has a verdict, whatever it is; 2 for input that cannot be used.
+
+    Options:
+        --object MESH (mesh): The object: a .obj, .stl, .ply or .glb file.
+        --units m|cm|mm: Unit of length of the mesh. [default: m]
+        --dataset FILE: Instead of --object: the data file OUT/grasping_oto.hdf5 or _otm. Each row
+            gives the object, its pose and the camera's pose.
+        --split: Rows of the dataset, and group in an HDF5 file of grasps. [default: test]
+        --rows 0,4,7-9|FILE.npy: With --dataset: the row of the split that each grasp is for, where
+            the file does not say. [default: all rows]
+        --frame: Frame of the grasps; mesh, with --object, has the axes and the origin of the file.
+            [default: object; with --dataset camera]
+        --camera FILE: With --object and --frame camera: .npy file with the camera's pose in the
+            table-top frame X_TC, as (4, 4), or per grasp as (n, 4, 4) or (n, 12).
+        --method: hand: close a simulated hand on the contacts and lift. forces: ask whether forces
+            at the contacts that they select on the surface can lift the object.
+        --snap-points: Move the points, not the normals, to the surface of the object first.
+        --protocol NAME|FILE.py:NAME: The rule of the verdict: {protocols}, or a class of your own.
+            All but lift run in MuJoCo.
+        --simulator: Where the protocol must run. [default: where it is at home]
+        --assets DIR: With files of DexGraspBench: the folder in which they name their objects.
+            [default: .]
+        --hand NAME|YAML|XML: The hand. [default: that of the configuration]
+        --config YAML|PRESET: Configuration: a file, or the preset paper, fast, randomized or
+            released. [default: that of the dataset, else the defaults]
+        --set
+        --out NAME: Write NAME.jsonl and NAME.h5 instead of printing lines of JSON.
+        CONNECTION
+        --quiet: Show neither progress nor the table.
+        --json (as_json): Print the lines of JSON also with --out, and nothing else.
     """
-    from drakegrasp.cli.placing import VerifyRequest
     from drakegrasp.protocols.protocol import find_protocol
 
     workers = chosen_workers(options)
@@ -346,70 +311,24 @@ def _own_files(request: VerifyRequest, folder: Path, execute: Executor, report: 
 
 
 @click.command(cls=Command)
+@described
 @click.argument("predictions", type=EXISTING, metavar="[PREDICTIONS]...", nargs=-1)
-@option(
-    "--dataset",
-    "FILE",
-    "The data file OUT/grasping_oto.hdf5 or _otm, or OUT/scenes.hdf5, whose rows or views the "
-    "predictions are for.",
-    type=PATH,
-    required=True,
-)
-@option("--split", None, "Rows of the dataset.", type=SPLITS, default="test", show_default=True)
-@option(
-    "--against",
-    "FILE",
-    "Predictions of another method for the same rows: the card says by how much the headline "
-    "is above its. May be given several times, for a method that was trained several times.",
-    type=EXISTING,
-    multiple=True,
-)
-@option(
-    "--train",
-    "FILE",
-    "Data file whose training rows give the reference rows.  [default: --dataset]",
-    type=PATH,
-)
-@option(
-    "--reference references",
-    "NAME",
-    "Score these reference rows only; may be given several times: own, nearest image, "
-    "constant, random, top-down, palm normals, surface.  [default: all]",
-    multiple=True,
-)
-@option("--per-object", "N", "Rows of each object, at most.", type=click.IntRange(1))
-@shared("--set")
-@option(
-    "--protocol",
-    "NAME|FILE.py:NAME",
-    "The rule of a verdict, see `drakegrasp verify`. All but lift try the first wrist pose of "
-    "a prediction in MuJoCo.",
-    default="lift",
-    show_default=True,
-)
-@option(
-    "--out",
-    "DIR",
-    "Folder of the card and of the verdicts; the same command goes on from there.",
-    type=PATH,
-    default=Path("score"),
-    show_default=True,
-)
-@option("--json as_json", None, "Print the card as JSON.", is_flag=True)
-@shared(*CONNECTION)
-@shared("--quiet", text="Show neither progress nor the table.")
 @click.pass_context
 def score(
     context: click.Context,
     /,
     predictions: tuple[Path, ...],
+    *,
     dataset: Path,
-    split: str,
-    against: tuple[Path, ...],
-    train: Path | None,
-    references: tuple[str, ...],
-    as_json: bool,
-    quiet: bool,
+    split: Annotated[str, SPLITS] = "test",
+    against: Annotated[tuple[Path, ...], EXISTING] = (),
+    train: Path | None = None,
+    references: tuple[str, ...] = (),
+    per_object: Annotated[int | None, click.IntRange(1)] = None,
+    protocol: str = "lift",
+    out: Path = Path("score"),
+    as_json: bool = False,
+    quiet: bool = False,
     **options: Any,
 ) -> None:
     """Score predicted grasps beside reference rows, and write a card.
@@ -420,6 +339,25 @@ def score(
     method that was trained several times. Without any, the reference rows are scored alone.
 
     DIR gets card.json, card.md, card.png, and the verdicts, so that an interrupted score goes on.
+
+    Options:
+        --dataset FILE: The data file OUT/grasping_oto.hdf5 or _otm, or OUT/scenes.hdf5, whose rows
+            or views the predictions are for.
+        --split: Rows of the dataset.
+        --against FILE: Predictions of another method for the same rows: the card says by how much
+            the headline is above its. May be given several times, for a method that was trained
+            several times.
+        --train FILE: Data file whose training rows give the reference rows. [default: --dataset]
+        --reference NAME (references): Score these reference rows only; may be given several times:
+            own, nearest image, constant, random, top-down, palm normals, surface. [default: all]
+        --per-object N: Rows of each object, at most.
+        --set
+        --protocol NAME|FILE.py:NAME: The rule of a verdict, see `drakegrasp verify`. All but lift
+            try the first wrist pose of a prediction in MuJoCo.
+        --out DIR: Folder of the card and of the verdicts; the same command goes on from there.
+        --json (as_json): Print the card as JSON.
+        CONNECTION
+        --quiet: Show neither progress nor the table.
     """
     from drakegrasp.api.scoring import score as score_predictions
     from drakegrasp.cli.tables import make_console, score_table
@@ -448,6 +386,9 @@ def score(
         against=against or None,
         train=trained,
         references=references,
+        per_object=per_object,
+        protocol=protocol,
+        out=out,
         again=_command(context),
         **options,
         **workers,
@@ -460,7 +401,7 @@ def score(
         for name, value in scored.card["headline"].items():
             low, high = 100.0 * value["low"], 100.0 * value["high"]
             say(f"{name}: {100.0 * value['value']:.1f} % ({low:.1f} to {high:.1f})")
-        say(str(options["out"] / "card.md"))
+        say(str(out / "card.md"))
     if not quiet:
         make_console(stderr=True).print(score_table(scored.card, scored.seconds))
         for warning in scored.card["warnings"]:

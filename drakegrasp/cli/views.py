@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 from textwrap import fill
+from typing import Annotated
 
 import click
 
 from drakegrasp import registry
 from drakegrasp.cli.console import Command, progress_bar, say
-from drakegrasp.cli.options import PATH, Named, dataset_argument, option, shared
+from drakegrasp.cli.options import PATH, Named, dataset_argument, described
 from drakegrasp.errors import counted
 
 #: Port without --port; the same every time, so that a tunnel to another machine can stay.
@@ -17,31 +18,14 @@ PORT = 8321
 
 
 @click.command("inspect")
+@described
 @dataset_argument()
-@option(
-    "--predictions results",
-    "RESULTS",
-    "Show predictions beside the rows that they are for: the results that "
-    "verify --dataset FILE --out NAME wrote.",
-    type=PATH,
-)
-@option(
-    "--port",
-    "N",
-    "Port on this machine; 0 takes any that is free.",
-    type=click.IntRange(0, 65535),
-    default=PORT,
-    show_default=True,
-)
-@option(
-    "--static folder",
-    "DIR",
-    "Write the pages to DIR as files that open without a server, and end.",
-    type=PATH,
-)
-@option("--no-browser", None, "Only print the address.", is_flag=True)
 def inspect_(
-    out: Path, results: Path | None, port: int, folder: Path | None, no_browser: bool
+    out: Path,
+    results: Path | None = None,
+    port: Annotated[int, click.IntRange(0, 65535)] = PORT,
+    folder: Path | None = None,
+    no_browser: bool = False,
 ) -> None:
     """Look at grasps in a browser, and reject them.
 
@@ -49,6 +33,13 @@ def inspect_(
     suspicious first. Rejections are written to OUT/reject.json at once; assemble --reject reads
     that file. The page can be reached from this machine only, and while a build runs, too. Ctrl-C
     ends it.
+
+    Options:
+        --predictions RESULTS (results): Show predictions beside the rows that they are for: the
+            results that verify --dataset FILE --out NAME wrote.
+        --port N: Port on this machine; 0 takes any that is free.
+        --static DIR (folder): Write the pages to DIR as files that open without a server, and end.
+        --no-browser: Only print the address.
     """
     from drakegrasp.errors import DataError
 
@@ -74,18 +65,14 @@ def inspect_(
 
 
 @click.command()
+@described
 @dataset_argument()
-@option("--out folder", "DIR", "Where to write.  [default: OUT/figures]", type=PATH)
-@option("--trial", "ID", "The grasp whose phases are drawn: row of trials.hdf5.", type=int)
-@option(
-    "--compare",
-    "OTHER",
-    "A dataset of the same objects by the other method of palm poses (candidates.method).",
-    type=PATH,
-)
-@shared("--quiet")
 def figures(
-    out: Path, folder: Path | None, trial: int | None, compare: Path | None, quiet: bool
+    out: Path,
+    quiet: bool,
+    folder: Path | None = None,
+    trial: int | None = None,
+    compare: Path | None = None,
 ) -> None:
     """Draw a dataset: pictures as PNG and SVG, numbers as JSON.
 
@@ -100,6 +87,13 @@ def figures(
     distributions  slip, turn, forces
     approaches     from where successes came
     views          views of scenes with a sample of each, if there are scenes
+
+    Options:
+        --out DIR (folder): Where to write. [default: OUT/figures]
+        --trial ID: The grasp whose phases are drawn: row of trials.hdf5.
+        --compare OTHER: A dataset of the same objects by the other method of palm poses
+            (candidates.method).
+        --quiet
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.foreign_files import refuse_link
     from drakegrasp.pictures.figures import write_figures
@@ -133,33 +127,27 @@ class _Export(Command):
 
 
 @click.command(cls=_Export)
+@described
 @dataset_argument()
 @click.argument("directory", type=PATH, required=False)
-@option("--to form", None, "The format.", type=Named("exporters"), required=True)
-@click.option(
-    "--licence",
-    "--license",
-    metavar="ID",
-    help="Licence that the card of format hf names, e.g. cc-by-4.0.",
-)
-@option(
-    "--about",
-    "YAML",
-    "For format hf: name, version, url, creators, published, licence, citation.",
-    type=PATH,
-)
-@shared("--quiet")
 def export(
     out: Path,
     directory: Path | None,
-    form: str,
-    licence: str | None,
-    about: Path | None,
     quiet: bool,
+    *,
+    form: Annotated[str, Named("exporters")],
+    licence: str | None = None,
+    about: Path | None = None,
 ) -> None:
     """Write the samples of a dataset in another format.
 
     DIRECTORY must be new or empty.  [default: OUT/export_FORMAT]
+
+    Options:
+        --to (form): The format.
+        --licence --license ID: Licence that the card of format hf names, e.g. cc-by-4.0.
+        --about YAML: For format hf: name, version, url, creators, published, licence, citation.
+        --quiet
     """
     from drakegrasp.exchange.export import Publication, export_dataset, not_said, read_publication
     from drakegrasp.foreign_files import refuse_link

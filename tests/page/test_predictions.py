@@ -16,7 +16,8 @@ from helpers.pages import Tags
 from helpers.predictions import write_predictions
 from starlette.testclient import TestClient
 
-from drakegrasp.cli.placing import VerifyRequest, requested_rows
+from drakegrasp.cli.placing import requested_rows
+from drakegrasp.cli.predictions import VerifyRequest
 from drakegrasp.dataset.predicted_rows import read_predicted_rows
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
