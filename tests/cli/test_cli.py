@@ -10,7 +10,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import get_args
 
 import click
 import h5py
@@ -30,7 +29,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.frames import make_pose
 from drakegrasp.hand.settings import load_config
-from drakegrasp.protocols.protocol import Simulator
+from drakegrasp.protocols.protocol import DexGraspBench, Lift
 from drakegrasp.shapes.catalog import BuiltinObject
 from drakegrasp.verification.prediction import FRAMES
 from drakegrasp.verification.verify import METHODS
@@ -422,7 +421,7 @@ def test_choices_of_verify_are_those_of_the_code() -> None:
         "split": SPLITS,
         "frame": FRAMES,
         "method": METHODS,
-        "simulator": get_args(Simulator),
+        "simulator": (Lift.simulator, DexGraspBench.simulator),
     }
 
 
