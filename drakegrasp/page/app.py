@@ -33,15 +33,14 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from drakegrasp.dataset.paths import SCENES_FILE
 from drakegrasp.errors import DataError, DrakegraspError, printable
 from drakegrasp.foreign_files import parse_json
-from drakegrasp.outcomes import Outcome
 from drakegrasp.page.actions import DecisionFile, Recordings
 from drakegrasp.page.attempts import Attempts
 from drakegrasp.page.catalog import Catalog, Snapshot, Watched
 from drakegrasp.page.gallery import Gallery, Places, Query, Site, render
 from drakegrasp.page.looks import HandView, object_surface, read_look
 from drakegrasp.page.plots import PLOTS, plot_svg, plots_values
-from drakegrasp.page.predictions import Predictions, read_predictions, result_file
-from drakegrasp.page.scenes import Scenes, read_scenes
+from drakegrasp.page.predictions import Predictions, result_file
+from drakegrasp.page.scenes import Scenes
 from drakegrasp.pictures.style import colour_png, strip_png
 
 ASSETS = Path(__file__).parent / "static"
@@ -87,13 +86,13 @@ class Inspection:
 
     def __init__(self, out: Path, results: Path | None = None) -> None:
         self.catalog = Catalog(out)
-        self._results = None if results is None else Watched(result_file(results), read_predictions)
+        self._results = None if results is None else Watched(result_file(results), Predictions)
         if self._results is not None:
             self._results.current(self.catalog.current())
         self.decisions = DecisionFile(out)
         self.hand = HandView(self.catalog.current().config)
         self.recordings = Recordings(out)
-        self._scenes = Watched(out / SCENES_FILE, read_scenes)
+        self._scenes = Watched(out / SCENES_FILE, Scenes)
         self.token = secrets.token_urlsafe(24)
         self._lock = threading.Lock()
         self._selections: OrderedDict[Any, Places] = OrderedDict()
@@ -266,7 +265,7 @@ def answer(inspection: Inspection, address: str) -> Response:
 def _decide(inspection: Inspection, content: dict[str, Any]) -> Response:
     snapshot, decision = inspection.snapshot(), content.get("decision")
     i = snapshot.find(str(content.get("label")))
-    if i is None or snapshot.table.outcome[i] != Outcome.SUCCESS:
+    if i is None or not snapshot.table.held[i]:
         raise HTTPException(404, "the attempt must be a success of the dataset")
     try:
         found = inspection.decisions.decide(snapshot.key(i), str(decision), _tab(content))

@@ -19,7 +19,7 @@ from drakegrasp.dataset.trials import NONE
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.outcomes import Outcome
-from drakegrasp.page.catalog import Snapshot
+from drakegrasp.page.catalog import IDENTITY, Snapshot
 from drakegrasp.page.gallery import Gallery, Places, Query
 from drakegrasp.page.looks import (
     THUMBNAIL,
@@ -31,6 +31,7 @@ from drakegrasp.page.looks import (
     read_look,
     read_rows,
 )
+from drakegrasp.table import AnyArray
 
 #: Features of an attempt that can be filtered and sorted by, as people read them.
 QUANTITIES = {
@@ -41,6 +42,8 @@ QUANTITIES = {
 }
 #: Choices of the split that say more than their values: all samples, and what is no sample.
 SPLIT_NAMES = {"samples": "any sample", "none": "no sample"}
+#: What no success is removed by, see `Removal`: what filters keep is called samples.
+KEPT = ("removal", Removal.KEPT.label)
 #: Reasons of suspicion that a card names, and the share from which on it names one.
 REASONS, REASON_SHARE = 2, 0.75
 
@@ -78,42 +81,28 @@ class Attempts(Gallery):
 
     def __init__(self, snapshot: Snapshot, decisions: Decisions, token: str = "") -> None:
         self.snapshot, self.decisions, self.token = snapshot, decisions, token
+        self.table = snapshot.table
 
-    @property
-    def objects(self) -> npt.NDArray[np.int32]:
-        """Numbers (n,) of the objects of the attempts."""
-        return self.snapshot.table.object
-
-    def column(self, name: str) -> npt.NDArray[Any]:
-        """Return the values (n,) of a feature, or the order of the rows."""
-        table = self.snapshot.table
-        return np.arange(len(table)) if name == "row" else table.feature(name)
+    def column(self, name: str) -> AnyArray:
+        """Return a column (n,), a feature among them, or the order of the rows."""
+        return self.snapshot.feature(name) if name in QUANTITIES else super().column(name)
 
     def matches(self, name: str, value: str) -> npt.NDArray[np.bool_]:
         """Return which attempts (n,) have what can be chosen."""
-        table = self.snapshot.table
-        if name == "outcome":
-            return table.outcome == Outcome[value.upper()]
-        if name == "split":
-            if value == "samples":
-                return table.split != NONE
-            return table.split == (NONE if value == "none" else SPLITS.index(value))
-        if name == "removal":
-            return table.removal == Removal[value.upper()]
         if name == "decision":
             return self._decided(value)
-        held = table.outcome == Outcome.SUCCESS
-        return {"held": held, "precision": table.precision, "stable": table.stable}[value]
+        if name == "split" and value in SPLIT_NAMES:
+            return np.asarray((self.table.split == NONE) == (value == "none"))
+        return super().matches(name, value)
 
     def options(self, name: str) -> Mapping[str, str]:
-        """Return what the form offers: outcomes and reasons that occur."""
-        table, named = self.snapshot.table, super().options(name)
-        if name == "outcome":
-            named = _names([Outcome(int(n)).label for n in np.unique(table.outcome)])
-        if name == "removal":
-            known = [Removal(int(n)) for n in np.unique(table.removal) if n != NONE]
-            named = _names([removal.label for removal in known if removal is not Removal.KEPT])
-        return {**named, **SPLIT_NAMES} if name == "split" else named
+        """Return what the form offers: decisions, and else what occurs."""
+        found = super().options(name)
+        if name == "decision":
+            found = {value: value for value in self.CHOICES[name]}
+        if name == "split":
+            found = {"samples": SPLIT_NAMES["samples"], **found, "none": SPLIT_NAMES["none"]}
+        return {value: text for value, text in found.items() if (name, value) != KEPT}
 
     def label(self, i: int) -> str:
         """Return the name of an attempt in addresses."""
@@ -139,22 +128,16 @@ class Attempts(Gallery):
             decision, decisions.rejected | decisions.kept
         )
         numbers = {name: i for i, name in enumerate(snapshot.names)}
-        wanted = [
+        wanted = {
             (numbers[key.object], key.candidate, key.standoff_index, key.child)
             for key in keys
             if key.object in numbers
-        ]
-
-        # Compare identities as single numbers: there may be thousands of decisions.
-        table = snapshot.table
-        (hits,) = np.nonzero(table.outcome == Outcome.SUCCESS)
-        columns = (table.object, table.candidate, table.standoff_index, table.child)
-        own = np.stack([column[hits] for column in columns], axis=1).astype(np.int64)
-        both = np.concatenate([np.array(wanted, dtype=np.int64).reshape(-1, 4), own])
-        _, codes = np.unique(both, axis=0, return_inverse=True)
-        decided = np.isin(codes[len(wanted) :], codes[: len(wanted)])
-        found = np.zeros(len(table), dtype=bool)
-        found[hits[~decided if decision == "open" else decided]] = True
+        }
+        hits = np.flatnonzero(self.table.held)
+        identities = zip(*(self.table[name][hits].tolist() for name in IDENTITY), strict=True)
+        decided = np.array([identity in wanted for identity in identities], dtype=bool)
+        found = np.zeros(self.table.count, dtype=bool)
+        found[hits] = decided != (decision == "open")
         return found
 
     def _decisions(self) -> dict[str, Any]:
@@ -215,21 +198,6 @@ class Attempts(Gallery):
             )
         return cards
 
-    def values(self, i: int) -> dict[str, str]:
-        """Return what a page without a server filters and sorts a success by."""
-        table = self.snapshot.table
-        holds = {"held", words_of(self.snapshot, i)[0]}
-        holds |= {"precision"} if table.precision[i] else set()
-        numbers = {name: table.value(name, i) * q.factor for name, q in QUANTITIES.items()}
-        removal = Removal(int(table.removal[i])).label if table.removal[i] != NONE else ""
-        return {
-            **{n: "Infinity" if np.isposinf(v) else f"{v:.6g}" for n, v in numbers.items()},
-            "split": SPLITS[table.split[i]] if table.split[i] != NONE else "none",
-            "hold": " ".join(sorted(holds)),
-            "removal": removal,
-            "row": str(i),
-        }
-
     def row(self, i: int, hand: HandView) -> dict[str, Any]:
         """Return what the page of an attempt says.
 
@@ -278,20 +246,16 @@ def name_of(snapshot: Snapshot, i: int) -> str:
     return f"pose {key.candidate}, stand-off {key.standoff_index}{refined}"
 
 
-def _names(values: list[str]) -> dict[str, str]:
-    return {value: value.replace("_", " ") for value in values}
-
-
 def _text(snapshot: Snapshot, name: str, i: int) -> str:
     """Return a feature of an attempt as people read it."""
-    return QUANTITIES[name].text(snapshot.table.value(name, i))
+    return QUANTITIES[name].text(snapshot.value(name, i))
 
 
 def words_of(snapshot: Snapshot, i: int) -> list[str]:
     """Return the words that describe an attempt: how it holds, its split or why it is no sample."""
     table = snapshot.table
     words = []
-    if table.outcome[i] == Outcome.SUCCESS:
+    if table.held[i]:
         words.append("stable" if table.stable[i] else "precision" if table.precision[i] else "held")
     if table.outcome[i] == Outcome.MOVED:
         words.append("lift ended, not judged")
@@ -306,7 +270,7 @@ def words_of(snapshot: Snapshot, i: int) -> list[str]:
 
 def _reasons(snapshot: Snapshot, i: int) -> list[str]:
     """Return the largest parts of an attempt's suspicion, as text."""
-    shares = [(snapshot.table.value(part.name, i) / part.scale, part.name) for part in PARTS]
+    shares = [(snapshot.value(part.name, i) / part.scale, part.name) for part in PARTS]
     large = sorted((s for s in shares if s[0] >= REASON_SHARE), reverse=True)[:REASONS]
     # A contact without a normal has no angle of it: an infinite share.
     return [
@@ -372,7 +336,7 @@ def _bears(row: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _certificate(snapshot: Snapshot, i: int) -> list[tuple[str, str]]:
     """Return how robust a success is; nothing where that was not tried."""
-    if snapshot.table.outcome[i] != Outcome.SUCCESS:
+    if not snapshot.table.held[i]:
         return []
     found, lines = read_certificate(snapshot, i), []
     share, friction = found["certified_share"], found["certified_friction"]

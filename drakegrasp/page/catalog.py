@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -35,20 +35,22 @@ from drakegrasp.dataset.paths import (
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.suspicion import COLUMNS, PARTS, suspicion
-from drakegrasp.dataset.trials import Stamp, TrialPart, Trials, sample_ids, shard_part, stamp
+from drakegrasp.dataset.trials import Stamp, TrialPart, Trials, shard_part, stamp
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import is_name, parse_json
 from drakegrasp.hand.folder import carried_hand
 from drakegrasp.outcomes import Outcome
+from drakegrasp.table import AnyArray, Table, join
 
 Found = TypeVar("Found")
-AnyArray = npt.NDArray[Any]
 #: Quantities that can be filtered and sorted by, besides the parts of the suspicion.
 EXTRA = ("suspicion", "force", "p_hold")
 FEATURES = (*EXTRA, *(part.name for part in PARTS))
+#: What tells an attempt from all others.
+IDENTITY = ("object", "candidate", "standoff_index", "child")
 #: Further columns that features follow from.
 _READ = ("closed_f_Q_O", "p_hold_samples", "p_hold_repeats")
-#: Columns that a table has as they are, and their types.
+#: Columns that the table of attempts has as they are, and their types.
 _KEPT: dict[str, type[np.generic]] = {
     "object": np.int32,
     "candidate": np.int32,
@@ -66,108 +68,37 @@ LISTING_PERIOD = 5.0
 NAMED = 3
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class AttemptTable:
-    """Columns of n attempts, in the order of the dataset's rows.
-
-    Attributes:
-        object: (n,) int32, number of the object.
-        candidate, standoff_index: (n,), which of the object's palm poses, and of the stand-offs.
-        child: (n,) int32, number in the family of that attempt, see the schema.
-        outcome: (n,) uint8, `Outcome`.
-        removal: (n,) uint8, `Removal` of a success; NONE for others, or where none is decided.
-        split: (n,) uint8, index into SPLITS; NONE for what is no sample.
-        precision, stable: (n,) bool, see the schema.
-        closed: (m,) int32, places of the attempts whose hand closed, in rising order.
-        features: By the names of FEATURES, (m,) float32, of these; the others have no values. NaN
-            where an attempt did not get so far, infinite where a contact has no normal.
-    """
-
-    object: npt.NDArray[np.int32]
-    candidate: npt.NDArray[np.int32]
-    standoff_index: npt.NDArray[np.uint8]
-    child: npt.NDArray[np.int32]
-    outcome: npt.NDArray[np.uint8]
-    removal: npt.NDArray[np.uint8]
-    split: npt.NDArray[np.uint8]
-    precision: npt.NDArray[np.bool_]
-    stable: npt.NDArray[np.bool_]
-    closed: npt.NDArray[np.int32]
-    features: Mapping[str, npt.NDArray[np.float32]]
-
-    def __len__(self) -> int:
-        return len(self.outcome)
-
-    def feature(self, name: str) -> npt.NDArray[np.float32]:
-        """Return a feature of all attempts (n,); NaN where an attempt has no value."""
-        values = np.full(len(self), np.nan, dtype=np.float32)
-        values[self.closed] = self.features[name]
-        return values
-
-    def value(self, name: str, i: int) -> float:
-        """Return a feature of one attempt; NaN if it has no value."""
-        k = int(np.searchsorted(self.closed, i))
-        there = k < len(self.closed) and self.closed[k] == i
-        return float(self.features[name][k]) if there else float("nan")
-
-    def find(self, object_: int, candidate: int, standoff_index: int, child: int = 0) -> int | None:
-        """Return the place of an attempt, or None if it is not there."""
-        (found,) = np.nonzero(
-            (self.object == object_)
-            & (self.candidate == candidate)
-            & (self.standoff_index == standoff_index)
-            & (self.child == child)
-        )
-        return int(found[0]) if len(found) else None
+#: What is kept of n attempts, in the order of the dataset's rows. First n rows with the columns
+#: _KEPT and `held`: `removal` is NONE for what is no success or where none is decided, `split` for
+#: what is no sample. Then a row for each attempt whose hand closed: `place` (m,) int32 in the
+#: table, rising, and FEATURES as float32, NaN where an attempt did not get so far, and infinite
+#: where a contact has no normal.
+Kept: TypeAlias = tuple[Table, Table]
 
 
-def read_table(trials: Trials) -> AttemptTable:
-    """Return the table of attempts, which is read block by block.
+def read_attempts(trials: Trials) -> Kept:
+    """Return the columns of attempts, which are read block by block.
 
     Raises:
         DataError: If a file cannot be read.
     """
-    # Splits are not known before the files are assembled.
     names = dict.fromkeys((*_KEPT, *COLUMNS, *_READ))
-    return join([_table(block) for block in trials.blocks(list(names))])
+    return _join([_columns_of(block) for block in trials.blocks(list(names))])
 
 
-def join(tables: Sequence[AttemptTable]) -> AttemptTable:
-    """Return tables, one at least, one after the other as one."""
-    starts = np.cumsum([0, *(len(table) for table in tables)], dtype=np.int32)
-    closed = [table.closed + start for table, start in zip(tables, starts, strict=False)]
-    return AttemptTable(
-        **{name: np.concatenate([getattr(table, name) for table in tables]) for name in _KEPT},
-        closed=np.concatenate(closed),
-        features={
-            name: np.concatenate([table.features[name] for table in tables]) for name in FEATURES
-        },
-    )
+def _join(parts: Sequence[Kept]) -> Kept:
+    """Return parts, one at least, one after the other as one."""
+    tables, few = zip(*parts, strict=True)
+    starts = np.cumsum([0, *(table.count for table in tables)]).tolist()
+    moved = [
+        closed.with_columns(place=closed.place + start)
+        for closed, start in zip(few, starts, strict=False)
+    ]
+    return join(tables), join(moved)
 
 
-def first_rows(table: AttemptTable, wanted: int | None) -> tuple[AttemptTable, int | None]:
-    """Return the attempts of a shard that an object needs, and how many grasps it wants after it.
-
-    Assembly takes the same rows: with `max_grasps` they end with the last wanted grasp.
-
-    Args:
-        table: Attempts of the shard.
-        wanted: Number of grasps that the object still wants; None for all.
-    """
-    if wanted is None:
-        return table, None
-    (hits,) = np.nonzero(table.outcome == Outcome.SUCCESS)
-    if len(hits) < wanted:
-        return table, wanted - len(hits)
-    count = int(hits[wanted - 1]) + 1 if wanted else 0
-    few = int(np.searchsorted(table.closed, count))
-    kept: dict[str, Any] = {name: getattr(table, name)[:count] for name in _KEPT}
-    features = {name: values[:few] for name, values in table.features.items()}
-    return AttemptTable(**kept, closed=table.closed[:few], features=features), 0
-
-
-def _table(columns: Mapping[str, AnyArray]) -> AttemptTable:
-    """Return the table of a block of attempts."""
+def _columns_of(columns: Mapping[str, AnyArray]) -> Kept:
+    """Return what is kept of a block of attempts."""
     # Most attempts never close the hand: only those that do have numbers.
     (closed,) = np.nonzero(np.isfinite(columns["time_close"]))
     few = {name: values[closed] for name, values in columns.items()}
@@ -188,12 +119,25 @@ def _table(columns: Mapping[str, AnyArray]) -> AttemptTable:
         name: np.where(np.isnan(v) & np.isfinite(doubts.shares[name]), np.inf, v)
         for name, v in doubts.values.items()
     }
-    kept: dict[str, Any] = {name: columns[name].astype(dtype) for name, dtype in _KEPT.items()}
-    return AttemptTable(
-        **kept,
-        closed=closed.astype(np.int32),
-        features={name: v.astype(np.float32) for name, v in (extra | values).items()},
-    )
+    features = {name: v.astype(np.float32) for name, v in (extra | values).items()}
+    kept = {name: columns[name].astype(dtype) for name, dtype in _KEPT.items()}
+    table = Table(kept, held=kept["outcome"] == Outcome.SUCCESS)
+    return table, Table(features, place=closed.astype(np.int32))
+
+
+def _wanted_rows(table: Table, wanted: int | None) -> tuple[int, int | None]:
+    """Return how many attempts of a shard an object needs, and the grasps it wants after them.
+
+    Assembly takes the same rows: with `max_grasps` they end with the last wanted grasp.
+
+    Args:
+        table: Attempts of the shard.
+        wanted: Number of grasps that the object still wants; None for all.
+    """
+    (hits,) = np.nonzero(table.held)
+    if wanted is None or len(hits) < wanted:
+        return table.count, wanted and wanted - len(hits)
+    return int(hits[wanted - 1]) + 1 if wanted else 0, 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -208,8 +152,7 @@ class Snapshot:
         names, classes: Of the objects, by their number.
         meshes: Hashes of the objects' meshes, hexadecimal.
         trials: The attempts, in their files.
-        table: What is kept of them in memory.
-        sample_ids: Trial ids of the samples by split, in rising order.
+        table, closed: What is kept of them in memory, see `Kept`.
         assembled: Whether the attempts are rows of trials.hdf5; else they are of shards.
         stamps: Of the assembled files; shards never change.
         missing: What is not there, in sentences.
@@ -222,8 +165,8 @@ class Snapshot:
     classes: tuple[str, ...]
     meshes: tuple[str, ...]
     trials: Trials
-    table: AttemptTable
-    sample_ids: dict[str, npt.NDArray[np.int64]]
+    table: Table
+    closed: Table
     assembled: bool
     own_hashes: Mapping[str, str] = field(default_factory=dict)
     stamps: Mapping[Path, Stamp] = field(default_factory=dict)
@@ -244,12 +187,22 @@ class Snapshot:
         """Numbers of the objects by their codes."""
         return {code: number for number, code in enumerate(self.codes)}
 
+    def feature(self, name: str) -> npt.NDArray[np.float32]:
+        """Return a feature of all attempts (n,); NaN where an attempt has no value."""
+        values = np.full(self.table.count, np.nan, dtype=np.float32)
+        values[self.closed.place] = self.closed[name]
+        return values
+
+    def value(self, name: str, i: int) -> float:
+        """Return a feature of one attempt; NaN if it has no value."""
+        k = int(np.searchsorted(self.closed.place, i))
+        there = k < self.closed.count and self.closed.place[k] == i
+        return float(self.closed[name][k]) if there else float("nan")
+
     def key(self, i: int) -> AttemptKey:
         """Return the identity of an attempt by its place in the table."""
-        table = self.table
-        name = self.names[table.object[i]]
-        numbers = (table.candidate[i], table.standoff_index[i], table.child[i])
-        return AttemptKey(name, *(int(number) for number in numbers))
+        number, *rest = (int(self.table[name][i]) for name in IDENTITY)
+        return AttemptKey(self.names[number], *rest)
 
     def label(self, i: int) -> str:
         """Return the identity of an attempt for addresses: `9f86d081884c-345-2`.
@@ -257,25 +210,32 @@ class Snapshot:
         A refined one has its number in the family behind: `9f86d081884c-345-2-7`.
         The files of a later state have the same label for it, and for no other attempt.
         """
-        table = self.table
-        code = self.codes[table.object[i]]
-        refined = f"-{table.child[i]}" if table.child[i] else ""
-        return f"{code}-{table.candidate[i]}-{table.standoff_index[i]}{refined}"
+        key, code = self.key(i), self.codes[self.table.object[i]]
+        return f"{code}-{key.candidate}-{key.standoff_index}" + f"-{key.child}" * bool(key.child)
 
     def find(self, label: str) -> int | None:
         """Return the place of the attempt of a label, or None if there is none."""
         code, *numbers = label.split("-")
         if len(numbers) not in (2, 3) or not all(n.isascii() and n.isdecimal() for n in numbers):
             return None
-        number = self.numbers.get(code)
-        return None if number is None else self.table.find(number, *map(int, numbers))
+        return self._place(self.numbers.get(code), *map(int, numbers))
 
     def find_key(self, key: AttemptKey) -> int | None:
         """Return the place of an attempt by its identity, or None if it is not there."""
-        if key.object not in self.names:
-            return None
-        number = self.names.index(key.object)
-        return self.table.find(number, key.candidate, key.standoff_index, key.child)
+        number = self.names.index(key.object) if key.object in self.names else None
+        return self._place(number, key.candidate, key.standoff_index, key.child)
+
+    def _place(
+        self, number: int | None, candidate: int, standoff_index: int, child: int = 0
+    ) -> int | None:
+        table = self.table
+        (found,) = np.nonzero(
+            (table.candidate == candidate)
+            & (table.standoff_index == standoff_index)
+            & (table.child == child)
+            & (table.object == (-1 if number is None else number))
+        )
+        return int(found[0]) if len(found) else None
 
     def trial_id(self, i: int) -> int | None:
         """Return the row of an attempt in trials.hdf5, or None before there is one."""
@@ -305,7 +265,7 @@ class Catalog:
     def __init__(self, out: Path) -> None:
         self.out = out
         self._lock = threading.Lock()
-        self._parts: dict[ShardHeader, tuple[TrialPart, AttemptTable]] = {}
+        self._parts: dict[ShardHeader, tuple[TrialPart, Kept]] = {}
         self._stamps: dict[Path, Stamp] = {}
         self._listed = -LISTING_PERIOD
         # The assembled files, if there are any, and the manifest of a build that is not in them.
@@ -332,14 +292,19 @@ class Catalog:
             return self._snapshot
 
     def _read_files(self, stamps: Mapping[Path, Stamp]) -> None:
-        """Read the assembled files, or the manifest of a build that has not ended."""
-        self._assembled = None
-        if stamps[self.out / TRIALS_FILE] is None:
+        """Read the assembled files, and the manifest of a build that is not in them."""
+        assembled = stamps[self.out / TRIALS_FILE] is not None
+        self._assembled, self._manifest = None, None
+        try:
             self._manifest = read_manifest(self.out)
-            return
-        self._parts.clear()
-        self._assembled, signature = _read_assembled(self.out, stamps)
-        self._manifest = _other_manifest(self.out, signature)
+        except DataError:
+            if not assembled:
+                raise  # else the files are all that there is
+        if assembled:
+            self._parts.clear()
+            self._assembled, signature = _read_assembled(self.out, self._manifest, stamps)
+            if self._manifest is not None and self._manifest.signature() == signature:
+                self._manifest = None
 
     def _list_shards(self) -> Snapshot:
         """Return the state of the files with the shards that are there."""
@@ -371,7 +336,7 @@ class Catalog:
             try:
                 if (read := self._parts.get(header)) is None:
                     part = shard_part(self.out, header, numbers[header.object_name])
-                    read = part, read_table(Trials.of_parts(self.out, objects, [part]))
+                    read = part, read_attempts(Trials.of_parts(self.out, objects, [part]))
                 parts[header] = read
             except DataError:
                 damaged.append(header.path(self.out).relative_to(self.out))
@@ -379,14 +344,16 @@ class Catalog:
 
         # The number of an object is its place in this manifest, which may have grown.
         wanted: dict[str, int | None] = dict.fromkeys(numbers, manifest.config.max_grasps)
-        cut, tables = [], []
-        for header, (part, table) in parts.items():
+        cut, rows = [], []
+        for header, (part, (table, closed)) in parts.items():
             name = header.object_name
-            table.object[:] = numbers[name]
-            rows, wanted[name] = first_rows(table, wanted[name])
-            cut.append(replace(part, count=len(rows), object=numbers[name]))
-            tables.append(rows)
+            count, wanted[name] = _wanted_rows(table, wanted[name])
+            number = np.full(count, numbers[name], dtype=np.int32)
+            cut.append(replace(part, count=count, object=numbers[name]))
+            kept = table[:count].with_columns(object=number)
+            rows.append((kept, closed[closed.place < count]))
         trials = Trials.of_parts(self.out, objects, cut)
+        table, closed = _join(rows) if rows else read_attempts(trials)
 
         missing = [
             f"{TRIALS_FILE} and the data files are not there yet: {len(parts):,} of "
@@ -404,10 +371,10 @@ class Catalog:
             classes=tuple(entry.class_name for entry in entries),
             meshes=tuple(entry.mesh_sha256 for entry in entries),
             trials=trials,
-            table=join(tables) if tables else read_table(trials),
-            sample_ids={},
+            table=table,
+            closed=closed,
             assembled=False,
-            own_hashes=_own_hashes(self.out),
+            own_hashes=_own_hashes(manifest),
             missing=tuple(missing),
         )
 
@@ -448,7 +415,9 @@ def find_model(out: Path, name: str) -> Path | None:
     return path if path is not None and path.is_file() else None
 
 
-def _read_assembled(out: Path, stamps: Mapping[Path, Stamp]) -> tuple[Snapshot, str]:
+def _read_assembled(
+    out: Path, manifest: Manifest | None, stamps: Mapping[Path, Stamp]
+) -> tuple[Snapshot, str]:
     """Return the state of a dataset with a trials.hdf5, and the signature of its manifest then.
 
     Nothing but that file has to be there.
@@ -477,6 +446,7 @@ def _read_assembled(out: Path, stamps: Mapping[Path, Stamp]) -> tuple[Snapshot, 
     if gone:
         missing.append(f"{len(gone):,} of {len(names):,} objects have no mesh: no 3D view of them.")
 
+    table, closed = read_attempts(trials)
     state = Snapshot(
         out=out,
         config=config,
@@ -485,21 +455,19 @@ def _read_assembled(out: Path, stamps: Mapping[Path, Stamp]) -> tuple[Snapshot, 
         classes=classes,
         meshes=meshes,
         trials=trials,
-        table=read_table(trials),
-        sample_ids=sample_ids(out),
+        table=table,
+        closed=closed,
         assembled=True,
-        own_hashes=_own_hashes(out),
+        own_hashes=_own_hashes(manifest),
         stamps={path: then for path, then in stamps.items() if path.name in ASSEMBLED_FILES},
         missing=tuple(missing),
     )
     return state, str(trials.attributes.get("signature", ""))
 
 
-def _own_hashes(out: Path) -> dict[str, str]:
+def _own_hashes(manifest: Manifest | None) -> dict[str, str]:
     """Return what `Snapshot.own_hashes` is; nothing if the files are all that there is."""
-    try:
-        manifest = read_manifest(out)
-    except DataError:
+    if manifest is None:
         return {}
     return {
         entry.name: entry.config_in(manifest.config).simulation_hash()
@@ -508,22 +476,13 @@ def _own_hashes(out: Path) -> dict[str, str]:
     }
 
 
-def _other_manifest(out: Path, signature: str) -> Manifest | None:
-    """Return the manifest if a build went on since the files were assembled, else None."""
-    try:
-        manifest = read_manifest(out)
-    except DataError:
-        return None  # the files are all that there is
-    return None if manifest.signature() == signature else manifest
-
-
 def _count_newer(state: Snapshot, manifest: Manifest) -> int:
     """Return how many work units are done that are not in the assembled files."""
     # Each object's last palm pose in the files, and whether it has all grasps that it wants.
     table, count = state.table, len(state.names)
     last = np.full(count, -1, dtype=np.int32)
     np.maximum.at(last, table.object, table.candidate)
-    grasps = np.bincount(table.object[table.outcome == Outcome.SUCCESS], minlength=count)
+    grasps = np.bincount(table.object[table.held], minlength=count)
     wanted = manifest.config.max_grasps
     full = np.zeros(count, dtype=bool) if wanted is None else grasps >= wanted
 

@@ -17,17 +17,26 @@ import numpy as np
 import numpy.typing as npt
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from drakegrasp.dataset.schema import Shown
+from drakegrasp.dataset.schema import SPLITS, Shown
 from drakegrasp.errors import DataError, counted, printable
+from drakegrasp.filters import Removal
+from drakegrasp.outcomes import Outcome
 from drakegrasp.page.catalog import Snapshot
 from drakegrasp.page.looks import HandView
 from drakegrasp.pictures.style import FINGER_COLOURS, PREDICTED, REACHED, TRUE
+from drakegrasp.table import AnyArray, Table
 
 Places: TypeAlias = npt.NDArray[np.int32]
 #: Least and largest value; None for no limit.
 Limits: TypeAlias = tuple[float | None, float | None]
 #: Cards on a page of a gallery.
 PAGE = 24
+#: What numbers in columns stand for, by the names of the columns.
+CODES: Mapping[str, Mapping[str, int]] = {
+    "outcome": {outcome.label: outcome.value for outcome in Outcome},
+    "split": {split: number for number, split in enumerate(SPLITS)},
+    "removal": {removal.label: removal.value for removal in Removal},
+}
 
 
 def _shown(value: Any) -> Any:
@@ -152,7 +161,8 @@ class Gallery(ABC):
         SORTS: Orders with their titles, that of the first page first.
         OUTCOME: The outcome that is asked for unless another is.
         snapshot: State of the dataset.
-        objects: (n,), numbers of the rows' objects.
+        table: The rows: `object` (n,), numbers of their objects; columns of CODES; a truth for each
+            other choice; QUANTITIES in SI; and what else they are sorted by.
     """
 
     HOME: ClassVar[str]
@@ -165,23 +175,7 @@ class Gallery(ABC):
     SORTS: ClassVar[Mapping[str, str]]
     OUTCOME: ClassVar[str] = ""
     snapshot: Snapshot
-
-    @property
-    @abstractmethod
-    def objects(self) -> npt.NDArray[np.int32]:
-        """Numbers (n,) of the rows' objects."""
-
-    @abstractmethod
-    def column(self, name: str) -> npt.NDArray[Any]:
-        """Return the values (n,) of a quantity in SI, or of an order."""
-
-    @abstractmethod
-    def matches(self, name: str, value: str) -> npt.NDArray[np.bool_]:
-        """Return which rows (n,) have what can be chosen."""
-
-    def options(self, name: str) -> Mapping[str, str]:
-        """Return what the form offers of a choice, with its text where it is another."""
-        return {value: value.replace("_", " ") for value in self.CHOICES[name]}
+    table: Table
 
     @abstractmethod
     def label(self, i: int) -> str:
@@ -200,16 +194,37 @@ class Gallery(ABC):
         """Return what the cards of rows say."""
 
     @abstractmethod
-    def values(self, i: int) -> dict[str, str]:
-        """Return what a page without a server filters and sorts a row by."""
-
-    @abstractmethod
     def row(self, i: int, hand: HandView) -> dict[str, Any]:
         """Return what the page of a row says.
 
         Raises:
             DataError: If a file was replaced meanwhile.
         """
+
+    # What tables may have another way of.
+
+    def column(self, name: str) -> AnyArray:
+        """Return a column (n,), or the order of the rows in a table without a column of it."""
+        return self.table[name] if name in self.table else np.arange(self.table.count)
+
+    def matches(self, name: str, value: str) -> npt.NDArray[np.bool_]:
+        """Return which rows (n,) have what can be chosen."""
+        if name in CODES:
+            return np.asarray(self.table[name] == CODES[name][value])
+        return self.table[value] if value in self.table else np.zeros(self.table.count, dtype=bool)
+
+    def options(self, name: str) -> Mapping[str, str]:
+        """Return what the form offers of a choice, with its text: what occurs in the table."""
+        there = set(self.table)
+        if name in CODES:
+            used = np.unique(self.table[name])
+            there = {label for label, code in CODES[name].items() if code in used}
+        return {v: v.replace("_", " ") for v in self.CHOICES[name] if v in there}
+
+    def identity(self, i: int) -> dict[str, Any]:
+        """Return how people name a row: its object's name and class."""
+        number = self.table.object[i]
+        return {"title": self.snapshot.names[number], "class_name": self.snapshot.classes[number]}
 
     # What all tables share.
 
@@ -247,7 +262,7 @@ class Gallery(ABC):
         own = zip(self.snapshot.names, self.snapshot.classes, strict=True)
         asked = query["object"], query["class"]
         wanted = [all(a in ("", b) for a, b in zip(asked, names, strict=True)) for names in own]
-        chosen = np.array(wanted, dtype=bool)[self.objects]
+        chosen = np.array(wanted, dtype=bool)[self.table.object]
         for name in self.CHOICES:
             if query[name]:
                 chosen &= self.matches(name, query[name])
@@ -279,16 +294,17 @@ class Gallery(ABC):
 
         # The cards, each with where it leads.
         cards = self.cards(shown)
-        for i, card in zip(shown.tolist(), cards, strict=True):
+        values = self._values(shown) if site.static else [{}] * len(cards)
+        for i, card, own in zip(shown.tolist(), cards, values, strict=True):
             card |= self.identity(i) | {"label": self.label(i), "href": self._address(i, query)}
             named = {"object": card["title"], "class": card["class_name"]}
-            card["values"] = named | self.values(i) if site.static else {}
+            card["values"] = named | own if site.static else {}
         return render(
             f"gallery_{self.ROW}.html",
             site,
             cards=cards,
             total=len(chosen),
-            all=len(self.objects),
+            all=self.table.count,
             page=page,
             pages=pages,
             home=self.HOME,
@@ -340,10 +356,24 @@ class Gallery(ABC):
             **values,
         )
 
-    def identity(self, i: int) -> dict[str, Any]:
-        """Return how people name a row: its object's name and class."""
-        number = self.objects[i]
-        return {"title": self.snapshot.names[number], "class_name": self.snapshot.classes[number]}
+    def _values(self, shown: Places) -> list[dict[str, str]]:
+        """Return what a page without a server filters and sorts rows by: numbers, and words."""
+        columns = {}
+        for name in (
+            *self.QUANTITIES,
+            *(name for name in self.SORTS if name not in self.QUANTITIES),
+        ):
+            factor = self.QUANTITIES[name].factor if name in self.QUANTITIES else 1
+            numbers = self.column(name)[shown] * factor
+            columns[name] = [f"{x:.9g}".replace("inf", "Infinity") for x in numbers.tolist()]
+        for name, values in self.CHOICES.items():
+            words = [""] * len(shown)
+            for value in values:
+                if value != "any":
+                    those = self.matches(name, value)[shown].tolist()
+                    words = [f"{w} {value}" if t else w for w, t in zip(words, those, strict=True)]
+            columns[name] = [word.strip() for word in words]
+        return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
     def _address(self, i: int, query: Query) -> str:
         params = query.params()

@@ -117,8 +117,8 @@ def look_source(snapshot: Snapshot, i: int, camera: str) -> str:
 
 
 def _sample_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
-    split = SPLITS[snapshot.table.split[i]]
-    row = int(np.searchsorted(snapshot.sample_ids[split], i))
+    number = snapshot.table.split[i]
+    split, row = SPLITS[number], np.count_nonzero(snapshot.table.split[:i] == number)
     path = snapshot.out / DATA_FILES[camera]
     if not path.is_file():
         return _shard_look(snapshot, i, camera)

@@ -71,7 +71,7 @@ def _draw(snapshot: Snapshot, name: str) -> Figure:
         return draw_codes(counts, Removal.KEPT, "successes")[0]
 
     # The others tell held grasps, and the better ones of these, apart.
-    held, size = table.outcome == Outcome.SUCCESS, len(snapshot.names)
+    held, size = table.held, len(snapshot.names)
     groups = {"held": held, "precision": table.precision, "stable": table.stable}
     if name == "objects":
         objects = {group: table.object[members] for group, members in groups.items()}
@@ -80,7 +80,7 @@ def _draw(snapshot: Snapshot, name: str) -> Figure:
             {group: np.bincount(o, minlength=size).tolist() for group, o in objects.items()},
         )
     quantities = [
-        (quantity.label, table.feature(feature)[held].astype(float) * quantity.factor)
+        (quantity.label, snapshot.feature(feature)[held].astype(float) * quantity.factor)
         for feature, quantity in QUANTITIES.items()
     ]
     return draw_distributions(quantities, {group: m[held] for group, m in groups.items()})

@@ -8,7 +8,7 @@ file lacks reads as without a value.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,10 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply, norm
-from drakegrasp.dataset.opening import Difference, opened, read_codes, refuse_first
+from drakegrasp.dataset.opening import differences, opened, read_codes, refuse_first
 from drakegrasp.dataset.predicted_rows import PredictedRows, read_predicted_rows
 from drakegrasp.dataset.schema import (
     CAMERAS,
+    TRIAL_FIELDS,
     VERIFICATION_FIELDS,
     Field,
     Shown,
@@ -44,32 +45,27 @@ from drakegrasp.page.looks import (
     read_look,
     read_rows,
 )
+from drakegrasp.table import Table
 
-#: Group of the verdicts in a result file.
+#: Group of the verdicts in a result file, and their fields.
 GROUP = "grasps"
 FIELDS: Mapping[str, Field] = {field.name: field for field in VERIFICATION_FIELDS}
-#: What a verdict cannot do without.
+#: What a verdict cannot do without; a file may lack any other field.
 NEEDED = ("object", "outcome", "p_OQ", "nhat_Q_O")
-#: Numbers of a prediction that can be filtered and sorted by, as people read them; of several
-#: contacts the largest.
+_MAY_LACK = tuple(replace(field, optional=field.name not in NEEDED) for field in FIELDS.values())
+#: Numbers of a verdict as people read them; of several contacts the largest.
+NUMBERS = {field.name: field.shown for field in FIELDS.values() if field.shown is not None}
+#: Those that the dataset's own trial has, too.
+_BOTH = {field.name for field in TRIAL_FIELDS if field.shown == NUMBERS.get(field.name, 0)}
+#: Numbers of a prediction that can be filtered and sorted by.
 QUANTITIES = {
-    "error": Shown("asked to reached", "mm"),
-    "normal_error": Shown("asked to reached normal", "°"),
+    "contact_error": NUMBERS["contact_error"],
+    "normal_error": NUMBERS["normal_error"],
     "true_error": Shown("asked to true", "mm"),
-    "surface": Shown("asked to surface", "mm"),
-    "slip": Shown("slip", "mm"),
-    "turn": Shown("turn", "°"),
-    "friction": Shown("least friction", digits=2),
+    **{name: NUMBERS[name] for name in ("surface_distance", "slip", "turn", "smallest_friction")},
 }
-#: Those that are columns of the file.
-_MEASURED = {
-    "contact_error": "error",
-    "normal_error": "normal_error",
-    "surface_distance": "surface",
-    "slip": "slip",
-    "turn": "turn",
-    "smallest_friction": "friction",
-}
+#: Those on cards.
+_CARD = ("contact_error", "true_error", "slip", "turn")
 #: Words of a verdict on a grasp that is held; and all, to filter by.
 WORDS = ("held", "success", "precision", "stable", "sample")
 VERDICTS = ("fails", *WORDS, "held_any")
@@ -79,38 +75,20 @@ _CONTACTS = {"asked": ("p_OQ", "nhat_Q_O"), "reached": ("closed_p_OQ", "closed_n
 ON_CARDS = ("reason", *(name for names in _CONTACTS.values() for name in names))
 #: Width of the part of an image that is shown over that of its marks, and the least share of it.
 LOOSE, LEAST_SHOWN = 1.7, 0.4
-#: Numbers that a verdict and the row's own trial both have.
-_BOTH = {
-    "slip": Shown("slip", "mm"),
-    "turn": Shown("turn", "°"),
-    "time_close": Shown("time of closing", "s", 2),
-    "time_lift": Shown("time of the lift", "s", 2),
-}
-#: Numbers of a verdict alone, of the fingers the largest.
-_OWN = {
-    "contact_error": Shown("asked to reached", "mm"),
-    "normal_error": Shown("asked to reached normal", "°"),
-    "surface_distance": Shown("asked to surface", "mm"),
-    "fit_residual": Shown("asked to fingertip of the fit", "mm"),
-    "fit_normal_error": Shown("asked normal to pad of the fit", "°"),
-    "tries": Shown("wrist poses tried", digits=0),
-    "smallest_friction": Shown("least friction at the asked contacts", digits=2),
-    "epsilon": Shown("epsilon of the asked contacts", digits=3),
-}
+#: The largest force of a fingertip.
+_FORCE = Shown("largest force after closing", "N")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Predictions(Gallery):
     """n predictions, in the order of the result file.
 
-    Attributes:
+    Args:
         path: The result file.
-        stamp: Of the file when it was read.
+        read_at: Its stamp.
         snapshot: State of the dataset.
-        rows: The rows that they are for.
-        outcome: (n,) uint8, `Outcome`.
-        words: By the names of VERDICTS, (n,) bool; those that the file tells.
-        features: By the names of QUANTITIES, (n,), in SI; NaN where a verdict has none.
+
+    Raises:
+        DataError: If the file cannot be read, or is not of this dataset.
     """
 
     HOME, ROW, NOUN = "/predictions", "prediction", "prediction"
@@ -120,56 +98,48 @@ class Predictions(Gallery):
     }
     SELECTS: ClassVar = {name: name for name in ("verdict", "outcome", "class", "object")}
     QUANTITIES = QUANTITIES
-    RANGES = ("error", "normal_error", "true_error", "surface", "slip", "turn")
+    RANGES = tuple(QUANTITIES)[:-1]
     SORTS: ClassVar = {
         "worst": "worst verdict",
         **{name: quantity.title for name, quantity in QUANTITIES.items()},
         "row": "row of the dataset",
     }
 
-    path: Path
-    stamp: Stamp
-    snapshot: Snapshot
-    rows: PredictedRows
-    outcome: npt.NDArray[np.uint8]
-    words: Mapping[str, npt.NDArray[np.bool_]]
-    features: Mapping[str, Array]
+    def __init__(self, path: Path, read_at: Stamp, snapshot: Snapshot) -> None:
+        self._path, self._stamp, self.snapshot = path, read_at, snapshot
+        with opened(path, "a result file of drakegrasp verify") as file:
+            group = file.get(GROUP)
+            if not isinstance(group, h5py.Group) or not all(name in group for name in NEEDED):
+                raise DataError(f"{path}: must be a result file of drakegrasp verify, got another")
+            refuse_other_schema(path, file.attrs.get("schema_version"))
+            refuse_first(path, differences(file, {GROUP: _MAY_LACK}))
+            names = group["object"].asstr()[:].tolist()
+            self.rows = _matched(path, file, snapshot, names)
+            outcome = read_codes(group["outcome"], list(Outcome))
+            there = [n for n in (*VERDICTS, *QUANTITIES, "p_OQ") if n in group and n != "held"]
+            columns = {name: group[name][:] for name in there}
 
-    @property
-    def places(self) -> npt.NDArray[np.int64]:
-        """Places (n,) of their rows in the table of the snapshot."""
-        return self.rows.trial_id
+        # The largest of the contacts; another hand may have another number of fingers.
+        p_OQ, held = columns.pop("p_OQ"), outcome == Outcome.SUCCESS
+        self._places = self.rows.trial_id
+        true = snapshot.trials[self._places.tolist()]["closed_p_OQ"]
+        columns["true_error"] = norm(p_OQ - true) if p_OQ.shape == true.shape else None
+        largest = {name: _largest(columns.pop(name, None), len(held)) for name in QUANTITIES}
 
-    @property
-    def objects(self) -> npt.NDArray[np.int32]:
-        """Numbers (n,) of their objects."""
-        return self.snapshot.table.object[self.places]
-
-    def column(self, name: str) -> npt.NDArray[Any]:
-        """Return the values (n,) of a quantity, or of an order.
-
-        The worst are those that fail, and of these those whose hand reached no contact; then the
-        distance of asked from reached contacts decides.
-        """
-        if name == "row":
-            return self.rows.row
-        if name != "worst":
-            return self.features[name]
-        error = self.features["error"]
-        # Below 1, in the order of the errors.
+        # The worst are those that fail, and of these those whose hand reached no contact; then the
+        # distance of asked from reached contacts decides, brought below 1.
+        error = largest["contact_error"]
         share = np.where(np.isnan(error), 1.0, error / (1.0 + error))
-        return np.asarray(np.where(self.words["held"], share, 2.0 + share))
-
-    def matches(self, name: str, value: str) -> npt.NDArray[np.bool_]:
-        """Return which predictions (n,) have what can be chosen."""
-        if name == "outcome":
-            return self.outcome == Outcome[value.upper()]
-        return self.words.get(value, np.zeros(len(self.outcome), dtype=bool))
-
-    def options(self, name: str) -> Mapping[str, str]:
-        """Return what the form offers: verdicts that the file tells, outcomes that occur."""
-        there = {Outcome(int(n)).label for n in np.unique(self.outcome)} | self.words.keys()
-        return {value: text for value, text in super().options(name).items() if value in there}
+        self.table = Table(
+            columns,
+            **largest,
+            object=snapshot.table.object[self._places],
+            outcome=outcome,
+            fails=~held,
+            held=held,
+            worst=np.where(held, share, 2.0 + share),
+            row=self.rows.row,
+        )
 
     def label(self, i: int) -> str:
         """Return the name of a prediction in addresses: its number in the file."""
@@ -178,7 +148,7 @@ class Predictions(Gallery):
     def find(self, label: str) -> int | None:
         """Return the number of the prediction of a label, or None if there is none."""
         there = label.isascii() and label.isdecimal() and len(label) < 10
-        return int(label) if there and int(label) < len(self.outcome) else None
+        return int(label) if there and int(label) < self.table.count else None
 
     def read(self, numbers: Sequence[int], names: Iterable[str] = FIELDS) -> list[dict[str, Any]]:
         """Return fields of some predictions; None for a field that the file lacks.
@@ -191,9 +161,11 @@ class Predictions(Gallery):
             DataError: If the file was replaced meanwhile, or is damaged.
         """
         rows, back = np.unique(np.asarray(numbers, dtype=np.int64), return_inverse=True)
-        with opened(self.path, "a result file of drakegrasp verify", again=True) as file:
-            if stamp(self.path) != self.stamp:
-                raise DataError(f"{self.path}: must stay while it is read, got another; load again")
+        with opened(self._path, "a result file of drakegrasp verify", again=True) as file:
+            if stamp(self._path) != self._stamp:
+                raise DataError(
+                    f"{self._path}: must stay while it is read, got another; load again"
+                )
             columns = {name: _column(file[GROUP], FIELDS[name], rows) for name in names}
         return [{n: None if v is None else v[k] for n, v in columns.items()} for k in back]
 
@@ -208,21 +180,20 @@ class Predictions(Gallery):
         """Return what the gallery says besides its cards."""
         out = self.snapshot.out
         return {
-            "title": self.path.name,
+            "title": self._path.name,
             "dataset": out.name or str(out),
             "split": self.rows.split,
             "rows": len(np.unique(self.rows.row)),
-            "held": int(np.count_nonzero(self.words["held"][chosen])),
+            "held": int(np.count_nonzero(self.table.held[chosen])),
         }
 
     def cards(self, shown: Places) -> list[dict[str, Any]]:
         """Return what the cards of predictions say."""
         snapshot, camera = self.snapshot, self.rows.camera
-        places, cards = self.places[shown].tolist(), []
+        places, cards = self._places[shown].tolist(), []
         rows, verdicts = read_rows(snapshot, places, THUMBNAIL), self.read(shown.tolist(), ON_CARDS)
 
         for i, at, row, verdict in zip(shown.tolist(), places, rows, verdicts, strict=True):
-            numbers = {name: float(values[i]) for name, values in self.features.items()}
             marks, size = self._marks(verdict, row, camera), snapshot.config.camera.size
             cards.append(
                 {
@@ -233,23 +204,11 @@ class Predictions(Gallery):
                     "verdict": self._verdict(i),
                     "reason": verdict["reason"] or "",
                     "numbers": [
-                        (QUANTITIES[n].title, QUANTITIES[n].text(numbers[n]))
-                        for n in ("error", "true_error", "slip", "turn")
+                        (QUANTITIES[n].title, QUANTITIES[n].text(self.table[n][i])) for n in _CARD
                     ],
                 }
             )
         return cards
-
-    def values(self, i: int) -> dict[str, str]:
-        """Return what a page without a server filters and sorts a prediction by."""
-        numbers = {name: QUANTITIES[name].factor * v[i] for name, v in self.features.items()}
-        return {
-            "outcome": Outcome(int(self.outcome[i])).label,
-            "verdict": " ".join(word for word, those in self.words.items() if those[i]),
-            **{name: f"{value:.6g}" for name, value in numbers.items()},
-            "worst": f"{self.column('worst')[i]:.9g}",
-            "row": f"{self.rows.row[i]}",
-        }
 
     def row(self, i: int, hand: HandView) -> dict[str, Any]:
         """Return what the page of a prediction says.
@@ -258,7 +217,7 @@ class Predictions(Gallery):
             DataError: If a file was replaced meanwhile.
         """
         # The verdict, the row, and where both cameras see the contacts; first that of the file.
-        snapshot, at, size = self.snapshot, int(self.places[i]), self.snapshot.config.camera.size
+        snapshot, at, size = self.snapshot, int(self._places[i]), self.snapshot.config.camera.size
         (verdict,), (row,) = self.read([i]), read_rows(snapshot, [at])
         views = []
         for camera in sorted(CAMERAS, key=lambda name: name != self.rows.camera):
@@ -283,11 +242,11 @@ class Predictions(Gallery):
 
     def _verdict(self, i: int) -> list[tuple[str, str]]:
         """Return the words of a verdict, each with the name of its look."""
-        words = {word for word, those in self.words.items() if those[i]}
+        words = {word for word in VERDICTS if word in self.table and self.table[word][i]}
         if "held" in words:
             return [("held", word) for word in WORDS if word in words]
         by_another = [("", "held by another wrist pose")] if "held_any" in words else []
-        return [("failed", _outcome(self.outcome[i])), *by_another]
+        return [("failed", _outcome(self.table.outcome[i])), *by_another]
 
     def _marks(
         self, verdict: Mapping[str, Any], row: dict[str, Any], camera: str, look: Look | None = None
@@ -307,19 +266,14 @@ class Predictions(Gallery):
         self, i: int, verdict: Mapping[str, Any], row: Mapping[str, Any]
     ) -> list[tuple[str, str, str | None]]:
         """Return lines of title, the prediction's value and the row's own, None if it has none."""
-        true = QUANTITIES["true_error"]
-        lines: list[tuple[str, str, str | None]] = [
-            (true.title, true.text(float(self.features["true_error"][i])), None)
-        ]
-        for name, shown in (_OWN | _BOTH).items():
+        lines: list[tuple[str, str, str | None]] = []
+        for name, shown in (QUANTITIES | NUMBERS).items():
             other = shown.text(row[name]) if name in _BOTH else None
-            lines.append((shown.title, shown.text(float(_largest(verdict.get(name))[0])), other))
-        force = Shown("largest force after closing", "N")
-        own, other = (
-            force.text(float(_largest(_lengths(source.get("closed_f_Q_O")))[0]))
-            for source in (verdict, row)
-        )
-        return [*lines, (force.title, own, other)]
+            known = self.table[name][i] if name in QUANTITIES else _largest(verdict.get(name))[0]
+            lines.append((shown.title, shown.text(known), other))
+        forces = (_lengths(source.get("closed_f_Q_O")) for source in (verdict, row))
+        own, other = (_FORCE.text(float(_largest(values)[0])) for values in forces)
+        return [*lines, (_FORCE.title, own, other)]
 
     def _scene(
         self, i: int, verdict: Mapping[str, Any], row: Mapping[str, Any], hand: HandView
@@ -343,7 +297,7 @@ class Predictions(Gallery):
         own = _hand(hand, X_TO, row["X_OG"], row["closed_q"]) or []
         forces = _contacts("force", row, "closed_", X_TO)
         states["dataset's grasp"] = {"links": own, "contacts": [*marks, *forces]}
-        return make_scene(self.snapshot, int(self.objects[i]), X_TO, states, hand)
+        return make_scene(self.snapshot, int(self.table.object[i]), X_TO, states, hand)
 
 
 def result_file(path: Path) -> Path:
@@ -351,49 +305,6 @@ def result_file(path: Path) -> Path:
     beside = path.with_suffix(".h5")
     lines = path.suffix.lower() in (".jsonl", ".json") or not path.is_file()
     return beside if lines and beside.is_file() else path
-
-
-def read_predictions(path: Path, read_at: Stamp, snapshot: Snapshot) -> Predictions:
-    """Return the predictions of a result file beside a state of the dataset.
-
-    Args:
-        path: The file.
-        read_at: Its stamp.
-        snapshot: State of the dataset.
-
-    Raises:
-        DataError: If the file cannot be read, or is not of this dataset.
-    """
-    with opened(path, "a result file of drakegrasp verify") as file:
-        group = file.get(GROUP)
-        if not isinstance(group, h5py.Group) or not all(name in group for name in NEEDED):
-            raise DataError(f"{path}: must be a result file of drakegrasp verify, got another")
-        refuse_other_schema(path, file.attrs.get("schema_version"))
-        count = len(group["outcome"])
-        refuse_first(path, _mistakes(group, count))
-        rows = _matched(path, file, snapshot, group["object"].asstr()[:].tolist())
-        outcome = read_codes(group["outcome"], list(Outcome))
-
-        # What the words and numbers are made of.
-        told = [name for name in VERDICTS if name in group and name != "held"]
-        words = {name: group[name][:] for name in told}
-        values = {name: group[name][:] if name in group else None for name in _MEASURED}
-        p_OQ = group["p_OQ"][:]
-    held = outcome == Outcome.SUCCESS
-    true = snapshot.trials[rows.trial_id.tolist()]["closed_p_OQ"]
-    # Another hand may have another number of fingers.
-    apart = norm(p_OQ - true) if p_OQ.shape == true.shape else None
-    features = {name: _largest(values[column], count) for column, name in _MEASURED.items()}
-    features["true_error"] = _largest(apart, count)
-    return Predictions(
-        path=path,
-        stamp=read_at,
-        snapshot=snapshot,
-        rows=rows,
-        outcome=outcome,
-        words={"fails": ~held, "held": held, **words},
-        features=features,
-    )
 
 
 def _matched(path: Path, file: h5py.File, snapshot: Snapshot, names: list[str]) -> PredictedRows:
@@ -412,33 +323,11 @@ def _matched(path: Path, file: h5py.File, snapshot: Snapshot, names: list[str]) 
     # Rows that exist, of the objects that the verdicts name.
     ids = rows.trial_id
     there = len(ids) == len(rows.row) == len(names) and bool(
-        ((ids >= 0) & (ids < len(snapshot.table))).all()
+        ((ids >= 0) & (ids < snapshot.table.count)).all()
     )
     if not there or [snapshot.names[k] for k in snapshot.table.object[ids]] != names:
         raise DataError(f"{path}: must be for rows of {snapshot.out}, got others; {again}")
     return rows
-
-
-def _mistakes(group: h5py.Group, count: int) -> list[Difference]:
-    """Return what is wrong with the types and shapes of the fields that are there."""
-    shape = group["p_OQ"].shape
-    sizes = {"k": shape[1] if len(shape) == 3 else 0, "j": 0}
-    if isinstance(joints := group.get("closed_q"), h5py.Dataset) and joints.ndim == 2:
-        sizes["j"] = joints.shape[1]
-    mistakes = []
-    for name in FIELDS.keys() & group.keys():
-        field, found = FIELDS[name], group[name]
-        text = field.dtype == "str"
-        right = isinstance(found, h5py.Dataset) and (
-            found.shape == (count, *field.row_shape(sizes))
-            and (h5py.check_string_dtype(found.dtype) is not None) == text
-            and (text or found.dtype.kind == np.dtype(field.dtype).kind)
-        )
-        if not right:
-            got = getattr(found, "shape", "a group")
-            must = f"{GROUP}/{name} must be (n, {field.shape}) of {field.dtype}"
-            mistakes.append(Difference(what=must, got=str(got)))
-    return mistakes
 
 
 def _column(group: h5py.Group, field: Field, rows: npt.NDArray[np.int64]) -> Any:

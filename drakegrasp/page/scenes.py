@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -23,6 +20,7 @@ from drakegrasp.page.catalog import Snapshot
 from drakegrasp.page.gallery import Gallery, Places, Query
 from drakegrasp.page.looks import ARROW, HandView, contacts_in_table, dots_of, make_scene
 from drakegrasp.pictures.style import REACHED, TRUE
+from drakegrasp.table import Table
 
 Rows = npt.NDArray[np.int64]
 #: Palms that the 3D view shows, and how many of these with the hand; lines of the table.
@@ -37,13 +35,16 @@ HOLDS, FAILS, UNKNOWN = (
 )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Scenes(Gallery):
     """All scenes of a dataset.
 
-    Attributes:
+    Args:
+        path: Their file.
+        read_at: Its stamp.
         snapshot: State of the other files.
-        data: All tables, and the images of all views.
+
+    Raises:
+        DataError: If the file cannot be read, or is not of this dataset.
     """
 
     HOME, ROW, NOUN = "/scenes", "scene", "scene"
@@ -57,52 +58,39 @@ class Scenes(Gallery):
         "row": "row of the file",
     }
 
-    snapshot: Snapshot
-    data: SceneDataset
+    def __init__(self, path: Path, read_at: Stamp, snapshot: Snapshot) -> None:
+        refuse_other_state(path, snapshot.trials)
+        data = SceneDataset(path, points=None)
+        scenes, grasps, views = (data.tables[name] for name in ("scenes", "grasps", "views"))
+        refuse_other_codes(path, "/grasps/outcome", grasps["outcome"], list(Outcome))
+        refuse_other_codes(path, "/grasps/trial_id", grasps["trial_id"], snapshot.table.count)
+        refuse_other_codes(path, "/views/kind", views["kind"], len(VIEW_KINDS))
+        if not np.isfinite(scenes["X_TO"]).all():
+            raise DataError(f"{path}: /scenes/X_TO must be finite, got other numbers")
+        if others := set(data.names) - set(snapshot.names):
+            raise DataError(f"{path}: must be of objects of {snapshot.out}, got {min(others)}")
 
-    @cached_property
-    def objects(self) -> npt.NDArray[np.int32]:
-        """Numbers (n,) of the objects in the snapshot."""
-        known = {name: number for number, name in enumerate(self.snapshot.names)}
-        numbers = np.array([known[name] for name in self.data.names], dtype=np.int32)
-        return numbers[self.data.tables["scenes"]["object"][:, 0]]
-
-    @cached_property
-    def labels(self) -> tuple[str, ...]:
-        """Of each scene for addresses: the code of its object, and the resting pose."""
-        resting = self.data.tables["scenes"]["resting"][:, 0].tolist()
-        codes = (self.snapshot.codes[number] for number in self.objects.tolist())
-        return tuple(f"{code}-{pose}" for code, pose in zip(codes, resting, strict=True))
-
-    @cached_property
-    def counts(self) -> Mapping[str, Rows]:
-        """(n,) each: how many grasps there are, are tested, held, samples; and the views."""
-        tables, count = self.data.tables, len(self.objects)
-        grasps = tables["grasps"]
+        # How many grasps there are in each, are tested, hold, are samples; and the views.
         of = {name: grasps["scene"][grasps[name]] for name in ("sample", "held", "tested")}
-        of |= {"grasps": grasps["scene"], "views": tables["views"]["scene"]}
-        return {name: np.bincount(rows, minlength=count) for name, rows in of.items()}
-
-    def column(self, name: str) -> Rows:
-        """Return the values (n,) of an order."""
-        return np.arange(len(self.objects)) if name == "row" else self.counts[name]
-
-    def matches(self, name: str, value: str) -> npt.NDArray[np.bool_]:
-        """Return which scenes (n,) are of a split."""
-        return np.asarray(self.data.tables["scenes"]["split"] == SPLITS.index(value))
-
-    def options(self, name: str) -> Mapping[str, str]:
-        """Return what the form offers: splits that occur."""
-        splits = np.unique(self.data.tables["scenes"]["split"])
-        return {SPLITS[number]: SPLITS[number] for number in splits}
+        of |= {"grasps": grasps["scene"], "views": views["scene"]}
+        numbers = np.array([snapshot.names.index(name) for name in data.names], dtype=np.int32)
+        self.snapshot, self.data = snapshot, data
+        self.table = Table(
+            {name: np.bincount(rows, minlength=len(scenes["split"])) for name, rows in of.items()},
+            object=numbers[scenes["object"][:, 0]],
+            split=scenes["split"],
+            resting=scenes["resting"][:, 0],
+        )
+        where = zip(self.table.object.tolist(), self.table.resting.tolist(), strict=True)
+        self._labels = [f"{snapshot.codes[number]}-{pose}" for number, pose in where]
 
     def label(self, i: int) -> str:
         """Return the name of a scene in addresses."""
-        return self.labels[i]
+        return self._labels[i]
 
     def find(self, label: str) -> int | None:
         """Return the number of the scene of a label, or None if there is none."""
-        return self.labels.index(label) if label in self.labels else None
+        return self._labels.index(label) if label in self._labels else None
 
     def views(self, scene: int) -> Rows:
         """Return the rows of a scene's views."""
@@ -118,18 +106,14 @@ class Scenes(Gallery):
 
     def identity(self, i: int) -> dict[str, Any]:
         """Return how people name a scene, and how many grasps it has."""
-        table = self.data.tables["scenes"]
-        return {
-            **super().identity(i),
-            "resting": int(table["resting"][i, 0]),
-            "split": SPLITS[table["split"][i]],
-            "counts": {name: int(values[i]) for name, values in self.counts.items()},
-        }
+        counts = {name: int(values[i]) for name, values in self.table.items()}
+        split, resting = SPLITS[counts["split"]], counts["resting"]
+        return {**super().identity(i), "split": split, "resting": resting, "counts": counts}
 
     def summary(self, query: Query, chosen: Places) -> dict[str, Any]:
         """Return what the gallery says besides its cards."""
         out = self.snapshot.out
-        views = int(self.counts["views"][chosen].sum())
+        views = int(self.table.views[chosen].sum())
         return {"title": out.name or str(out), "views": views}
 
     def cards(self, shown: Places) -> list[dict[str, Any]]:
@@ -141,12 +125,6 @@ class Scenes(Gallery):
                 best = int(np.argmax(self._visible(i, np.array([drawn])).sum(axis=(1, 2))))
             cards.append({"view": self._seen(i, best, drawn) if len(self.views(i)) else None})
         return cards
-
-    def values(self, i: int) -> dict[str, str]:
-        """Return what a page without a server filters and sorts a scene by."""
-        split = SPLITS[self.data.tables["scenes"]["split"][i]]
-        counts = {name: f"{values[i]}" for name, values in self.counts.items()}
-        return {"split": split, **counts, "row": f"{i}"}
 
     def row(self, i: int, hand: HandView) -> dict[str, Any]:
         """Return what the page of a scene says."""
@@ -183,7 +161,7 @@ class Scenes(Gallery):
             along = PALM / ARROW * X_CG[None, :3, 2]
             palm = dots_of(K, X_CG[None, :3, 3], along, near, lambda finger, u, v: False)
         return {
-            "href": f"/view/{self.labels[i]}-{k}.png",
+            "href": f"/view/{self._labels[i]}-{k}.png",
             "size": self.data.image_size,
             "kind": VIEW_KINDS[self.data.tables["views"]["kind"][view]],
             "dots": [dot for dot in dots if np.isfinite(dot).all()],
@@ -256,29 +234,5 @@ class Scenes(Gallery):
             colour = self._holds(row)[2]
             palms.append({"p": X[:3, 3].tolist(), "z": X[:3, 2].tolist(), "colour": colour})
         states = states or {"no grasp": {"links": [], "contacts": []}}
-        scene = make_scene(self.snapshot, int(self.objects[i]), X_TO, states, hand)
+        scene = make_scene(self.snapshot, int(self.table.object[i]), X_TO, states, hand)
         return scene | {"palms": palms}
-
-
-def read_scenes(path: Path, read_at: Stamp, snapshot: Snapshot) -> Scenes:
-    """Return the scenes of a file beside a state of the dataset.
-
-    Args:
-        path: The file.
-        read_at: Its stamp.
-        snapshot: State of the dataset.
-
-    Raises:
-        DataError: If the file cannot be read, or is not of this dataset.
-    """
-    refuse_other_state(path, snapshot.trials)
-    data = SceneDataset(path, points=None)
-    grasps, views = data.tables["grasps"], data.tables["views"]
-    refuse_other_codes(path, "/grasps/outcome", grasps["outcome"], list(Outcome))
-    refuse_other_codes(path, "/grasps/trial_id", grasps["trial_id"], len(snapshot.table))
-    refuse_other_codes(path, "/views/kind", views["kind"], len(VIEW_KINDS))
-    if not np.isfinite(data.tables["scenes"]["X_TO"]).all():
-        raise DataError(f"{path}: /scenes/X_TO must be finite, got other numbers")
-    if others := set(data.names) - set(snapshot.names):
-        raise DataError(f"{path}: must be of objects of {snapshot.out}, got {min(others)}")
-    return Scenes(snapshot=snapshot, data=data)

@@ -50,6 +50,6 @@ def test_a_grasp_without_an_optional_finger_is_a_success_but_no_sample(
     assert replay_trial(report.out, row).same
 
     # What is not there makes it no more suspicious.
-    table = Catalog(report.out).current().table
+    snapshot = Catalog(report.out).current()
     for part in ("normal_angle", "surface_distance", "normal_sum"):
-        assert np.isfinite(table.value(part, row))
+        assert np.isfinite(snapshot.value(part, row))

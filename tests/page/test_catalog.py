@@ -18,7 +18,6 @@ from drakegrasp.dataset.rejections import Decisions
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
-from drakegrasp.outcomes import Outcome
 from drakegrasp.page import catalog as catalog_module
 from drakegrasp.page.attempts import Attempts
 from drakegrasp.page.catalog import FEATURES, Catalog
@@ -43,14 +42,14 @@ def test_table_is_what_the_files_say(boxes: Path) -> None:
             ids = np.flatnonzero(table.split == number)
             np.testing.assert_array_equal(ids, data[split]["trial_id"][:])
     assert (table.removal != NONE).sum() == (table.split != NONE).sum() == 9
-    assert set(table.features) == set(FEATURES)
-    np.testing.assert_allclose(table.feature("slip")[table.precision], SLIP)
-    assert table.value("force", 0) == 12.5
+    assert set(snapshot.closed) == {*FEATURES, "place"}
+    np.testing.assert_allclose(snapshot.feature("slip")[table.precision], SLIP)
+    assert snapshot.value("force", 0) == 12.5
     # The second attempt misses a finger, the third is below the table.
-    assert np.isnan(table.feature("slip")[[1, 2]]).all()
-    assert np.isnan(table.value("force", 2))
-    assert table.value("force", 1) == 10.0
-    assert np.isfinite(table.feature("force")[table.closed]).all()
+    assert np.isnan(snapshot.feature("slip")[[1, 2]]).all()
+    assert np.isnan(snapshot.value("force", 2))
+    assert snapshot.value("force", 1) == 10.0
+    assert np.isfinite(snapshot.feature("force")[snapshot.closed.place]).all()
 
 
 def test_attempts_are_found_by_their_label(boxes: Path) -> None:
@@ -113,7 +112,7 @@ def test_a_build_that_runs_shows_what_is_done(out: Path, monkeypatch: pytest.Mon
     hidden.rename(out / "later")
     catalog = Catalog(out)
     first = catalog.current()
-    assert len(first.table) == 24
+    assert first.table.count == 24
     assert "4 of 6 work units are done" in first.missing[0]
     assert first.trial_id(0) is None
 
@@ -121,8 +120,8 @@ def test_a_build_that_runs_shows_what_is_done(out: Path, monkeypatch: pytest.Mon
     (out / "later").rename(hidden)
     assert catalog.current() is first
     monkeypatch.setattr(catalog_module, "LISTING_PERIOD", 0.0)
-    assert len(catalog.current().table) == 36
-    assert (catalog.current().table.outcome == Outcome.SUCCESS).sum() == 9
+    assert catalog.current().table.count == 36
+    assert catalog.current().table.held.sum() == 9
     assemble(out)
     assert catalog.current().assembled
     assert catalog.current() is catalog.current()
@@ -132,7 +131,7 @@ def test_a_build_that_has_done_nothing_yet_has_no_attempts(out: Path) -> None:
     build_again(out)
     shutil.rmtree(out / "shards")
     table = Catalog(out).current().table
-    assert len(table) == 0
+    assert table.count == 0
     assert table.candidate.dtype == np.int32
 
 
@@ -155,12 +154,12 @@ def test_a_label_stays_that_of_its_attempt_when_objects_are_added(
         assemble(out)
     catalog = Catalog(out)
     before = catalog.current()
-    labels = {before.label(i): before.key(i) for i in range(len(before.table))}
+    labels = {before.label(i): before.key(i) for i in range(before.table.count)}
     write_manifest(whole, out)
     if assembled:
         assemble(out)
     after = catalog.current()
-    assert len(after.table) == len(labels) + 12
+    assert after.table.count == len(labels) + 12
     for label, key in labels.items():
         place = after.find(label)
         assert place is not None
@@ -192,7 +191,7 @@ def test_attempts_stay_with_their_objects_when_the_manifest_grows(
 
     # And when it shrinks: what is gone is not kept.
     write_manifest(replace(whole, objects=whole.objects[1:]), out)
-    assert len(catalog.current().table) == 24
+    assert catalog.current().table.count == 24
 
 
 def test_a_file_that_was_replaced_is_not_read_as_the_one_before(out: Path) -> None:
@@ -214,7 +213,7 @@ def test_a_file_that_was_replaced_is_not_read_as_the_one_before(out: Path) -> No
 def test_a_shard_of_another_mesh_is_not_read_as_the_one_before(out: Path) -> None:
     build_again(out)
     before = Catalog(out).current()
-    for i in range(0, len(before.table), 6):
+    for i in range(0, before.table.count, 6):
         part, _ = before.trials.part_of(i)
         with h5py.File(part.path, "r+") as file:
             file.attrs["mesh_sha256"] = "0" * 64
@@ -228,7 +227,7 @@ def test_a_damaged_shard_is_named_and_the_others_are_shown(out: Path) -> None:
     path = next((out / "shards" / "2_box_b").iterdir())
     path.write_bytes(path.read_bytes()[:1000])
     snapshot = Catalog(out).current()
-    assert len(snapshot.table) == 30
+    assert snapshot.table.count == 30
     assert snapshot.missing[1].startswith("Damaged, and not shown: shards/2_box_b/")
     assert "5 of 6 work units are done" in snapshot.missing[0]
 
@@ -247,31 +246,31 @@ def test_files_of_an_earlier_state_are_told(out: Path, monkeypatch: pytest.Monke
     (out / "later").rename(hidden)
     first = catalog.current()
     assert "2 work units are newer" in first.missing[0]
-    assert len(first.table) == 24
+    assert first.table.count == 24
     assert catalog.current() is first
     assemble(out)
     assert catalog.current().missing == ()
-    assert len(catalog.current().table) == 36
+    assert catalog.current().table.count == 36
 
 
 @pytest.mark.parametrize("wanted", [1, 2])
 def test_attempts_beyond_the_wanted_grasps_are_not_shown(tmp_path: Path, wanted: int) -> None:
     """Assembly takes none of them, so they cannot be rejected either."""
     out = make_dataset(tmp_path / "out", tmp_path, overrides=[f"max_grasps={wanted}"])
-    assembled = Catalog(out).current().table
+    assembled = Catalog(out).current()
     build_again(out)
-    building = Catalog(out).current().table
-    assert (building.outcome == Outcome.SUCCESS).sum() == 3 * wanted
-    for name in ("object", "candidate", "standoff_index", "outcome", "closed"):
-        np.testing.assert_array_equal(getattr(building, name), getattr(assembled, name))
-    for name in FEATURES:
-        np.testing.assert_array_equal(building.features[name], assembled.features[name])
+    building = Catalog(out).current()
+    assert building.table.held.sum() == 3 * wanted
+    for name in ("object", "candidate", "standoff_index", "outcome"):
+        np.testing.assert_array_equal(building.table[name], assembled.table[name])
+    for name, values in building.closed.items():
+        np.testing.assert_array_equal(values, assembled.closed[name])
 
 
 def test_a_contact_without_a_normal_has_the_largest_angle(out: Path) -> None:
     change(out, TRIALS, "trials/normal_angle", 0, set_at(0, to=np.nan))
     snapshot = Catalog(out).current()
-    assert snapshot.table.value("normal_angle", 0) == np.inf
+    assert snapshot.value("normal_angle", 0) == np.inf
     table = Attempts(snapshot, Decisions())
     assert table.select(Attempts.query({"min_normal_angle": "10"})).tolist() == [0]
     assert table.select(Attempts.query({"sort": "normal_angle"}))[0] == 0

@@ -47,7 +47,7 @@ def test_the_worst_come_first(client: TestClient) -> None:
     """Never closed, failed, then those that hold, by how far the contacts are off."""
     assert shown(client) == ["2", "3", "1", "0"]
     assert shown(client, "order=up") == ["0", "1", "3", "2"]
-    assert shown(client, "sort=error") == ["1", "3", "0", "2"]
+    assert shown(client, "sort=contact_error") == ["1", "3", "0", "2"]
 
 
 @pytest.mark.parametrize(
@@ -57,8 +57,8 @@ def test_the_worst_come_first(client: TestClient) -> None:
         ("verdict=precision", ["0"]),
         ("outcome=dropped", ["3"]),
         ("object=nothing", []),
-        ("class=box&min_error=5", ["3", "1"]),
-        ("max_error=5", ["0"]),
+        ("class=box&min_contact_error=5", ["3", "1"]),
+        ("max_contact_error=5", ["0"]),
         ("min_true_error=3.9&verdict=held", ["1", "0"]),
     ],
 )
@@ -79,7 +79,7 @@ def test_asked_reached_and_true_contacts_are_marked(client: TestClient) -> None:
 
 
 def test_page_of_a_prediction_has_both_hands_and_all_contacts(client: TestClient) -> None:
-    page = client.get("/prediction/3?sort=error").text
+    page = client.get("/prediction/3?sort=contact_error").text
     assert "2 of 4" in page and "row 1 of train" in page and "dropped" in page
     scene = _scene(page)
     assert set(scene["states"]) == {"closed", "dataset's grasp"}
@@ -139,7 +139,7 @@ def _no_verdicts(file: h5py.File) -> None:
         (_of_others, "as it is now, got another"),
         (_beyond, "must be for rows of"),
         (_another_object, "must be for rows of"),
-        (_flat, "grasps/closed_p_OQ must be"),
+        (_flat, "/grasps/closed_p_OQ: shape must be"),
         (_no_verdicts, "must be a result file of drakegrasp verify, got another"),
     ],
 )

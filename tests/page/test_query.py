@@ -55,7 +55,7 @@ def test_words_choose_by_how_an_attempt_holds(snapshot: Snapshot) -> None:
     table = snapshot.table
     precision, stable = table.precision.copy(), table.stable.copy()
     precision[12] = stable[12] = stable[15] = False
-    changed = replace(snapshot, table=replace(table, precision=precision, stable=stable))
+    changed = replace(snapshot, table=table.with_columns(precision=precision, stable=stable))
     counts = {
         hold: len(chosen(changed, f"hold={hold}")) for hold in ("held", "precision", "stable")
     }
@@ -71,7 +71,7 @@ def test_splits_are_a_partition_of_the_samples(snapshot: Snapshot) -> None:
 def test_any_sample_is_one_choice(snapshot: Snapshot) -> None:
     split = snapshot.table.split.copy()
     split[[0, 3]] = NONE
-    changed = replace(snapshot, table=replace(snapshot.table, split=split))
+    changed = replace(snapshot, table=snapshot.table.with_columns(split=split))
     assert len(chosen(changed, "split=samples&outcome=any")) == 7
     assert set(chosen(changed, "split=none")) == {"0-0-0", "0-1-0"}
 
@@ -87,12 +87,10 @@ def test_ranges_are_in_the_units_that_are_shown(snapshot: Snapshot) -> None:
 
 
 def test_order_is_by_the_quantity_and_those_without_come_last(snapshot: Snapshot) -> None:
-    table = snapshot.table
-    score = table.features["suspicion"].copy()
-    score[np.searchsorted(table.closed, [0, 3, 11])] = [5.0, np.nan, 7.0]
-    changed = replace(
-        snapshot, table=replace(table, features={**table.features, "suspicion": score})
-    )
+    closed = snapshot.closed
+    score = closed.suspicion.copy()
+    score[np.searchsorted(closed.place, [0, 3, 11])] = [5.0, np.nan, 7.0]
+    changed = replace(snapshot, closed=closed.with_columns(suspicion=score))
     down, up = chosen(changed, ""), chosen(changed, "order=up")
     assert down[:2] == ["0-3-2", "0-0-0"]
     assert up[-3:] == ["0-0-0", "0-3-2", "0-1-0"]

@@ -112,14 +112,10 @@
           const x = number(card, range[2]), limit = Number.parseFloat(value);
           if (Number.isNaN(limit)) continue;
           if (!(range[1] === "min" ? x >= limit : x <= limit)) return false;
-        } else if (name === "decision") {
-          const decision = card.querySelector(".word.decision").textContent || "open";
-          if (decision !== value) return false;
-        } else if (name === "split" && value === "samples") {
-          if (card.dataset.split === "none") return false;
         } else {
+          // Names may have blanks; the others are words.
           const own = card.dataset[key(name)];
-          if (!(name === "hold" || name === "verdict" ? own.split(" ") : [own]).includes(value)) return false;
+          if (!(name === "object" || name === "class" ? [own] : own.split(" ")).includes(value)) return false;
         }
       }
       return true;
