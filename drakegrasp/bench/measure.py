@@ -22,9 +22,14 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import installed_versions
 from drakegrasp.dataset.prepared_objects import PreparedObject
 from drakegrasp.errors import DataError
-from drakegrasp.generation.attempts import TrialSetup, list_attempts, predict_attempts, try_attempt
+from drakegrasp.generation.attempts import (
+    TrialSetup,
+    list_attempts,
+    look_at,
+    predict_attempts,
+    try_attempt,
+)
 from drakegrasp.generation.prepare import prepare
-from drakegrasp.generation.work_unit import render_successes
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome
@@ -146,7 +151,9 @@ def _measure_object(
             records.append(try_attempt(bench, attempt, prediction))
         counter.add(records[-1].outcome)
     with _cpu_timed(seconds, "look"):
-        render_successes(bench, attempts, records)
+        for attempt, record in zip(attempts, records, strict=True):
+            if record.outcome is Outcome.SUCCESS:
+                look_at(bench, attempt, record.X_TO)
 
     report = {
         "name": source.name,

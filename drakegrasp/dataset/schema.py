@@ -116,8 +116,8 @@ class Field:
             columns of `needs`, its values (n, ...). No shard stores it.
         needs: Names of these columns.
         of: Where its value is measured, as a path of attributes: from a `TrialRow` of
-            `generation.columns` for a trial, from a `Verification` for a verdict. For a number of a
-            sample, the column of its trial that it copies. Empty if it is computed otherwise.
+            `generation.attempts` for a trial, from a `Verification` for a verdict. For a number of
+            a sample, the column of its trial that it copies. Empty if it is computed otherwise.
         shown: How people read it; None if it is not shown by itself.
     """
 

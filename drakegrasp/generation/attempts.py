@@ -1,45 +1,51 @@
-"""One object's trial setup in this process, and the steps of a trial on it.
+"""One object's trial setup in this process, the steps of a trial on it, and the rows of a shard.
 
 In: a prepared object of a dataset, and attempts. Out: what geometry predicts of them, the records
-of their trials, how contacts lie on the surface, and the views of a grasp. Nothing is written
-here, see `drakegrasp.generation.columns`.
+of their trials, and the columns of a shard by the names of `drakegrasp.dataset.schema`: `/trials`,
+a row per attempt, and `/looks`, what the cameras see of each success. Nothing is written here. A
+verdict asks the filters of a dataset about the columns that a trial alone has.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.config import Config
+from drakegrasp.config import Config, FilterConfig
+from drakegrasp.dataset.assembly.survey import successes_of
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
-from drakegrasp.dataset.schema import CAMERAS
-from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.dataset.schema import CAMERAS, NO_PRESHAPE, sizes
+from drakegrasp.dataset.shards import ShardHeader, trial_columns
 from drakegrasp.errors import DataError, MachineError
-from drakegrasp.frames import Array
+from drakegrasp.filters import RULES, Removal, first_removal
+from drakegrasp.frames import Array, pack_pose
+from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ContactFit, ObjectModel, fit_contacts
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.simulation.attempts import posture_attempts
-from drakegrasp.simulation.candidates import Attempt, children, family_member, make_attempts
-from drakegrasp.simulation.conditions import draw_conditions, usual_conditions
-from drakegrasp.simulation.scene import Scene
+from drakegrasp.simulation.candidates import Attempt, children, make_attempts
+from drakegrasp.simulation.conditions import Conditions, draw_conditions, usual_conditions
+from drakegrasp.simulation.scene import Scene, hand_joint_names
 from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes
 from drakegrasp.simulation.screen import Prediction, centred, predict
 from drakegrasp.simulation.trial import TrialRecord, lift_on, run_attempt
+from drakegrasp.table import AnyArray, Table
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
 from drakegrasp.vision.depth_sensor import spoil_depth
 from drakegrasp.vision.rendering import Renderer, paint, render
 
 #: Prepared objects that a process keeps: the next unit is mostly of the same object.
 KEPT_OBJECTS = 2
+#: Where the cameras of a name are, given the pose of the palm.
+_CAMERA_POSES = {"oto": camera_pose_oto, "otm": camera_pose_otm}
 
 
 @dataclass(eq=False)
@@ -55,7 +61,6 @@ class TrialSetup:
     prepared: PreparedObject
     config: Config
     scene: Scene
-    _renderer: Renderer | None = None
 
     def scene_of(self, attempt: Attempt) -> Scene:
         """Return the scene of an attempt: the hand may be in a preshape."""
@@ -64,29 +69,24 @@ class TrialSetup:
         model, config = self.prepared.model, self.config
         return cached_scene(model, config.physics, config.hand_source, attempt.preshape)
 
-    @property
+    def renew_scene(self) -> None:
+        """Take the scene anew, if Drake failed in the one that was kept."""
+        config = self.config
+        self.scene = cached_scene(self.prepared.model, config.physics, config.hand_source)
+
+    @cached_property
     def renderer(self) -> Renderer:
         """The object's renderer, built when it is first needed."""
-        if self._renderer is None:
-            self._renderer = cached_renderer(self.prepared.model, self.config.camera)
-        return self._renderer
+        return cached_renderer(self.prepared.model, self.config.camera)
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class View:
-    """What one camera sees of the resting object.
-
-    Attributes:
-        image: (4, S, S) float32, R, G, B in 0..1 and depth [m].
-        mask: (S, S) uint8, 1 where the object is seen.
-        X_TC: Pose of the camera in the table-top frame, (4, 4).
-        X_CI: The object's frame as the image shows it, (4, 4); None where none was estimated.
-    """
-
-    image: npt.NDArray[np.float32]
-    mask: npt.NDArray[np.uint8]
-    X_TC: Array
-    X_CI: Array | None = None
+    @cached_property
+    def sizes(self) -> dict[str, int]:
+        """The array lengths that the schema leaves open: fingers, joints and pixels."""
+        return sizes(
+            fingers=self.scene.hand.num_fingers,
+            joints=len(hand_joint_names(self.scene)),
+            image=self.config.camera.size,
+        )
 
 
 def trial_setup(out: Path, header: ShardHeader, config: Config) -> TrialSetup:
@@ -113,27 +113,26 @@ def _load(out: Path, name: str, mesh_sha256: str, config: Config) -> PreparedObj
     return prepared
 
 
+# Attempts
+
+
 def list_attempts(prepared: PreparedObject, indices: range, config: Config) -> list[Attempt]:
     """Return the attempts of a range of an object's candidates, with their conditions."""
-    model, drawn = prepared.model, prepared.candidates
-    place: Any = {"name": model.name, "seed": config.seed}
-    hand = load_hand(config.hand_source)
+    drawn, hand = prepared.candidates, load_hand(config.hand_source)
+    place: Any = {"name": prepared.model.name, "seed": config.seed}
     if drawn.postures is None:
         count = len(hand.preshapes)
         made = list(make_attempts(drawn, indices, config.candidates, **place, preshapes=count))
     else:
         made = list(posture_attempts(drawn, indices, hand, **place))
     made = [replace(a, unused=hand.unused_in(a.preshape)) for a in made] if hand.preshapes else made
-    made = centred(model, hand, made)
-    return [_with_conditions(attempt, model, config) for attempt in made]
+    return _completed(prepared.model, made, config)
 
 
 def list_children(prepared: PreparedObject, parent: Attempt, config: Config) -> list[Attempt]:
     """Return the attempts about that of a grasp that holds, with their conditions."""
-    model = prepared.model
-    made = children(parent, config.refine, name=model.name, seed=config.seed)
-    made = centred(model, load_hand(config.hand_source), made)
-    return [_with_conditions(attempt, model, config) for attempt in made]
+    made = children(parent, config.refine, name=prepared.model.name, seed=config.seed)
+    return _completed(prepared.model, made, config)
 
 
 def find_attempt(
@@ -144,25 +143,29 @@ def find_attempt(
     Raises:
         DataError: If there is no such number in a family.
     """
-    most = sum(config.refine.children**k for k in range(1, config.refine.generations + 1))
+    siblings, generations = config.refine.children, config.refine.generations
+    most = sum(siblings**k for k in range(1, generations + 1))
     if not 0 <= child <= most:
         raise DataError(f"child must be 0 to {most}, got {child}")
-    first = list_attempts(prepared, range(candidate, candidate + 1), config)[standoff_index]
-    model, hand = prepared.model, load_hand(config.hand_source)
-    member = family_member(
-        first,
-        child,
-        config.refine,
-        name=model.name,
-        seed=config.seed,
-        place=lambda attempt: centred(model, hand, [attempt])[0],
-    )
-    return _with_conditions(member, model, config)
+    if child == 0:
+        first = list_attempts(prepared, range(candidate, candidate + 1), config)
+        return first[standoff_index]
+    number, place = divmod(child - 1, siblings)
+    parent = find_attempt(prepared, candidate, standoff_index, number, config)
+    return list_children(prepared, parent, config)[place]
 
 
-def _with_conditions(attempt: Attempt, model: ObjectModel, config: Config) -> Attempt:
-    place = attempt.candidate, attempt.standoff_index, attempt.child
-    return replace(attempt, conditions=draw_conditions(model, config, *place))
+def _completed(model: ObjectModel, attempts: Sequence[Attempt], config: Config) -> list[Attempt]:
+    """Return attempts whose palms are centred, see `centred`, with their conditions."""
+    return [
+        replace(
+            each,
+            conditions=draw_conditions(
+                model, config, each.candidate, each.standoff_index, each.child
+            ),
+        )
+        for each in centred(model, load_hand(config.hand_source), attempts)
+    ]
 
 
 def predict_attempts(setup: TrialSetup, attempts: Sequence[Attempt]) -> list[Prediction | None]:
@@ -171,18 +174,15 @@ def predict_attempts(setup: TrialSetup, attempts: Sequence[Attempt]) -> list[Pre
     hand = load_hand(config.hand_source)
 
     # A call is about one resting pose and preshape.
+    groups: dict[tuple[int, int | None], list[int]] = {}
+    for row, attempt in enumerate(attempts):
+        groups.setdefault((attempt.resting, attempt.preshape), []).append(row)
     found: list[Prediction | None] = [None] * len(attempts)
-    for k, X_TO in enumerate(prepared.resting_poses):
-        for preshape in sorted({attempt.preshape for attempt in attempts}, key=str):
-            rows = [
-                row
-                for row, attempt in enumerate(attempts)
-                if (attempt.resting, attempt.preshape) == (k, preshape)
-            ]
-            own, shaped = [attempts[row] for row in rows], hand.at(preshape)
-            predictions = predict(prepared.model, shaped, X_TO, own, config.screen)
-            for row, prediction in zip(rows, predictions, strict=True):
-                found[row] = prediction
+    for (resting, preshape), rows in groups.items():
+        own, X_TO = [attempts[row] for row in rows], prepared.resting_poses[resting]
+        said = predict(prepared.model, hand.at(preshape), X_TO, own, config.screen)
+        for row, prediction in zip(rows, said, strict=True):
+            found[row] = prediction
     return found
 
 
@@ -195,24 +195,22 @@ def try_attempt(
     record = run_attempt(
         setup.scene_of(attempt), X_TO, attempt, setup.config, prediction, is_visible=is_visible
     )
-    _replace_failed(setup, record)
-    return record
+    return _without_failed(setup, record)
 
 
 def lift_scraped(setup: TrialSetup, attempt: Attempt, record: TrialRecord) -> TrialRecord:
     """Lift the hand of `try_attempt`, which only scraped the table; see `lift_on`."""
     is_visible = partial(_is_visible, setup, attempt, record.X_TO)
     lifted = lift_on(setup.scene_of(attempt), record, attempt, setup.config, is_visible=is_visible)
-    _replace_failed(setup, lifted)
-    return lifted
+    return _without_failed(setup, lifted)
 
 
-def _replace_failed(setup: TrialSetup, record: TrialRecord) -> None:
-    """Replace the scene if Drake failed in it."""
+def _without_failed(setup: TrialSetup, record: TrialRecord) -> TrialRecord:
+    """Return a record; a scene in which Drake failed is not used again."""
     if record.outcome is Outcome.SOLVER_ERROR:
         forget_scenes()
-        config = setup.config
-        setup.scene = cached_scene(setup.prepared.model, config.physics, config.hand_source)
+        setup.renew_scene()
+    return record
 
 
 def _is_visible(setup: TrialSetup, attempt: Attempt, X_TO: Array) -> bool:
@@ -225,49 +223,157 @@ def _is_visible(setup: TrialSetup, attempt: Attempt, X_TO: Array) -> bool:
     if least == 0.0:
         return True
     try:
-        view = _render_view(setup, attempt, X_TO, "otm")
+        depth = _seen(setup, attempt, X_TO, "otm")["image_otm"][3]
     except MachineError:
         raise
     except (RuntimeError, SystemExit) as error:
         raise MachineError(f"{setup.prepared.model.name}: cannot render: {error}") from None
-    return bool(view.image[3].astype(float).var() >= least)
+    return bool(depth.astype(float).var() >= least)
 
 
-def measure_contacts(setup: TrialSetup, record: TrialRecord) -> ContactFit | None:
-    """Return how the contacts after closing lie on the object's mesh, a row per finger.
+# Rows of a shard
 
-    Returns:
-        Distances and angles; None if the hand lifted nothing.
+
+class TrialRow(NamedTuple):
+    """What a row of `/trials` is made of; `Field.of` in the schema says of which part.
+
+    Attributes:
+        attempt: What was tried.
+        conditions: Its friction, mass, looks and cameras.
+        trial: What happened.
+        fit: How the contacts after closing lie on the surface, if the hand lifted something.
     """
+
+    attempt: Attempt
+    conditions: Conditions
+    trial: TrialRecord
+    fit: ContactFit | None
+
+
+def trial_rows(
+    setup: TrialSetup, attempts: Sequence[Attempt], records: Sequence[TrialRecord]
+) -> dict[str, AnyArray]:
+    """Return the columns of `/trials` that attempts and the records of their trials give."""
+    return _trial_rows(setup.prepared.model, setup.config, setup.sizes, attempts, records)
+
+
+def _trial_rows(
+    model: ObjectModel,
+    config: Config,
+    sizes: dict[str, int],
+    attempts: Sequence[Attempt],
+    records: Sequence[TrialRecord],
+) -> dict[str, AnyArray]:
+    fields = [field for field in trial_columns() if field.of]
+    columns = {field.name: field.empty(len(records), sizes) for field in fields}
+    # The index of a preshape, of which a posture has none.
+    columns["preshape"][:] = NO_PRESHAPE if load_hand(config.hand_source).preshapes else 0
+    usual = usual_conditions(model, config.physics)
+    for i, (attempt, record) in enumerate(zip(attempts, records, strict=True)):
+        row = TrialRow(attempt, attempt.conditions or usual, record, _fit(model, record))
+        used = ~unused_fingers(attempt.unused, sizes["k"])
+        for field in fields:
+            # What a stage did not reach keeps the column's fill value.
+            value = field.value_of(row)
+            if value is None:
+                continue
+            if field.shape.startswith("k"):
+                # A finger that a preshape does not use has no contact, and no force.
+                columns[field.name][i] = np.nan if field.per_finger else 0
+                columns[field.name][i][used] = value
+            else:
+                columns[field.name][i] = pack_pose(value) if field.shape == "12" else value
+    return columns
+
+
+def _fit(model: ObjectModel, record: TrialRecord) -> ContactFit | None:
+    """Return how the contacts after closing lie on the mesh; None if the hand lifted nothing."""
     if record.closed is None or record.lift is None:
         return None
     closed = record.closed.contacts
-    return fit_contacts(setup.prepared.model, closed.p_OQ, closed.nhat_Q_O)
+    return fit_contacts(model, closed.p_OQ, closed.nhat_Q_O)
 
 
-def render_views(setup: TrialSetup, attempt: Attempt, record: TrialRecord) -> dict[str, View]:
-    """Return what both cameras see of a success, by the names of `CAMERAS`.
+def look_at(setup: TrialSetup, attempt: Attempt, X_TO: Array) -> dict[str, AnyArray]:
+    """Return the row of `/looks` of a success on an object that rests at X_TO (4, 4).
+
+    Where the object is out of sight the image frame is missing, and a filter removes the sample.
 
     Raises:
         BlankImageError: If an image is blank, because OpenGL failed.
     """
-    return {name: _render_view(setup, attempt, record.X_TO, name) for name in CAMERAS}
+    return _seen(setup, attempt, X_TO, "oto") | _seen(setup, attempt, X_TO, "otm")
 
 
-def _render_view(setup: TrialSetup, attempt: Attempt, X_TO: Array, name: str) -> View:
+def _seen(setup: TrialSetup, attempt: Attempt, X_TO: Array, name: str) -> dict[str, AnyArray]:
     """Return what the camera of a name sees of the object at rest, before the attempt."""
     # The camera, and how the scene looks.
     camera, model = setup.config.camera, setup.prepared.model
     conditions = attempt.conditions or usual_conditions(model, setup.config.physics)
-    pose = {"oto": camera_pose_oto, "otm": camera_pose_otm}[name]
-    X_TC = pose(multiply(X_TO, attempt.X_OG), camera, conditions.X_C0C)
+    X_TC = _CAMERA_POSES[name](multiply(X_TO, attempt.X_OG), camera, conditions.X_C0C)
     paint(setup.renderer, conditions.appearance)
     seen = render(setup.renderer, X_TO, X_TC)
 
     # The object's frame comes from the clean image; the sensor's errors come last.
-    K = intrinsics(camera)
-    estimated = name == "otm" and seen.mask.any()
-    X_CI = image_frame(K, seen.mask, seen.image[3]) if estimated else None
-    image, number = seen.image, CAMERAS.index(name)
-    image[3] = spoil_depth(image[3], K, conditions.sensor, number, camera)
-    return View(image=image, mask=seen.mask, X_TC=X_TC, X_CI=X_CI)
+    K, image = intrinsics(camera), seen.image
+    found: dict[str, AnyArray] = {"mask": seen.mask, "X_TC": pack_pose(X_TC)}
+    if name == "otm" and seen.mask.any():
+        found["X_CI"] = pack_pose(image_frame(K, seen.mask, image[3]))
+    image[3] = spoil_depth(image[3], K, conditions.sensor, CAMERAS.index(name), camera)
+    found["image"] = image
+    return {f"{key}_{name}": value for key, value in found.items()}
+
+
+# Filters
+
+
+def judge_sample(
+    model: ObjectModel, trial: TrialRecord, config: Config, *, views: bool = True
+) -> Removal | None:
+    """Return the first filter that removes a held grasp, `KEPT` if none does.
+
+    The cameras are where a build puts them without randomisation.
+
+    Args:
+        model: The object.
+        trial: Of the grasp.
+        config: With the filters and the camera.
+        views: Whether the filters of the view of a camera count: where it is, and whether it sees
+            the contacts. They do not where the palm is off, as the picture was taken before.
+
+    Returns:
+        The filter; None for a trial that is no success.
+    """
+    if trial.outcome is not Outcome.SUCCESS:
+        return None
+
+    # Its row of /trials, as a build would write it.
+    assert trial.closed is not None
+    fingers, joints = len(trial.closed.contacts.touching), len(trial.closed.q)
+    lengths = sizes(fingers=fingers, joints=joints, image=0)
+    attempt = Attempt(
+        X_OG=trial.X_OG, spread=0.0, candidate=0, standoff_index=0, standoff=0.0, seed=0
+    )
+    columns = _trial_rows(model, config, lengths, [attempt], [trial])
+
+    # And where the cameras would be.
+    if views:
+        X_TG = multiply(trial.X_TO, trial.X_OG)
+        for name, pose in _CAMERA_POSES.items():
+            columns[f"X_TC_{name}"] = pack_pose(pose(X_TG, config.camera))[None]
+    successes = successes_of(Table(columns), config.camera)
+    return Removal(int(first_removal(successes, config.filters)[0]))
+
+
+#: Of the filters' columns, those that only pictures of a success show.
+_OF_PICTURES = {"seen", "depth_variance"}
+
+
+def unjudged(rules: FilterConfig) -> tuple[Removal, ...]:
+    """Return the filters, of those that are on, about which a verdict knows nothing."""
+    of_pictures = (rule for rule in RULES if rule.is_on(rules) and {*rule.needs} & _OF_PICTURES)
+    others = {Removal.OUTLIER: rules.outlier_sigma > 0.0, Removal.OWN: bool(rules.own)}
+    return (
+        *(rule.removal for rule in of_pictures),
+        *(reason for reason, on in others.items() if on),
+    )

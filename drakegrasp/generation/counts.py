@@ -8,17 +8,21 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import takewhile
 from math import ceil
+from typing import TYPE_CHECKING
 
 from drakegrasp.config import Config
+from drakegrasp.dataset.assembly.survey import headers_by_object
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.shards import ShardHeader
-from drakegrasp.errors import NAMED, ConfigError, listed
+from drakegrasp.errors import ConfigError, listed
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import WorkerPool
 from drakegrasp.runtime.progress import Report
+
+if TYPE_CHECKING:
+    from drakegrasp.generation.work_unit import UnitSummary
 
 #: Outcomes of attempts that the machine, or an error of the simulator, ended.
 ENDED = (Outcome.CRASHED, Outcome.TIMEOUT)
@@ -37,8 +41,8 @@ class Counts:
         simulated: Work units that were run now.
         reused: Work units that were done before.
         damaged: Damaged shards.
-        named: The first damaged shards.
         errors: Number of solver errors by message.
+        target: What a number of samples to find needs; None without one.
     """
 
     def __init__(self, manifest: Manifest, pool: WorkerPool | None, report: Report) -> None:
@@ -49,9 +53,13 @@ class Counts:
             pool: Its size is shown, if there is one.
             report: Called with the figures.
         """
-        self.simulated = self.reused = self.damaged = 0
-        self.named: list[str] = []
+        self.simulated = self.reused = 0
+        self.damaged: list[str] = []
         self.errors: Counter[str] = Counter()
+        self.target: Target | None = None
+        if has_target(manifest.config):
+            units = {of[0].object_name: of for of in headers_by_object(manifest) if of}
+            self.target = Target(manifest.config, units)
 
         # Progress: attempts of the first round, all by outcome, and those that were there before.
         self._pool, self._report = pool, report
@@ -77,21 +85,14 @@ class Counts:
         self._gap: Counter[str] = Counter()
         self._beyond: dict[str, dict[int, tuple[int, int]]] = {}
 
-    def add_damaged(self, name: str) -> None:
-        """Count a damaged shard."""
-        self.damaged += 1
-        if len(self.named) < NAMED:
-            self.named.append(name)
-
-    def add(
-        self,
-        header: ShardHeader,
-        outcomes: dict[Outcome, int],
-        *,
-        reused: bool = False,
-        samples: int | None = None,
-    ) -> None:
-        """Count the attempts of a unit that is done, now or before (`reused`), and its samples."""
+    def add(self, summary: UnitSummary, *, reused: bool = False) -> None:
+        """Count a unit that is done, now or before (`reused`)."""
+        header, outcomes, samples = summary.header, summary.outcomes, summary.samples
+        self.reused += reused
+        self.simulated += not reused
+        self.errors.update(summary.errors)
+        if self.target is not None and samples is not None:
+            self.target.found[header] = samples
         grasps = outcomes.get(Outcome.SUCCESS, 0)
         self._found[header.object_name] += grasps if samples is None else samples
         self._outcomes.update(outcomes)
@@ -120,7 +121,7 @@ class Counts:
     def show(self) -> None:
         """Report what is done, and by how many workers."""
         figures = {"grasps": self._outcomes[Outcome.SUCCESS]}
-        for outcome in (Outcome.CRASHED, Outcome.TIMEOUT):
+        for outcome in ENDED:
             if self._outcomes[outcome]:
                 figures[outcome.label] = self._outcomes[outcome]
         if self._wanted is not None:
@@ -156,23 +157,22 @@ class Counts:
             self._grasps[name] += more
 
 
-@dataclass(kw_only=True)
 class Target:
     """The units of a target, and what is known of them.
 
     Attributes:
-        config: Its `samples`, `samples_per_object` and `samples_patience` state the target.
         units: Work units of each object, by its name, in their order.
         found: Number of samples of each unit that is done.
     """
 
-    config: Config
-    units: Mapping[str, Sequence[ShardHeader]]
-    found: dict[ShardHeader, int] = field(default_factory=dict)
+    def __init__(self, config: Config, units: Mapping[str, Sequence[ShardHeader]]) -> None:
+        """Take the units of a target.
 
-    def add(self, header: ShardHeader, samples: int) -> None:
-        """Add the number of samples of a unit that is done."""
-        self.found[header] = samples
+        Args:
+            config: Its `samples`, `samples_per_object` and `samples_patience` state the target.
+            units: See the attributes.
+        """
+        self._config, self.units, self.found = config, units, dict[ShardHeader, int]()
 
     def plan(self) -> tuple[dict[str, int], dict[str, int], list[ShardHeader]]:
         """Return how far the rounds are known.
@@ -223,8 +223,8 @@ class Target:
         """Return what a target that has been run could not give, in words; empty if it is met."""
         taken, counts, _ = self.plan()
         total, lines = sum(counts.values()), list[str]()
-        wanted, per_object = self.config.samples, self.config.samples_per_object
-        patience = self.config.samples_patience
+        wanted, per_object = self._config.samples, self._config.samples_per_object
+        patience = self._config.samples_patience
         if wanted is not None and total >= wanted:
             return lines
         if wanted is not None and per_object is None:
@@ -249,7 +249,7 @@ class Target:
             name
             for name, units in self.units.items()
             if taken[name] < len(units)
-            and self._in_vain(units[: taken[name]]) < self.config.samples_patience
+            and self._in_vain(units[: taken[name]]) < self._config.samples_patience
         ]
         level = self._level([counts[name] for name in left], sum(counts.values()))
         return [name for name in left if level is None or counts[name] < level]
@@ -261,7 +261,7 @@ class Target:
 
     def _level(self, counts: Sequence[int], total: int) -> int | None:
         """Return the number of samples below which an object takes part; None: any number."""
-        level, wanted = self.config.samples_per_object, self.config.samples
+        level, wanted = self._config.samples_per_object, self._config.samples
         if wanted is None:
             return level
         if total >= wanted:
@@ -291,8 +291,3 @@ def refuse_two_ends(config: Config) -> None:
     """
     if config.max_grasps is not None and has_target(config):
         raise ConfigError("max_grasps must be null with samples or samples_per_object, got both")
-
-
-def target_of(config: Config, units: Mapping[str, Sequence[ShardHeader]]) -> Target | None:
-    """Return the target that a configuration states, or None; `units` as in `Target`."""
-    return Target(config=config, units=units) if has_target(config) else None

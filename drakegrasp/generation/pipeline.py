@@ -6,9 +6,11 @@ work unit. Results may come back in any order; the files are the same.
 
 from __future__ import annotations
 
+import socket
+import sys
 import time
 from collections.abc import Collection, Iterable, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,10 +18,10 @@ from pathlib import Path
 from drakegrasp.config import Config, continued, is_own_class
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.assembly.split import rank_in_split
-from drakegrasp.dataset.assembly.survey import headers_by_object
 from drakegrasp.dataset.card import write_card
 from drakegrasp.dataset.filtering import own_filters
 from drakegrasp.dataset.lock import Holder, build_lock
+from drakegrasp.dataset.log import BuildLog
 from drakegrasp.dataset.manifest import (
     Manifest,
     ObjectEntry,
@@ -34,14 +36,25 @@ from drakegrasp.dataset.paths import SCENES_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
-from drakegrasp.errors import ConfigError, DataError, DrakegraspError, GraspError, listed
+from drakegrasp.errors import (
+    ConfigError,
+    DataError,
+    DrakegraspError,
+    GraspError,
+    listed,
+    printable,
+)
 from drakegrasp.frames import unpack_pose
-from drakegrasp.generation.counts import Counts, Target, refuse_two_ends, target_of
-from drakegrasp.generation.done_units import find_tasks, find_units
-from drakegrasp.generation.events import BuildEvents, nothing_trains, too_heavy
+from drakegrasp.generation.cautions import nothing_trains, too_heavy
+from drakegrasp.generation.counts import Counts, refuse_two_ends
 from drakegrasp.generation.prepare import PrepareTask, prepare_one
 from drakegrasp.generation.scenes import make_scenes_locked
-from drakegrasp.generation.work_unit import WorkUnit, run_unit
+from drakegrasp.generation.work_unit import (
+    WorkUnit,
+    find_tasks,
+    find_units,
+    run_unit,
+)
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import carry_hand
 from drakegrasp.hand.parsing import position_order
@@ -85,18 +98,6 @@ class BuildReport:
     unexplained: tuple[str, ...]
     assembled: bool
     assembly: Assembly
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Job:
-    """What the steps of a build share."""
-
-    out: Path
-    execute: Executor
-    pool: WorkerPool | None
-    events: BuildEvents
-    postures: Attempts | None
-    show: bool
 
 
 def build(
@@ -199,8 +200,7 @@ def build_locked(
     Raises:
         DataError, DiskFullError, MachineError: As for `build`.
     """
-    events = BuildEvents(out, pool, show=show)
-    job = _Job(out=out, execute=execute, pool=pool, events=events, postures=postures, show=show)
+    job = _Build(out, execute, pool, postures, show=show)
     with disk_full_named(out):
         # The directory must be ours, and the dataset in it must be of these meshes.
         known = claim_directory(out, config)
@@ -210,100 +210,281 @@ def build_locked(
         config = carry_hand(out, config, known.config.hand if known else None)
 
         notices = [] if dead is None else [f"the lock of a dead build was taken over: {dead}"]
-        notices += _sweep(out)
+        swept = [str(path.relative_to(out)) for path in sweep_temporary(out)]
+        if swept:
+            notices.append(f"{_count(swept, 'temporary file')} of dead processes removed")
         try:
-            return _build(sources, config, known, notices, job)
+            return job.run(sources, config, known, notices)
         except BaseException as error:
             # The log says why a build stopped; a second error would hide the first.
             with suppress(OSError, DataError):
                 if (out / "manifest.json").exists():
-                    events.stopped(error)
+                    job.log("stopped", reason=f"{type(error).__name__}: {error}")
                 else:
                     release_directory(out)
             raise
 
 
-def _build(
-    sources: Sequence[MeshSource],
-    config: Config,
-    known: Manifest | None,
-    notices: list[str],
-    job: _Job,
-) -> BuildReport:
-    """Prepare, simulate, assemble."""
-    out, start = job.out, time.monotonic()
+class _Build:
+    """The steps of a build, and what they share; `log` writes its events, see `BuildLog`."""
 
-    # The manifest comes first: without one a directory holds no dataset.
-    hand, versions = load_hand(config.hand_source), installed_versions(config)
-    new = Manifest(config=config, versions=versions, fingers=finger_names(config))
-    joints = position_order(hand.model, hand.palm_link)
-    manifest = replace(known or new, config=config, joints=joints)
-    manifest = replace(manifest, versions={**manifest.versions, "hand": versions["hand"]})
-    write_manifest(manifest, out)
-    job.events.started(manifest, notices)
-    if warning := nothing_trains(sources, config.split):
-        job.events.warn(warning)
+    def __init__(
+        self,
+        out: Path,
+        execute: Executor,
+        pool: WorkerPool | None,
+        postures: Attempts | None,
+        *,
+        show: bool,
+    ) -> None:
+        self._out, self._execute, self._pool = out, execute, pool
+        self._postures, self._show, self.log = postures, show, BuildLog(out)
 
-    # Prepare each object, or refuse its mesh.
-    with progress_bar("prepare", "objects", show=job.show) as report:
-        manifest = _prepare_all(sources, manifest, job, report)
-    if not manifest.objects:
-        if known is None:
-            release_directory(out)
-        reasons = "; ".join(f"{entry.name}: {entry.reason}" for entry in manifest.refused)
-        raise DataError(f"no mesh can be simulated: {reasons}")
-    write_manifest(manifest, out)
-    if warning := too_heavy(manifest):
-        job.events.warn(warning)
-    if job.postures is not None:
-        refused, nameless = _refused_postures(job.postures, manifest), job.postures.nameless
-        for told in filter(None, (refused, nameless)):
-            job.events.warn(told)
-            notices.append(told)
+    def run(
+        self,
+        sources: Sequence[MeshSource],
+        config: Config,
+        known: Manifest | None,
+        notices: list[str],
+    ) -> BuildReport:
+        """Prepare, simulate, assemble."""
+        out, execute, start = self._out, self._execute, time.monotonic()
 
-    # Simulate the work units that are not done; killed workers leave temporary files.
-    with progress_bar("simulate", "attempts", show=job.show) as report:
-        counts, manifest, target = _run_all(manifest, job, report)
-    write_manifest(manifest, out)
-    notices += [] if target is None else target.shortfall()
-    if job.pool is not None:
-        sweep_temporary(out)
+        # The manifest comes first: without one a directory holds no dataset.
+        hand, versions = load_hand(config.hand_source), installed_versions(config)
+        new = Manifest(config=config, versions=versions, fingers=finger_names(config))
+        joints = position_order(hand.model, hand.palm_link)
+        manifest = replace(known or new, config=config, joints=joints)
+        manifest = replace(manifest, versions={**manifest.versions, "hand": versions["hand"]})
+        write_manifest(manifest, out)
+        self._begin(manifest, notices)
+        self._warn(nothing_trains(sources, config.split))
 
-    # Assemble the shards, unless the files are of these very shards already.
-    stale = not is_assembled(out, verify_shards=True, execute=job.execute)
-    if stale:
-        with progress_bar("assemble", "tasks", show=job.show) as report:
-            assemble_locked(out, manifest, execute=job.execute, progress=report)
-    else:
-        write_card(out)  # the licence of a mesh may be stated otherwise now
-    if config.scenes.when == "assembled" and (stale or not (out / SCENES_FILE).is_file()):
-        with progress_bar("scenes", "objects", show=job.show) as report:
-            make_scenes_locked(out, execute=job.execute, progress=report)
+        # Prepare each object, or refuse its mesh.
+        with self._progress("prepare", "objects") as report:
+            manifest = self._prepare_all(sources, manifest, report)
+        if not manifest.objects:
+            if known is None:
+                release_directory(out)
+            reasons = "; ".join(f"{entry.name}: {entry.reason}" for entry in manifest.refused)
+            raise DataError(f"no mesh can be simulated: {reasons}")
+        write_manifest(manifest, out)
+        self._warn(too_heavy(manifest))
+        if self._postures is not None:
+            refused, nameless = _refused(self._postures, manifest), self._postures.nameless
+            for told in filter(None, (refused, nameless)):
+                self._warn(told)
+                notices.append(told)
 
-    # Report.
-    if counts.damaged:
-        damaged = _count(counts.named, "shard", counts.damaged)
-        notices.append(f"{damaged}: damaged, and simulated again")
-    unexplained = tuple(counts.unexplained())
-    for line in unexplained:
-        job.events.warn(line)
-    seconds = time.monotonic() - start
-    job.events.finished(simulated=counts.simulated, reused=counts.reused, seconds=seconds)
-    return BuildReport(
-        out=out,
-        simulated=counts.simulated,
-        reused=counts.reused,
-        objects=len(manifest.objects),
-        refused=manifest.refused,
-        errors=dict(counts.errors),
-        notices=tuple(notices),
-        unexplained=unexplained,
-        assembled=stale,
-        assembly=summarise(out),
-    )
+        # Simulate the work units that are not done; killed workers leave temporary files.
+        with self._progress("simulate", "attempts") as report:
+            counts, manifest = self._run_all(manifest, report)
+        write_manifest(manifest, out)
+        notices += [] if counts.target is None else counts.target.shortfall()
+        if self._pool is not None:
+            sweep_temporary(out)
+
+        # Assemble the shards, unless the files are of these very shards already.
+        stale = not is_assembled(out, verify_shards=True, execute=execute)
+        if stale:
+            with self._progress("assemble", "tasks") as report:
+                assemble_locked(out, manifest, execute=execute, progress=report)
+        else:
+            write_card(out)  # the licence of a mesh may be stated otherwise now
+        if config.scenes.when == "assembled" and (stale or not (out / SCENES_FILE).is_file()):
+            with self._progress("scenes", "objects") as report:
+                make_scenes_locked(out, execute=execute, progress=report)
+
+        # Report.
+        if counts.damaged:
+            notices.append(f"{_count(counts.damaged, 'shard')}: damaged, and simulated again")
+        unexplained = tuple(counts.unexplained())
+        for line in unexplained:
+            self._warn(line)
+        done = {"simulated": counts.simulated, "reused": counts.reused}
+        self.log("finished", **done, seconds=round(time.monotonic() - start, 3))
+        return BuildReport(
+            out=out,
+            **done,
+            objects=len(manifest.objects),
+            refused=manifest.refused,
+            errors=dict(counts.errors),
+            notices=tuple(notices),
+            unexplained=unexplained,
+            assembled=stale,
+            assembly=summarise(out),
+        )
+
+    def _progress(self, stage: str, unit: str) -> AbstractContextManager[Report]:
+        return progress_bar(stage, unit, show=self._show)
+
+    def _warn(self, text: str) -> None:
+        """Log what the user should know before the end, if there is anything, and say it."""
+        if text:
+            self.log("notice", text=text)
+            self._say(text)
+
+    def _say(self, text: str) -> None:
+        if self._show:
+            sys.stderr.write(f"{printable(text)}\n")
+
+    def _no_worker(self) -> None:
+        self.log("no worker")
+        self._say("there is no worker: waiting for one")
+
+    def _begin(self, manifest: Manifest, notices: Sequence[str]) -> None:
+        """Log who builds what, and listen to the workers."""
+        self.log(
+            "started",
+            command=sys.argv,
+            host=socket.gethostname(),
+            config_hash=manifest.config.simulation_hash(),
+            seed=manifest.config.seed,
+            versions=manifest.versions,
+        )
+        for notice in notices:
+            self.log("notice", text=notice)
+        if self._pool is not None:
+            self._pool.on_change = self._workers_changed
+            self._pool.on_none = self._no_worker
+
+    def _workers_changed(self, joined: set[str], left: set[str]) -> None:
+        assert self._pool is not None
+        for event, addresses in (("worker joined", joined), ("worker lost", left)):
+            for address in sorted(addresses):
+                self.log(event, address=address, workers=self._pool.size)
+
+    def _prepare_all(
+        self, sources: Sequence[MeshSource], manifest: Manifest, report: Report
+    ) -> Manifest:
+        """Return the manifest with every object prepared or refused, in the sources' order."""
+        entries: dict[str, ObjectEntry | RefusedMesh] = {}
+        tasks = []
+
+        # What the manifest says of an unchanged mesh still holds.
+        for source in sources:
+            digest = source_sha256(source)
+            entry = _known_entry(source, digest, self._out, manifest)
+            if entry is not None:
+                entries[source.name] = entry
+                continue
+            tasks.append(
+                PrepareTask(
+                    source=source,
+                    mesh_sha256=digest,
+                    out=self._out,
+                    config=manifest.config,
+                    postures=self._postures and self._postures.of_object(source.name),
+                    restartable=self._pool is not None,
+                )
+            )
+        known = len(entries)
+        report(known, len(sources), found=known)
+
+        # Prepare the others, in any order.
+        for name, entry in self._execute(prepare_one, tasks):
+            entries[name] = entry
+            if isinstance(entry, RefusedMesh):
+                self.log("mesh refused", name=name, reason=entry.reason)
+            else:
+                facts = {"candidates": entry.candidates, "notes": list(entry.notes)}
+                self.log("mesh prepared", name=name, **facts)
+            report(len(entries), len(sources), found=known)
+
+        # Licence and group do not affect results; take them from the sources.
+        said = {source.name: source for source in sources}
+        ordered = [entries[source.name] for source in sources]
+
+        # A rejected grasp of another mesh was another grasp.
+        before = {entry.name: entry.mesh_sha256 for entry in manifest.objects}
+        same = {entry.name for entry in ordered if before.get(entry.name) == entry.mesh_sha256}
+        objects = (entry for entry in ordered if isinstance(entry, ObjectEntry))
+        return replace(
+            manifest,
+            objects=tuple(
+                replace(entry, licence=said[entry.name].licence, group=said[entry.name].group)
+                for entry in objects
+            ),
+            refused=tuple(entry for entry in ordered if isinstance(entry, RefusedMesh)),
+            rejected=tuple(key for key in manifest.rejected if key.object in same),
+        )
+
+    def _run_all(self, manifest: Manifest, report: Report) -> tuple[Counts, Manifest]:
+        """Run the work units that are not done.
+
+        Returns:
+            The counts of all, and the manifest with how many palm poses a target of samples took.
+        """
+        every = replace(manifest, objects=tuple(replace(e, tried=None) for e in manifest.objects))
+        counts = Counts(every, self._pool, report)
+
+        # The progress bar shows the number of workers as it changes.
+        if self._pool is not None:
+
+            def change(joined: set[str], left: set[str]) -> None:
+                self._workers_changed(joined, left)
+                counts.show()
+
+            self._pool.on_change = change
+
+        # What an earlier build has done is not done again.
+        done = set[ShardHeader]()
+        find = partial(find_units, every.config)
+        for units, damaged in self._execute(find, find_tasks(self._out, every)):
+            for summary in units:
+                done.add(summary.header)
+                counts.add(summary, reused=True)
+            for path, reason in damaged:
+                counts.damaged.append(path)
+                self.log("damaged shard", reason=reason)
+
+        target = counts.target
+        if target is None:
+            # An object may have enough grasps by the time that there is room for its next unit.
+            headers = (h for h in every.headers() if counts.needs(h) and h not in done)
+            self._run_units(headers, every, counts)
+            return counts, every
+
+        # Round after round until the target is met.
+        while (plan := target.plan())[2]:
+            self._run_units(target.next_units(), every, counts)
+        tried = {
+            name: units[taken - 1].stop if (taken := plan[0][name]) else 0
+            for name, units in target.units.items()
+        }
+        objects = tuple(replace(e, tried=tried.get(e.name, 0)) for e in every.objects)
+        return counts, replace(every, objects=objects)
+
+    def _run_units(
+        self, headers: Iterable[ShardHeader], manifest: Manifest, counts: Counts
+    ) -> None:
+        """Run work units, and count what they found."""
+        spared, tested = _spared(manifest), _likely_tested(manifest)
+        units = (
+            WorkUnit(
+                out=self._out,
+                header=header,
+                config=manifest.config,
+                refined=header.object_name not in spared,
+                likely_tested=header.object_name in tested,
+                restartable=self._pool is not None,
+            )
+            for header in headers
+        )
+        for summary in self._execute(run_unit, units):
+            counts.add(summary)
+            self.log(
+                "unit done",
+                object=summary.header.object_name,
+                start=summary.header.start,
+                stop=summary.header.stop,
+                outcomes={outcome.label: count for outcome, count in summary.outcomes.items()},
+                seconds={stage: round(seconds, 4) for stage, seconds in summary.seconds.items()},
+                errors=summary.errors,
+            )
 
 
-def _refused_postures(postures: Attempts, manifest: Manifest) -> str:
+def _refused(postures: Attempts, manifest: Manifest) -> str:
     """Return which rows of the postures are not tried, and why; empty if all are.
 
     Raises:
@@ -316,12 +497,6 @@ def _refused_postures(postures: Attempts, manifest: Manifest) -> str:
     if all(postures.invalid):
         raise GraspError(postures.refused)
     return postures.refused
-
-
-def _sweep(out: Path) -> list[str]:
-    """Remove what dead processes left half-written; return a notice of it."""
-    swept = [str(path.relative_to(out)) for path in sweep_temporary(out)]
-    return [f"{_count(swept, 'temporary file')} of dead processes removed"] if swept else []
 
 
 def refuse_missing(known: Manifest, names: Collection[str], out: Path) -> None:
@@ -344,59 +519,6 @@ def refuse_missing(known: Manifest, names: Collection[str], out: Path) -> None:
         )
 
 
-def _prepare_all(
-    sources: Sequence[MeshSource], manifest: Manifest, job: _Job, report: Report
-) -> Manifest:
-    """Return the manifest with every object prepared or refused, in the order of the sources."""
-    out, config = job.out, manifest.config
-    entries: dict[str, ObjectEntry | RefusedMesh] = {}
-    tasks = []
-
-    # What the manifest says of an unchanged mesh still holds.
-    for source in sources:
-        digest = source_sha256(source)
-        entry = _known_entry(source, digest, out, manifest)
-        if entry is None:
-            tasks.append(
-                PrepareTask(
-                    source=source,
-                    mesh_sha256=digest,
-                    out=out,
-                    config=config,
-                    postures=job.postures and job.postures.of_object(source.name),
-                    restartable=job.pool is not None,
-                )
-            )
-        else:
-            entries[source.name] = entry
-    known = len(entries)
-    report(known, len(sources), found=known)
-
-    # Prepare the others, in any order.
-    for name, entry in job.execute(prepare_one, tasks):
-        entries[name] = entry
-        job.events.mesh_done(entry)
-        report(len(entries), len(sources), found=known)
-
-    # Licence and group do not affect results; take them from the sources.
-    said = {source.name: (source.licence, source.group) for source in sources}
-    ordered = [entries[source.name] for source in sources]
-
-    # A rejected grasp of another mesh was another grasp.
-    before = {entry.name: entry.mesh_sha256 for entry in manifest.objects}
-    same = {entry.name for entry in ordered if before.get(entry.name) == entry.mesh_sha256}
-    return replace(
-        manifest,
-        objects=tuple(
-            replace(entry, licence=said[entry.name][0], group=said[entry.name][1])
-            for entry in ordered
-            if isinstance(entry, ObjectEntry)
-        ),
-        refused=tuple(entry for entry in ordered if isinstance(entry, RefusedMesh)),
-        rejected=tuple(key for key in manifest.rejected if key.object in same),
-    )
-
-
 def _known_entry(
     source: MeshSource, digest: str, out: Path, manifest: Manifest
 ) -> ObjectEntry | RefusedMesh | None:
@@ -413,53 +535,6 @@ def _known_entry(
                 return None
             return entry
     return None
-
-
-def _run_all(
-    manifest: Manifest, job: _Job, report: Report
-) -> tuple[Counts, Manifest, Target | None]:
-    """Run the work units that are not done.
-
-    Returns:
-        The counts of all, the manifest with how many palm poses a target of samples took, and the
-        target.
-    """
-    every = replace(manifest, objects=tuple(replace(e, tried=None) for e in manifest.objects))
-    counts = Counts(every, job.pool, report)
-
-    # The progress bar shows the number of workers as it changes.
-    if job.pool is not None:
-
-        def change(joined: set[str], left: set[str]) -> None:
-            job.events.workers_changed(joined, left)
-            counts.show()
-
-        job.pool.on_change = change
-
-    # What an earlier build has done is not done again.
-    by_object = {units[0].object_name: units for units in headers_by_object(every) if units}
-    target = target_of(every.config, by_object)
-    done = _count_done(every, job, counts, target)
-    if target is None:
-        # An object may have enough grasps by the time that there is room for its next unit.
-        headers = (h for h in every.headers() if counts.needs(h) and h not in done)
-        _run_units(headers, every, job, counts, None)
-        return counts, every, None
-
-    # Round after round until the target is met.
-    while (plan := target.plan())[2]:
-        _run_units(target.next_units(), every, job, counts, target)
-    taken, _, _ = plan
-    objects = tuple(
-        replace(entry, tried=_tried(by_object.get(entry.name, ())[: taken.get(entry.name, 0)]))
-        for entry in every.objects
-    )
-    return counts, replace(every, objects=objects), target
-
-
-def _tried(units: Sequence[ShardHeader]) -> int:
-    """Return the number of palm poses in the first units of an object."""
-    return units[-1].stop if units else 0
 
 
 def _spared(manifest: Manifest) -> set[str]:
@@ -485,57 +560,6 @@ def _likely_tested(manifest: Manifest) -> set[str]:
     return {name for name, rank in ranks.items() if rank < low or rank >= high}
 
 
-def _run_units(
-    headers: Iterable[ShardHeader],
-    manifest: Manifest,
-    job: _Job,
-    counts: Counts,
-    target: Target | None,
-) -> None:
-    """Run work units, and count what they found."""
-    config, restartable = manifest.config, job.pool is not None
-    spared, tested = _spared(manifest), _likely_tested(manifest)
-    units = (
-        WorkUnit(
-            out=job.out,
-            header=header,
-            config=config,
-            refined=header.object_name not in spared,
-            likely_tested=header.object_name in tested,
-            restartable=restartable,
-        )
-        for header in headers
-    )
-
-    for summary in job.execute(run_unit, units):
-        counts.simulated += 1
-        counts.errors.update(summary.errors)
-        if target is not None and summary.samples is not None:
-            target.add(summary.header, summary.samples)
-        counts.add(summary.header, summary.outcomes, samples=summary.samples)
-        job.events.unit_done(summary)
-
-
-def _count_done(
-    manifest: Manifest, job: _Job, counts: Counts, target: Target | None
-) -> set[ShardHeader]:
-    """Return the work units that are done; count them, and the damage."""
-    done = set[ShardHeader]()
-    find = partial(find_units, manifest.config)
-    for found in job.execute(find, find_tasks(job.out, manifest)):
-        for header, outcomes, samples in found.done:
-            done.add(header)
-            counts.reused += 1
-            counts.add(header, outcomes, reused=True, samples=samples)
-            if target is not None and samples is not None:
-                target.add(header, samples)
-        for path, reason in found.damaged:
-            counts.add_damaged(path)
-            job.events.damaged_shard(reason)
-    return done
-
-
-def _count(names: Sequence[str], what: str, total: int | None = None) -> str:
+def _count(names: Sequence[str], what: str) -> str:
     """Return e.g. `3 shards (a, b, c)`; of many only the first are named."""
-    count = len(names) if total is None else total
-    return f"{count} {what}{'s' * (count != 1)} ({listed(names, total)})"
+    return f"{len(names)} {what}{'s' * (len(names) != 1)} ({listed(names)})"

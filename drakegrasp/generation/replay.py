@@ -13,8 +13,7 @@ from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.shards import trial_columns
 from drakegrasp.dataset.trials import Trials
-from drakegrasp.generation.attempts import TrialSetup, find_attempt, measure_contacts, try_attempt
-from drakegrasp.generation.columns import trial_rows
+from drakegrasp.generation.attempts import TrialSetup, find_attempt, trial_rows, try_attempt
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.recording import record_attempt
@@ -70,7 +69,7 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
     scene = build_scene(prepared.model, config.physics, load_hand(config.hand_source))
     setup = TrialSetup(prepared=prepared, config=config, scene=scene)
     record = try_attempt(setup, stored.attempt)
-    row = trial_rows(setup, [stored.attempt], [record], [measure_contacts(setup, record)])
+    row = trial_rows(setup, [stored.attempt], [record])
     if stored.row["outcome"] == Outcome.SLIPPED and record.outcome is Outcome.PARTLY_HELD:
         row["outcome"][0] = Outcome.SLIPPED  # as an older version called it
 

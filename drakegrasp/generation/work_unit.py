@@ -10,6 +10,7 @@ died (see `drakegrasp.runtime.journal`).
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -20,24 +21,26 @@ from pathlib import Path
 import numpy as np
 
 from drakegrasp.config import Config, FilterConfig
-from drakegrasp.dataset.assembly.survey import count_samples, successes_of
+from drakegrasp.dataset.assembly.survey import SurveyTask, count_samples, successes_of, survey_tasks
 from drakegrasp.dataset.filtering import judge_successes
-from drakegrasp.dataset.schema import HOLD_FIELDS
+from drakegrasp.dataset.manifest import Manifest
+from drakegrasp.dataset.paths import shards_folder
+from drakegrasp.dataset.schema import HOLD_FIELDS, LOOK_FIELDS
 from drakegrasp.dataset.shards import Shard, ShardHeader, read_trials, write_shard
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.filters import Removal
 from drakegrasp.generation.attempts import (
     TrialSetup,
+    judge_sample,
     lift_scraped,
     list_attempts,
     list_children,
-    measure_contacts,
+    look_at,
     predict_attempts,
-    render_views,
+    trial_rows,
     trial_setup,
     try_attempt,
 )
-from drakegrasp.generation.columns import empty_looks, fill_look, judge_sample, trial_rows
 from drakegrasp.generation.counts import has_target
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread, timed, trim_memory
@@ -52,11 +55,10 @@ from drakegrasp.runtime.journal import (
     open_journal,
 )
 from drakegrasp.simulation.candidates import Attempt
-from drakegrasp.simulation.robustness import Certificate, certify, is_drawn
-from drakegrasp.simulation.scene_cache import cached_scene
+from drakegrasp.simulation.robustness import certify, is_drawn
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord, has_only_scraped
-from drakegrasp.table import AnyArray, Table
+from drakegrasp.table import AnyArray, Table, join
 
 #: An attempt that takes this many times its limit of computing time hangs: it never looks at it.
 HANG_FACTOR = 1.5
@@ -101,7 +103,7 @@ class WorkUnit:
 
 @dataclass(frozen=True, kw_only=True)
 class UnitSummary:
-    """What a unit returns; its data are in its shard.
+    """What is known of a unit that is done; its data are in its shard.
 
     Attributes:
         header: Of the unit.
@@ -137,144 +139,245 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
     """
     out, header = unit.out, unit.header
     with _one_unit, disk_full_named(out):
-        outcomes = _outcomes_there(out, header)
-        if outcomes is not None:
-            # A process died after it wrote the shard and before it answered.
-            summary = UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={})
-        elif unit.restartable:
+        try:
+            # A process may have died after it wrote the shard and before it answered.
+            summary = _find_unit(out, header)
+        except DataError:
+            summary = None
+        if summary is None and unit.restartable:
             with open_journal(header.journal_path(out), header.stored) as journal:
-                summary = _run_experiment(unit, journal)
-        else:
-            summary = _run_experiment(unit, NO_JOURNAL)
+                summary = _Experiment(unit, journal).run()
+        elif summary is None:
+            summary = _Experiment(unit, NO_JOURNAL).run()
         header.journal_path(out).unlink(missing_ok=True)
         trim_memory()
-        if not has_target(unit.config):
-            return summary
-        return replace(summary, samples=count_samples(out, header, unit.config))
+        return _with_samples(out, summary, unit.config)
 
 
-def _run_experiment(unit: WorkUnit, journal: Journal) -> UnitSummary:
-    """Tell the whole experiment: set up, run round after round, write."""
-    config, out, header = unit.config, unit.out, unit.header
-    seconds: dict[str, float] = {}
-    _refuse_crash_loop(journal, header)
+class _Experiment:
+    """The attempts of a unit, round after round, with the journal and the times of its steps.
 
-    # Build the object's scene, or take the one of the unit before, and list the attempts.
-    with _stage(journal, "build", header.object_name, seconds):
-        setup = _build_setup(out, header, config)
-        attempts = list_attempts(setup.prepared, range(header.start, header.stop), config)
-
-    # Run the attempts, then those about the samples among them, and so on.
-    rounds = list[_Round]()
-    refines = unit.refined and config.refine.children > 0
-    while attempts:
-        first = sum(len(done.attempts) for done in rounds)
-        has_children = refines and len(rounds) < config.refine.generations
-        done = _run_round(setup, attempts, first, journal, seconds, has_children=has_children)
-        rounds.append(done)
-        if config.certified:
-            with timed(seconds, "certify"):
-                _certify_lifts(setup, done, first, journal, likely_tested=unit.likely_tested)
-        attempts = []
-        if has_children:
-            with timed(seconds, "try"):
-                attempts = _children(setup, done)
-
-    # Write the shard: all of it or nothing.
-    with _stage(journal, "write", header.object_name, seconds):
-        trials = _joined([done.trials for done in rounds])
-        looks = _joined([done.looks for done in rounds])
-        write_shard(out, Shard(header=header, trials=trials, looks=looks))
-
-    messages = [record.message for done in rounds for record in done.records if record.message]
-    return UnitSummary(
-        header=header,
-        outcomes=count_outcomes(trials["outcome"]),
-        seconds=seconds,
-        errors=dict(Counter(messages)),
-    )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Round:
-    """Attempts of a unit, their records, and their columns of `/trials` and `/looks`.
-
-    In the rows `scraping` are hands that would be samples if they had not scraped the table.
+    Rows count through all rounds of the unit.
     """
 
-    attempts: Sequence[Attempt]
-    records: Sequence[TrialRecord]
-    scraping: Sequence[int]
-    trials: dict[str, AnyArray]
-    looks: dict[str, AnyArray]
+    def __init__(self, unit: WorkUnit, journal: Journal) -> None:
+        """Build the object's scene, or take the one of the unit before, and list the attempts.
 
+        Raises:
+            MachineError: If the process died in this unit again and again.
+        """
+        self._unit, self._config, self._journal = unit, unit.config, journal
+        self._seconds: dict[str, float] = {}
+        self._errors: Counter[str] = Counter()
+        header = unit.header
+        if journal.in_crash_loop:
+            raise MachineError(
+                f"{header.object_name}, palm poses {header.start} to {header.stop - 1}: the worker "
+                f"died {GIVE_UP_DEATHS} times in a row in this work unit; is there enough memory? "
+                "The same command goes on from here"
+            )
+        with self._stage("build"):
+            self._setup = self._build_setup()
+            indices = range(header.start, header.stop)
+            self._attempts = list_attempts(self._setup.prepared, indices, self._config)
 
-def _run_round(
-    setup: TrialSetup,
-    attempts: Sequence[Attempt],
-    first: int,
-    journal: Journal,
-    seconds: dict[str, float],
-    *,
-    has_children: bool,
-) -> _Round:
-    """Try attempts, the first of which is in row `first` of the unit; measure, render."""
-    # Try each attempt: what geometry already decides is not simulated.
-    with timed(seconds, "try"):
-        predictions = _predict_all(setup, attempts, journal)
-        records, scraping = _try_all(
-            setup, attempts, predictions, journal, first, has_children=has_children
+    def run(self) -> UnitSummary:
+        """Run round after round, and write the shard: all of it or nothing."""
+        # Run the attempts, then those about the samples among them, and so on.
+        header, rules = self._unit.header, self._config.refine
+        attempts, trials, looks = self._attempts, list[Table](), list[Table]()
+        refines = self._unit.refined and rules.children > 0
+        while attempts:
+            first = sum(table.count for table in trials)
+            has_children = refines and len(trials) < rules.generations
+            records, scraping = self._try_all(attempts, first, lift_scraping=has_children)
+            with self._stage("measure"):
+                rows = trial_rows(self._setup, attempts, records)
+            looks.append(self._looks(attempts, records, first))
+            certified = self._config.certified
+            samples = self._samples(rows, looks[-1]) if has_children or certified else []
+            if certified:
+                with timed(self._seconds, "certify"):
+                    rows |= self._certify(attempts, rows, looks[-1], samples, first)
+            trials.append(Table(rows))
+
+            # Most palm poses about a hand that only scraped the table do not scrape it.
+            parents = sorted({*samples, *scraping}) if has_children else []
+            with timed(self._seconds, "try"):
+                attempts = [
+                    child
+                    for row in parents
+                    for child in list_children(self._setup.prepared, attempts[row], self._config)
+                ]
+
+        with self._stage("write"):
+            whole = join(trials)
+            shard = Shard(header=header, trials={**whole}, looks={**join(looks)})
+            write_shard(self._unit.out, shard)
+        return UnitSummary(
+            header=header,
+            outcomes=count_outcomes(whole["outcome"]),
+            seconds=self._seconds,
+            errors=dict(self._errors),
         )
 
-    # Measure how the contacts of each lift lie on the object's true surface.
-    with _stage(journal, "measure", setup.prepared.model.name, seconds):
-        fits = [measure_contacts(setup, record) for record in records]
+    @contextmanager
+    def _step(self, step: str) -> Iterator[None]:
+        """Run a step that is no attempt: that it ended its process is not the grasp's fault.
 
-    # Render both cameras' images of each success.
-    with timed(seconds, "look"):
-        looks = render_successes(setup, attempts, records, journal, first)
+        Raises:
+            MachineError: If it did.
+        """
+        name, verdict = self._unit.header.object_name, self._journal.verdict(step)
+        if verdict is not None:
+            what = _STEPS[step.partition(" ")[0]]
+            raise MachineError(
+                f"{name}: {what} {verdict.value}; see `drakegrasp doctor`. "
+                "The same command tries again"
+            )
+        with self._journal.step(step, STAGE_SECONDS):
+            yield
 
-    trials = trial_rows(setup, attempts, records, fits)
-    return _Round(attempts=attempts, records=records, scraping=scraping, trials=trials, looks=looks)
+    @contextmanager
+    def _stage(self, step: str) -> Iterator[None]:
+        """Run and time a stage that is one step, see `_step`."""
+        with timed(self._seconds, step), self._step(step):
+            yield
 
+    def _build_setup(self) -> TrialSetup:
+        header = self._unit.header
+        try:
+            return trial_setup(self._unit.out, header, self._config)
+        # A failed assertion within Drake arrives as SystemExit, which would end the worker.
+        except SystemExit as error:
+            name = header.object_name
+            raise DataError(f"{name}: Drake cannot build its scene: {error}") from None
 
-def _children(setup: TrialSetup, done: _Round) -> list[Attempt]:
-    """Return attempts about each of a round that is a sample by the default filters.
+    def _try_all(
+        self, attempts: Sequence[Attempt], first: int, *, lift_scraping: bool
+    ) -> tuple[list[TrialRecord], list[int]]:
+        """Return the records of attempts, and which would be samples but for scraping the table.
 
-    Or would be one if it did not scrape the table: most palm poses about such a one do not.
-    """
-    return [
-        child
-        for row in sorted({*_samples(setup, done), *done.scraping})
-        for child in list_children(setup.prepared, done.attempts[row], setup.config)
-    ]
+        What geometry already decides is not simulated. The first attempt is in row `first`.
+        Attempts in which an earlier process died, and that are not yet judged, run first: then a
+        failing one is found at once. Hands that scrape are lifted while they are still closed.
+        """
+        with timed(self._seconds, "try"):
+            # The first time it measures the object's distances.
+            with self._step("predict"):
+                inject_fault(self._unit.header.object_name, "predict")
+                predictions = predict_attempts(self._setup, attempts)
+            steps = [f"{ATTEMPT} {first + row}" for row in range(len(attempts))]
+            unresolved = set(self._journal.unresolved)
+            records, scraping = dict[int, TrialRecord](), list[int]()
+            for row in sorted(range(len(steps)), key=lambda row: steps[row] not in unresolved):
+                attempt = attempts[row]
+                records[row] = self._try(attempt, predictions[row], steps[row])
+                if lift_scraping and self._only_scrapes(attempt, records[row], first + row):
+                    scraping.append(row)
+        ordered = [records[row] for row in range(len(attempts))]
+        self._errors.update(record.message for record in ordered if record.message)
+        return ordered, scraping
 
+    def _try(self, attempt: Attempt, prediction: Prediction | None, step: str) -> TrialRecord:
+        verdict = self._journal.verdict(step)
+        if verdict is not None:
+            outcome = Outcome.TIMEOUT if verdict is Verdict.HUNG else Outcome.CRASHED
+            X_TO = self._setup.prepared.resting_poses[attempt.resting]
+            return TrialRecord(outcome=outcome, X_TO=X_TO, X_OG=attempt.X_OG)
+        with self._journal.step(step, HANG_FACTOR * self._config.attempt_seconds):
+            name = self._unit.header.object_name
+            inject_fault(name, attempt.candidate, attempt.standoff_index)
+            return try_attempt(self._setup, attempt, prediction)
 
-def _samples(setup: TrialSetup, done: _Round) -> list[int]:
-    """Return the rows of a round that are samples by the default filters."""
-    rows = np.flatnonzero(done.trials["outcome"] == Outcome.SUCCESS)
-    trials = {name: values[rows] for name, values in done.trials.items()}
-    depths = done.looks["image_otm"][:, 3]
-    found = Table({**trials, **done.looks}, depth_otm=depths)
-    successes = successes_of(found, setup.config.camera)
-    removal = judge_successes(successes, PARENT_FILTERS)
-    return rows[removal == Removal.KEPT].tolist()
+    def _only_scrapes(self, attempt: Attempt, record: TrialRecord, row: int) -> bool:
+        """Return whether a trial shows no sample only because the hand scraped the table.
 
+        Whether it would be one is seen by lifting it. If that ended its process, it costs the
+        children.
+        """
+        step = f"lift {row}"
+        if not has_only_scraped(record) or self._journal.verdict(step) is not None:
+            return False
+        with self._journal.step(step, HANG_FACTOR * self._config.attempt_seconds):
+            lifted = lift_scraped(self._setup, attempt, record)
+        return self._is_sample(lifted)
 
-def _joined(parts: Sequence[dict[str, AnyArray]]) -> dict[str, AnyArray]:
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    def _is_sample(self, trial: TrialRecord, *, views: bool = True) -> bool:
+        """Return whether a trial shows a sample by the default filters, see `judge_sample`."""
+        rules = self._config.model_copy(update={"filters": PARENT_FILTERS})
+        return judge_sample(self._setup.prepared.model, trial, rules, views=views) is Removal.KEPT
 
+    def _looks(
+        self, attempts: Sequence[Attempt], records: Sequence[TrialRecord], first: int
+    ) -> Table:
+        """Return the rows of `/looks`: what both cameras see of every success."""
+        rows = [i for i, record in enumerate(records) if record.outcome is Outcome.SUCCESS]
+        looks = {f.name: f.empty(len(rows), self._setup.sizes) for f in LOOK_FIELDS}
+        with timed(self._seconds, "look"):
+            for k, row in enumerate(rows):
+                looks["row"][k] = first + row
+                with self._step(f"look {first + row}"):
+                    look = look_at(self._setup, attempts[row], records[row].X_TO)
+                for name, value in look.items():
+                    looks[name][k] = value
+        return Table(looks)
 
-def find_outcomes(out: Path, header: ShardHeader) -> dict[Outcome, int] | None:
-    """Return the number of attempts by outcome of a unit that is done, or None if it is not.
+    def _samples(self, trials: dict[str, AnyArray], looks: Table) -> list[int]:
+        """Return which attempts of a round are samples by the default filters."""
+        rows = np.flatnonzero(trials["outcome"] == Outcome.SUCCESS)
+        found = Table({name: values[rows] for name, values in trials.items()})
+        found = found.with_columns(looks, depth_otm=looks["image_otm"][:, 3])
+        removal = judge_successes(successes_of(found, self._config.camera), PARENT_FILTERS)
+        return rows[removal == Removal.KEPT].tolist()
 
-    Raises:
-        DataError: If its shard is damaged or of something else.
-    """
-    path = header.path(out)
-    if not path.exists():
-        return None
-    return count_outcomes(read_trials(path, header, ("outcome",))["outcome"])
+    def _certify(
+        self,
+        attempts: Sequence[Attempt],
+        trials: dict[str, AnyArray],
+        looks: Table,
+        samples: Sequence[int],
+        first: int,
+    ) -> dict[str, AnyArray]:
+        """Return the columns of how much the lifts of a round bear that are drawn for it.
+
+        The least friction of a success goes into its row of `/looks`.
+        """
+        rules, known = self._config.certify, set(samples)
+        tested = rules.share_tested if self._unit.likely_tested else 0.0
+        of_samples = max(rules.share or 0.0, tested)
+        holds = {field.name: field.empty(len(attempts), {}) for field in HOLD_FIELDS}
+        look_of = {row - first: k for k, row in enumerate(looks["row"].tolist())}
+        for row in np.flatnonzero(np.isfinite(trials["time_lift"])).tolist():
+            probability = of_samples if row in known else rules.share_others
+            if not is_drawn(attempts[row], probability):
+                continue
+            held = row in look_of
+            found = self._certificate(attempts[row], first + row, held=held)
+            holds["p_hold_probability"][row] = probability
+            for name in found.keys() & holds.keys():
+                holds[name][row] = found[name]
+            if held and found:
+                looks["certified_friction"][look_of[row]] = found["certified_friction"]
+        # A scene in which Drake failed was forgotten.
+        self._setup.renew_scene()
+        return holds
+
+    def _certificate(self, attempt: Attempt, row: int, *, held: bool) -> dict[str, float]:
+        """Return how much an attempt bears, see `certify`; empty if that ended its process."""
+        step, config, prepared = f"certify {row}", self._config, self._setup.prepared
+        if self._journal.verdict(step) is not None:
+            return {}
+        simulations = config.certify.repeats + config.certify.friction_steps + 1
+        with self._journal.step(step, CERTIFY_FACTOR * simulations * config.attempt_seconds):
+            return certify(
+                prepared.model,
+                prepared.resting_poses[attempt.resting],
+                attempt,
+                config,
+                lambda trial: self._is_sample(trial, views=False),
+                held=held,
+            )
 
 
 def count_outcomes(outcomes: AnyArray) -> dict[Outcome, int]:
@@ -283,201 +386,71 @@ def count_outcomes(outcomes: AnyArray) -> dict[Outcome, int]:
     return {Outcome(int(v)): int(n) for v, n in zip(values, counts, strict=True)}
 
 
-def render_successes(
-    setup: TrialSetup,
-    attempts: Sequence[Attempt],
-    records: Sequence[TrialRecord],
-    journal: Journal = NO_JOURNAL,
-    first: int = 0,
-) -> dict[str, AnyArray]:
-    """Return the columns of `/looks`: both images of every success.
+# Units that are done
 
-    The first attempt is in row `first` of the unit.
+
+def _find_unit(out: Path, header: ShardHeader) -> UnitSummary | None:
+    """Return what is known of a unit that is done but for its samples, or None if it is not.
 
     Raises:
-        BlankImageError: If OpenGL renders blank images.
-        MachineError: If rendering ended the process before.
+        DataError: If its shard is damaged or of something else.
     """
-    rows = [i for i, record in enumerate(records) if record.outcome is Outcome.SUCCESS]
-    looks = empty_looks(setup, len(rows))
-    for k, row in enumerate(rows):
-        step = f"look {first + row}"
-        _refuse_failing(journal, step, setup.prepared.model.name)
-        looks["row"][k] = first + row
-        with journal.step(step, STAGE_SECONDS):
-            fill_look(looks, k, render_views(setup, attempts[row], records[row]))
-    return looks
-
-
-def _outcomes_there(out: Path, header: ShardHeader) -> dict[Outcome, int] | None:
-    """Return the outcomes of a complete shard; None if it is missing or damaged."""
-    try:
-        return find_outcomes(out, header)
-    except DataError:
+    path = header.path(out)
+    if not path.exists():
         return None
+    outcomes = count_outcomes(read_trials(path, header, ("outcome",))["outcome"])
+    return UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={})
 
 
-def _build_setup(out: Path, header: ShardHeader, config: Config) -> TrialSetup:
+def _with_samples(out: Path, summary: UnitSummary, config: Config) -> UnitSummary:
+    """Return a summary with its number of samples, if there is a target of them."""
+    if not has_target(config):
+        return summary
+    return replace(summary, samples=count_samples(out, summary.header, config))
+
+
+def find_tasks(out: Path, manifest: Manifest) -> Iterator[SurveyTask]:
+    """Yield the task of each object of which there may be a shard, for `find_units`."""
     try:
-        return trial_setup(out, header, config)
-    # A failed assertion within Drake arrives as SystemExit, which would end the worker.
-    except SystemExit as error:
-        raise DataError(f"{header.object_name}: Drake cannot build its scene: {error}") from None
+        folders = set(os.listdir(out / "shards"))
+    except FileNotFoundError:
+        return
+    for task in survey_tasks(out, manifest):
+        if shards_folder(out, task.headers[0].object_name).name in folders:
+            yield task
 
 
-def _predict_all(
-    setup: TrialSetup, attempts: Sequence[Attempt], journal: Journal
-) -> list[Prediction | None]:
-    """Return what geometry says of attempts; the first time it measures the object's distances.
+def find_units(config: Config, task: SurveyTask) -> tuple[list[UnitSummary], list[tuple[str, str]]]:
+    """Look at the shards of an object of a dataset, up to its last wanted grasp.
 
-    Raises:
-        MachineError: If this ended the process before.
+    The folder is listed once and the seals of its shards are verified, so a build that goes on
+    looks at them with all its workers.
+
+    Returns:
+        The work units whose shard is whole; path within the dataset of each other shard, and what
+        is wrong with it.
     """
-    _refuse_failing(journal, "predict", setup.prepared.model.name)
-    with journal.step("predict", STAGE_SECONDS):
-        inject_fault(setup.prepared.model.name, "predict")
-        return list(predict_attempts(setup, attempts))
+    out, done, damaged = Path(task.out), list[UnitSummary](), list[tuple[str, str]]()
+    names = set(os.listdir(shards_folder(out, task.headers[0].object_name)))
+    grasps, unbroken = 0, True
+    for header in task.headers:
+        # Enough grasps in the units before the first gap: no other unit is needed.
+        if task.wanted is not None and grasps >= task.wanted:
+            break
 
-
-def _try_all(
-    setup: TrialSetup,
-    attempts: Sequence[Attempt],
-    predictions: Sequence[Prediction | None],
-    journal: Journal,
-    first: int,
-    *,
-    has_children: bool,
-) -> tuple[list[TrialRecord], list[int]]:
-    """Return the records of attempts in their order, and the rows of `_Round.scraping`.
-
-    The first attempt is in row `first` of the unit. Attempts in which an earlier process died, and
-    that are not yet judged, run first: then a failing one is found at once. Hands that scrape are
-    lifted at once, while they are still closed, where a round has children.
-    """
-    steps = [f"{ATTEMPT} {first + row}" for row in range(len(attempts))]
-    unresolved = set(journal.unresolved)
-    order = sorted(range(len(attempts)), key=lambda row: steps[row] not in unresolved)
-    records, scraping = dict[int, TrialRecord](), list[int]()
-    for row in order:
-        attempt = attempts[row]
-        records[row] = _try_step(setup, attempt, predictions[row], journal, steps[row])
-        if has_children and _only_scrapes(
-            setup, attempt, records[row], journal, f"lift {first + row}"
-        ):
-            scraping.append(row)
-    return [records[row] for row in range(len(attempts))], scraping
-
-
-def _try_step(
-    setup: TrialSetup,
-    attempt: Attempt,
-    prediction: Prediction | None,
-    journal: Journal,
-    step: str,
-) -> TrialRecord:
-    verdict = journal.verdict(step)
-    if verdict is not None:
-        outcome = Outcome.TIMEOUT if verdict is Verdict.HUNG else Outcome.CRASHED
-        X_TO = setup.prepared.resting_poses[attempt.resting]
-        return TrialRecord(outcome=outcome, X_TO=X_TO, X_OG=attempt.X_OG)
-    with journal.step(step, HANG_FACTOR * setup.config.attempt_seconds):
-        inject_fault(setup.prepared.model.name, attempt.candidate, attempt.standoff_index)
-        return try_attempt(setup, attempt, prediction)
-
-
-def _only_scrapes(
-    setup: TrialSetup, attempt: Attempt, record: TrialRecord, journal: Journal, step: str
-) -> bool:
-    """Return whether a trial shows no sample only because the hand scraped the table.
-
-    Whether it would be one is seen by lifting it. If that ended its process, it costs the children.
-    """
-    if not has_only_scraped(record) or journal.verdict(step) is not None:
-        return False
-    rules = setup.config.model_copy(update={"filters": PARENT_FILTERS})
-    with journal.step(step, HANG_FACTOR * rules.attempt_seconds):
-        lifted = lift_scraped(setup, attempt, record)
-    return judge_sample(setup.prepared.model, lifted, rules) is Removal.KEPT
-
-
-def _certify_lifts(
-    setup: TrialSetup, done: _Round, first: int, journal: Journal, *, likely_tested: bool
-) -> None:
-    """Add to a round how much its lifts bear that are drawn for it.
-
-    Args:
-        setup: Of the unit.
-        done: The round.
-        first: Row of its first attempt in the unit.
-        journal: Of the unit.
-        likely_tested: Of the unit.
-    """
-    rules, trials, samples = setup.config.certify, done.trials, set(_samples(setup, done))
-    of_samples = max(rules.share or 0.0, rules.share_tested if likely_tested else 0.0)
-    trials |= {field.name: field.empty(len(done.attempts), {}) for field in HOLD_FIELDS}
-    look_of = {row - first: k for k, row in enumerate(done.looks["row"].tolist())}
-    for row in np.flatnonzero(np.isfinite(trials["time_lift"])).tolist():
-        probability = of_samples if row in samples else rules.share_others
-        if not is_drawn(done.attempts[row], probability):
+        # A file that is not listed is not opened.
+        try:
+            found = _find_unit(out, header) if header.file_name in names else None
+        except DataError as error:
+            damaged.append((str(header.path(out).relative_to(out)), str(error)))
+            found = None
+        if found is None:
+            unbroken = False
             continue
-        held = row in look_of
-        step = f"certify {first + row}"
-        found = _certify_step(setup, done.attempts[row], journal, step, held=held)
-        trials["p_hold_probability"][row] = probability
-        for name in ("repeats", "held", "samples", "half_step"):
-            trials[f"p_hold_{name}"][row] = getattr(found, name)
-        if held:
-            done.looks["certified_friction"][look_of[row]] = found.friction
-    # A scene in which Drake failed was forgotten.
-    setup.scene = cached_scene(setup.prepared.model, setup.config.physics, setup.config.hand_source)
 
-
-def _certify_step(
-    setup: TrialSetup, attempt: Attempt, journal: Journal, step: str, *, held: bool
-) -> Certificate:
-    # A certificate that ended its process costs the certificate: the lift itself has its verdict.
-    if journal.verdict(step) is not None:
-        return Certificate()
-    model, config = setup.prepared.model, setup.config
-    rules = config.model_copy(update={"filters": PARENT_FILTERS})
-    simulations = config.certify.repeats + config.certify.friction_steps + 1
-    with journal.step(step, CERTIFY_FACTOR * simulations * config.attempt_seconds):
-        return certify(
-            model,
-            setup.prepared.resting_poses[attempt.resting],
-            attempt,
-            config,
-            lambda trial: judge_sample(model, trial, rules, views=False) is Removal.KEPT,
-            held=held,
-        )
-
-
-@contextmanager
-def _stage(journal: Journal, step: str, name: str, seconds: dict[str, float]) -> Iterator[None]:
-    """Run and time a stage that is one step of the journal.
-
-    Raises:
-        MachineError: If the stage ended the process before.
-    """
-    _refuse_failing(journal, step, name)
-    with timed(seconds, step), journal.step(step, STAGE_SECONDS):
-        yield
-
-
-def _refuse_crash_loop(journal: Journal, header: ShardHeader) -> None:
-    if journal.in_crash_loop:
-        raise MachineError(
-            f"{header.object_name}, palm poses {header.start} to {header.stop - 1}: the worker "
-            f"died {GIVE_UP_DEATHS} times in a row in this work unit; is there enough memory? "
-            "The same command goes on from here"
-        )
-
-
-def _refuse_failing(journal: Journal, step: str, name: str) -> None:
-    """Refuse a step that is no attempt and ended its process: that is not the grasp's fault."""
-    verdict = journal.verdict(step)
-    if verdict is not None:
-        what = _STEPS[step.partition(" ")[0]]
-        raise MachineError(
-            f"{name}: {what} {verdict.value}; see `drakegrasp doctor`. The same command tries again"
-        )
+        # A process may have died after it wrote the shard and before it removed the journal.
+        if header.journal_path(out).name in names:
+            header.journal_path(out).unlink(missing_ok=True)
+        done.append(_with_samples(out, found, config))
+        grasps += found.outcomes.get(Outcome.SUCCESS, 0) * unbroken
+    return done, damaged

@@ -1,6 +1,6 @@
 """How much a grasp bears: the attempt is repeated, disturbed, and with less friction.
 
-In: an attempt that was lifted. Out: a `Certificate`: how many of its repeats hold, and would be
+In: an attempt that was lifted. Out: how many of its repeats hold, and would be
 samples, with noise on palm pose, friction and mass; whether it would be a sample at half the time
 step; and the least friction at which it holds without noise, at half the step. Repeats have the
 trial's own step: its error is numerics, and told apart. The lift that was stored is none of them.
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -37,27 +37,6 @@ FACTOR_GRID = 2.0**-32
 _DRAWN = 5
 
 
-@dataclass(frozen=True, kw_only=True)
-class Certificate:
-    """How much one attempt bears.
-
-    Attributes:
-        repeats: Number of disturbed repeats with a verdict.
-        held, samples: Number of these that hold, and that would be samples.
-        half_step: Whether it would be a sample, undisturbed, at half the step: 1 or 0; NaN if that
-            was inconclusive.
-        friction: Least coefficient of hand and object at which it holds at half the step, to within
-            the attempt's own / 2^`certify.friction_steps`; inf if it does not hold at its own, NaN
-            if a simulation was inconclusive, or if it was not looked for.
-    """
-
-    repeats: int = 0
-    held: int = 0
-    samples: int = 0
-    half_step: float = np.nan
-    friction: float = np.nan
-
-
 def is_drawn(attempt: Attempt, probability: float) -> bool:
     """Return whether an attempt is certified, which its own seed decides."""
     stream = Stream(attempt.seed, attempt.standoff_index, _DRAWN)
@@ -72,8 +51,16 @@ def certify(
     is_sample: Callable[[TrialRecord], bool],
     *,
     held: bool = True,
-) -> Certificate:
-    """Return how much an attempt bears.
+) -> dict[str, float]:
+    """Return how much an attempt bears, by the names of the schema.
+
+    * `p_hold_repeats`: number of disturbed repeats with a verdict.
+    * `p_hold_held`, `p_hold_samples`: number of these that hold, and that would be samples.
+    * `p_hold_half_step`: whether it would be a sample, undisturbed, at half the step: 1 or 0; NaN
+      if that was inconclusive.
+    * `certified_friction`: least coefficient of hand and object at which it holds at half the step,
+      to within the attempt's own / 2^`certify.friction_steps`; inf if it does not hold at its own,
+      NaN if a simulation was inconclusive, or if it was not looked for.
 
     Args:
         model: The object.
@@ -86,18 +73,19 @@ def certify(
     # Repeat the attempt with noise; inconclusive repeats do not count.
     known = attempt.conditions or usual_conditions(model, config.physics)
     config = with_whole_lifts(config)  # whether a grasp holds is the verdict of a whole lift
-    repeater = _Repeater(model, X_TO, config, attempt.preshape)
     stream = Stream(attempt.seed, attempt.standoff_index)
-    repeats = [repeater.lift(each) for each in _noisy(stream, attempt, known, config.certify)]
+    noisy = _noisy(stream, attempt, known, config.certify)
+    repeats = [_lift(model, X_TO, each, config) for each in noisy]
     conclusive = [record for record in repeats if record is not None]
 
     # Once without noise at half the step.
     step = STEP_RATIO * config.physics.time_step
     physics = config.physics.model_copy(update={"time_step": step, "coarse_steps": 1})
     finer = config.model_copy(update={"physics": physics})
-    repeater = _Repeater(model, X_TO, finer, attempt.preshape)
-    prediction = repeater.predict(attempt)
-    undisturbed = repeater.lift(_with_materials(attempt, known), prediction)
+    hand = load_hand(config.hand_source)
+    placed, shaped = centred(model, hand, [attempt]), hand.at(attempt.preshape)
+    (prediction,) = predict(model, shaped, X_TO, placed, config.screen)
+    undisturbed = _lift(model, X_TO, _with_materials(attempt, known), finer, prediction)
 
     # Search for the least friction; what geometry decides does not depend on friction.
     highest, friction = known.materials.friction_hand, np.nan
@@ -105,18 +93,18 @@ def certify(
     def holds(friction: float) -> bool | None:
         other, record = _with_materials(attempt, known, friction_hand=friction), undisturbed
         if friction != highest:
-            record = repeater.lift(other, prediction)
+            record = _lift(model, X_TO, other, finer, prediction)
         return None if record is None else record.outcome is Outcome.SUCCESS
 
     if held and config.certify.friction_steps:
         friction = least_friction(holds, highest, config.certify.friction_steps)
-    return Certificate(
-        repeats=len(conclusive),
-        held=sum(record.outcome is Outcome.SUCCESS for record in conclusive),
-        samples=sum(map(is_sample, conclusive)),
-        half_step=np.nan if undisturbed is None else float(is_sample(undisturbed)),
-        friction=friction,
-    )
+    return {
+        "p_hold_repeats": len(conclusive),
+        "p_hold_held": sum(record.outcome is Outcome.SUCCESS for record in conclusive),
+        "p_hold_samples": sum(map(is_sample, conclusive)),
+        "p_hold_half_step": np.nan if undisturbed is None else float(is_sample(undisturbed)),
+        "certified_friction": friction,
+    }
 
 
 def least_friction(holds: Callable[[float], bool | None], highest: float, steps: int) -> float:
@@ -170,36 +158,21 @@ def _noise_factor(stream: Stream, deviation: float) -> float:
     return round(math.exp(deviation * stream.normal(1)[0]) / FACTOR_GRID) * FACTOR_GRID
 
 
-class _Repeater:
-    """Runs attempts on an object; a scene in which Drake failed is not used again."""
+def _lift(
+    model: ObjectModel,
+    X_TO: Array,
+    attempt: Attempt,
+    config: Config,
+    prediction: Prediction | None = None,
+) -> TrialRecord | None:
+    """Return the record of an attempt, or None if it is inconclusive.
 
-    def __init__(
-        self, model: ObjectModel, X_TO: Array, config: Config, preshape: int | None
-    ) -> None:
-        """Take an object, its resting pose (4, 4), the rules of the attempts, and the preshape."""
-        self._model, self._X_TO, self._preshape = model, X_TO, preshape
-        self._config, self._hand = config, load_hand(config.hand_source)
-
-    def predict(self, attempt: Attempt) -> Prediction | None:
-        """Return what geometry says of an attempt."""
-        rules = self._config.screen
-        placed = centred(self._model, self._hand, [attempt])
-        (prediction,) = predict(
-            self._model, self._hand.at(self._preshape), self._X_TO, placed, rules
-        )
-        return prediction
-
-    def lift(self, attempt: Attempt, prediction: Prediction | None = None) -> TrialRecord | None:
-        """Return the record of an attempt, or None if it is inconclusive.
-
-        Args:
-            attempt: What to try.
-            prediction: What `predict` returns for it, where the caller has it already.
-        """
-        config = self._config
-        scene = cached_scene(self._model, config.physics, config.hand_source, self._preshape)
-        (attempt,) = centred(self._model, self._hand, [attempt])
-        record = run_attempt(scene, self._X_TO, attempt, config, prediction)
-        if record.outcome is Outcome.SOLVER_ERROR:
-            forget_scenes()
-        return None if record.outcome.inconclusive else record
+    `prediction` is what `predict` returns for it, where the caller has it already. A scene in which
+    Drake failed is not used again.
+    """
+    scene = cached_scene(model, config.physics, config.hand_source, attempt.preshape)
+    (attempt,) = centred(model, load_hand(config.hand_source), [attempt])
+    record = run_attempt(scene, X_TO, attempt, config, prediction)
+    if record.outcome is Outcome.SOLVER_ERROR:
+        forget_scenes()
+    return None if record.outcome.inconclusive else record

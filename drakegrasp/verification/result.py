@@ -18,7 +18,7 @@ from drakegrasp.arithmetic import norm
 from drakegrasp.config import Config
 from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
-from drakegrasp.generation.columns import unjudged
+from drakegrasp.generation.attempts import unjudged
 from drakegrasp.grasp import for_all_fingers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
@@ -48,7 +48,7 @@ class PoseTrial:
             closing [m]; NaN for a fingertip that does not touch, and for a posture.
         normal_error: (k,), angle between their normals [rad]; NaN likewise.
         removal: The first filter of a dataset that would remove the grasp, `KEPT` if none does, see
-            `generation.columns`; None if it does not hold.
+            `generation.attempts`; None if it does not hold.
     """
 
     fit: WristFit | None

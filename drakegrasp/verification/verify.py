@@ -19,7 +19,7 @@ import numpy as np
 
 from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.frames import Array, invert_pose
-from drakegrasp.generation.columns import judge_sample
+from drakegrasp.generation.attempts import judge_sample
 from drakegrasp.grasp import for_all_fingers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits

@@ -30,6 +30,7 @@ from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.generation.counts import Counts
 from drakegrasp.generation.pipeline import build
+from drakegrasp.generation.work_unit import UnitSummary
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime import files as file_set
@@ -131,6 +132,7 @@ DIE = """
 import os, signal, sys
 from drakegrasp.generation.counts import Counts
 from drakegrasp.generation.pipeline import build
+from drakegrasp.generation.work_unit import UnitSummary
 from drakegrasp.cli.main import main
 from drakegrasp.config import Config
 rename, (setting, *copies) = os.replace, sys.argv[1:]
@@ -217,7 +219,7 @@ def test_crashes_that_no_physics_explains_end_the_build_with_an_error(
     def build_here(objects: Path, out: Path, *, config: Config, show: bool, **_: Any) -> Any:
         return build(find_meshes(objects), out, config, run_here, show=show)
 
-    monkeypatch.setattr("drakegrasp.generation.work_unit._try_step", _crash)
+    monkeypatch.setattr("drakegrasp.generation.work_unit.try_attempt", _crash)
     monkeypatch.setattr("drakegrasp.api.building.build_dataset", build_here)
     (tmp_path / "meshes").mkdir()
     trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "meshes" / "1_box.obj")
@@ -233,7 +235,8 @@ def test_few_crashes_are_no_error(whole: Path) -> None:
     counts = Counts(read_manifest(whole), None, silent)
     header = next(read_manifest(whole).headers())
     for crashed, said in ((9, 0), (1, 1)):
-        counts.add(header, {Outcome.SUCCESS: 100, Outcome.CRASHED: crashed})
+        outcomes = {Outcome.SUCCESS: 100, Outcome.CRASHED: crashed}
+        counts.add(UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={}))
         assert len(counts.unexplained()) == said
 
 

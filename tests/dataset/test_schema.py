@@ -31,7 +31,7 @@ from drakegrasp.dataset.schema import (
 from drakegrasp.dataset.shards import ASSEMBLED_FIELDS
 from drakegrasp.dataset.statistics import count_funnel, count_splits, count_unfinished
 from drakegrasp.errors import DataError
-from drakegrasp.generation.columns import TrialRow
+from drakegrasp.generation.attempts import TrialRow
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Stage

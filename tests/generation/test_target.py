@@ -43,9 +43,9 @@ def run(target: Target, workers: int = 1) -> tuple[dict[str, int], dict[str, int
             if len(in_flight) >= workers:
                 # The last that began ends first.
                 done = in_flight.pop()
-                target.add(done, YIELDS[done.object_name][done.start])
+                target.found[done] = YIELDS[done.object_name][done.start]
         for header in in_flight:
-            target.add(header, YIELDS[header.object_name][header.start])
+            target.found[header] = YIELDS[header.object_name][header.start]
     taken, counts, _ = target.plan()
     return taken, counts
 
@@ -93,11 +93,11 @@ def test_workers_have_work_while_a_round_ends() -> None:
     coming = target.next_units()
     first = [next(coming) for _ in YIELDS]
     assert {header.start for header in first} == {0}
-    target.add(first[0], 4)
+    target.found[first[0]] = 4
     ahead = next(coming)
     assert (ahead.object_name, ahead.start) == ("rich", 1)
     # But by one round only.
-    target.add(ahead, 4)
+    target.found[ahead] = 4
     assert next(coming, None) is None
 
 

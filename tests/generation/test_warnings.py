@@ -10,7 +10,7 @@ from helpers.hands import write_pincer
 
 from drakegrasp.config import SplitConfig
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry
-from drakegrasp.generation.events import nothing_trains, too_heavy
+from drakegrasp.generation.cautions import nothing_trains, too_heavy
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource
 

@@ -11,18 +11,19 @@ import pytest
 import yaml
 from helpers.successes import good
 
-from drakegrasp.config import CandidateConfig, Config, FilterConfig
+from drakegrasp.config import CandidateConfig, FilterConfig
 from drakegrasp.dataset.filtering import judge_successes
 from drakegrasp.errors import HandError
 from drakegrasp.exchange.dexgraspbench import grasp_dictionary
 from drakegrasp.exchange.export import ClosedGrasp
 from drakegrasp.exchange.isaac_grasp import grasp_entry
 from drakegrasp.filters import Removal
-from drakegrasp.generation.columns import trial_rows
+from drakegrasp.generation.attempts import TrialSetup, trial_rows
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand, load_plain_hand
 from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.still_scene import StillScene
@@ -116,18 +117,16 @@ def test_preshapes_are_drawn_after_the_spreads() -> None:
 
 @pytest.mark.parametrize(("name", "none"), [("allegro_four", 255), ("allegro", 0)])
 def test_a_posture_is_not_stored_as_of_the_first_preshape(
-    name: str, none: int, cube: ObjectModel, config: Config
+    name: str, none: int, cube: ObjectModel
 ) -> None:
-    hand, X = load_hand(name), np.eye(4)
-    prepared = SimpleNamespace(model=cube)
-    setup = SimpleNamespace(
-        scene=build_scene(cube, config.physics, hand), prepared=prepared, config=config
-    )
+    hand, X, config = load_hand(name), np.eye(4), load_config(overrides=[f"hand={name}"])
+    scene = build_scene(cube, config.physics, hand)
+    setup = TrialSetup(prepared=SimpleNamespace(model=cube), config=config, scene=scene)
     place = {"candidate": 0, "standoff_index": 0, "standoff": np.nan, "spread": 0.0, "seed": 0}
     posture = Attempt(X_OG=X, source=Source.POSTURES, **place)
     drawn = replace(posture, source=Source.NORMALS, preshape=0 if hand.preshapes else None)
     record = TrialRecord(outcome=Outcome.START_COLLISION, X_TO=X, X_OG=X)
-    rows = trial_rows(setup, [posture, drawn], [record] * 2, [None] * 2)
+    rows = trial_rows(setup, [posture, drawn], [record] * 2)
     assert rows["preshape"].tolist() == [none, 0]
 
 

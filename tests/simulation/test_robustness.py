@@ -16,7 +16,6 @@ from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.robustness import (
-    Certificate,
     certify,
     is_drawn,
     least_friction,
@@ -31,7 +30,7 @@ def config() -> Config:
     return load_config(overrides=["certify.repeats=2", "certify.friction_steps=3"])
 
 
-def certified(cube, config: Config, *, height: float = STANDOFF, **options) -> Certificate:
+def certified(cube, config: Config, *, height: float = STANDOFF, **options) -> dict[str, float]:
     """Return the certificate of the cube's grasp; what holds would be a sample."""
     return certify(
         cube,
@@ -44,22 +43,30 @@ def certified(cube, config: Config, *, height: float = STANDOFF, **options) -> C
 
 
 @pytest.fixture(scope="module")
-def certificate(cube, config) -> Certificate:
+def certificate(cube, config) -> dict[str, float]:
     return certified(cube, config)
 
 
 def test_same_grasp_has_the_same_certificate_and_one_in_the_air_another(cube, config, certificate):
     assert certified(cube, config) == certificate
-    assert (certificate.samples, certificate.held, certificate.repeats) == (2, 2, 2)
-    assert certificate.half_step == 1.0
-    assert 0.0 < certificate.friction <= config.physics.friction_hand
+    assert (
+        certificate["p_hold_samples"],
+        certificate["p_hold_held"],
+        certificate["p_hold_repeats"],
+    ) == (2, 2, 2)
+    assert certificate["p_hold_half_step"] == 1.0
+    assert 0.0 < certificate["certified_friction"] <= config.physics.friction_hand
     other = certified(cube, config, height=0.25)
-    assert (other.samples, other.held, other.repeats) == (0, 0, 2)
-    assert (other.half_step, other.friction) == (0.0, np.inf)
+    assert (other["p_hold_samples"], other["p_hold_held"], other["p_hold_repeats"]) == (0, 0, 2)
+    assert (other["p_hold_half_step"], other["certified_friction"]) == (0.0, np.inf)
 
 
 def test_least_friction_holds_and_less_does_not(cube, config, certificate):
-    attempt, X_TO, found = from_above(cube, STANDOFF), standing(cube), certificate.friction
+    attempt, X_TO, found = (
+        from_above(cube, STANDOFF),
+        standing(cube),
+        certificate["certified_friction"],
+    )
     gap = config.physics.friction_hand / 2**config.certify.friction_steps
     half = config.physics.time_step / 2.0
     for friction, holds in ((found, True), (found - gap, False)):
@@ -86,7 +93,10 @@ def test_own_friction_of_the_object_is_searched_and_shaken(cube, config, monkeyp
         return SimpleNamespace(outcome=Outcome.SUCCESS)
 
     monkeypatch.setattr("drakegrasp.simulation.robustness.run_attempt", hold)
-    assert certify(replace(cube, friction=0.5), X_TO, attempt, config, bool).friction <= 0.5
+    assert (
+        certify(replace(cube, friction=0.5), X_TO, attempt, config, bool)["certified_friction"]
+        <= 0.5
+    )
     certify(cube, X_TO, attempt, other, bool)
     half = len(tried) // 2
     assert tried[:half] == tried[half:]
@@ -102,7 +112,7 @@ def test_bisection_ends_at_the_least_that_holds_or_knows_nothing():
 
 def test_noise_of_centimetres_spoils_grasps(cube, config):
     wild = override_config(config, ["certify.palm_noise=0.04", "certify.palm_noise_deg=20"])
-    assert certified(cube, wild).held < 2
+    assert certified(cube, wild)["p_hold_held"] < 2
 
 
 class Seen:
@@ -149,8 +159,10 @@ def test_repeats_are_lifted_to_their_end(cube, config, monkeypatch):
 
 def test_least_friction_is_that_of_grasps_that_hold(cube, config, monkeypatch):
     seen = Seen(monkeypatch)
-    assert np.isnan(certified(cube, config, held=False).friction)
-    assert np.isnan(certified(cube, override_config(config, ["certify.friction_steps=0"])).friction)
+    assert np.isnan(certified(cube, config, held=False)["certified_friction"])
+    assert np.isnan(
+        certified(cube, override_config(config, ["certify.friction_steps=0"]))["certified_friction"]
+    )
     assert len(seen.attempts) == 2 * (2 + 1)
 
 
@@ -159,7 +171,12 @@ def test_repeats_are_judged_by_the_rules_of_a_sample(cube, config, monkeypatch):
     Seen(monkeypatch)
     attempt, answers = from_above(cube, STANDOFF), iter([True, False, False])
     found = certify(cube, standing(cube), attempt, config, lambda _: next(answers))
-    assert (found.samples, found.held, found.repeats, found.half_step) == (1, 2, 2, 0.0)
+    assert (
+        found["p_hold_samples"],
+        found["p_hold_held"],
+        found["p_hold_repeats"],
+        found["p_hold_half_step"],
+    ) == (1, 2, 2, 0.0)
 
 
 def test_draw_is_the_attempts_own_and_of_its_probability(cube):
@@ -216,8 +233,8 @@ def test_repeats_without_a_verdict_do_not_count(cube, config, monkeypatch):
     """A new scene after each; and if there is none with a verdict, nothing is known."""
     seen = Seen(monkeypatch, Outcome.SOLVER_ERROR)
     found = certified(cube, config)
-    assert found.repeats == 0
-    assert np.isnan([found.half_step, found.friction]).all()
+    assert found["p_hold_repeats"] == 0
+    assert np.isnan([found["p_hold_half_step"], found["certified_friction"]]).all()
     assert len(seen.forgotten) == len(seen.attempts) == len(seen.physics) == 3
 
 
@@ -229,8 +246,8 @@ def test_counts_are_those_of_the_repeats_with_a_verdict(cube, config, monkeypatc
         lambda *_: SimpleNamespace(outcome=next(said)),
     )
     found = certified(cube, override_config(config, ["certify.repeats=3"]))
-    assert (found.held, found.repeats) == (1, 2)
-    assert found.friction == pytest.approx(config.physics.friction_hand / 2**3)
+    assert (found["p_hold_held"], found["p_hold_repeats"]) == (1, 2)
+    assert found["certified_friction"] == pytest.approx(config.physics.friction_hand / 2**3)
 
 
 def test_less_friction_is_tried_on_the_attempt_without_noise(cube, config, monkeypatch):
