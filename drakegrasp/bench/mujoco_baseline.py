@@ -23,7 +23,7 @@ from drakegrasp.mjcf.links import TIME_STEP, pair_friction, quaternion
 from drakegrasp.mjcf.scene import IMMOVABLE, build_mujoco_scene
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.conditions import Materials, usual_materials
 from drakegrasp.simulation.contacts import MAX_BESIDE
 from drakegrasp.simulation.drive import drive_of
@@ -141,7 +141,7 @@ class MujocoBaseline:
         """Let the object rest in a pose (4, 4) from the next attempt on."""
         self._X_WO = X_WT @ X_TO
 
-    def run(self, attempt: Pregrasp) -> PeerTrial:
+    def run(self, attempt: Attempt) -> PeerTrial:
         """Return the result of one attempt; its fingers close from the open hand."""
         # Palm pose and start, as in a trial.
         if not attempt.ray_hits:

@@ -37,7 +37,7 @@ from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.objects.model import ObjectModel, make_object
 from drakegrasp.outcomes import LOST, Outcome
 from drakegrasp.runtime.environment import one_thread
-from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
@@ -65,7 +65,7 @@ GRASPS = (
 
 #: An object, its pose X_TO (4, 4) on the table, where the hand starts, and the width of the object
 #: between the fingers [m].
-TrialGrasp: TypeAlias = tuple[ObjectModel, Array, Pregrasp, float]
+TrialGrasp: TypeAlias = tuple[ObjectModel, Array, Attempt, float]
 #: What is held, but moves more in the hand than a sample may.
 MOVED = "moved too far in the hand"
 #: What a drive does to the fingers.
@@ -231,7 +231,7 @@ def _trial_grasp(hand: Hand, shape: str, pinch: Pinch, angle: float) -> TrialGra
     height = reach(hand, down) - float((R_TO @ X_OG[:3, 3])[2]) + ABOVE_TABLE
     height = max(height, float(-(mesh.vertices @ R_TO.T)[:, 2].min()) + ABOVE_TABLE)
     X_TO = make_pose(R_TO, [0.0, 0.0, height])
-    return model, X_TO, Pregrasp(X_OG=X_OG, spread=0.0), pinch.width
+    return model, X_TO, Attempt(X_OG=X_OG, spread=0.0), pinch.width
 
 
 @one_thread

@@ -32,7 +32,8 @@ from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel, load_object, save_object
 from drakegrasp.runtime.files import atomic_hdf5
-from drakegrasp.simulation.candidates import Candidates, GivenPostures
+from drakegrasp.simulation.candidates import Candidates
+from drakegrasp.table import Table
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,14 +114,14 @@ def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
             _save_postures(candidates.postures, file)
 
 
-def _save_postures(postures: GivenPostures, file: h5py.File) -> None:
+def _save_postures(postures: Table, file: h5py.File) -> None:
     """Write the arrays of postures; texts are JSON."""
     for field in (*POSTURE_FIELDS, *POSTURE_TEXTS):
-        data = getattr(postures, field.name)
-        if field.optional and not any(data):
+        data = postures[field.name]
+        if field.optional and not any(data.tolist()):
             continue
-        if isinstance(data, tuple):
-            data = np.frombuffer(json.dumps(data).encode(), dtype=np.uint8)
+        if data.dtype.kind == "U":
+            data = np.frombuffer(json.dumps(data.tolist()).encode(), dtype=np.uint8)
         file.create_dataset(field.name, data=data, dtype=field.dtype)
 
 
@@ -172,19 +173,17 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
     )
 
 
-def _given_postures(arrays: dict[str, AnyArray], path: Path) -> GivenPostures | None:
+def _given_postures(arrays: dict[str, AnyArray], path: Path) -> Table | None:
     """Return the postures of a plan, or None if its palm poses come from samplers."""
     if not arrays:
         return None
-
-    def texts(name: str) -> tuple[str, ...]:
-        return tuple(map(str, parse_json(arrays.pop(name).tobytes())))
-
     try:
-        count, said = len(arrays["row"]), texts("said")
-        preshape = texts("preshape") if "preshape" in arrays else ("",) * count
-        if len(preshape) != count:
-            raise ValueError(f"preshapes of {len(preshape)} rows of {count}")
-        return GivenPostures(**arrays, said=said, preshape=preshape)
+        texts: dict[str, AnyArray] = {
+            name: np.array(list(map(str, parse_json(arrays[name].tobytes()))), dtype=str)
+            for name in ("said", "preshape")
+            if name in arrays
+        }
+        nothing = np.full(len(arrays["row"]), "")
+        return Table({"preshape": nothing, "said": texts["said"], **arrays, **texts})
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path}: must hold postures, got none: {one_line(error)}") from None

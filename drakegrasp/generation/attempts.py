@@ -351,9 +351,7 @@ def judge_sample(
     assert trial.closed is not None
     fingers, joints = len(trial.closed.contacts.touching), len(trial.closed.q)
     lengths = sizes(fingers=fingers, joints=joints, image=0)
-    attempt = Attempt(
-        X_OG=trial.X_OG, spread=0.0, candidate=0, standoff_index=0, standoff=0.0, seed=0
-    )
+    attempt = Attempt(X_OG=trial.X_OG, spread=0.0)
     columns = _trial_rows(model, config, lengths, [attempt], [trial])
 
     # And where the cameras would be.

@@ -26,7 +26,7 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.pictures.style import PREDICTED
 from drakegrasp.runtime.environment import allow_network
 from drakegrasp.runtime.files import write_atomic
-from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
 from drakegrasp.simulation.scene import ObjectScene, Scene, reset_attempt, reset_object
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
@@ -55,7 +55,7 @@ DISTANCE, HAND_RADIUS = 1.15, 0.1
 def record_attempt(
     model: ObjectModel,
     X_TO: npt.ArrayLike,
-    attempt: Pregrasp,
+    attempt: Attempt,
     config: Config,
     path: Path,
     *,

@@ -28,7 +28,6 @@ from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.candidates import (
     Attempt,
     Candidates,
-    GivenPostures,
     Source,
     is_audited,
 )
@@ -40,6 +39,7 @@ from drakegrasp.simulation.posture import (
     start_of,
 )
 from drakegrasp.simulation.settle import SAME_UP
+from drakegrasp.table import Table
 
 #: Frames of a table: those of a posture, and {M}, the axes and the origin of the mesh file.
 TableFrame = Literal["object", "table", "camera", "world", "mesh"]
@@ -582,6 +582,10 @@ def misfits(table: Attempts, name: str, scale: float, poses: Array) -> list[str]
     return found
 
 
+#: What a plan has of postures, beside their palm poses.
+_IN_PLAN = ("q_grasp", "q_pregrasp", "q_squeeze", "row", "said", "preshape")
+
+
 def given_candidates(
     model: ObjectModel, X_TO: Array, table: Attempts, X_OM: Array, config: Config
 ) -> Candidates:
@@ -613,14 +617,7 @@ def given_candidates(
         combinations=count,
         valid=count,
         distinct=count,
-        postures=GivenPostures(
-            q_grasp=table.q_grasp,
-            q_pregrasp=table.q_pregrasp,
-            q_squeeze=table.q_squeeze,
-            row=table.row,
-            said=table.said,
-            preshape=table.preshape,
-        ),
+        postures=Table({name: getattr(table, name) for name in _IN_PLAN}),
     )
 
 
@@ -646,7 +643,7 @@ def posture_attempts(
 
     for i in indices:
         before, after = _given(given.q_pregrasp[i]), _given(given.q_squeeze[i])
-        shape = given.preshape[i] or None
+        shape = str(given.preshape[i]) or None
         posture = Posture(candidates.X_OG[i], given.q_grasp[i], before, after, shape)
         start = start_of(posture, hand)
         yield Attempt(

@@ -38,6 +38,7 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.conditions import Conditions
 from drakegrasp.simulation.samplers import OwnPoses, above_table, make_poses, rotation_candidates
+from drakegrasp.table import Table
 
 #: Surface points that `normals` draws together; another number is another draw.
 BLOCK = 1000
@@ -63,26 +64,6 @@ class Source(IntEnum):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class GivenPostures:
-    """Joint positions (n, j) [rad or m] of postures from outside, in the plant's order.
-
-    Attributes:
-        q_grasp: When the fingers hold the object.
-        q_pregrasp, q_squeeze: Where the trial begins, and where motors press to; NaN: not given.
-        row: (n,), row of each in its file.
-        said: Where each comes from, in words; may be empty.
-        preshape: (n,), name of the hand's preshape; empty: all fingers close.
-    """
-
-    q_grasp: Array
-    q_pregrasp: Array
-    q_squeeze: Array
-    row: npt.NDArray[np.int64]
-    said: tuple[str, ...]
-    preshape: tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Candidates:
     """Palm poses of one object.
 
@@ -96,7 +77,8 @@ class Candidates:
         combinations: Number of combinations of rotations, or of surface points drawn.
         valid: Number of those above the table whose palm ray meets the bounding box.
         distinct: Number of different poses among the valid ones.
-        postures: Joints of each, where they come from outside and not from samplers.
+        postures: Rows of `Attempts`, where they come from outside and not from samplers: `q_grasp`,
+            `q_pregrasp`, `q_squeeze`, `row`, `said` and `preshape`.
     """
 
     X_OG: Array
@@ -107,7 +89,7 @@ class Candidates:
     combinations: int
     valid: int
     distinct: int
-    postures: GivenPostures | None = None
+    postures: Table | None = None
 
     def __len__(self) -> int:
         return len(self.X_OG)
@@ -132,11 +114,15 @@ class JointPath:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Pregrasp:
-    """Palm pose and joint angles before the fingers close: the start of a trial.
+class Attempt:
+    """What a trial starts from, and how a dataset counts it.
+
+    An attempt of the first round is a candidate at a stand-off. It is number 0 of its family; the
+    children of number n have the numbers n c + 1 to n c + c, where c is `refine.children`.
 
     Attributes:
-        X_OG: Pose of the palm (4, 4); the candidate's own where its ray misses.
+        X_OG: Pose of the palm (4, 4) before the fingers close; the candidate's own where its ray
+            misses.
         spread: Angle of the spread joints [rad].
         closing: Positions of the closing joints (k,) [rad or m] at the start; None is the open
             hand.
@@ -146,27 +132,6 @@ class Pregrasp:
         path: Of a posture that spread and closing cannot say: the positions of all joints.
         preshape: Index of the hand's preshape; None if all fingers close.
         unused: Fingers that the preshape leaves out, see `Hand.unused_in`.
-    """
-
-    X_OG: Array
-    spread: float
-    closing: Array | None = None
-    ray_hits: bool = True
-    conditions: Conditions | None = None
-    audited: bool = False
-    path: JointPath | None = None
-    preshape: int | None = None
-    unused: int = 0
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Attempt(Pregrasp):
-    """One palm pose to try, as a dataset counts it.
-
-    An attempt of the first round is a candidate at a stand-off. It is number 0 of its family; the
-    children of number n have the numbers n c + 1 to n c + c, where c is `refine.children`.
-
-    Attributes:
         candidate: Index of the candidate of its object.
         standoff_index: Index into `candidates.standoffs`.
         standoff: Distance of the palm from the surface point along -Gz [m]; of the family's first
@@ -180,10 +145,19 @@ class Attempt(Pregrasp):
         posture_row: Row of a posture in its file; NaN for a palm pose of a sampler.
     """
 
-    candidate: int
-    standoff_index: int
-    standoff: float
-    seed: int
+    X_OG: Array
+    spread: float
+    closing: Array | None = None
+    ray_hits: bool = True
+    conditions: Conditions | None = None
+    audited: bool = False
+    path: JointPath | None = None
+    preshape: int | None = None
+    unused: int = 0
+    candidate: int = 0
+    standoff_index: int = 0
+    standoff: float = np.nan
+    seed: int = 0
     resting: int = 0
     source: Source = Source.ROTATIONS
     log_density: float = np.nan
@@ -476,33 +450,6 @@ def children(parent: Attempt, config: RefineConfig, *, name: str, seed: int) -> 
         _child(parent, number, config, name=name, seed=seed)
         for number in range(first, first + config.children)
     ]
-
-
-def family_member(
-    first: Attempt,
-    child: int,
-    config: RefineConfig,
-    *,
-    name: str,
-    seed: int,
-    place: Callable[[Attempt], Attempt] = lambda attempt: attempt,
-) -> Attempt:
-    """Return an attempt by its number in the family of a first-round attempt, see `children`.
-
-    Args:
-        first: The attempt of the first round.
-        child: The number.
-        config: How many, and how far away.
-        name: The object's name.
-        seed: Of the dataset.
-        place: What becomes of each attempt before it is tried, and before it has children.
-    """
-    # From the first through the numbers of its ancestors.
-    if child == 0:
-        return first
-    number = (child - 1) // config.children
-    parent = family_member(first, number, config, name=name, seed=seed, place=place)
-    return place(_child(parent, child, config, name=name, seed=seed))
 
 
 def _child(parent: Attempt, number: int, config: RefineConfig, *, name: str, seed: int) -> Attempt:

@@ -15,7 +15,7 @@ Sampled output ports report the contacts of the step before.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
@@ -154,44 +154,27 @@ def build_object_scene(
         resting_surface: What the table meets, in {O}; the object's `resting_surface` if None.
     """
     physics = model.own_physics(physics)
-    draft = _draft(model, physics, resting_surface or model.resting_surface, meshcat)
-    draft.plant.Finalize()
-    manager = draft.scene_graph.collision_filter_manager()
-    _part_surfaces(draft.plant, manager, (draft.object, draft.table), [])
-    return ObjectScene(**draft.scene_fields())
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Draft:
-    """A scene that is being built: the attributes of `ObjectScene`, and what else is needed.
-
-    Attributes:
-        builder: Of the diagram.
-    """
-
-    builder: DiagramBuilder
-    model: ObjectModel
-    physics: PhysicsConfig
-    plant: MultibodyPlant
-    scene_graph: SceneGraph
-    object: RigidBody
-    table_side: GeometryId
-    table: RigidBody
-
-    def scene_fields(self) -> dict[str, Any]:
-        """Build the diagram, with a simulator that owns its one context."""
-        names = ("model", "physics", "plant", "scene_graph", "object", "table_side", "table")
-        simulator = Simulator(self.builder.Build())
-        return {"simulator": simulator, **{name: getattr(self, name) for name in names}}
+    builder, drawn = _draft(model, physics, resting_surface or model.resting_surface, meshcat)
+    drawn["plant"].Finalize()
+    manager = drawn["scene_graph"].collision_filter_manager()
+    _part_surfaces(drawn["plant"], manager, (drawn["object"], drawn["table"]), [])
+    return ObjectScene(simulator=Simulator(builder.Build()), **drawn)
 
 
 def _draft(
     model: ObjectModel, physics: PhysicsConfig, resting_surface: Solid, meshcat: Meshcat | None
-) -> _Draft:
-    """Return a diagram with the free object and the table."""
+) -> tuple[DiagramBuilder, dict[str, Any]]:
+    """Return a diagram with the free object and the table, and attributes of `ObjectScene`."""
     # The free object has one surface for the hand and one for the table.
     builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlant(_plant_config(physics), builder)
+    config = MultibodyPlantConfig(
+        time_step=physics.time_step,
+        contact_model="hydroelastic_with_fallback",
+        discrete_contact_approximation=physics.solver,
+        # Sampled ports would report the contacts of the step before.
+        use_sampled_output_ports=False,
+    )
+    plant, scene_graph = AddMultibodyPlant(config, builder)
     object_body = plant.AddRigidBody(
         "object", plant.AddModelInstance("object"), object_inertia(model, model.mass)
     )
@@ -204,16 +187,15 @@ def _draft(
         _add_visual(plant, object_body, model)
         rate = MeshcatVisualizerParams(publish_period=1.0 / MESHCAT_RATE)
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, rate)
-    return _Draft(
-        builder=builder,
-        model=model,
-        physics=physics,
-        plant=plant,
-        scene_graph=scene_graph,
-        object=object_body,
-        table_side=table_side,
-        table=table,
-    )
+    return builder, {
+        "model": model,
+        "physics": physics,
+        "plant": plant,
+        "scene_graph": scene_graph,
+        "object": object_body,
+        "table_side": table_side,
+        "table": table,
+    }
 
 
 def _build(
@@ -224,48 +206,39 @@ def _build(
     own_motors: bool,
 ) -> Scene:
     # The object on the table, and the hand on its wrist, which follows a trajectory.
-    draft = _draft(model, physics, model.resting_surface, meshcat)
-    plant, scene_graph = draft.plant, draft.scene_graph
-    trajectory = draft.builder.AddSystem(
+    builder, drawn = _draft(model, physics, model.resting_surface, meshcat)
+    plant, scene_graph = drawn["plant"], drawn["scene_graph"]
+    trajectory = builder.AddSystem(
         TrajectorySource(PiecewisePolynomial(np.zeros((3, 1))), output_derivative_order=1)
     )
-    parts_of_hand = _add_hand(plant, scene_graph, hand, own_motors)
-    instance, fingertips = parts_of_hand["instance"], parts_of_hand["fingertips"]
+    drawn |= _add_hand(plant, scene_graph, hand, own_motors)
+    instance, fingertips = drawn["instance"], drawn["fingertips"]
     _make_compliant_hand(plant, scene_graph, instance, fingertips, physics)
     plant.Finalize()
 
     # What needs the finalized plant: collision filters and the wrist's input.
-    parts = [geometry for geometry, _ in parts_of_hand["parts"]]
+    parts = [geometry for geometry, _ in drawn["parts"]]
     manager = scene_graph.collision_filter_manager()
-    _part_surfaces(plant, manager, (draft.object, draft.table), parts)
+    _part_surfaces(plant, manager, (drawn["object"], drawn["table"]), parts)
     _filter_within_hand(plant, scene_graph, instance, fingertips)
-    draft.builder.Connect(
+    builder.Connect(
         trajectory.get_output_port(),
-        plant.get_desired_state_input_port(parts_of_hand["wrist_instance"]),
+        plant.get_desired_state_input_port(drawn["wrist_instance"]),
     )
 
     # Motors of their own follow a path; the command of the hand file's never changes.
     command, path = plant.get_desired_state_input_port(instance), None
     if own_motors:
-        still = PiecewisePolynomial(np.zeros((len(parts_of_hand["motors"]), 1)))
-        path = draft.builder.AddSystem(TrajectorySource(still, output_derivative_order=1))
-        draft.builder.Connect(path.get_output_port(), command)
-    scene = Scene(
-        **draft.scene_fields(), **parts_of_hand, wrist_trajectory=trajectory, joint_trajectory=path
-    )
+        still = PiecewisePolynomial(np.zeros((len(drawn["motors"]), 1)))
+        path = builder.AddSystem(TrajectorySource(still, output_derivative_order=1))
+        builder.Connect(path.get_output_port(), command)
+    paths = {"wrist_trajectory": trajectory, "joint_trajectory": path}
+    scene = Scene(simulator=Simulator(builder.Build()), **drawn, **paths)
     if not own_motors:
-        command.FixValue(scene.context, _closing_command(hand))
+        # The constant [q_d; v_d] that closes all fingers at the hand's speed.
+        closing = np.concatenate([np.zeros(hand.num_fingers), hand.closing_speed])
+        command.FixValue(scene.context, closing)
     return scene
-
-
-def _plant_config(physics: PhysicsConfig) -> MultibodyPlantConfig:
-    return MultibodyPlantConfig(
-        time_step=physics.time_step,
-        contact_model="hydroelastic_with_fallback",
-        discrete_contact_approximation=physics.solver,
-        # Sampled ports would report the contacts of the step before.
-        use_sampled_output_ports=False,
-    )
 
 
 def _add_surface(
@@ -569,11 +542,6 @@ def _of_motors(
         "driven": tuple(driven),
         "still_joints": still,
     }
-
-
-def _closing_command(hand: Hand) -> Array:
-    """Return the constant [q_d; v_d] that closes all fingers at the hand's speed."""
-    return np.concatenate([np.zeros(hand.num_fingers), hand.closing_speed])
 
 
 def _make_compliant_hand(

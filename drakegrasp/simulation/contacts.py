@@ -233,14 +233,14 @@ class _Reader:
 
         the pressure of its own faces, and its share of what friction and damping add to all.
         """
-        faces = _read_faces(surface, object_is_M)
+        areas, centres_W, normals_W, pressures, depths = _read_faces(surface, object_is_M)
 
         # Which faces are on the pad, and how much of the patch they carry.
         tip = self._scene.fingertips[i]
-        p_FiQ = transform_points(invert_pose(self._scene.pose(tip)), faces.centres_W)
+        p_FiQ = transform_points(invert_pose(self._scene.pose(tip)), centres_W)
         on_pad = self._scene.hand.fingers[i].on_pad(p_FiQ)
-        weight = faces.areas * faces.pressures
-        moment_n = weight[:, None] * faces.normals_W
+        weight = areas * pressures
+        moment_n = weight[:, None] * normals_W
 
         # A patch that reaches over the pad's border is the fingertip's as a whole. One that lies
         # mostly beside the pad is split: its rest is a contact of another link. Drake tells the
@@ -258,11 +258,11 @@ class _Reader:
 
         # Sums over the pad's faces.
         self._force_W[i] += pad_force_W
-        self._area[i] += faces.areas[on_pad].sum()
+        self._area[i] += areas[on_pad].sum()
         self._weight[i] += weight[on_pad].sum()
-        self._moment_p[i] += (weight[:, None] * faces.centres_W)[on_pad].sum(axis=0)
+        self._moment_p[i] += (weight[:, None] * centres_W)[on_pad].sum(axis=0)
         self._moment_n[i] += moment_n[on_pad].sum(axis=0)
-        self._penetration[i] = max(self._penetration[i], *faces.depths[on_pad], 0.0)
+        self._penetration[i] = max(self._penetration[i], *depths[on_pad], 0.0)
 
     def add_point_pair(self, bodies: set[BodyIndex]) -> None:
         """Add a point contact of two bodies."""
@@ -303,30 +303,17 @@ def hand_bodies(scene: Scene) -> set[BodyIndex]:
     return set(scene.plant.GetBodyIndices(scene.instance))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Faces:
-    """The n faces of a patch on the object.
-
-    Attributes:
-        areas: (n,) [m^2].
-        centres_W: (n, 3), centroids [m].
-        normals_W: (n, 3), unit, out of the object.
-        pressures: (n,), at the centroids [Pa].
-        depths: (n,), of the object's surface in the fingertip [m].
-    """
-
-    areas: Array
-    centres_W: Array
-    normals_W: Array
-    pressures: Array
-    depths: Array
-
-
-def _read_faces(surface: ContactSurface, object_is_M: bool) -> _Faces:
-    """Return the faces of a patch.
+def _read_faces(
+    surface: ContactSurface, object_is_M: bool
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the n faces of a patch on the object.
 
     The fingertip's pressure p is zero at its surface and grows with the depth below it, so the
     depth of a face is p / |∇p| to first order.
+
+    Returns:
+        Areas (n,) [m^2]; centroids (n, 3) in {W} [m]; unit normals (n, 3) out of the object in {W};
+        pressures (n,) at the centroids [Pa]; depths (n,) of the surface in the fingertip [m].
     """
     field, compliant_is_M = surface.poly_e_MN(), not object_is_M
     has_gradient = surface.HasGradE_M() if compliant_is_M else surface.HasGradE_N()
@@ -340,14 +327,9 @@ def _read_faces(surface: ContactSurface, object_is_M: bool) -> _Faces:
         [field.EvaluateCartesian(face, centre) for face, centre in enumerate(centres)]
     )
     slopes = np.array([norm(gradient(face)) if has_gradient else np.inf for face in indices])
-    return _Faces(
-        areas=np.array([surface.area(face) for face in indices]),
-        centres_W=centres,
-        normals_W=outward
-        * np.array([surface.face_normal(face) for face in indices]).reshape(-1, 3),
-        pressures=pressures,
-        depths=pressures / slopes,
-    )
+    areas = np.array([surface.area(face) for face in indices])
+    normals = np.array([surface.face_normal(face) for face in indices]).reshape(-1, 3)
+    return areas, centres, outward * normals, pressures, pressures / slopes
 
 
 def _body_of(scene: ObjectScene, geometry_id: object) -> BodyIndex:

@@ -1,7 +1,7 @@
 """Postures: a wrist pose with the positions of all joints, and the trial that follows from one.
 
 In: what a network or another tool says of a grasp. Out: a `Posture`, checked and held in {O}, from
-it the `Pregrasp` of a trial, and the trial of one on an object. Where the posture follows the
+it the `Attempt` of a trial, and the trial of one on an object. Where the posture follows the
 couplings of the hand file, the hand's own motors close it, as they close every attempt. Where it
 does not, each joint has a motor of its own, which goes from the pregrasp to the grasp and on to the
 squeeze.
@@ -24,7 +24,7 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import coordinate_limits, open_together
 from drakegrasp.hand.parsing import position_order
 from drakegrasp.runtime.environment import one_thread
-from drakegrasp.simulation.candidates import JointPath, Pregrasp
+from drakegrasp.simulation.candidates import Attempt, JointPath
 from drakegrasp.simulation.placement import PlacedObject, config_for, refuse_other_objects
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
@@ -184,7 +184,7 @@ def _places(order: Sequence[str], joints: Sequence[str]) -> list[int]:
 # The trial of a posture
 
 
-def start_of(posture: Posture, hand: Hand) -> Pregrasp:
+def start_of(posture: Posture, hand: Hand) -> Attempt:
     """Return what the trial of a posture starts from.
 
     The rule: the hand file's motors close the fingers if in every given vector each coupled joint
@@ -199,7 +199,7 @@ def start_of(posture: Posture, hand: Hand) -> Pregrasp:
     return replace(start, preshape=preshape, unused=hand.unused_in(preshape))
 
 
-def _start_of(posture: Posture, hand: Hand) -> Pregrasp:
+def _start_of(posture: Posture, hand: Hand) -> Attempt:
     """Return what the trial of a posture starts from, of a hand all of whose fingers close."""
     given = [q for q in (posture.q_pregrasp, posture.q_grasp, posture.q_squeeze) if q is not None]
     start = opened(posture.q_grasp, hand) if posture.q_pregrasp is None else posture.q_pregrasp
@@ -214,7 +214,7 @@ def _start_of(posture: Posture, hand: Hand) -> Pregrasp:
     # A posture that the hand file can say is an attempt like any other.
     still = [abs(posture.q_grasp[index[n]] - at) <= OPEN for n, at in hand.preshape.items()]
     if not own_motors and all(still):
-        return Pregrasp(
+        return Attempt(
             X_OG=posture.X_OG,
             spread=spread,
             closing=None if np.abs(closing).max() <= OPEN else closing,
@@ -232,7 +232,7 @@ def _start_of(posture: Posture, hand: Hand) -> Pregrasp:
     start, grasp = np.clip(start, lower, upper), np.clip(posture.q_grasp, lower, upper)
     squeeze = squeezed(start, grasp, hand) if posture.q_squeeze is None else posture.q_squeeze
     squeeze = np.clip(squeeze, lower, upper)
-    return Pregrasp(
+    return Attempt(
         X_OG=posture.X_OG,
         spread=spread,
         closing=closing,

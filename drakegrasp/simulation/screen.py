@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +33,7 @@ from drakegrasp.hand.kinematics import open_together
 from drakegrasp.mesh.distance_field import DistanceField
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Attempt, Pregrasp, Source
+from drakegrasp.simulation.candidates import Attempt, Source
 
 Counts = npt.NDArray[np.int64]
 
@@ -72,7 +71,7 @@ def predict(
     model: ObjectModel,
     hand: Hand,
     X_TO: npt.ArrayLike,
-    attempts: Sequence[Pregrasp],
+    attempts: Sequence[Attempt],
     config: ScreenConfig,
 ) -> list[Prediction | None]:
     """Return what geometry decides about attempts; None for an attempt that is not screened.
@@ -342,10 +341,8 @@ TOUCH, STEPS = 5e-5, 40
 #: Points this far from the object need no exact distance [m].
 FAR = 0.02
 
-_A = TypeVar("_A", bound=Pregrasp)
 
-
-def centred(model: ObjectModel, hand: Hand, attempts: Sequence[_A]) -> list[_A]:
+def centred(model: ObjectModel, hand: Hand, attempts: Sequence[Attempt]) -> list[Attempt]:
     """Return attempts whose fingers of one motor meet the object together, where they can.
 
     An attempt is as it was if its palm ray misses, its fingers start closed, one side of the
@@ -361,7 +358,7 @@ def centred(model: ObjectModel, hand: Hand, attempts: Sequence[_A]) -> list[_A]:
     found = list(attempts)
     groups: dict[tuple[int | None, float], list[int]] = {}
     for row, attempt in enumerate(found):
-        given = isinstance(attempt, Attempt) and attempt.source is Source.POSTURES
+        given = attempt.source is Source.POSTURES
         if attempt.ray_hits and attempt.closing is None and not given:
             groups.setdefault((attempt.preshape, attempt.spread), []).append(row)
 

@@ -20,7 +20,7 @@ from drakegrasp.errors import MachineError, first_line
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import JointPath, Pregrasp
+from drakegrasp.simulation.candidates import Attempt, JointPath
 from drakegrasp.simulation.conditions import Materials, usual_materials
 from drakegrasp.simulation.contacts import (
     Contacts,
@@ -117,7 +117,7 @@ class TrialRecord:
 def run_attempt(
     scene: Scene,
     X_TO: npt.ArrayLike,
-    attempt: Pregrasp,
+    attempt: Attempt,
     config: Config,
     prediction: Prediction | None = None,
     *,
@@ -226,7 +226,7 @@ def has_only_scraped(record: TrialRecord) -> bool:
 def lift_on(
     scene: Scene,
     record: TrialRecord,
-    attempt: Pregrasp,
+    attempt: Attempt,
     config: Config,
     *,
     is_visible: Callable[[], bool] = lambda: True,
@@ -264,7 +264,7 @@ def _failed(start: TrialRecord, error: BaseException) -> TrialRecord:
 def _lift_closed(
     scene: Scene,
     record: TrialRecord,
-    attempt: Pregrasp,
+    attempt: Attempt,
     config: Config,
     limits: TrialLimits,
     is_visible: Callable[[], bool],
@@ -295,7 +295,7 @@ def _lift_closed(
     return replace(record, outcome=Outcome(int(verdict)))
 
 
-def start_meetings(scene: Scene, X_TO: Array, attempt: Pregrasp) -> dict[str, list[str]]:
+def start_meetings(scene: Scene, X_TO: Array, attempt: Attempt) -> dict[str, list[str]]:
     """Return which links of the hand intersect "object" or "table" where an attempt starts.
 
     Args:
@@ -311,12 +311,12 @@ def start_meetings(scene: Scene, X_TO: Array, attempt: Pregrasp) -> dict[str, li
     return open_hand_meets(scene)
 
 
-def _predict(scene: Scene, X_TO: Array, attempt: Pregrasp, config: Config) -> Prediction | None:
+def _predict(scene: Scene, X_TO: Array, attempt: Attempt, config: Config) -> Prediction | None:
     (prediction,) = predict(scene.model, scene.hand, X_TO, [attempt], config.screen)
     return prediction
 
 
-def _chance(scene: Scene, X_TO: Array, attempt: Pregrasp, closed: Contacts) -> float:
+def _chance(scene: Scene, X_TO: Array, attempt: Attempt, closed: Contacts) -> float:
     """Return the chance that lifting a closed hand gives a sample; NaN for a hand without one."""
     model = scene.hand.lift_chance
     if model is None:
@@ -330,7 +330,7 @@ def _chance(scene: Scene, X_TO: Array, attempt: Pregrasp, closed: Contacts) -> f
     return float(model.of(grasp))
 
 
-def _materials(scene: Scene, attempt: Pregrasp) -> Materials:
+def _materials(scene: Scene, attempt: Attempt) -> Materials:
     """Return the friction and mass of an attempt; the scene's own where it says nothing."""
     if attempt.conditions is None:
         return usual_materials(scene.model, scene.physics)

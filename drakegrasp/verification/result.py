@@ -22,7 +22,7 @@ from drakegrasp.generation.attempts import unjudged
 from drakegrasp.grasp import for_all_fingers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.placement import PlacedObject
@@ -52,7 +52,7 @@ class PoseTrial:
     """
 
     fit: WristFit | None
-    pregrasp: Pregrasp
+    pregrasp: Attempt
     trial: TrialRecord
     contact_error: Array
     normal_error: Array
@@ -205,7 +205,7 @@ class Verification:
         return self.first.fit if self.first else None
 
     @property
-    def pregrasp(self) -> Pregrasp | None:
+    def pregrasp(self) -> Attempt | None:
         """Palm and opened fingers that the first trial started from."""
         return self.first.pregrasp if self.first else None
 

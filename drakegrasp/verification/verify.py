@@ -27,7 +27,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread, timed
 from drakegrasp.runtime.executor import Executor
 from drakegrasp.runtime.progress import Report
-from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import Posture, run_trial, start_of
@@ -311,7 +311,7 @@ def _try(base: Verification, fit: WristFit) -> PoseTrial:
 
 def _run(
     placed: PlacedObject, X_TO: Array, fit: WristFit, config: Config
-) -> tuple[Pregrasp, TrialRecord]:
+) -> tuple[Attempt, TrialRecord]:
     """Open the fingers of a fit until the hand is clear, and run the trial from there.
 
     Returns:
@@ -323,7 +323,7 @@ def _run(
     for share in MARGINS:
         margin = share * np.deg2rad(config.verify.open_margin_deg) * hand.closing_unit
         closing = np.maximum(fit.closing - margin, least)
-        pregrasp = Pregrasp(X_OG=fit.X_OG, spread=fit.spread, closing=closing)
+        pregrasp = Attempt(X_OG=fit.X_OG, spread=fit.spread, closing=closing)
         trial = run_attempt(scene, X_TO, pregrasp, config)
         if trial.outcome is not Outcome.START_COLLISION:
             break

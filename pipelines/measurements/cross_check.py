@@ -37,7 +37,7 @@ from drakegrasp.outcomes import LOST, Outcome
 from drakegrasp.runtime.environment import one_thread, require_mujoco
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.conditions import Materials, usual_conditions
 from drakegrasp.simulation.drive import drive_of
 
@@ -71,7 +71,7 @@ class StoredLift:
     group: Group
     outcome: Outcome
     resting: int
-    pregrasp: Pregrasp
+    pregrasp: Attempt
     materials: Materials
 
 
@@ -190,7 +190,7 @@ def _read_lifts(out: Path) -> list[StoredLift]:
                 group=held if outcome is Outcome.SUCCESS else "lost",
                 outcome=outcome,
                 resting=int(row["resting"]),
-                pregrasp=Pregrasp(X_OG=unpack_pose(row["X_OG"]), spread=float(row["spread"])),
+                pregrasp=Attempt(X_OG=unpack_pose(row["X_OG"]), spread=float(row["spread"])),
                 materials=Materials(**{name: float(row[name]) for name in names}),
             )
         )

@@ -48,13 +48,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     # Torsion radius, and radius of the disc of the same area.
     radii, discs = [], []
-    for faces in patches:
-        weights = faces.areas * faces.pressures
+    for areas, centres, _, pressures, _ in patches:
+        weights = areas * pressures
         if weights.sum() > 0.0:
-            centre = np.average(faces.centres_W, axis=0, weights=weights)
-            distances = np.linalg.norm(faces.centres_W - centre, axis=1)
+            centre = np.average(centres, axis=0, weights=weights)
+            distances = np.linalg.norm(centres - centre, axis=1)
             radii.append(np.average(distances, weights=weights))
-            discs.append(np.sqrt(faces.areas.sum() / np.pi))
+            discs.append(np.sqrt(areas.sum() / np.pi))
     low, middle, high = np.percentile(radii, [25, 50, 75]) * 1e3
     sys.stdout.write(
         f"{len(radii)} patches of {len(held)} trials: torsion radius {middle:.2f} mm (half of them "

@@ -9,7 +9,7 @@ import numpy as np
 from drakegrasp.filters import Removal
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.trial import Closed, TrialRecord
@@ -64,7 +64,7 @@ def some_fit(X_OG: Array, **values: Any) -> WristFit:
 def some_try(trial: TrialRecord, **values: Any) -> PoseTrial:
     """Return the trial of a wrist pose whose contacts are a few millimetres off."""
     held = trial.outcome is Outcome.SUCCESS
-    start = Pregrasp(X_OG=trial.X_OG, spread=0.25, closing=np.array([0.1, 0.2, 0.3]))
+    start = Attempt(X_OG=trial.X_OG, spread=0.25, closing=np.array([0.1, 0.2, 0.3]))
     usual: dict[str, Any] = {
         "fit": some_fit(trial.X_OG), "pregrasp": start, "trial": trial,
         "contact_error": np.array([0.001, 0.002, 0.003]),

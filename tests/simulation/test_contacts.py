@@ -155,13 +155,8 @@ def test_point_and_normal_are_weighted_by_pressure(
 ) -> None:
     """The faces carry 5 and 3 N, whatever their areas are."""
     X_WO = closed.pose(closed.object)
-    faces = contacts_module._Faces(
-        areas=AREAS,
-        centres_W=transform_points(X_WO, POINTS),
-        normals_W=NORMALS @ X_WO[:3, :3].T,
-        pressures=PRESSURES,
-        depths=np.array([1e-4, 3e-4]),
-    )
+    places = transform_points(X_WO, POINTS), NORMALS @ X_WO[:3, :3].T
+    faces = AREAS, *places, PRESSURES, np.array([1e-4, 3e-4])
     monkeypatch.setattr(contacts_module, "_read_faces", lambda *_: faces)
     found = with_pads(closed, EVERYWHERE, EVERYWHERE, EVERYWHERE)
     assert found.touching.all()

@@ -19,7 +19,7 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel, make_object
 from drakegrasp.simulation import drive as drive_module
 from drakegrasp.simulation import screen as centring
-from drakegrasp.simulation.candidates import Attempt, Pregrasp, Source
+from drakegrasp.simulation.candidates import Attempt, Source
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.drive import disengage, drive_of, engage, opening_torques
 from drakegrasp.simulation.scene import (
@@ -117,7 +117,7 @@ def test_a_weak_worm_yields_with_both_fingers(
 def test_a_palm_stands_where_both_jaws_meet_the_object(tmp_path: Path, off: float) -> None:
     hand, model = gripper(tmp_path, one_motor=True), box()
     X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.002, off, 0.08])
-    (found,) = centred(model, hand, [Pregrasp(X_OG=X_OG, spread=0.0)])
+    (found,) = centred(model, hand, [Attempt(X_OG=X_OG, spread=0.0)])
     np.testing.assert_allclose(found.X_OG[:3, 3], [0.002, 0.0, 0.08], atol=2e-4)
     np.testing.assert_array_equal(found.X_OG[:3, :3], X_OG[:3, :3])
 
@@ -125,7 +125,7 @@ def test_a_palm_stands_where_both_jaws_meet_the_object(tmp_path: Path, off: floa
 def test_a_palm_stays_where_nothing_is_between_its_jaws(tmp_path: Path) -> None:
     hand, model = gripper(tmp_path, one_motor=True), box()
     X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.2, 0.01, 0.08])
-    (found,) = centred(model, hand, [Pregrasp(X_OG=X_OG, spread=0.0)])
+    (found,) = centred(model, hand, [Attempt(X_OG=X_OG, spread=0.0)])
     np.testing.assert_array_equal(found.X_OG, X_OG)
 
 
@@ -138,13 +138,13 @@ def test_a_palm_stays_where_a_pad_does_not_move(
     moved = centring._pad_motion
     monkeypatch.setattr(centring, "_pad_motion", lambda *a: moved(*a) * (next(sides) not in still))
     X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.002, 0.004, 0.08])
-    (found,) = centred(box(), hand, [Pregrasp(X_OG=X_OG, spread=0.0)])
+    (found,) = centred(box(), hand, [Attempt(X_OG=X_OG, spread=0.0)])
     np.testing.assert_array_equal(found.X_OG, X_OG)
 
 
 def test_jaws_with_motors_of_their_own_are_not_centred(tmp_path: Path) -> None:
     X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.01, 0.08])
-    attempt = Pregrasp(X_OG=X_OG, spread=0.0)
+    attempt = Attempt(X_OG=X_OG, spread=0.0)
     (found,) = centred(box(), gripper(tmp_path, one_motor=False), [attempt])
     assert found is attempt
 

@@ -19,7 +19,7 @@ from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.samplers import R_OG0
@@ -44,7 +44,7 @@ def cube(tmp_path_factory: pytest.TempPathFactory) -> PlacedObject:
 def grasp(cube: PlacedObject) -> tuple[np.ndarray, np.ndarray]:
     """Contacts of a simulated grasp that held, across two faces of the cube, from above."""
     scene = build_scene(cube.model, CONFIG.physics, load_hand(CONFIG.hand))
-    pregrasp = Pregrasp(X_OG=make_pose(R_OG0, [0.0, 0.0, CUBE / 2.0 + 0.06]), spread=0.0)
+    pregrasp = Attempt(X_OG=make_pose(R_OG0, [0.0, 0.0, CUBE / 2.0 + 0.06]), spread=0.0)
     record = run_attempt(scene, cube.X_TO, pregrasp, CONFIG)
     assert record.outcome is Outcome.SUCCESS and record.closed is not None
     return record.closed.contacts.p_OQ, record.closed.contacts.nhat_Q_O
@@ -528,7 +528,7 @@ def test_fingers_are_opened_until_the_hand_is_clear(
     """By the whole margin, then by half of it."""
     opened, ends = [], iter([Outcome.START_COLLISION] * collisions + [Outcome.SUCCESS])
 
-    def run(scene: object, X_TO: np.ndarray, attempt: Pregrasp, config: Config) -> TrialRecord:
+    def run(scene: object, X_TO: np.ndarray, attempt: Attempt, config: Config) -> TrialRecord:
         opened.append(attempt.closing)
         return TrialRecord(outcome=next(ends), X_TO=X_TO, X_OG=attempt.X_OG)
 
