@@ -11,8 +11,9 @@ import filecmp
 import os
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path, PurePath
+from typing import TypeAlias
 
 from drakegrasp.config import CarriedHand, Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked
@@ -41,21 +42,9 @@ from drakegrasp.runtime.progress import Report, silent
 _FREE = ("seed", "samples", "samples_per_object", "samples_patience")
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Part:
-    """An object of one of the datasets.
-
-    Attributes:
-        out: Directory of the dataset.
-        entry: The object there.
-        headers: Its work units.
-        merged: What it is in the merged dataset.
-    """
-
-    out: Path
-    entry: ObjectEntry
-    headers: tuple[ShardHeader, ...]
-    merged: ObjectEntry
+#: An object of one of the datasets: the directory, the object there, its work units, and what it is
+#: in the merged dataset.
+_Part: TypeAlias = tuple[Path, ObjectEntry, Sequence[ShardHeader], ObjectEntry]
 
 
 def merge(
@@ -168,7 +157,7 @@ def _parts(manifests: Mapping[Path, Manifest]) -> list[_Part]:
                 )
 
     # A mesh keeps its name under the first seed, and where it has one seed only.
-    parts = []
+    parts = list[_Part]()
     for out, entry, headers, own in entries:
         mesh, alone = entry.mesh_name, own == seed or len(seeds[entry.mesh_name]) == 1
         merged = replace(
@@ -177,7 +166,7 @@ def _parts(manifests: Mapping[Path, Manifest]) -> list[_Part]:
             seed=None if own == seed else own,
             drawn_as=None if alone else mesh,
         )
-        parts.append(_Part(out=out, entry=entry, headers=headers, merged=merged))
+        parts.append((out, entry, headers, merged))
     return parts
 
 
@@ -189,18 +178,20 @@ def _merged_manifest(manifests: Mapping[Path, Manifest], parts: Iterable[_Part])
     """
     # Each object once; of two that are equal, the one that was tried for longer.
     objects, names = dict[str, ObjectEntry](), dict[tuple[Path, str], str]()
-    for part in parts:
-        names[part.out, part.entry.name] = part.merged.name
-        known = objects.setdefault(part.merged.name, part.merged)
-        tried = (
-            None
-            if None in (known.tried, part.merged.tried)
-            else (max(known.tried or 0, part.merged.tried or 0))
-        )
+    for out, entry, _, merged in parts:
+        names[out, entry.name] = merged.name
+        known = objects.setdefault(merged.name, merged)
+        untold = None in (known.tried, merged.tried)
+        tried = None if untold else max(known.tried or 0, merged.tried or 0)
         longer = replace(known, tried=tried)
-        if longer != replace(part.merged, tried=tried):
-            raise _unequal(part, known)
-        objects[part.merged.name] = longer
+        if longer != replace(merged, tried=tried):
+            theirs, ours = known.to_json(), merged.to_json()
+            keys = [key for key in {**theirs, **ours} if theirs.get(key) != ours.get(key)]
+            raise DataError(
+                f"{out}: {merged.name} must be equal in all datasets that have it under the same "
+                f"seed, got others in {', '.join(key for key in keys if key != 'tried')}"
+            )
+        objects[merged.name] = longer
 
     first = next(iter(manifests.values()))
     refused = [mesh for manifest in manifests.values() for mesh in manifest.refused]
@@ -234,18 +225,18 @@ def _take_files(part: _Part, folder: Path) -> None:
     Raises:
         DataError: If another part has put others there.
     """
-    old, new = part.entry.name, part.merged.name
-    pairs = [(path(part.out, old), path(folder, new)) for path in (model_path, plan_path)]
-    for header in part.headers:
+    out, entry, headers, merged = part
+    pairs = [(path(out, entry.name), path(folder, merged.name)) for path in (model_path, plan_path)]
+    for header in headers:
         # Behind the last wanted grasp there need be none.
-        if header.path(part.out).exists():
-            pairs.append((header.path(part.out), shards_folder(folder, new) / header.file_name))
+        if header.path(out).exists():
+            pairs.append((header.path(out), shards_folder(folder, merged.name) / header.file_name))
     for source, target in pairs:
         if not target.exists():
             _link(source, target)
         elif not filecmp.cmp(source, target, shallow=False):
             raise DataError(
-                f"{source}: must be equal in all datasets with {part.entry.mesh_name} under the "
+                f"{source}: must be equal in all datasets with {entry.mesh_name} under the "
                 "same seed, got another"
             )
 
@@ -258,13 +249,3 @@ def _link(source: Path, target: Path) -> None:
     except OSError:
         shutil.copyfile(source, target)
         sync(target)
-
-
-def _unequal(part: _Part, known: ObjectEntry) -> DataError:
-    """Return the refusal of an object that another dataset has, too, and says otherwise of it."""
-    theirs, ours = known.to_json(), part.merged.to_json()
-    keys = [key for key in {**theirs, **ours} if theirs.get(key) != ours.get(key)]
-    return DataError(
-        f"{part.out}: {part.merged.name} must be equal in all datasets that have it under the same "
-        f"seed, got others in {', '.join(key for key in keys if key != 'tried')}"
-    )

@@ -471,6 +471,8 @@ class _Build:
             )
             for header in headers
         )
+
+        # Count and log each when it is done.
         for summary in self._execute(run_unit, units):
             counts.add(summary)
             self.log(

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.shards import trial_columns
@@ -62,39 +61,38 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
     Raises:
         DataError: If the dataset or the trial is not there.
     """
-    stored = _stored_trial(Path(out), trial_id)
-    prepared, config = stored.prepared, stored.config
+    stored, prepared, attempt, config = _stored_trial(Path(out), trial_id)
 
     # Run the attempt as a work unit would, up to the row that it would store.
     scene = build_scene(prepared.model, config.physics, load_hand(config.hand_source))
     setup = TrialSetup(prepared=prepared, config=config, scene=scene)
-    record = try_attempt(setup, stored.attempt)
-    row = trial_rows(setup, [stored.attempt], [record])
-    if stored.row["outcome"] == Outcome.SLIPPED and record.outcome is Outcome.PARTLY_HELD:
+    record = try_attempt(setup, attempt)
+    row = trial_rows(setup, [attempt], [record])
+    if stored["outcome"] == Outcome.SLIPPED and record.outcome is Outcome.PARTLY_HELD:
         row["outcome"][0] = Outcome.SLIPPED  # as an older version called it
 
     # What a hand met that could not start.
     meetings = {}
     if record.outcome is Outcome.START_COLLISION:
-        meetings = start_meetings(setup.scene_of(stored.attempt), record.X_TO, stored.attempt)
+        meetings = start_meetings(setup.scene_of(attempt), record.X_TO, attempt)
 
     # Compare bit for bit; other versions may explain a difference.
-    now = installed_versions(config)
+    then, now = read_manifest(Path(out)).versions, installed_versions(config)
+    pairs = {f.name: (stored[f.name], row[f.name][0]) for f in trial_columns() if f.name in row}
     return Replay(
         trial_id=trial_id,
-        object_name=stored.row["object_name"],
-        recorded=Outcome(int(stored.row["outcome"])),
+        object_name=stored["object_name"],
+        recorded=Outcome(int(stored["outcome"])),
         found=Outcome(int(row["outcome"][0])),
         differences={
-            field.name: _difference(stored.row[field.name], row[field.name][0])
-            for field in trial_columns()
-            if field.name in row
-            and not np.array_equal(stored.row[field.name], row[field.name][0], equal_nan=True)
+            name: _difference(*pair)
+            for name, pair in pairs.items()
+            if not np.array_equal(*pair, equal_nan=True)
         },
         versions={
-            key: f"{then} -> {now.get(key)}"
-            for key, then in stored.versions.items()
-            if now.get(key) != then
+            key: f"{known} -> {now.get(key)}"
+            for key, known in then.items()
+            if now.get(key) != known
         },
         meetings=meetings,
     )
@@ -110,40 +108,23 @@ def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
         DataError: If the dataset or the trial is not there.
         OSError: If the file cannot be written.
     """
-    stored = _stored_trial(Path(out), trial_id)
-    X_TO = stored.prepared.resting_poses[stored.attempt.resting]
-    model, config = stored.prepared.model, stored.config
+    stored, prepared, attempt, config = _stored_trial(Path(out), trial_id)
+    X_TO = prepared.resting_poses[attempt.resting]
     # A hand that was not lifted for its image is not lifted here, and nothing is rendered.
-    lifted = stored.row["outcome"] != Outcome.NOT_LIFTED
-    attempt = stored.attempt
-    return record_attempt(model, X_TO, attempt, config, Path(path), is_visible=lifted).outcome
+    lifted = stored["outcome"] != Outcome.NOT_LIFTED
+    found = record_attempt(prepared.model, X_TO, attempt, config, Path(path), is_visible=lifted)
+    return found.outcome
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _StoredTrial:
-    """A row of trials.hdf5, and what to run it again with."""
-
-    row: dict[str, Any]
-    prepared: PreparedObject
-    attempt: Attempt
-    config: Config
-    versions: dict[str, str]
-
-
-def _stored_trial(out: Path, trial_id: int) -> _StoredTrial:
-    manifest = read_manifest(out)
-    row = Trials(out).trial(trial_id)
-    name = row["object_name"]
-    config = manifest.config_of(name)
-    prepared = load_prepared(out, name, config)
+def _stored_trial(
+    out: Path, trial_id: int
+) -> tuple[dict[str, Any], PreparedObject, Attempt, Config]:
+    """Return a row of trials.hdf5, and what to run it again with."""
+    manifest, row = read_manifest(out), Trials(out).trial(trial_id)
+    config = manifest.config_of(row["object_name"])
+    prepared = load_prepared(out, row["object_name"], config)
     candidate, standoff, child = (int(row[key]) for key in ("candidate", "standoff_index", "child"))
-    return _StoredTrial(
-        row=row,
-        prepared=prepared,
-        attempt=find_attempt(prepared, candidate, standoff, child, config),
-        config=config,
-        versions=manifest.versions,
-    )
+    return row, prepared, find_attempt(prepared, candidate, standoff, child, config), config
 
 
 def _difference(a: np.ndarray, b: np.ndarray) -> float:

@@ -29,7 +29,7 @@ OTHERS = ("hand", "mesh", "objects", "vision", "dataset", "generation", "scoring
 #: Modules and folders that draw a picture or tell a story: they decide nothing.
 _TELLING = {
     *("dataset/card.py", "dataset/holding.py", "dataset/shortfall.py", "dataset/log.py"),
-    *("generation/events.py", "hand/files.py", "scoring/card.py"),
+    *("generation/cautions.py", "hand/files.py", "scoring/card.py"),
     *("verification/figure.py", "vision/probe_image.py"),
 }
 #: How many imports may lie between a module and a test, in its room and elsewhere.

@@ -48,8 +48,7 @@ from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.filters import Removal
 from drakegrasp.frames import make_pose, rotation_about
-from drakegrasp.generation.attempts import find_attempt
-from drakegrasp.generation.attempts import judge_sample
+from drakegrasp.generation.attempts import find_attempt, judge_sample
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import override_config
 from drakegrasp.outcomes import Outcome
