@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.shards import trial_columns
