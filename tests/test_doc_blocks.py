@@ -238,6 +238,7 @@ def test_commands_of_the_docs_run(
             shutil.rmtree(tmp_path / "FOLDER")
 
 
+@pytest.mark.nightly
 @pytest.mark.sim
 @pytest.mark.slow
 @pytest.mark.parametrize(

@@ -283,9 +283,17 @@ def test_results_are_dated_and_of_now(page: Path) -> None:
     assert not re.findall(r"^\|.*\bbefore \|.*\bnow \|", text, re.M)
 
 
+#: Pages with Python that runs; those of the first tier show the public calls.
+FIRST = ("README.md", "docs/reference/python.md")
+PYTHON_PAGES = [
+    pytest.param(page, id=name, marks=() if name in FIRST else pytest.mark.nightly)
+    for page, name in ((page, page_id(page)) for page in DOCS if blocks(page, "python"))
+]
+
+
 @pytest.mark.sim
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in DOCS if blocks(page, "python")], ids=page_id)
+@pytest.mark.parametrize("page", PYTHON_PAGES)
 def test_python_of_the_docs_runs(
     page: Path,
     small_dataset: Path,

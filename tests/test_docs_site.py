@@ -51,6 +51,7 @@ def test_every_public_name_is_in_the_reference() -> None:
     assert set(drakegrasp.__all__) - named == {"Config"}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("mkdocs") is None, reason="the site needs the extra docs")
 def test_the_site_is_built_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:

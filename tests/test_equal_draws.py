@@ -49,6 +49,7 @@ def check(found: dict[str, object]) -> dict[str, list[str]]:
     return kernels
 
 
+@pytest.mark.nightly
 def test_newest_blas_kernel_changes_no_draw() -> None:
     """The newest of this CPU; all that are older lie between it and the next test's."""
     flags = cpu_flags()

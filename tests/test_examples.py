@@ -44,6 +44,7 @@ def test_a_docstring_without_concepts_is_refused(tmp_path: Path) -> None:
         example_gallery.read_example(script)
 
 
+@pytest.mark.nightly
 @pytest.mark.sim
 @pytest.mark.slow
 @pytest.mark.cluster

@@ -84,6 +84,7 @@ def test_wheel_has_every_file_of_the_package(wheel: Path) -> None:
         assert f"drakegrasp/{name}" in files
 
 
+@pytest.mark.nightly
 def test_environment_runs_the_wheel_and_not_the_checkout(installed: Path, tmp_path: Path) -> None:
     code = "import drakegrasp; print(drakegrasp.__file__); print(drakegrasp.__version__)"
     file, version = run(installed / "python", "-c", code, cwd=tmp_path).splitlines()
@@ -100,6 +101,7 @@ def test_version_is_the_newest_of_the_changelog_and_that_to_cite() -> None:
     assert citation["version"] == VERSION
 
 
+@pytest.mark.nightly
 def test_every_module_of_the_wheel_can_be_imported(installed: Path, tmp_path: Path) -> None:
     """All but what needs the extras `peer` and `slurm`; public names, hand and presets, too."""
     code = """
@@ -117,6 +119,7 @@ print(len(names))
     assert int(run(installed / "python", "-c", code, cwd=tmp_path)) > 100
 
 
+@pytest.mark.nightly
 @pytest.mark.sim
 @pytest.mark.cluster
 def test_the_installed_command_builds_a_dataset(installed: Path, tmp_path: Path) -> None:

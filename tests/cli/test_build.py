@@ -20,6 +20,7 @@ from distributed.security import Security
 from helpers.builds import start_build, workers_of
 from helpers.commands import run
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
+from helpers.tiers import in_second_tier
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.lock import build_lock
@@ -293,7 +294,7 @@ def test_build_connects_with_the_certificates_that_it_is_given(
 
 @pytest.mark.cluster
 @pytest.mark.slow
-@pytest.mark.parametrize("seconds", [0.5, 1.0, 3.0])
+@pytest.mark.parametrize("seconds", [1.0, *map(in_second_tier, (0.5, 3.0))])
 def test_ctrl_c_while_workers_start_is_one_line(tmp_path: Path, seconds: float) -> None:
     """It reaches every process of the terminal, also those that have just begun."""
     (tmp_path / "meshes").mkdir()

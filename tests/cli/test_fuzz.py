@@ -13,6 +13,7 @@ CASES, SEED = 16, 7
 MODELS = {"meshes": 12, "hands": 8}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.timeout(240)
 def test_spoilt_files_are_read_with_equal_values_or_refused_in_a_line(out: Path) -> None:
@@ -20,6 +21,7 @@ def test_spoilt_files_are_read_with_equal_values_or_refused_in_a_line(out: Path)
     assert [finding for finding in fuzz(out, CASES, SEED) if finding] == []
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize("kind", MODELS)

@@ -52,6 +52,7 @@ def test_a_card_does_not_depend_on_the_number_of_workers(
     assert card["sets"]["own"]["measures"]["held"]["value"] > 0.0
 
 
+@pytest.mark.nightly
 @pytest.mark.sim
 @pytest.mark.slow
 @pytest.mark.cluster

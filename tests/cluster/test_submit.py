@@ -391,6 +391,7 @@ def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
             process.wait(60)
 
 
+@pytest.mark.nightly
 @pytest.mark.cluster
 @pytest.mark.sim
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.hands import write_slider
+from helpers.tiers import in_second_tier
 
 from drakegrasp.commissioning.trial_grasps import check_grasp, trial_grasps
 from drakegrasp.hand.description import load_hand
@@ -36,8 +37,8 @@ def test_a_pinch_is_where_the_pads_leave_its_width(tmp_path) -> None:
 
 @pytest.mark.sim
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["allegro", "franka", "leap"])
-@pytest.mark.parametrize("drive", ["worm", "locked"])
+@pytest.mark.parametrize("name", ["allegro", "franka", in_second_tier("leap")])
+@pytest.mark.parametrize("drive", ["worm", in_second_tier("locked")])
 def test_a_pinched_box_slips_by_less_than_a_millimetre(name: str, drive: str) -> None:
     """Within the payload; joints of the preshape keep their positions."""
     hand, config = load_hand(name), load_config(overrides=[f"lift.drive={drive}"])

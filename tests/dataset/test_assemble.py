@@ -284,6 +284,7 @@ for limit in map(int, sys.argv[2:]):
 """
 
 
+@pytest.mark.nightly
 def test_full_disk_is_one_line_wherever_it_fills(out: Path) -> None:
     before = {name: (out / name).read_bytes() for name in FILES}
     largest = max(map(len, before.values()))
@@ -332,6 +333,7 @@ print(kills)
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_whenever_assembling_is_killed_the_files_are_of_one_state(out: Path) -> None:
     before = [(out / name).read_bytes() for name in FILES]

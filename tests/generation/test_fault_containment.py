@@ -18,6 +18,7 @@ import pytest
 import trimesh
 from helpers.assertions import assert_same_dataset
 from helpers.builds import FAST, finish, start_build, wait_for_shards, workers_of
+from helpers.tiers import in_second_tier
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
@@ -84,7 +85,7 @@ def assert_clean(out: Path, *patterns: str) -> None:
 
 
 @pytest.mark.cluster
-@pytest.mark.parametrize("kills", [3, pytest.param(20, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("kills", [3, in_second_tier(20)])
 def test_random_kills_change_nothing(
     meshes: Path, undisturbed: Path, tmp_path: Path, kills: int
 ) -> None:

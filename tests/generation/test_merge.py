@@ -317,6 +317,7 @@ def test_several_seeds_are_not_built_on(sound: Path, other: Path, tmp_path: Path
         claim_directory(tmp_path / "into", read_manifest(sound).config)
 
 
+@pytest.mark.nightly
 @pytest.mark.sim
 @pytest.mark.slow
 def test_merged_builds_replay_bit_equal(tmp_path: Path) -> None:

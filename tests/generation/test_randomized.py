@@ -77,6 +77,7 @@ def test_attempts_are_those_of_a_build_without_draws(randomized: Path, small_dat
     assert np.all(drawn["slip"][lifted] != usual["slip"][lifted])
 
 
+@pytest.mark.nightly
 def test_order_of_work_changes_nothing(
     sources: list[MeshSource], config: Config, randomized: Path, tmp_path: Path
 ) -> None:

@@ -390,6 +390,7 @@ def test_camera_stands_behind_the_palm(cube, config):
     assert np.allclose(X_GC, make_pose(np.eye(3), [0.0, 0.0, -0.25]))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_smaller_step_gives_the_same_verdicts(tmp_path, config, hand):
     """At the default of 8 ms 95 % of what is simulated ends as at 1 ms."""
