@@ -24,8 +24,11 @@ from drakegrasp.simulation.samplers import make_poses
 POINTS = 2048
 #: Targets lie within these shares of the half extents along the major and the minor axis.
 ALONG, ACROSS = 0.6, 0.2
-#: Most that a palm is turned from the axes, and tilted from the vertical [degree].
-YAW, TILT = 20.0, 25.0
+#: Most that a palm is turned from the axes [degree].
+YAW = 20.0
+#: Least and most that it is tilted from the vertical [degree]. Straight from above the camera sees
+#: a flat image, which no sample has; with more tilt most hands meet the table.
+TILT = 10.0, 35.0
 #: Random numbers of a pose: two of the target, the quarter, the turn, and two of the tilt.
 NUMBERS = 6
 
@@ -61,9 +64,10 @@ class Above:
         self._axes, self._middle = axes, (low + high) / 2.0
         self._height = float(p_TQ[:, 2].max()) / 2.0
         area = 4.0 * float(self._half[0] * self._half[1])
-        cap = 2.0 * math.pi * (1.0 - math.cos(math.radians(TILT)))
+        most, least = (math.cos(math.radians(tilt)) for tilt in TILT)
+        zone = 2.0 * math.pi * (most - least)
         turns = 4.0 * math.radians(2.0 * YAW)
-        self.log_density = rounded_density(-math.log(area * turns * cap))
+        self.log_density = rounded_density(-math.log(area * turns * zone))
 
     def poses(self, count: int) -> Array:
         """Return the first poses (count, 4, 4)."""
@@ -79,12 +83,12 @@ class Above:
 
     def _draw(self, numbers: Array) -> Array:
         """Return the poses X_OG (n, 4, 4) of random numbers (n, NUMBERS)."""
-        # Where the palm looks at, and from where: uniform over the cap about the vertical.
+        # Where the palm looks at, and from where: uniform over a zone of the sphere.
         target = self._middle + (2.0 * numbers[:, :2] - 1.0) * self._half
         p_TQ = np.column_stack([multiply(target, self._axes), np.full(len(target), self._height)])
         sine, cosine = sin_cos_deg(360.0 * numbers[:, 4])
-        least = float(sin_cos_deg(TILT)[1])
-        down = 1.0 - numbers[:, 5] * (1.0 - least)
+        most, least = sin_cos_deg(np.array(TILT))[1]
+        down = most - numbers[:, 5] * (most - least)
         aside = np.sqrt(1.0 - down * down)
         z = np.column_stack([aside * cosine, aside * sine, -down])
 

@@ -28,9 +28,10 @@ def test_palms_look_down_at_the_bar_from_beyond_it(drawn) -> None:
     X_TG, middle, candidates = drawn
     z = X_TG[:, :3, 2]
     tilt = np.rad2deg(np.arccos(-z[:, 2]))
-    assert 0.0 <= tilt.min() < 2.0 and 0.95 * TILT < tilt.max() <= TILT + 1e-9
-    # Uniform over the cap: the median of 1 - cos is half of the greatest.
-    assert np.median(1.0 + z[:, 2]) == pytest.approx(0.5 * (1 - np.cos(np.deg2rad(TILT))), rel=0.1)
+    assert TILT[0] - 1e-9 <= tilt.min() < 12.0 and 34.0 < tilt.max() <= TILT[1] + 1e-9
+    # Uniform over the zone: half of it lies above its middle height.
+    middle_height = np.cos(np.deg2rad(TILT)).mean()
+    assert np.mean(-z[:, 2] > middle_height) == pytest.approx(0.5, abs=0.08)
     assert (np.linalg.norm(X_TG[:, :3, 3] - middle, axis=1) > np.linalg.norm(SIZE) / 2).all()
     assert np.isfinite(candidates.distance).all()
     np.testing.assert_allclose(np.linalg.det(X_TG[:, :3, :3]), 1.0, atol=1e-12)
@@ -49,13 +50,13 @@ def test_palms_aim_along_the_major_axis_and_turn_by_quarters(drawn) -> None:
     x = X_TG[:, :2, 0]
     angle = np.rad2deg(np.arctan2(x @ across, x @ along))
     quarter = np.round(angle / 90.0)
-    assert np.abs(angle - 90.0 * quarter).max() < YAW + 6.0
+    assert np.abs(angle - 90.0 * quarter).max() < YAW + 12.0
     assert (np.bincount(quarter.astype(int) % 4, minlength=4) > 100).all()
 
 
 def test_density_is_of_the_uniform_draw(drawn) -> None:
     target = ALONG * ACROSS * SIZE[0] * SIZE[1]
-    cap = 2.0 * np.pi * (1.0 - np.cos(np.deg2rad(TILT)))
-    expected = -np.log(target * 4.0 * np.deg2rad(2.0 * YAW) * cap)
+    zone = 2.0 * np.pi * -np.diff(np.cos(np.deg2rad(TILT)))[0]
+    expected = -np.log(target * 4.0 * np.deg2rad(2.0 * YAW) * zone)
     # The bar's ends are seen to the nearest of 2048 points.
     np.testing.assert_allclose(drawn[2].log_density, expected, atol=0.05)
