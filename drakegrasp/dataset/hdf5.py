@@ -96,23 +96,14 @@ def _find_elsewhere(file: h5py.File) -> str | None:
             if isinstance(item, h5py.h5g.GroupID) and address not in seen:
                 groups.append((item, name))
             elif isinstance(item, h5py.h5d.DatasetID):
-                if _is_elsewhere(item):
+                made = item.get_create_plist()
+                if made.get_external_count() > 0 or made.get_layout() == h5py.h5d.VIRTUAL:
                     return f"values outside of it at {name}"
-                if _claimed_bytes(item) > MOST_PACKED * size:
+                rows = int(item.get_space().get_simple_extent_npoints())
+                if rows * int(item.get_type().get_size()) > MOST_PACKED * size:
                     return f"more rows than a file of {size:,} byte can hold at {name}"
             seen.add(address)
     return None
-
-
-def _is_elsewhere(dataset: h5py.h5d.DatasetID) -> bool:
-    """Return whether the values of a dataset are in other files."""
-    made = dataset.get_create_plist()
-    return made.get_external_count() > 0 or made.get_layout() == h5py.h5d.VIRTUAL
-
-
-def _claimed_bytes(dataset: h5py.h5d.DatasetID) -> int:
-    """Return how many bytes the values of a dataset would take."""
-    return int(dataset.get_space().get_simple_extent_npoints()) * int(dataset.get_type().get_size())
 
 
 def read_texts(dataset: h5py.Dataset) -> tuple[str, ...]:

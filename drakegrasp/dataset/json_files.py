@@ -5,14 +5,18 @@ In: a file and a pydantic model. Out: the model, or a `DataError` that names the
 
 from __future__ import annotations
 
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ValidationError
 
 from drakegrasp.config import describe_mistake
 from drakegrasp.errors import DataError, one_line, printable
 from drakegrasp.foreign_files import LARGEST_TEXT, NAME_RULE, is_name, parse_json, read_content
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -26,6 +30,12 @@ def _refuse_no_name(text: str) -> str:
 
 #: The name of an object or a class.
 Name = Annotated[str, AfterValidator(_refuse_no_name)]
+
+
+def stated(entry: DataclassInstance) -> dict[str, Any]:
+    """Return a dataclass as JSON types, without the values that are those of its defaults."""
+    values = asdict(entry)
+    return {f.name: values[f.name] for f in fields(entry) if values[f.name] != f.default}
 
 
 def read_mapping(path: Path, what: str) -> tuple[dict[str, Any], bytes]:

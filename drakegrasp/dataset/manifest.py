@@ -13,7 +13,7 @@ import shutil
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,9 +36,9 @@ from drakegrasp.config import (
 )
 from drakegrasp.dataset import lock, log
 from drakegrasp.dataset.assembly.split import Rule, number_poses, split_rule
-from drakegrasp.dataset.json_files import Name, read_mapping, validated
+from drakegrasp.dataset.json_files import Name, read_mapping, stated, validated
 from drakegrasp.dataset.paths import FILE_NAME
-from drakegrasp.dataset.rejections import AttemptKey, key_to_json
+from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.schema import (
     CONVENTIONS,
     SCHEMA_VERSION,
@@ -177,11 +177,7 @@ class ObjectEntry:
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
-        # What is not stated leaves no trace.
-        optional = ("licence", "tried", "group", "seed", "drawn_as")
-        unsaid = [key for key in optional if getattr(self, key) is None]
-        said = {key: v for key, v in asdict(self).items() if key not in unsaid}
-        return {"class" if key == "class_name" else key: v for key, v in said.items()}
+        return {"class" if key == "class_name" else key: v for key, v in stated(self).items()}
 
 
 @with_config(ConfigDict(extra="forbid"))
@@ -200,10 +196,6 @@ class RefusedMesh:
     mesh_sha256: Hex
     reason: str
     again: bool = False
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the entry as JSON types, in the order of the manifest."""
-        return {key: value for key, value in asdict(self).items() if key != "again" or value}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -340,11 +332,11 @@ def _content(manifest: Manifest) -> dict[str, Any]:
         "fingers": manifest.fingers,
         **({"joints": list(manifest.joints)} if manifest.joints else {}),
         "objects": [entry.to_json() for entry in manifest.objects],
-        "refused": [entry.to_json() for entry in manifest.refused],
+        "refused": [stated(entry) for entry in manifest.refused],
     }
     # Most datasets have none.
     if manifest.rejected:
-        content["rejected"] = [key_to_json(key) for key in manifest.rejected]
+        content["rejected"] = [stated(key) for key in manifest.rejected]
     return content
 
 

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -114,25 +115,6 @@ def _opened_whole(
         yield file
 
 
-def open_samples(path: Path) -> AbstractContextManager[h5py.File]:
-    """Open grasping_oto.hdf5 or grasping_otm.hdf5 while the block runs.
-
-    Raises:
-        DataError: If it is missing, damaged, or differs from the schema.
-    """
-    return _opened_whole(path, "a data file of drakegrasp", OF_CAMERA, DATA_TABLES)
-
-
-def open_trials(path: Path) -> AbstractContextManager[h5py.File]:
-    """Open trials.hdf5 while the block runs; errors as for `open_samples`."""
-    return _opened_whole(path, "the trials of a dataset", ORIGIN, TRIAL_TABLES)
-
-
-def open_scenes(path: Path) -> AbstractContextManager[h5py.File]:
-    """Open scenes.hdf5 while the block runs; errors as for `open_samples`."""
-    return _opened_whole(path, "the scenes of a dataset", OF_SCENES, SCENE_TABLES)
-
-
 def refuse_first(path: Path, mistakes: Iterable[object]) -> None:
     """Refuse a file with any mistake; the first is told.
 
@@ -210,16 +192,8 @@ def _is_json(
     return obeys
 
 
-def _is_truth(value: Any) -> bool:
-    return isinstance(value, bool)
-
-
 def _is_whole(value: Any) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= 0)
-
-
-def _is_positive(value: Any) -> bool:
-    return isinstance(value, float | np.floating) and bool(0.0 < value < np.inf)
 
 
 def _is_matrix(value: Any) -> bool:
@@ -234,10 +208,19 @@ ORIGIN: Mapping[str, Rule] = {
     **dict.fromkeys(("config", "versions"), ("a mapping in JSON", _is_json(dict))),
     **dict.fromkeys(("config_hash", "signature", "shards"), TEXT),
     "seed": COUNT,
-    "fingers": ("whether a grasp needs each finger, in JSON", _is_json(dict, _is_truth)),
+    "fingers": (
+        "whether a grasp needs each finger, in JSON",
+        _is_json(dict, lambda value: isinstance(value, bool)),
+    ),
     "joints": ("names of the hand's joints, in JSON", _is_json(list, _is_text)),
     "K": ("a matrix of 3 x 3 finite numbers", _is_matrix),
-    **dict.fromkeys(("near", "far"), ("a positive number", _is_positive)),
+    **dict.fromkeys(
+        ("near", "far"),
+        (
+            "a positive number",
+            lambda v: isinstance(v, float | np.floating) and bool(0.0 < v < np.inf),
+        ),
+    ),
 }
 #: Those that files of before they were written may lack.
 _YOUNG = ("fingers", "joints", "split_by")
@@ -249,6 +232,18 @@ OF_CAMERA: Mapping[str, Rule] = {
 }
 #: Of scenes.hdf5, whose views have their own camera matrices.
 OF_SCENES: Mapping[str, Rule] = {key: rule for key, rule in ORIGIN.items() if key != "K"}
+
+#: Each opens a file of a dataset, given its path, while a block runs: grasping_oto.hdf5 or
+#: grasping_otm.hdf5, trials.hdf5, scenes.hdf5. One that is missing, damaged, or differs from the
+#: schema is a DataError.
+open_samples, open_trials, open_scenes = (
+    partial(_opened_whole, what=what, rules=rules, tables=tables)
+    for what, rules, tables in (
+        ("a data file of drakegrasp", OF_CAMERA, DATA_TABLES),
+        ("the trials of a dataset", ORIGIN, TRIAL_TABLES),
+        ("the scenes of a dataset", OF_SCENES, SCENE_TABLES),
+    )
+)
 
 
 def attribute_mistakes(file: h5py.File, rules: Mapping[str, Rule]) -> dict[str, Difference]:

@@ -11,13 +11,13 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, with_config
 
-from drakegrasp.dataset.json_files import Name, read_mapping, validated
+from drakegrasp.dataset.json_files import Name, read_mapping, stated, validated
 from drakegrasp.errors import DataError, printable
 from drakegrasp.foreign_files import read_text
 from drakegrasp.runtime.files import write_atomic
@@ -120,8 +120,8 @@ def write_decisions(path: Path, decisions: Decisions) -> None:
     """Write a `reject.json`, atomically; equal decisions give equal bytes."""
     content = {
         "version": VERSION,
-        "rejected": [key_to_json(key) for key in sorted(decisions.rejected)],
-        "kept": [key_to_json(key) for key in sorted(decisions.kept)],
+        "rejected": [stated(key) for key in sorted(decisions.rejected)],
+        "kept": [stated(key) for key in sorted(decisions.kept)],
     }
     write_atomic(path, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
 
@@ -211,9 +211,3 @@ def unused_rejections(
             f"--reject {shlex.quote(str(path))} uses them"
         ]
     return []
-
-
-def key_to_json(key: AttemptKey) -> dict[str, Any]:
-    """Return the identity of an attempt as JSON types; that of the first round has no child."""
-    said = asdict(key)
-    return said if key.child else {name: said[name] for name in said if name != "child"}

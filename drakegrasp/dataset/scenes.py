@@ -11,7 +11,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import h5py
 import numpy as np
@@ -45,13 +45,6 @@ MANY = 8
 LABELS = ("tested", "held", "sample")
 #: Streams of what is kept of a view, of what is drawn for an item, and of orders.
 _VIEW, _ITEM, _ORDER, _ROUND = 0, 1, 2, 3
-
-
-class _Lens(NamedTuple):
-    """What `spoil_depth` asks of a camera: near and far plane [m]."""
-
-    near: float
-    far: float
 
 
 class SceneDataset:
@@ -115,6 +108,8 @@ class SceneDataset:
         joints, fingers: Names of the hand's joints and fingers, in the order of the arrays.
         views: Rows of /views that items are of: those of scenes with a grasp to draw.
         image_size: Height and width of the images [px].
+        near, far: Planes of the cameras [m].
+        tables: Columns of /scenes, /views and /grasps by their names, all splits; no images.
         epoch: Changes what is drawn.
 
     Raises:
@@ -163,7 +158,7 @@ class SceneDataset:
             self.names, self.classes = (
                 read_texts(file["objects"][key]) for key in ("name", "class_name")
             )
-            self._tables = {
+            self.tables: Mapping[str, Mapping[str, AnyArray]] = {
                 group: {f.name: _column(file[group], f) for f in fields if not f.sample}
                 for group, fields in SCENE_TABLES.items()
                 if group not in ("objects", "visible")
@@ -172,7 +167,7 @@ class SceneDataset:
             self.image_size = file["views/mask"].shape[1:]
             self.joints = tuple(parse_json(file.attrs["joints"]))
             self.fingers = tuple(parse_json(file.attrs["fingers"]))
-            self._lens = _Lens(near=float(file.attrs["near"]), far=float(file.attrs["far"]))
+            self.near, self.far = float(file.attrs["near"]), float(file.attrs["far"])
         if objects is not None and (unknown := sorted(set(objects) - set(self.names))):
             raise DataError(f"objects must be of {self.path}, got {unknown[0]!r}")
         self._number()
@@ -201,7 +196,7 @@ class SceneDataset:
         else:
             item = self._cloud(view, X_AT, stream)
         item |= self._grasps_of(view, self._drawn(scene, stream), X_AT)
-        scenes = self._tables["scenes"]
+        scenes = self.tables["scenes"]
         item |= {
             key: np.asarray(scenes[key][scene, 0], dtype=np.float32)
             for key in ("mass", "friction_hand", "friction_table")
@@ -223,11 +218,6 @@ class SceneDataset:
     def __getstate__(self) -> dict[str, Any]:
         # Another process keeps points of its own.
         return {**self.__dict__, "_pools": {}, "_kept": 0}
-
-    @property
-    def tables(self) -> Mapping[str, Mapping[str, AnyArray]]:
-        """Columns of /scenes, /views and /grasps by their names, all splits; no images."""
-        return self._tables
 
     def rounds(self, seed: int = 0) -> Rounds:
         """Return a sampler for torch's DataLoader: each round has all items in another order."""
@@ -253,16 +243,6 @@ class SceneDataset:
         first, last = self._first_visible[view : view + 2]
         return self._visible[first:last]
 
-    @property
-    def near(self) -> float:
-        """Near plane of the cameras [m]."""
-        return self._lens.near
-
-    @property
-    def far(self) -> float:
-        """Far plane of the cameras [m]."""
-        return self._lens.far
-
     def surface(self, object: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
         """Return points p_OS (4096, 3) [m] on an object, by its row, and their unit normals."""
         with self._opened() as file:
@@ -273,7 +253,7 @@ class SceneDataset:
 
     def _number(self) -> None:
         """Number the rows of /grasps by scene and of /visible by view."""
-        views, scenes = self._tables["views"], self._tables["scenes"]
+        views, scenes = self.tables["views"], self.tables["scenes"]
         count = len(scenes["split"])
         for name, shape in (("object", scenes["object"].shape), ("mask", self.image_size)):
             if count and 0 in shape:
@@ -282,12 +262,12 @@ class SceneDataset:
             ("/scenes/split", scenes["split"], len(SPLITS)),
             ("/scenes/object", scenes["object"][:, 0], len(self.names)),
             ("/views/scene", views["scene"], count),
-            ("/grasps/scene", self._tables["grasps"]["scene"], count),
+            ("/grasps/scene", self.tables["grasps"]["scene"], count),
         ):
             refuse_other_codes(self.path, name, values, codes)
 
         # Grasps of a scene and rows of a view stand together.
-        grasps = np.bincount(self._tables["grasps"]["scene"], minlength=count)
+        grasps = np.bincount(self.tables["grasps"]["scene"], minlength=count)
         self._bounds = np.concatenate([[0], np.cumsum(grasps)])
         self._scene_of = views["scene"]
         of_views = grasps[self._scene_of]
@@ -301,7 +281,7 @@ class SceneDataset:
 
     def _choose(self, negatives: Negatives, positives: Positives) -> None:
         """Find the good and bad grasps of each scene, and the weights of the good ones."""
-        grasps = self._tables["grasps"]
+        grasps = self.tables["grasps"]
         bad = grasps["tested"] & ~grasps["held"]
         if negatives == "closed":
             bad |= grasps["outcome"] == Outcome.MISSING_FINGERTIP
@@ -319,7 +299,7 @@ class SceneDataset:
         self, balance: Balance, names: Collection[str] | None
     ) -> tuple[AnyArray, AnyArray]:
         """Return the views to draw from, and of each item the object's place, or the view."""
-        scenes = self._tables["scenes"]
+        scenes = self.tables["scenes"]
         usable = np.array([len(good) + len(bad) > 0 for good, _, bad in self._kinds], dtype=bool)
         usable &= scenes["split"] == SPLITS.index(self.split)
         if names is not None:
@@ -360,7 +340,7 @@ class SceneDataset:
 
     def _grasps_of(self, view: int, rows: AnyArray, X_AT: Array) -> dict[str, AnyArray]:
         """Return the values of some grasps of a view's scene."""
-        grasps = self._tables["grasps"]
+        grasps = self.tables["grasps"]
         R_TA = X_AT[:3, :3].T
         first = self._first_visible[view] - self._bounds[self._scene_of[view]]
         found = {key: grasps[key][rows] for key in _AS_STORED}
@@ -382,7 +362,7 @@ class SceneDataset:
         """Return the points of an item: some that follow each other in what is kept of the view."""
         pool, n = self._kept_of(view), self._points or 0
         rows = (int(stream.integers(len(pool["uv"]), 1)[0]) + np.arange(n)) % len(pool["uv"])
-        f_u, f_v, c_u, c_v = self._tables["views"]["K"][view][[0, 4, 2, 5]].astype(np.float32)
+        f_u, f_v, c_u, c_v = self.tables["views"]["K"][view][[0, 4, 2, 5]].astype(np.float32)
         z, uv = pool["depth"][rows], pool["uv"][rows].astype(np.float32)
         p_CP = np.column_stack([z * (uv[:, 0] - c_u) / f_u, z * (uv[:, 1] - c_v) / f_v, z])
         X_AC = (X_AT @ self._X_TC[view]).astype(np.float32)
@@ -435,12 +415,12 @@ class SceneDataset:
 
     def images(self, view: int) -> dict[str, AnyArray]:
         """Return the images of a view and its camera matrix, by the keys of an item."""
-        views, (rgb, stored, mask) = self._tables["views"], self.stored_images(view)
+        views, (rgb, stored, mask) = self.tables["views"], self.stored_images(view)
         depth, K = stored * np.float32(DEPTH_UNIT), views["K"][view].reshape(3, 3)
         noise = float(views["depth_noise"][view])
         if self._noise and noise:
             sensor = DepthSensor(noise=noise, seed=int(views["depth_seed"][view]))
-            depth = spoil_depth(depth, K, sensor, 0, self._lens)
+            depth = spoil_depth(depth, K, sensor, 0, self)
         return {"rgb": rgb, "depth": depth, "mask": mask, "K": K.astype(np.float32)}
 
     def stored_images(self, view: int) -> tuple[AnyArray, AnyArray, AnyArray]:
