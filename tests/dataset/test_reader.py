@@ -83,6 +83,9 @@ def test_samples_come_by_index(data_file: Path) -> None:
     assert sample.props["object_name"] == "object 3 ü"
     assert data[-1].trial_id == 4
     assert [s.trial_id for s in data] == [0, 1, 2, 3, 4]
+    assert data.camera == "oto"
+    assert np.array_equal(data.K, np.eye(3))
+    assert list(GraspDataset(data_file, split="valid")) == []
 
 
 def test_several_samples_come_as_a_list(data_file: Path) -> None:
@@ -100,8 +103,9 @@ def test_several_samples_come_as_a_list(data_file: Path) -> None:
     for wrong in ("grasps", 1.0, (0, 1), [0.5]):
         with pytest.raises(TypeError):
             data[wrong]
-    with pytest.raises(IndexError, match="index must be below 5, got 7"):
-        data[[0, 7]]
+    for beyond in (5, -6, [0, 7]):
+        with pytest.raises(IndexError, match=r"index must be below 5, got (5|-6|7)"):
+            data[beyond]
 
 
 def test_sample_is_printed_on_one_screen(data_file: Path) -> None:
@@ -119,28 +123,12 @@ def test_sample_is_printed_on_one_screen(data_file: Path) -> None:
         assert text in str(sample)
 
 
-@pytest.mark.parametrize("index", [5, -6])
-def test_index_beyond_the_end_is_refused(data_file: Path, index: int) -> None:
-    with pytest.raises(IndexError, match="index must be below 5"):
-        GraspDataset(data_file)[index]
-
-
 def test_columns_come_whole(data_file: Path) -> None:
     data = GraspDataset(data_file)
     assert data.column("grasps").shape == (5, 18)
     assert data.column("object_props/class_name").tolist()[1] == "object 1 ü"
     with pytest.raises(DataError, match=r"field must be one of images, .*, got 'poses'"):
         data.column("poses")
-
-
-def test_file_says_whose_camera_it_is(data_file: Path) -> None:
-    data = GraspDataset(data_file)
-    assert data.camera == "oto"
-    assert np.array_equal(data.K, np.eye(3))
-
-
-def test_empty_split_is_empty(data_file: Path) -> None:
-    assert list(GraspDataset(data_file, split="valid")) == []
 
 
 def test_other_things_are_refused(data_file: Path, tmp_path: Path) -> None:
@@ -199,12 +187,6 @@ def handles(path: Path) -> list[int]:
 MARK = 1234
 
 
-def _shared_handles(datasets: tuple[GraspDataset, GraspDataset]) -> list[bool]:
-    for data in datasets:
-        list(data)
-    return [os.lseek(h, 0, os.SEEK_CUR) == MARK for h in handles(datasets[0].path)]
-
-
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs the handles of Linux")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_no_handle_is_shared_across_a_fork(data_file: Path) -> None:
@@ -224,7 +206,10 @@ _inherited: dict[str, tuple[GraspDataset, GraspDataset]] = {}
 
 
 def _of_inherited() -> list[bool]:
-    return _shared_handles(_inherited["datasets"])
+    for data in _inherited["datasets"]:
+        list(data)
+    path = _inherited["datasets"][0].path
+    return [os.lseek(h, 0, os.SEEK_CUR) == MARK for h in handles(path)]
 
 
 def test_a_file_with_other_samples_is_refused(tmp_path: Path) -> None:
@@ -315,12 +300,11 @@ def test_files_that_are_packed_otherwise_are_read_by_hdf5(
         assert (ImageRows(usual)[1] == values[1]).all()
 
 
-def test_missing_torch_is_one_line(data_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_torch_is_one_line_and_unknown_fields_are_refused_first(
+    data_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(MachineError, match=r"to_torch needs torch, got none: pip install"):
         GraspDataset(data_file).to_torch()
-
-
-def test_unknown_fields_are_refused_whatever_is_installed(data_file: Path) -> None:
     with pytest.raises(DataError, match=r"field must be one of images, .*, got 'image'"):
         GraspDataset(data_file).to_torch(["image"])

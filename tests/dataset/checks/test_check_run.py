@@ -27,7 +27,7 @@ from helpers.datasets import (
     set_at,
 )
 
-from drakegrasp.dataset.assembly import decisions
+from drakegrasp.dataset.assembly import pack
 from drakegrasp.dataset.checks import assembled, samples, trials
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
@@ -81,7 +81,7 @@ def test_two_processes_find_what_one_does(out: Path, monkeypatch: pytest.MonkeyP
     assert kinds.count((TRIALS, "/trials")) == 22  # 20 candidates, the number of more, an object
     assert {(OTO, "/test"), (OTM, "/test"), ("objects/1_box_a.npz", "")} <= set(kinds)
 
-    for module in (assembled, decisions):
+    for module in (assembled, pack):
         monkeypatch.setattr(module, "TASK_ROWS", 7)
     monkeypatch.setattr(samples, "TASK_ROWS", 1)
     small = check_dataset(out)

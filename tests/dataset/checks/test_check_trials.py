@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -20,6 +21,7 @@ from helpers.datasets import (
     TRIALS,
     Edit,
     change,
+    edit_file,
     end_lift,
     found,
     leave_closed,
@@ -132,81 +134,64 @@ def test_a_wrong_value_of_a_trial_is_found(out: Path, cases: dict[int, str]) -> 
     must_find_without_shards(out, *((TRIALS, "/trials", row, what) for row, *_, what in spoilt))
 
 
+def end(slip: float) -> Callable[[Path, int], None]:
+    return lambda out, row: end_lift(out, row, slip)
+
+
+def put(name: str, value: Any) -> Callable[[Path, int], None]:
+    return lambda out, row: change(out, TRIALS, f"trials/{name}", row, lambda _: value)
+
+
+def audit_others(out: Path, row: int) -> None:
+    """Else they would be wrong: none is likely to hold."""
+    edit_file(out / TRIALS, lambda f: f["trials/audited"].write_direct(np.arange(36) != row))
+
+
+ENDED, UNLIKELY = "lift.stop_when=lost_sample", "lift.least_chance=0.999"
+FLAT = ("lift.least_depth_variance=1e-9", "filters.min_depth_variance=1e-9")
+
+
 @pytest.mark.parametrize(
-    ("override", "slip", "sound"),
+    ("settings", "edits", "sound"),
     [
-        ("lift.stop_when=lost_sample", 0.011, True),
-        ("lift.stop_when=lost_sample", 0.010, False),
-        ("lift.stop_when=never", 0.011, False),
+        # A lift is ended where the configuration says so, whatever its contacts say then, and
+        # only by a hand that may lift.
+        ([ENDED], [end(0.011)], True),
+        ([ENDED], [end(0.010)], False),
+        (["lift.stop_when=never"], [end(0.011)], False),
+        ([ENDED], [end(0.02), put("closed_other_links", 1)], False),
+        # A hand is not lifted where its chance says so, and nowhere else.
+        (["lift.least_chance=1e-6"], [], True),
+        (["lift.least_chance=1e-6"], [leave_closed], False),
+        ([UNLIKELY], [audit_others, leave_closed], True),
+        ([UNLIKELY], [audit_others, put("audited", True), leave_closed], False),
+        ([UNLIKELY], [audit_others, put("audited", True)], True),
+        ([UNLIKELY], [audit_others], False),
+        # One that is likely to hold is not lifted only for its image.
+        (FLAT, [leave_closed], True),
+        (FLAT, [put("audited", True), leave_closed], False),
     ],
 )
-def test_lift_is_ended_only_where_the_configuration_says_so(
-    tmp_path: Path, override: str, slip: float, sound: bool
+def test_lift_is_ended_or_left_out_only_where_the_configuration_says_so(
+    tmp_path: Path,
+    settings: Sequence[str],
+    edits: Sequence[Callable[[Path, int], None]],
+    sound: bool,
 ) -> None:
-    """Whatever its contacts say then."""
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=[override])
-    end_lift(out, SLIPPED, slip)
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=settings)
+    for edit in edits:
+        edit(out, SLIPPED)
     what = (TRIALS, "/trials", SLIPPED, "outcome must follow from the contacts")
     must_find(out / TRIALS, *([] if sound else [what]))
 
 
-@pytest.mark.parametrize(
-    ("least", "audited", "left", "sound"),
-    [
-        (1e-6, False, False, True),
-        (1e-6, False, True, False),
-        (0.999, False, True, True),
-        (0.999, True, True, False),
-        (0.999, True, False, True),
-        (0.999, False, False, False),
-    ],
-)
-def test_hand_is_not_lifted_where_its_chance_says_so_and_nowhere_else(
-    tmp_path: Path, least: float, audited: bool, left: bool, sound: bool
+def test_contact_that_slides_or_of_a_failed_attempt_may_be_pressed_from_any_side(
+    out: Path,
 ) -> None:
-    out = make_dataset(
-        tmp_path / "out", tmp_path / "meshes", overrides=[f"lift.least_chance={least}"]
-    )
-    others = [row for row in range(36) if row != SLIPPED] if least > 0.5 else []
-    for row in others:
-        change(out, TRIALS, "trials/audited", row, lambda _: True)
-    change(out, TRIALS, "trials/audited", SLIPPED, lambda _: audited)
-    if left:
-        leave_closed(out, SLIPPED)
-    what = "outcome must follow from the contacts"
-    must_find(out / TRIALS, *([] if sound else [(TRIALS, "/trials", SLIPPED, what)]))
-
-
-@pytest.mark.parametrize("audited", [False, True])
-def test_hand_that_is_likely_to_hold_is_not_lifted_only_for_its_image(
-    tmp_path: Path, audited: bool
-) -> None:
-    settings = ("lift.least_depth_variance=1e-9", "filters.min_depth_variance=1e-9")
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=settings)
-    change(out, TRIALS, "trials/audited", SLIPPED, lambda _: audited)
-    leave_closed(out, SLIPPED)
-    what = (TRIALS, "/trials", SLIPPED, "outcome must follow from the contacts")
-    must_find(out / TRIALS, *([what] if audited else []))
-
-
-def test_hand_that_may_not_lift_ends_no_lift(tmp_path: Path) -> None:
-    out = make_dataset(
-        tmp_path / "out", tmp_path / "meshes", overrides=["lift.stop_when=lost_sample"]
-    )
-    end_lift(out, SLIPPED, 0.02)
-    change(out, TRIALS, "trials/closed_other_links", SLIPPED, lambda _: 1)
-    must_find(out / TRIALS, (TRIALS, "/trials", SLIPPED, "outcome must follow from the contacts"))
-
-
-def test_contact_that_slides_may_be_pressed_from_any_side(out: Path) -> None:
+    change(out, TRIALS, "trials/closed_f_Q_O", HAND, set_at(0, to=[6.5, 0, 0]))
     change(out, TRIALS, "trials/lifted_f_Q_O", SLIPPED, set_at(1, to=[-10, 0, 0]))
     # It uses nothing of its cone: the force has no part along the normal.
     change(out, TRIALS, "trials/slip_use", SLIPPED, set_at(1, to=np.nan))
-    must_find(out / TRIALS)
-
-
-def test_contact_on_a_rim_of_a_failed_attempt_may_be_pressed_from_any_side(out: Path) -> None:
-    change(out, TRIALS, "trials/closed_f_Q_O", HAND, set_at(0, to=[6.5, 0, 0]))
     must_find(out / TRIALS)
 
 
