@@ -19,7 +19,7 @@ import trimesh
 
 from drakegrasp.arithmetic import dot, norm
 from drakegrasp.frames import Array
-from drakegrasp.mesh.surfaces import Faces
+from drakegrasp.mesh.surfaces import Faces, from_manifold, is_solid_surface, to_manifold
 from drakegrasp.shapes.curves import EDGE, arc_length, between, ellipse
 
 #: Vertices are rounded to this many decimals [m], in files too. This also hides the rounding
@@ -268,6 +268,10 @@ def _from_boolean(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Return the result of a boolean without the slivers along its seams."""
     # A canonical order first, because the repairs below depend on the order.
     tidy = solid(mesh.vertices, mesh.faces)
+    if not is_solid_surface(np.asarray(tidy.faces)):
+        # Rounding has opened it at edges that are too short: those go first.
+        whole = to_manifold(np.asarray(mesh.vertices), np.asarray(mesh.faces)).as_original()
+        tidy = solid(*from_manifold(whole.simplify(10.0**-DECIMALS)))
     points = np.array(tidy.vertices, dtype=float)
     faces = _even_out(points, np.array(tidy.faces, dtype=np.int64))
     refused: set[tuple[int, ...]] = set()

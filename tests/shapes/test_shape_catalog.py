@@ -185,6 +185,11 @@ def test_funnel_is_open_at_both_ends() -> None:
     assert mesh.euler_number == 0
 
 
+def test_seam_that_rounding_opens_is_closed() -> None:
+    mesh = builtin_object("25_watertap_1", seed=2).build()
+    assert mesh.is_watertight and mesh.body_count == 1
+
+
 def test_export_round_trip(tmp_path: Path) -> None:
     paths = export_builtin(tmp_path / "new" / "meshes", SOME)
     assert paths == [tmp_path / "new" / "meshes" / f"{name}.obj" for name in SOME]
