@@ -79,24 +79,19 @@ def test_size_is_the_solids_not_the_files(tmp_path):
 @pytest.mark.parametrize(
     ("said", "warning"),
     [
-        ("{}", "! 1 kg make 31,250 kg/m^3"),
-        ("{mass: 0.0001}", "! 0.0001 kg make 3 kg/m^3"),
-        ("{mass: 0.02}", ""),
+        ("{}", ["1 kg make 31,250 kg/m^3: give its mass or density"]),
+        ("{mass: 0.0001}", ["0.0001 kg make 3 kg/m^3: give its mass or density"]),
+        ("{mass: 0.02}", []),
     ],
 )
-def test_mass_that_nothing_has_is_told(tmp_path, said, warning):
+def test_mass_that_nothing_has_and_thin_walls_are_told(tmp_path, said, warning):
     write(tmp_path / "a.obj", box((0.04, 0.04, 0.02)))
-    (tmp_path / "objects.yaml").write_text(f"objects: {{a: {said}}}")
-    (row,) = audit(tmp_path)
-    assert [f"! {text}"[: len(warning)] for text in row.warnings] == [warning] * bool(warning)
-
-
-def test_thin_walls_and_crossing_bodies_are_told(tmp_path):
-    write(tmp_path / "a.obj", box((0.06, 0.06, 0.0015)))
-    (tmp_path / "objects.yaml").write_text("objects: {a: {density: 900}}")
-    (row,) = audit(tmp_path)
-    assert row.warnings == ("walls of 1.5 mm, thin for a fingertip (below 2 mm)",)
-    assert row.status == "fit"
+    write(tmp_path / "b.obj", box((0.06, 0.06, 0.0015)))
+    (tmp_path / "objects.yaml").write_text(f"objects: {{a: {said}, b: {{density: 900}}}}")
+    thick, thin = audit(tmp_path)
+    assert list(thick.warnings) == warning
+    assert thin.warnings == ("walls of 1.5 mm, thin for a fingertip (below 2 mm)",)
+    assert thin.status == "fit"
 
 
 @pytest.mark.parametrize(

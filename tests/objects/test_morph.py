@@ -40,15 +40,12 @@ def test_formula_is_the_databases() -> None:
     np.testing.assert_allclose(found[3], [0.015 * 1.2, 0.0, 0.1 * (0.9 + 0.25 / 4.0)], atol=1e-15)
 
 
-def test_radius_shrinks_to_a_quarter_at_most() -> None:
+def test_radius_shrinks_to_a_quarter_at_most_and_space_keeps_its_sides() -> None:
     points = np.array([[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0], [0.03, 0.0, 0.1]])
     found = morph_points(points, 2, (0.3, -0.2, -0.2, 1.0, 0.0))
     assert found is not None
     np.testing.assert_allclose(found[:, 0], [0.009, -0.009, 0.0075])
-
-
-def test_morph_that_turns_space_inside_out_is_not_used() -> None:
-    points = np.array([[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0], [0.03, 0.0, 0.1]])
+    # One that turns space inside out is not used.
     assert morph_points(points, 2, (0.75, -0.25, -0.25, 0.75, -0.25)) is not None
     assert morph_points(points, 2, (0.3, 1.0, 1.0, 0.2, 0.25)) is None
 
@@ -136,28 +133,21 @@ def test_axis_and_unit_of_the_file_are_resolved(tmp_path: Path) -> None:
     np.testing.assert_allclose(a.bounds, b.bounds, atol=2e-7)
 
 
-def test_bad_meshes_are_told_and_leave_the_others(tmp_path: Path) -> None:
-    meshes = tmp_path / "meshes"
-    meshes.mkdir()
-    stool(meshes)
-    write(meshes / "9_sheet.obj", trimesh.Trimesh(np.eye(3) * 0.05, [[0, 1, 2]], process=False))
-    report = morph_meshes(meshes, tmp_path / "out", per_mesh=1)
-    assert report.morphs == 1
-    assert [line[:12] for line in report.refused] == ["9_sheet.obj:"]
-
-
 def test_morphs_of_two_meshes_that_would_have_one_name_are_told(tmp_path: Path) -> None:
-    """`b_c` of class `a`, and `c` of class `a_b`; the first keeps its morphs."""
+    """`b_c` of class `a`, and `c` of class `a_b`; the first keeps its morphs. A sheet has none."""
     meshes = tmp_path / "meshes"
     meshes.mkdir()
     for name in ("b_c", "c"):
         stool(meshes, name)
+    write(meshes / "9_sheet.obj", trimesh.Trimesh(np.eye(3) * 0.05, [[0, 1, 2]], process=False))
     (meshes / "objects.yaml").write_text("objects: {b_c: {class: a}, c: {class: a_b}}")
     report = morph_meshes(meshes, tmp_path / "out", per_mesh=2)
     assert report.morphs == len(list((tmp_path / "out").glob("*.obj"))) == 2
-    assert report.refused == (
+    sheet, twin = report.refused
+    assert sheet.startswith("9_sheet.obj: ")
+    assert twin == (
         "c of class a_b: its morphs must have names of their own, got a_b_c_m1, which another mesh "
-        "has; rename it",
+        "has; rename it"
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -90,17 +89,6 @@ def object_points(seen: RenderedView, X_TC: Array) -> Array:
     return transform_points(invert_pose(X_TO) @ X_TC, p_CQ)
 
 
-@pytest.mark.parametrize("distance", [0.1, 0.25, 0.6])
-def test_depth_of_a_face_is_its_distance_along_the_axis(
-    renderer: Renderer, distance: float
-) -> None:
-    """Depth is z, not range: it is the same all over a face that the camera sees squarely."""
-    seen = render(renderer, X_TO, facing_x(distance))
-    np.testing.assert_allclose(seen.image[3, 63:65, 63:65], distance, atol=1e-4)
-    rows, columns = np.nonzero(seen.mask)
-    np.testing.assert_allclose(seen.image[3][rows, columns], distance, atol=1e-4)
-
-
 def test_depth_from_above_is_that_of_the_lid_and_of_the_table(renderer: Renderer) -> None:
     X_TC = make_pose(R_FROM_ABOVE, [0.0, 0.0, 0.5])
     seen = render(renderer, X_TO, X_TC)
@@ -111,10 +99,13 @@ def test_depth_from_above_is_that_of_the_lid_and_of_the_table(renderer: Renderer
 
 
 @pytest.mark.parametrize("distance", [0.15, 0.25, 0.5])
-def test_mask_of_a_face_covers_its_projection(renderer: Renderer, distance: float) -> None:
-    """Edges of f w / d pixels, to a pixel, centred: y to the right, z up."""
-    mask = render(renderer, X_TO, facing_x(distance)).mask
+def test_face_seen_squarely_has_its_depth_and_outline(renderer: Renderer, distance: float) -> None:
+    """Depth is z, not range. Edges of f w / d pixels, to a pixel, centred: y right, z up."""
+    seen = render(renderer, X_TO, facing_x(distance))
+    mask = seen.mask
     rows, columns = np.nonzero(mask)
+    np.testing.assert_allclose(seen.image[3, 63:65, 63:65], distance, atol=1e-4)
+    np.testing.assert_allclose(seen.image[3][rows, columns], distance, atol=1e-4)
     for pixels, edge in ((columns, EXTENTS[1]), (rows, EXTENTS[2])):
         assert abs((pixels.max() - pixels.min() + 1) - K[0, 0] * edge / distance) <= 1.0
         assert abs((pixels.max() + pixels.min()) / 2.0 - 63.5) <= 1.0
@@ -137,13 +128,9 @@ def test_mask_has_no_bias(renderer: Renderer) -> None:
 def test_pixels_beyond_the_table_hold_far(renderer: Renderer) -> None:
     """Level with the table there is no table above the horizon: exactly `far`, in float32."""
     seen = render(renderer, X_TO, facing_x(0.25))
-    background = seen.image[3][:20]
-    np.testing.assert_array_equal(background, np.float32(CONFIG.far))
-    assert not seen.mask[:20].any()
+    assert (seen.image[3][:20] == np.float32(CONFIG.far)).all() and not seen.mask[:20].any()
     assert seen.image[3].max() == np.float32(CONFIG.far)
-
-
-def test_object_beyond_far_is_not_in_mask_or_depth(renderer: Renderer) -> None:
+    # An object beyond it is not seen.
     seen = render(renderer, X_TO, facing_x(0.8))
     assert not seen.mask.any()
     np.testing.assert_array_equal(seen.image[3, 63:65, 63:65], np.float32(CONFIG.far))
@@ -239,11 +226,9 @@ def test_image_follows_the_object(renderer: Renderer) -> None:
 
 
 @pytest.fixture
-def painted(box: ObjectModel) -> Iterator[Renderer]:
-    """The renderer of the box, whose looks are as usual again afterwards."""
-    renderer = build_renderer(box, CONFIG)
-    yield renderer
-    paint(renderer, usual_appearance(box.name))
+def painted(box: ObjectModel) -> Renderer:
+    """A renderer of the box whose looks may change."""
+    return build_renderer(box, CONFIG)
 
 
 def test_table_looks_as_its_model_says(box: ObjectModel) -> None:
@@ -268,46 +253,34 @@ def test_painting_changes_the_colours_of_object_and_table(painted: Renderer) -> 
     assert table[1] > 4.0 * table[[0, 2]].max()
 
 
-def test_light_from_another_side_lights_another_face(painted: Renderer) -> None:
+def test_light_has_a_direction_and_a_strength(painted: Renderer) -> None:
     def faces() -> tuple[float, float]:
         """Return how bright the faces towards +x and +y are."""
         return tuple(
             float(render(painted, X_TO, make_pose(R, p)).image[:3, 64, 64].mean())
-            for R, p in (
-                (R_FROM_X, [0.25, 0.0, HALF[2]]),
-                (R_FROM_Y, [0.0, 0.25, HALF[2]]),
-            )
+            for R, p in ((R_FROM_X, [0.25, 0.0, HALF[2]]), (R_FROM_Y, [0.0, 0.25, HALF[2]]))
         )  # type: ignore[return-value]
 
-    along_x, along_y = np.array([-0.8, 0.0, -0.6]), np.array([0.0, -0.8, -0.6])
-    paint(painted, replace(painted.appearance, light_direction=along_x))
-    x, y = faces()
-    assert x > 1.2 * y
-    paint(painted, replace(painted.appearance, light_direction=along_y))
-    x, y = faces()
-    assert y > 1.2 * x
+    for first, along in ((0, [-0.8, 0.0, -0.6]), (1, [0.0, -0.8, -0.6])):
+        paint(painted, replace(painted.appearance, light_direction=np.array(along)))
+        both = faces()
+        assert both[first] > 1.2 * both[1 - first]
 
-
-def test_stronger_light_makes_a_brighter_image(painted: Renderer) -> None:
+    # A weaker light makes a darker image.
     _, usual = brightness(painted)
     paint(painted, replace(painted.appearance, light_strength=0.2))
     _, dim = brightness(painted)
     assert np.all(dim < 0.8 * usual)
 
 
-def test_painting_changes_neither_depth_nor_mask(painted: Renderer) -> None:
+def test_nothing_remains_of_the_looks_before(painted: Renderer, box: ObjectModel) -> None:
     before = render(painted, X_TO, oblique())
     paint(painted, GARISH)
     after = render(painted, X_TO, oblique())
+    # Neither depth nor mask changes.
     assert np.array_equal(before.image[3], after.image[3])
     assert np.array_equal(before.mask, after.mask)
-    assert not np.array_equal(before.image[:3], after.image[:3])
-
-
-def test_nothing_remains_of_the_looks_before(painted: Renderer, box: ObjectModel) -> None:
-    usual = pixels(render(painted, X_TO, oblique()))
-    paint(painted, GARISH)
-    garish = pixels(render(painted, X_TO, oblique()))
+    usual, garish = pixels(before), pixels(after)
     paint(painted, usual_appearance(box.name))
     assert pixels(render(painted, X_TO, oblique())) == usual != garish
     paint(painted, GARISH)
