@@ -11,11 +11,11 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import yaml
 from pydantic import (
@@ -78,8 +78,48 @@ Licence = Annotated[str, Field(pattern=r"^[ -~]*[!-~][ -~]*$", max_length=200)]
 LONGEST_SHOWN = 200
 
 
+@dataclass(frozen=True)
+class Decides:
+    """A mark of a field, `Annotated[Count, NO_SHARD]`: where its value counts.
+
+    Attributes:
+        files: Whether files of datasets say it, given its section and itself.
+        shards: Whether what files say decides what a shard holds, given these.
+    """
+
+    files: Callable[[Any, Any], bool] = lambda section, value: True
+    shards: Callable[[Any, Any], bool] = lambda section, value: True
+
+
+#: Of values that change no shard: they act on assembled shards, or only say where to stop.
+NO_SHARD = Decides(shards=lambda section, value: False)
+
+
+def _told_unless(usual: Any) -> Decides:
+    """Return the mark of a field of which files say nothing where its value is the usual one."""
+    return Decides(files=lambda section, value: value != usual)
+
+
+def _counts_unless(usual: Any) -> Decides:
+    """Return the mark of a field without effect on shards where its value is the usual one."""
+    return Decides(shards=lambda section, value: value != usual)
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def tree(self, *, shards: bool = False) -> dict[str, Any]:
+        """Return the values that files say as plain JSON types, or only those that shards have."""
+        tree = self.model_dump(mode="json")
+        for name, field in type(self).model_fields.items():
+            value = getattr(self, name)
+            marks = [mark for mark in field.metadata if isinstance(mark, Decides)]
+            counts = [m.files(self, value) and (not shards or m.shards(self, value)) for m in marks]
+            if not all(counts):
+                del tree[name]
+            elif isinstance(value, _Section):
+                tree[name] = value.tree(shards=shards)
+        return tree
 
     @field_validator("*", mode="before")
     @classmethod
@@ -142,7 +182,7 @@ class PhysicsConfig(_Section):
     max_speed: Positive = 10.0  # [m/s], a faster object means that the simulation diverged
     # [N] at the pad point of the strongest fingertip; motors that press harder are all weakened by
     # one factor. Null: as strong as the hand file says.
-    finger_load: Positive | None = None
+    finger_load: Annotated[Positive | None, _told_unless(None)] = None
 
     @model_validator(mode="after")
     def _short_enough(self) -> PhysicsConfig:
@@ -220,7 +260,8 @@ class CandidateConfig(_ExtensibleSection):
     # Sampler, or a list of samplers that take turns; one that is named twice has two turns. One of
     # the user's own is `file.py:Name`.
     method: Annotated[str | tuple[str, ...], BeforeValidator(_samplers)] = "rotations"
-    max: Count = 10_000  # per object; more are thinned at random, by the seed (paper)
+    # Per object; more are thinned at random, by the seed (paper). A dataset may grow.
+    max: Annotated[Count, NO_SHARD] = 10_000
     global_x_deg: Angles = tuple(range(0, 181, 30))  # paper, Table II
     global_y_deg: Angles = tuple(range(0, 360, 30))
     global_z_deg: Angles = tuple(range(0, 360, 45))
@@ -229,7 +270,9 @@ class CandidateConfig(_ExtensibleSection):
     local_z_deg: Angles = tuple(range(0, 360, 45))
     jitter_deg: NonNegative = 0.0  # each angle gets a whole number of degrees below this
     # Digest of the postures that are tried instead of palm poses of samplers; `--postures` sets it.
-    postures: Annotated[str, Field(pattern="^[0-9a-f]{16}$")] | None = None
+    postures: Annotated[
+        Annotated[str, Field(pattern="^[0-9a-f]{16}$")] | None, _told_unless(None)
+    ] = None
     # [m] of the palm from the surface, an attempt each (paper); not given: the hand's own.
     standoffs: Standoffs
     # One is drawn per attempt (released code); not given: the hand's own.
@@ -282,7 +325,11 @@ class CloseConfig(_Section):
     check_period: Positive = 0.1  # [s] of simulation between two checks
     # [m], a hand that comes farther below the table's top while it closes or lifts is a
     # `table_contact`. Null: not measured, as in datasets of versions without this key.
-    scrape_depth: NonNegative | None = 5e-4
+    scrape_depth: Annotated[NonNegative | None, _told_unless(None)] = 5e-4
+
+
+#: Of what ends lifts early; without, hashes are as before there was a choice.
+_STOPS = Decides(shards=lambda lift, _: lift.stop_when != "never")
 
 
 class LiftConfig(_Section):
@@ -301,13 +348,18 @@ class LiftConfig(_Section):
     check_period: Positive = 0.1  # [s] simulated between two checks, and up to a coarse step more
     # "lost_sample" ends a lift, as `moved`, when the object moved more in the hand than the next
     # two say at a check: no filter may then let such a grasp become a sample.
-    stop_when: Literal["never", "lost_sample"] = "never"
-    stop_slip: Positive = 0.010  # [m], of the object in the hand since it is free
-    stop_turn_deg: Positive = 10.0  # of the object in the hand since it is free
+    stop_when: Annotated[Literal["never", "lost_sample"], _STOPS] = "never"
+    # [m], of the object in the hand since it is free
+    stop_slip: Annotated[Positive, _STOPS] = 0.010
+    stop_turn_deg: Annotated[Positive, _STOPS] = 10.0  # of the object in the hand since it is free
     # Closed hands with a smaller chance of a sample are not lifted, but for a tenth; 0: all are.
-    least_chance: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    least_chance: Annotated[float, Field(ge=0.0, lt=1.0), _counts_unless(0.0)] = 0.0
     # Nor are those whose otm depth image is flatter than this [m^2], but for the same tenth.
-    least_depth_variance: NonNegative = 0.0
+    least_depth_variance: Annotated[NonNegative, _counts_unless(0.0)] = 0.0
+
+
+#: Of keys that older versions lack: files that say nothing of what attempts bear are as theirs.
+_CERTIFIED = Decides(files=lambda certify, _: certify.certified)
 
 
 class CertifyConfig(_Section):
@@ -316,11 +368,12 @@ class CertifyConfig(_Section):
     repeats: NonNegativeCount = 0  # disturbed, of each attempt that is drawn; 0: none is drawn
     # Probability that a sample (by the default filters) is drawn; null stores nothing, as it is of
     # datasets whose successes an older version certified.
-    share: Share | None = 1.0
-    share_others: Share = 0.0  # probability that another lifted attempt is drawn
+    share: Annotated[Share | None, _CERTIFIED] = 1.0
+    # Probability that another lifted attempt is drawn.
+    share_others: Annotated[Share, _CERTIFIED] = 0.0
     # The same of a sample of an object that a split by object is likely to test or to validate
     # with; the larger one counts.
-    share_tested: Share = 0.0
+    share_tested: Annotated[Share, _CERTIFIED] = 0.0
     palm_noise: NonNegative = 0.002  # [m], standard deviation along each axis of the palm
     palm_noise_deg: NonNegative = 1.0  # standard deviation about each axis of the palm
     friction_noise: NonNegative = 0.1  # standard deviation of the coefficient's logarithm
@@ -328,8 +381,10 @@ class CertifyConfig(_Section):
     # Halvings to the least friction of successes; 0: it is not looked for.
     friction_steps: Annotated[int, Field(ge=0, le=16)] = 4
 
-    #: Keys that older versions lack.
-    NEW: ClassVar[tuple[str, ...]] = ("share", "share_others", "share_tested")
+    @property
+    def certified(self) -> bool:
+        """Whether files say how much attempts bear, see `schema.HOLD_FIELDS`."""
+        return self.repeats > 0 and self.share is not None
 
 
 class CameraConfig(_Section):
@@ -433,15 +488,14 @@ _KINDS: dict[str, Any] = {
 
 def _filter_config() -> type[_Filters]:
     """Return section `filters`: its settings are those of `drakegrasp.filters.LIMITS`."""
-    settings: dict[str, Any] = {
-        name: (
-            _KINDS[limit.kind] | None if limit.off == "null" else _KINDS[limit.kind],
-            limit.default,
-        )
-        for name, limit in LIMITS.items()
-    }
+    settings: dict[str, Any] = {}
+    for name, limit in LIMITS.items():
+        kind = _KINDS[limit.kind] | None if limit.off == "null" else _KINDS[limit.kind]
+        told = _told_unless(limit.default) if limit.later else Decides()
+        settings[name] = (Annotated[kind, told], limit.default)
     # Filters of the user's own, `file.py:Name` each.
-    settings["own"] = (Annotated[tuple[str, ...], BeforeValidator(_own_filters)], ())
+    own = Annotated[tuple[str, ...], BeforeValidator(_own_filters), _told_unless(())]
+    settings["own"] = (own, ())
     doc = "Which successes become samples, decided when the files are assembled; null: no limit."
     return create_model("FilterConfig", __base__=_Filters, __doc__=doc, **settings)
 
@@ -491,13 +545,6 @@ class VerifyConfig(_Section):
 UNIT_CANDIDATES, LARGEST_UNIT = 50, 400
 
 
-#: Keys that change no shard: they act on assembled shards, or only say where to stop.
-POSTPROCESSING_KEYS = (
-    *("filters", "split", "max_grasps", "samples", "samples_per_object"),
-    *("samples_patience", "attempt_seconds", "verify", "scenes"),
-)
-
-
 #: A hand of the package.
 DEFAULT_HAND = "barrett"
 
@@ -528,30 +575,33 @@ class Config(_Section):
     seed: Seed = 0
     # Candidates in a work unit; None: 50, growing up to 400.
     unit_candidates: Count | None = None
-    attempt_seconds: Positive = 60.0  # [s] of computing (CPU time) before an attempt is a `timeout`
+    # [s] of computing (CPU time) before an attempt is a `timeout`
+    attempt_seconds: Annotated[Positive, NO_SHARD] = 60.0
     objects: ObjectConfig = ObjectConfig()
     builtin: BuiltinConfig = BuiltinConfig()
     physics: PhysicsConfig = PhysicsConfig()
     settle: SettleConfig = SettleConfig()
     candidates: CandidateConfig
-    refine: RefineConfig = RefineConfig()
+    refine: Annotated[RefineConfig, Decides(shards=lambda _, it: it.children)] = RefineConfig()
     screen: ScreenConfig = ScreenConfig()
     close: CloseConfig = CloseConfig()
     lift: LiftConfig = LiftConfig()
-    certify: CertifyConfig = CertifyConfig()
+    # Without repeats its noise is not used.
+    certify: Annotated[CertifyConfig, Decides(shards=lambda _, it: it.repeats)] = CertifyConfig()
     camera: CameraConfig = CameraConfig()
-    randomize: RandomizeConfig = RandomizeConfig()
-    scenes: ScenesConfig = ScenesConfig()
-    max_grasps: Count | None = None  # successes per object after which no more are tried
+    randomize: Annotated[RandomizeConfig, _counts_unless(RandomizeConfig())] = RandomizeConfig()
+    scenes: Annotated[ScenesConfig, NO_SHARD, _told_unless(ScenesConfig())] = ScenesConfig()
+    # Successes per object after which no more are tried.
+    max_grasps: Annotated[Count | None, NO_SHARD] = None
     # Samples, before the filter of outliers, after which no more is tried: of all objects, which
     # share them in turns, and of each; an object may have fewer.
-    samples: Count | None = None
-    samples_per_object: Count | None = None
+    samples: Annotated[Count | None, NO_SHARD] = None
+    samples_per_object: Annotated[Count | None, NO_SHARD] = None
     # Palm poses in a row without a sample after which an object is given up for such a number.
-    samples_patience: Count = 400
-    filters: FilterConfig = FilterConfig()
-    split: SplitConfig = SplitConfig()
-    verify: VerifyConfig = VerifyConfig()
+    samples_patience: Annotated[Count, NO_SHARD] = 400
+    filters: Annotated[FilterConfig, NO_SHARD] = FilterConfig()
+    split: Annotated[SplitConfig, NO_SHARD] = SplitConfig()
+    verify: Annotated[VerifyConfig, NO_SHARD] = VerifyConfig()
     _carried: CarriedHand | None = PrivateAttr(None)
 
     @property
@@ -595,32 +645,15 @@ class Config(_Section):
     def to_dict(self) -> dict[str, Any]:
         """Return the resolved values as plain JSON types.
 
-        `filters.own` and `candidates.postures` leave no trace where there are none, nor do `scenes`
-        and later limits of the filters that are the defaults. `parse_stored` reads it.
+        What is marked with `Decides` leaves no trace where files do not say it. `parse_stored`
+        reads it.
         """
-        tree = self.model_dump(mode="json")
-        if not self.filters.own:
-            del tree["filters"]["own"]
-        for name, limit in LIMITS.items():
-            if limit.later and tree["filters"][name] == limit.default:
-                del tree["filters"][name]
-        if self.candidates.postures is None:
-            del tree["candidates"]["postures"]
-        if self.scenes == ScenesConfig():
-            del tree["scenes"]
-        if self.physics.finger_load is None:
-            del tree["physics"]["finger_load"]
-        if self.close.scrape_depth is None:
-            del tree["close"]["scrape_depth"]
-        if not self.certified:
-            for key in CertifyConfig.NEW:
-                del tree["certify"][key]
-        return tree
+        return self.tree()
 
     @property
     def certified(self) -> bool:
         """Whether files say how much attempts bear, see `schema.HOLD_FIELDS`."""
-        return self.certify.repeats > 0 and self.certify.share is not None
+        return self.certify.certified
 
     @property
     def code(self) -> Mapping[str, str]:
@@ -657,29 +690,16 @@ class Config(_Section):
     def simulation_hash(self) -> str:
         """Return the hash (16 hex digits) of every value that decides what a shard holds.
 
-        Left out are filters and split, which act later on assembled shards, `max_grasps`,
-        `samples`, its kin and `candidates.max`, which only say where to stop, the
-        wall-clock limit, and `verify`. A hand's files count by their digest, which is in the
-        manifest's versions, and not by their folder.
+        Left out is what its mark says, see `Decides`. A hand's files count by their digest, which
+        is in the manifest's versions, and not by their folder.
         """
-        values = {**self.to_dict(), "hand": PurePath(self.hand).stem}
-        for key in POSTPROCESSING_KEYS:
-            values.pop(key, None)
-        del values["candidates"]["max"]  # a dataset may grow
-        if not self.certify.repeats:
-            del values["certify"]  # without repeats the noise is not used
-        if self.randomize == RandomizeConfig():
-            del values["randomize"]  # nothing is drawn
-        if not self.refine.children:
-            del values["refine"]
-        if self.lift.stop_when == "never":
-            for key in ("stop_when", "stop_slip", "stop_turn_deg"):
-                del values["lift"][key]  # as before there was a choice
-        for key in ("least_chance", "least_depth_variance"):
-            if not values["lift"][key]:
-                del values["lift"][key]  # all are lifted
+        values = {**self.tree(shards=True), "hand": PurePath(self.hand).stem}
         canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+
+#: Keys of the configuration that change no shard.
+POSTPROCESSING_KEYS = tuple(k for k, v in Config.model_fields.items() if NO_SHARD in v.metadata)
 
 
 def preset_names() -> list[str]:

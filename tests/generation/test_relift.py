@@ -1,0 +1,59 @@
+"""Stored attempts that are tried again: which are drawn, and what is told of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import relift
+from helpers.datasets import make_dataset
+
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.outcomes import Outcome
+from drakegrasp.seeding import Stream
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("out") / "data", tmp_path_factory.mktemp("meshes"))
+
+
+@pytest.mark.parametrize("kind", ["attempts", "lifts", "samples", "both"])
+def test_drawn_rows_are_of_their_kind(dataset, kind):
+    trials = Trials(dataset)
+    samples = set(trials.where(sample=True).trial_ids.tolist())
+    lifts = set(trials.trial_ids[np.isfinite(trials["time_lift"])].tolist())
+    closed = set(trials.trial_ids[np.isfinite(trials["time_close"])].tolist())
+    every = {"attempts": closed, "samples": samples}.get(kind, lifts)
+    assert set(relift.chosen_rows(dataset, kind, 1000, 0).tolist()) == every
+    few = relift.chosen_rows(dataset, kind, 2, 0).tolist()
+    assert few == relift.chosen_rows(dataset, kind, 2, 0).tolist()
+    if kind == "both":
+        assert len(set(few) & samples) == len(set(few) - samples) == 2
+    else:
+        assert len(few) == 2
+
+
+def test_disturbances_come_in_both_directions():
+    found = list(relift.disturbances(Stream(0)))
+    names = [name for name, *_ in found]
+    assert names.count("palm") == relift.PALMS and names.count("together") == relift.TOGETHER
+    for of in (1, 2):  # friction, mass
+        factors = sorted(row[of] for row in found if row[0].startswith(("friction", "mass")))
+        assert factors[0] - 1.0 == pytest.approx(1.0 - factors[-1])
+    assert {row[3] for row in found if row[0] in ("palm", "together")} == {True}
+
+
+def test_summary_counts_what_has_a_verdict():
+    def row(change, outcome, sample, **more):
+        told = {"change": change, "outcome": outcome.label, "sample": sample, "seconds": 1.0}
+        return {**told, **more}
+
+    rows = [
+        [row("as stored", Outcome.SUCCESS, True), row("half step", Outcome.SLIPPED, False)],
+        [row("as stored", Outcome.SUCCESS, False), row("half step", Outcome.TIMEOUT, False)],
+    ]
+    found = relift.summary(rows)
+    assert found["as stored"]["held"][0] == 2 and found["as stored"]["sample"][0] == 1
+    half = found["half step"]
+    assert (half["tried"], half["with a verdict"], half["held"][0]) == (2, 1, 0)
+    assert half["changed"] == {"success -> slipped": 1, "success -> timeout": 1}
