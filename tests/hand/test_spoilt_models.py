@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -193,19 +192,6 @@ def test_what_is_no_number_is_refused(
     path = write_model(tmp_path, changed(text, old, new.replace("{}", word), 1), name)
     with pytest.raises(HandError, match=r"must be a number, got|does not have enough data"):
         read_model(read_source(path, {}))
-
-
-def test_a_sound_model_is_not_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the faults were planted in."""
-    drawn: list[Callable[..., None]] = []
-    monkeypatch.setattr("drakegrasp.commissioning.draft.run.GRASPS", ())
-    monkeypatch.setattr("drakegrasp.cli.models._draw", lambda *files: drawn.append(files))
-    for name, text in (("hand.urdf", JAWS), ("hand.xml", JAWS_MJCF)):
-        path, out = write_model(tmp_path / name, text, name), tmp_path / f"out of {name}"
-        result = CliRunner().invoke(main, ["hand", "new", str(path), "--out", str(out)])
-        assert result.exit_code == 0, result.output
-        assert len(list(out.glob("*.urdf"))) == 1
-    assert len(drawn) == 2
 
 
 def test_fault_of_an_sdformat_file_is_said_once(

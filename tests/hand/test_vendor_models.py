@@ -75,21 +75,6 @@ def test_limits_that_bar_the_way_of_a_mimic_are_its_leaders(tmp_path: Path) -> N
     assert read(write_model(tmp_path / "sound", JAWS)).notes == ()
 
 
-def test_mjcf_says_the_same_as_urdf(tmp_path: Path) -> None:
-    """Equalities of joints are its mimics, ranges of force its efforts."""
-    urdf = read(write_model(tmp_path, JAWS))
-    mjcf = read(write_model(tmp_path, JAWS_MJCF, "hand.xml"))
-    assert mjcf.mimics == urdf.mimics
-    for name, joint in urdf.joints.items():
-        np.testing.assert_allclose(mjcf.joints[name].axis, joint.axis)
-        np.testing.assert_allclose(mjcf.joints[name].limits, joint.limits)
-    assert mjcf.joints["left_slide"].effort == 60.0
-    for name, link in urdf.links.items():
-        np.testing.assert_allclose(
-            np.sort(mjcf.links[name].corners(), axis=0), np.sort(link.corners(), axis=0), atol=1e-12
-        )
-
-
 MOTOR = '<motor joint="left_slide" forcerange="-60 60"/>'
 JOINT = '<joint name="left_slide"'
 LINE = 'polycoef="0 1 0 0 0"'
@@ -285,11 +270,3 @@ def test_a_mesh_outside_of_the_folder_is_refused_unless_given(tmp_path: Path, wa
     with pytest.raises(HandError, match=r"must lie in the model's folder, got .* --root FOLDER"):
         read(path)
     assert read(path, given=[mesh.parent]).links["left_jaw"].collisions
-
-
-def test_a_joint_turned_round_moves_its_link_alike(tmp_path: Path) -> None:
-    joint = read(write_model(tmp_path, JAWS)).joints["left_slide"]
-    closing = joint.rebased(-1.0, 0.05)
-    np.testing.assert_allclose(closing.limits, [0.0, 0.05])
-    for position in (0.0, 0.02, 0.05):
-        np.testing.assert_allclose(closing.pose(position), joint.pose(0.05 - position), atol=1e-12)
