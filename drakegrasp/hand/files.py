@@ -106,7 +106,7 @@ def _package_name(manifest: Path) -> str:
 
 #: Suffixes of models, which a model may include.
 MODEL_SUFFIXES = (".sdf", ".urdf", ".xml")
-_PACKAGE = "package://"
+PACKAGE = "package://"
 #: What a model names: meshes and models in SDFormat, meshes in URDF; then textures.
 _NAMED = re.compile(
     rb"<uri>\s*(?P<uri>.*?)\s*</uri>|<mesh\b[^>]*\bfilename\s*=\s*[\"'](?P<mesh>.*?)[\"']"
@@ -116,11 +116,6 @@ _NAMED = re.compile(
 #: What Wavefront files name: materials, and their textures at the end of a line.
 _MATERIALS = re.compile(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t\r]*$", re.MULTILINE)
 _TEXTURES = re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|norm)[ \t](?:.*[ \t])?(\S+)[ \t\r]*$", re.M)
-
-
-def names_packages(model: bytes) -> bool:
-    """Return whether a model names files by their packages."""
-    return _PACKAGE.encode() in model
 
 
 def model_references(model: bytes) -> Iterator[tuple[str, bool]]:
@@ -176,7 +171,7 @@ def file_of(uri: str, folder: Path, packages: Mapping[str, Path]) -> Path:
         folder: Of the model.
         packages: Folders of `package://` URIs by name.
     """
-    if not uri.startswith(_PACKAGE):
+    if not uri.startswith(PACKAGE):
         return folder / uri.removeprefix("file://")
-    package, _, rest = uri.removeprefix(_PACKAGE).partition("/")
+    package, _, rest = uri.removeprefix(PACKAGE).partition("/")
     return packages.get(package, folder / package) / rest

@@ -27,13 +27,13 @@ from drakegrasp.errors import DataError, HandError
 from drakegrasp.hand.files import (
     MODEL_SUFFIXES,
     MODELS,
+    PACKAGE,
     chance_file,
     file_of,
     find_packages,
     hand_file,
     mesh_references,
     model_references,
-    names_packages,
     refuse_outside,
     rewritten,
 )
@@ -294,7 +294,7 @@ def _packages(path: Path) -> dict[str, Path]:
     named, model = described.get("packages"), path.parent / str(described.get("model", ""))
     own = named.items() if isinstance(named, dict) else ()
     folders = {str(k): path.parent / str(v) for k, v in own}
-    if model.is_file() and names_packages(model.read_bytes()):
+    if model.is_file() and PACKAGE.encode() in model.read_bytes():
         return find_packages(path.parent, str(described.get("model")), {}) | folders
     return folders
 

@@ -206,27 +206,6 @@ def _reach(hand: Hand) -> tuple[float, float, Array]:
     return farthest, *at
 
 
-def joint_frames(hand: Hand, finger: int, *, spread: float, closing: npt.ArrayLike) -> Array:
-    """Return the poses X_GJ (m, 4, 4) of the joints from the palm to a fingertip, before they move.
-
-    Args:
-        hand: The hand.
-        finger: Index of the finger.
-        spread: Angle of the spread joints [rad].
-        closing: (k,), position of each finger's closing joint [rad or m].
-
-    Raises:
-        ValueError: If `closing` is not one position per finger.
-    """
-    chain = hand.chains[finger]
-    q = multiply(chain.gain, _coordinates(hand, spread, closing)) + chain.offset
-    X, frames = np.eye(4), []
-    for j, X_PJ in enumerate(chain.X_PJ):
-        frames.append(multiply(X, X_PJ))
-        X = multiply(frames[-1], _motion(chain, j, q[j]))
-    return np.array(frames)
-
-
 def _coordinates(hand: Hand, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:
     """Return coordinates (..., 1 + k) from a spread (...,) and closing positions (..., k)."""
     positions = np.asarray(closing, dtype=float)
@@ -242,11 +221,22 @@ def _coordinates(hand: Hand, spread: npt.ArrayLike, closing: npt.ArrayLike) -> A
 
 def _chain_pose(chain: Chain, c: Array) -> Array:
     """Return the poses (..., 4, 4) of a chain's link in {G} at coordinates (..., 1 + k)."""
+    return _chain_frames(chain, c)[1]
+
+
+def _chain_frames(chain: Chain, c: Array) -> tuple[list[Array], Array]:
+    """Return the poses (..., 4, 4) of a chain's joints, before they move, and of its link in {G}.
+
+    Args:
+        chain: Of m joints.
+        c: (..., 1 + k), coordinates.
+    """
     q = multiply(c[..., None, :], chain.gain.T)[..., 0, :] + chain.offset
-    X = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
+    X, frames = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4)), []
     for j, X_PJ in enumerate(chain.X_PJ):
-        X = multiply(multiply(X, X_PJ), _motion(chain, j, q[..., j]))
-    return multiply(X, chain.X_JFi)
+        frames.append(multiply(X, X_PJ))
+        X = multiply(frames[-1], _motion(chain, j, q[..., j]))
+    return frames, multiply(X, chain.X_JFi)
 
 
 def _motion(chain: Chain, j: int, position: Array) -> Array:
@@ -335,12 +325,11 @@ def closing_levers(hand: Hand, closing: npt.ArrayLike) -> Array:
     Raises:
         ValueError: If `closing` is not one position per finger.
     """
-    X_GF = fingertip_poses(hand, spread=0.0, closing=closing)
-    levers = []
+    c, levers = _coordinates(hand, 0.0, closing), []
     for i, (finger, chain) in enumerate(zip(hand.fingers, hand.chains, strict=True)):
         # Each joint turns the pad point about its axis or slides it along, by its gain.
-        p_GP = transform_points(X_GF[i], finger.p_FiP[None])[0]
-        X_GJ = joint_frames(hand, i, spread=0.0, closing=closing)
+        frames, X_GF = _chain_frames(chain, c)
+        X_GJ, p_GP = np.array(frames), transform_points(X_GF, finger.p_FiP[None])[0]
         axes = multiply(X_GJ[:, :3, :3], chain.axis[:, :, None])[..., 0]
         turned = np.cross(axes, p_GP - X_GJ[:, :3, 3])
         moved = np.where(chain.slides[:, None], axes, turned)

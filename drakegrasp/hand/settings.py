@@ -62,7 +62,10 @@ def load_config(
     except ConfigError:
         # If the file alone is invalid, name it in the error.
         if source is not None:
-            _refuse_mistakes(own, str(source))
+            try:
+                _completed(own)
+            except ConfigError as error:
+                raise ConfigError(f"{source}: {error}") from None
         raise
 
 
@@ -158,15 +161,3 @@ def _completed(
         filled = {key: getattr(described, key) for key in missing}
         tree = {**tree, "candidates": {**candidates, **filled}}
     return parse_config(tree).with_code({**(known or {}), **code})
-
-
-def _refuse_mistakes(tree: dict[str, Any], name: str) -> None:
-    """Refuse what a preset or a file says by itself.
-
-    Raises:
-        ConfigError: If it cannot be used, with its name.
-    """
-    try:
-        _completed(tree)
-    except ConfigError as error:
-        raise ConfigError(f"{name}: {error}") from None

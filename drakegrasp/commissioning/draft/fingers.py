@@ -153,17 +153,16 @@ def _without_linkages(model: VendorModel, palm: str, leaves: Sequence[str]) -> l
 
     Those are moved by a motor that moves others, and have fewer joints or reach less far.
     """
-    reach, motors, joined = {}, {}, {}
+    facts = {}
     for leaf in leaves:
         corners = transform_points(model.pose(leaf, {}, palm), model.links[leaf].corners())
-        reach[leaf] = float(np.linalg.norm(corners, axis=1).max())
         joints = model.chain(leaf, palm)
-        joined[leaf] = len(joints)
-        motors[leaf] = {model.mimic(joint.name).leader for joint in joints}
+        motors = {model.mimic(joint.name).leader for joint in joints}
+        facts[leaf] = motors, len(joints), float(np.linalg.norm(corners, axis=1).max())
 
     def is_bar(leaf: str, other: str) -> bool:
-        less = joined[leaf] < joined[other] or reach[leaf] < REACH * reach[other]
-        return motors[leaf] <= motors[other] and less
+        (motors, joined, reach), (others, most, farthest) = facts[leaf], facts[other]
+        return motors <= others and (joined < most or reach < REACH * farthest)
 
     return [leaf for leaf in leaves if not any(is_bar(leaf, other) for other in leaves)]
 
