@@ -270,6 +270,7 @@ def test_what_never_rests_is_refused_with_its_speed(config: Config):
         settle(ball, strict)
 
 
+@pytest.mark.nightly
 @needs_g3db
 @pytest.mark.slow
 def test_real_meshes_do_not_sink_into_the_table(config: Config):
