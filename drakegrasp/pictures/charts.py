@@ -179,9 +179,11 @@ def card_picture(card: Mapping[str, Any], *, dpi: int = 150) -> bytes:
     if calibrated:
         _draw_calibration(axes[-1], calibrated, colours)
     for panel in axes:
-        for side in ("top", "right"):
-            panel.spines[side].set_visible(False)
+        panel.spines[["top", "right"]].set_visible(False)
         panel.tick_params(colors=INK)
+        panel.set_axisbelow(True)
+        panel.xaxis.label.set_color(INK)
+        panel.title.set(fontsize="medium", color=INK)
     _caption(figure, card)
 
     return png_bytes(figure, dpi=dpi)
@@ -210,13 +212,12 @@ def _draw_headline(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, st
     axes.set_ylim(len(card["sets"]) - 0.5, -0.5)
     axes.set_xlim(-2.0, 102.0)
     axes.grid(axis="x", color="#E3E6EA")
-    axes.set_axisbelow(True)
-    axes.set_xlabel("per cent of rows, mean over objects", color=INK)
+    axes.set_xlabel("per cent of rows, mean over objects")
     protocol = card["settings"].get("protocol")
     title = f"Sample within {card['limit_mm']:g} mm, 95 % interval\n(tick: held anywhere)"
     if protocol is not None:
         title = f"Success by {protocol['protocol']}, 95 % interval"
-    axes.set_title(title, fontsize="medium", color=INK)
+    axes.set_title(title)
 
 
 _ENDS = ("value", "low", "high")
@@ -234,9 +235,8 @@ def _draw_curves(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, str]
     axes.set_xlim(0.0, max(float(d) for d in curve))
     axes.set_ylim(-2.0, 102.0)
     axes.grid(color="#E3E6EA")
-    axes.set_axisbelow(True)
-    axes.set_xlabel("d: farthest contact from the one asked for [mm]", color=INK)
-    axes.set_title("held(d) [%]", fontsize="medium", color=INK)
+    axes.set_xlabel("d: farthest contact from the one asked for [mm]")
+    axes.set_title("held(d) [%]")
 
 
 def _draw_calibration(
@@ -251,9 +251,8 @@ def _draw_calibration(
             axes.plot([0.0, 1.0], [0.0, 100.0], color=INK, linewidth=0.8, linestyle=":")
     axes.set_ylim(-2.0, 102.0)
     axes.grid(color="#E3E6EA")
-    axes.set_axisbelow(True)
-    axes.set_xlabel("stated confidence, five groups", color=INK)
-    axes.set_title("share that counts [%]", fontsize="medium", color=INK)
+    axes.set_xlabel("stated confidence, five groups")
+    axes.set_title("share that counts [%]")
 
 
 def _caption(figure: Figure, card: Mapping[str, Any]) -> None:

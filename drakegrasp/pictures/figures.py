@@ -57,8 +57,8 @@ COLUMNS = (
     *("slip", "turn", "closed_f_Q_O", "lifted_f_Q_O", "lifted_penetration", "normal_angle"),
     *("precision", "stable"),
 )
-#: Figures by name, with their numbers.
-Drawn: TypeAlias = tuple[dict[str, Figure], Any]
+#: A figure, or the pages of one, with its numbers.
+Drawn: TypeAlias = tuple[Figure | list[Figure], Any]
 
 
 @dataclass(kw_only=True)
@@ -118,15 +118,15 @@ def write_figures(
     read_manifest(out)  # a damaged one is no reason to leave out a figure or two
     funnel = count_funnel(out)
     drawings: dict[str, Callable[[], Drawn]] = {
-        "palm_poses": lambda: _one("palm_poses", samplers_figure(out, compare)),
+        "palm_poses": lambda: samplers_figure(out, compare),
         "phases": lambda: _phases(out, held, trial_id),
         "classes": lambda: _classes(out),
-        "outcomes": lambda: _one("outcomes", _outcomes(funnel)),
-        "hold": lambda: _one("hold", _hold(held, funnel)),
-        "objects": lambda: _one("objects", _objects(funnel)),
-        "distributions": lambda: _one("distributions", _distributions(held)),
-        "approaches": lambda: _one("approaches", _approaches(out, funnel)),
-        "views": lambda: _one("views", scene_views(out / SCENES_FILE)),
+        "outcomes": lambda: draw_codes(funnel.outcomes.sum(axis=0), Outcome.SUCCESS, "attempts"),
+        "hold": lambda: _hold(held, funnel),
+        "objects": lambda: _objects(funnel),
+        "distributions": lambda: _distributions(held),
+        "approaches": lambda: _approaches(out, funnel),
+        "views": lambda: scene_views(out / SCENES_FILE),
     }
     known = {*drawings}
     if not (out / SCENES_FILE).exists():
@@ -135,11 +135,13 @@ def write_figures(
     # What was asked for by an option must be drawn; all else as far as there is something.
     asked = {"palm_poses": compare is not None, "phases": trial_id is not None}
     written, numbers = Written(folder=folder), {}
-    for i, (name, draw) in enumerate(drawings.items()):
+    for done, (name, draw) in enumerate(drawings.items(), start=1):
         try:
             with _plain_style():
-                figures, numbers[name] = draw()
-                for part, figure in figures.items():
+                found, numbers[name] = draw()
+                pages = [found] if isinstance(found, Figure) else found
+                for i, figure in enumerate(pages, start=1):
+                    part = name if found is figure else f"{name}_{i}"
                     for suffix, content in ((".png", png_bytes), (".svg", svg_bytes)):
                         write_atomic(folder / f"{part}{suffix}", content(figure, dpi=DPI))
                     written.names.append(part)
@@ -147,7 +149,7 @@ def write_figures(
             if asked.get(name):
                 raise
             written.left_out[name] = str(error)
-        progress(i + 1, len(drawings))
+        progress(done, len(drawings))
 
     # Delete figures of an earlier run that this run did not draw; a sheet of classes has pages.
     names = {*known, *(path.stem for path in folder.glob("classes_[0-9]*.*"))}
@@ -205,12 +207,6 @@ def _plain_style() -> Iterator[None]:
         yield
 
 
-def _one(name: str, drawn: tuple[Figure, Any]) -> Drawn:
-    """Return a figure that is one page under its name, with its numbers."""
-    figure, numbers = drawn
-    return {name: figure}, numbers
-
-
 def _phases(out: Path, held: HeldGrasps, trial_id: int | None) -> Drawn:
     if trial_id is None:
         # The first of the best group that is not empty.
@@ -219,19 +215,15 @@ def _phases(out: Path, held: HeldGrasps, trial_id: int | None) -> Drawn:
         if best is None:
             raise DataError("no attempt succeeded")
         trial_id = int(held.trial_ids[np.argmax(best)])
-    return {"phases": phases_figure(out, trial_id)}, {"trial_id": trial_id}
+    return phases_figure(out, trial_id), {"trial_id": trial_id}
 
 
 def _classes(out: Path) -> Drawn:
     pages, trials = class_sheets(out / DATA_FILES["oto"])
-    return {f"classes_{i + 1}": page for i, page in enumerate(pages)}, {"trial_ids": trials}
+    return pages, {"trial_ids": trials}
 
 
-def _outcomes(funnel: Funnel) -> tuple[Figure, Any]:
-    return draw_codes(funnel.outcomes.sum(axis=0), Outcome.SUCCESS, "attempts")
-
-
-def _hold(held: HeldGrasps, funnel: Funnel) -> tuple[Figure, Any]:
+def _hold(held: HeldGrasps, funnel: Funnel) -> Drawn:
     removals = funnel.removals.sum(axis=0)
     numbers = {name: int(group.sum()) for name, group in held.groups.items()}
     numbers["samples"] = int(funnel.samples.sum())
@@ -245,7 +237,7 @@ def _hold(held: HeldGrasps, funnel: Funnel) -> tuple[Figure, Any]:
     return draw_counts(numbers, "successes", colours=colours), numbers
 
 
-def _objects(funnel: Funnel) -> tuple[Figure, Any]:
+def _objects(funnel: Funnel) -> Drawn:
     groups = {
         "held": funnel.outcomes[:, Outcome.SUCCESS],
         "precision": funnel.precision,
@@ -257,7 +249,7 @@ def _objects(funnel: Funnel) -> tuple[Figure, Any]:
     return draw_objects(funnel.names, {name: v.tolist() for name, v in groups.items()}), numbers
 
 
-def _distributions(held: HeldGrasps) -> tuple[Figure, Any]:
+def _distributions(held: HeldGrasps) -> Drawn:
     if not len(held.trial_ids):
         raise DataError("no attempt succeeded")
     numbers = {
@@ -274,7 +266,7 @@ def _distributions(held: HeldGrasps) -> tuple[Figure, Any]:
     return draw_distributions(list(held.quantities.items()), held.groups), numbers
 
 
-def _approaches(out: Path, funnel: Funnel) -> tuple[Figure, Any]:
+def _approaches(out: Path, funnel: Funnel) -> Drawn:
     # The objects with the most successes.
     held, names = funnel.outcomes[:, Outcome.SUCCESS], funnel.names
     config_of = read_manifest(out).config_of

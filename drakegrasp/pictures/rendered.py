@@ -58,9 +58,8 @@ from drakegrasp.pictures.style import (
     ARROW,
     FINGER_COLOURS,
     INK,
-    Panel,
     add_axes,
-    draw_panel,
+    draw_marks,
     hide_ticks,
     new_page,
     save_figure,
@@ -390,25 +389,29 @@ def phases_figure(out: Path, trial_id: int) -> Figure:
 
     # The same side of all three.
     azimuth, elevation = _side(trial, X_WC)
-    panels = []
-    for title, poses, arrows, more, lighting in (
-        (start, trial.place, {}, [], SHADOWS),
-        (closed, trial.close, trial.normals("closed"), [], SHADOWS),
-        (lifted, trial.lift, trial.normals("lifted"), [table], NO_SHADOWS),
+    width, height = 3 * (EDGE + GAP) + GAP, TITLE + EDGE + LEGEND
+    figure = new_page(width, height)
+    for k, (title, poses, arrows, more, lighting) in enumerate(
+        (
+            (start, trial.place, {}, [], SHADOWS),
+            (closed, trial.close, trial.normals("closed"), [], SHADOWS),
+            (lifted, trial.lift, trial.normals("lifted"), [table], NO_SHADOWS),
+        )
     ):
         around = np.vstack([trial.scene.outline(poses), X_WC[None, :3, 3], *more])
         view = camera_pose(around, azimuth, elevation)
-        panels.append(
-            Panel(
-                title=title,
-                picture=trial.scene.picture(view, (PIXELS, PIXELS), lighting),
-                strokes=strokes,
-                points={"C": X_WC[:3, 3]},
-                arrows=arrows,
-            )
-        )
+        picture = trial.scene.picture(view, (PIXELS, PIXELS), lighting)
+        axes = add_axes(figure, GAP + k * (EDGE + GAP), TITLE, EDGE, EDGE)
+        show_image(axes, picture.image)
+        draw_marks(axes, picture, strokes=strokes, points={"C": X_WC[:3, 3]}, arrows=arrows)
+        stage, _, detail = title.partition("\n")
+        write_beside(axes, 0.0, 1.072, f"{k + 1}  {stage}", 12.0, weight="bold")
+        write_beside(axes, 0.0, 1.018, detail, 9.5)
+    _draw_phases_legend(figure, camera)
     name = f"{shortened(trial.model.name, 30)}, trial {trial_id}"
-    return _draw_phases(panels, name, camera.fov_y_deg, camera.distance)
+    figure.text(1.0 - GAP / width, 0.1 / height, name, fontsize=9, color=INK, ha="right",
+                va="bottom", parse_math=False)  # fmt: skip
+    return figure
 
 
 def _side(trial: TrialStages, X_WC: Array) -> tuple[float, float]:
@@ -421,27 +424,16 @@ def _side(trial: TrialStages, X_WC: Array) -> tuple[float, float]:
     return float(np.arctan2(y, x)), float(np.arcsin(z))
 
 
-def _draw_phases(panels: list[Panel], name: str, field_deg: float, distance: float) -> Figure:
-    """Return the page: the panels side by side over a legend."""
-    width = len(panels) * (EDGE + GAP) + GAP
-    height = TITLE + EDGE + LEGEND
-    figure = new_page(width, height)
-    for k, panel in enumerate(panels):
-        axes = add_axes(figure, GAP + k * (EDGE + GAP), TITLE, EDGE, EDGE)
-        show_image(axes, panel.picture.image)
-        draw_panel(axes, panel)
-        stage, _, detail = panel.title.partition("\n")
-        write_beside(axes, 0.0, 1.072, f"{k + 1}  {stage}", 12.0, weight="bold")
-        write_beside(axes, 0.0, 1.018, detail, 9.5)
-
-    # What the colours are, and of which trial.
+def _draw_phases_legend(figure: Figure, camera: CameraConfig) -> None:
+    """Draw what the colours are."""
     dots = [
         Line2D([], [], color=colour, marker="o", linestyle="none", markeredgecolor="white",
                markersize=8) for colour in FINGER_COLOURS[:3]
     ]  # fmt: skip
+    field = f"field of view, {camera.fov_y_deg:g}°"
     marks: dict[str, Any] = {
         "line of sight of the camera C": Line2D([], [], color=SIGHT, linewidth=1.6),
-        f"field of view, {field_deg:g}°; C stands {distance:g} m behind the palm": Line2D(
+        f"{field}; C stands {camera.distance:g} m behind the palm": Line2D(
             [], [], color=FIELD, linewidth=1.6
         ),
         "contacts, with their outward normals": tuple(dots),
@@ -449,10 +441,7 @@ def _draw_phases(panels: list[Panel], name: str, field_deg: float, distance: flo
     figure.legend(
         handles=list(marks.values()), labels=list(marks),
         handler_map={tuple: HandlerTuple(ndivide=None, pad=0.2)},
-        loc="lower left", bbox_to_anchor=(GAP / width, 0.02), ncols=len(marks),
+        loc="lower left", bbox_to_anchor=(GAP / figure.get_figwidth(), 0.02), ncols=len(marks),
         fontsize=9, frameon=False, borderaxespad=0.0, borderpad=0.0, labelcolor=INK,
         columnspacing=1.6,
     )  # fmt: skip
-    figure.text(1.0 - GAP / width, 0.1 / height, name, fontsize=9, color=INK, ha="right",
-                va="bottom", parse_math=False)  # fmt: skip
-    return figure

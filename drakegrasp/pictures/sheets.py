@@ -6,7 +6,6 @@ In: a data file or scenes.hdf5. Out: figures. Needs matplotlib, not Drake.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +28,12 @@ from drakegrasp.pictures.style import (
     mark_contact,
     new_page,
     read_far,
-    save_figure,
     shortened,
     write_beside,
 )
 from drakegrasp.vision.camera import project
 
-#: Samples per line of a contact sheet, and the edge of each of its images [inch].
+#: Samples per line of a sheet, and the edge of each of its images [inch].
 ACROSS, EDGE = 3, 1.12
 #: Classes on a page.
 PER_PAGE = 24
@@ -44,70 +42,6 @@ SCENES = {"train": 4, "valid": 1, "test": 2}
 VIEWS, WIDE = 4, 1.9
 #: Length of the line along +Gz from the palm's origin [m].
 PALM = 0.06
-
-
-def contact_sheet(path: Path, png: Path, *, rows: int = 8, split: str | None = None) -> int:
-    """Draw samples of a data file: colour, depth and mask of each, with its contacts.
-
-    The sheet shows as many different objects as it can. The same file gives the same sheet.
-
-    Args:
-        path: `grasping_oto.hdf5` or `grasping_otm.hdf5`.
-        png: The file to write.
-        rows: Most lines of samples.
-        split: The split to draw from; all of them if None.
-
-    Returns:
-        The number of samples drawn.
-
-    Raises:
-        DataError: If the file is not a data file or holds no sample.
-    """
-    # All samples of the file.
-    splits = SPLITS if split is None else (split,)
-    parts = [GraspDataset(path, split=each, fewer_fingers=True) for each in splits]
-    places = [(part, row) for part in parts for row in range(len(part))]
-    if not places:
-        raise DataError(f"{path}: must hold at least one sample to draw, got none")
-
-    # Choose some of them, and draw.
-    names = [str(name) for part in parts for name in part.column("object_props/object_name")]
-    chosen = spread_over_objects(names, rows * ACROSS)
-    samples = [places[i][0][places[i][1]] for i in chosen]
-    figure = draw_sheet(samples, parts[0].K, far=read_far(path))
-    save_figure(figure, png, dpi=130)
-    return len(samples)
-
-
-def spread_over_objects(names: Sequence[str], count: int) -> list[int]:
-    """Return the indices of at most `count` samples, spread over as many objects as possible.
-
-    Objects are in the order of their numbers. If there are more objects than places, evenly
-    spaced ones are taken. Of each object the first samples are taken.
-
-    Args:
-        names: Name of the object of each sample.
-        count: Most samples to choose.
-    """
-    # Turn t holds the t-th sample of every object that has so many.
-    order = sorted(range(len(names)), key=lambda i: (_natural(names[i]), i))
-    turns: list[list[int]] = []
-    for _, group in groupby(order, key=lambda i: names[i]):
-        for turn, i in enumerate(group):
-            if turn == len(turns):
-                turns.append([])
-            turns[turn].append(i)
-
-    # Fill the places turn by turn.
-    chosen: list[int] = []
-    for turn_indices in turns:
-        room = min(count - len(chosen), len(turn_indices))
-        picks = np.linspace(0, len(turn_indices) - 1, room).round().astype(int)
-        chosen += [turn_indices[k] for k in picks]
-
-    # Samples of an object stand side by side.
-    place = {i: k for k, i in enumerate(order)}
-    return sorted(chosen, key=place.__getitem__)
 
 
 def draw_sheet(
@@ -155,12 +89,6 @@ def draw_sheet(
         figure, len(samples[0].grasp) // 6, (margin / width, 1.0 - 0.10 / height), 7.0
     )
     return figure
-
-
-def _natural(name: str) -> tuple[int, str]:
-    """Return the sorting key of a name: its leading number, then the rest."""
-    number, _, rest = name.partition("_")
-    return (int(number), rest) if number.isdecimal() else (10**9, name)
 
 
 def class_sheets(path: Path) -> tuple[list[Figure], dict[str, int]]:

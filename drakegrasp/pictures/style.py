@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import cycle, islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -25,7 +24,7 @@ from matplotlib.patheffects import withStroke
 
 from drakegrasp.dataset.opening import open_samples
 from drakegrasp.dataset.reader import Sample
-from drakegrasp.frames import Array, invert_pose, transform_points
+from drakegrasp.frames import Array
 from drakegrasp.grasp import unpack_grasp
 from drakegrasp.vision.camera import Picture, project
 
@@ -41,8 +40,6 @@ ARROW = 0.03
 HIDDEN = 0.006
 #: Colour of text and lines.
 INK = "#333333"
-#: Colours of the x, y and z axes of a frame.
-AXIS_COLOURS = ("#D62728", "#2CA02C", "#1F4FD8")
 #: Distance of a label from its point [points].
 LABEL_REACH = 13.0
 #: Colours of depths; on thumbnails of pixels without depth, of the mask's background and object.
@@ -286,83 +283,49 @@ def colour_png(colours: npt.NDArray[np.uint8]) -> bytes:
     return buffer.getvalue()
 
 
-class Triad(NamedTuple):
-    """A frame {A} to draw over a picture.
+def draw_marks(
+    axes: Axes,
+    picture: Picture,
+    *,
+    strokes: Mapping[str, Sequence[Array]] | None = None,
+    points: Mapping[str, Array],
+    arrows: Mapping[str, tuple[Array, Array]],
+    labels: Mapping[str, Array] | None = None,
+    obstacles: Sequence[Array] = (),
+) -> None:
+    """Draw lines, points and arrows over a picture, and their names where there is room.
 
-    Attributes:
-        label: Its letter.
-        X_WA: (4, 4), its pose.
-        length: Of its axes [m].
-    """
-
-    label: str
-    X_WA: Array
-    length: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Panel:
-    """A picture, and what to draw over it.
-
-    Attributes:
-        title: Text above the picture.
-        picture: The picture.
-        triads: Frames.
-        lines: Dashed polylines, each (n, 3) in {W} [m].
-        strokes: By colour, polylines (n, 3) in {W} [m], drawn as they are.
+    Args:
+        axes: That show the picture.
+        picture: With its camera.
+        strokes: By colour, polylines (n, 3) in {W} [m].
         points: By name, points (3,) in {W} [m].
         arrows: By name, tail (3,) and tip (3,) in {W} [m], drawn in the colours of the fingers.
+        labels: By name, more points (3,) to be named.
+        obstacles: More points (n, 3) each in {W} that no name should cover.
     """
-
-    title: str
-    picture: Picture
-    triads: Sequence[Triad] = ()
-    lines: Sequence[Array] = ()
-    strokes: Mapping[str, Sequence[Array]] = field(default_factory=dict)
-    points: Mapping[str, Array] = field(default_factory=dict)
-    arrows: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
-
-
-def draw_panel(axes: Axes, panel: Panel) -> None:
-    """Draw lines, frames, points and arrows of a panel over its picture."""
-    picture, halo = panel.picture, [withStroke(linewidth=3.0, foreground="white")]
-
-    # Lines and frames.
-    for line in panel.lines:
-        axes.plot(*picture.pixels(line).T, color=INK, linewidth=0.9, linestyle=(0, (5, 3)))
-    for colour, strokes in panel.strokes.items():
-        for line in strokes:
+    halo = [withStroke(linewidth=3.0, foreground="white")]
+    for colour, lines in (strokes or {}).items():
+        for line in lines:
             axes.plot(*picture.pixels(line).T, color=colour, linewidth=1.4, path_effects=halo,
                       solid_capstyle="round")  # fmt: skip
-    for triad in panel.triads:
-        tips = triad.X_WA[:3, 3] + triad.length * triad.X_WA[:3, :3].T
-        # Draw the farthest axis first, so that nearer ones cover it.
-        depths = transform_points(invert_pose(picture.X_WC), tips)[:, 2]
-        for k in np.argsort(-depths):
-            ends = picture.pixels(np.vstack([triad.X_WA[:3, 3], tips[k]]))
-            axes.plot(*ends.T, color=AXIS_COLOURS[k], linewidth=2.2, solid_capstyle="round",
-                      path_effects=halo, zorder=5)  # fmt: skip
 
     # Contacts and other points.
-    for i, (start, end) in enumerate(panel.arrows.values()):
+    for i, (start, end) in enumerate(arrows.values()):
         colour = FINGER_COLOURS[i % len(FINGER_COLOURS)]
         tail, tip = picture.pixels(np.vstack([start, end]))
         axes.annotate("", tip, tail, zorder=6, arrowprops={
             "arrowstyle": "-|>", "color": colour, "linewidth": 2.0, "shrinkA": 0.0, "shrinkB": 0.0,
             "path_effects": halo, "mutation_scale": 11.0})  # fmt: skip
         axes.plot(*tail, "o", color=colour, markersize=6.5, markeredgecolor="white", zorder=7)
-    for point in panel.points.values():
+    for point in points.values():
         axes.plot(*picture.pixels(point[None])[0], "o", color=INK, markersize=6.0,
                   markeredgecolor="white", zorder=7)  # fmt: skip
 
-    # Labels, placed where they cover none of the above.
-    labels = {triad.label: triad.X_WA[:3, 3] for triad in panel.triads}
-    labels |= dict(panel.points) | {name: start for name, (start, _) in panel.arrows.items()}
-    drawn = [
-        t.X_WA[:3, 3] + f * t.length * t.X_WA[:3, :3].T for t in panel.triads for f in (0.5, 1)
-    ]
-    drawn += [np.linspace(start, end, 4) for start, end in panel.arrows.values()]
-    anchors = {name: picture.pixels(p[None])[0] for name, p in labels.items()}
+    # Names, placed where they cover none of the above.
+    named = {**(labels or {}), **points, **{name: start for name, (start, _) in arrows.items()}}
+    drawn = [*obstacles, *(np.linspace(start, end, 4) for start, end in arrows.values())]
+    anchors = {name: picture.pixels(p[None])[0] for name, p in named.items()}
     _draw_labels(axes, anchors, picture.pixels(np.vstack([np.zeros((0, 3)), *drawn])))
 
 

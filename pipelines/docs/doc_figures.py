@@ -6,8 +6,10 @@ from start to lift, and all frames.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,20 +19,82 @@ from matplotlib.patheffects import withStroke
 from drakegrasp.dataset.reader import GraspDataset, Sample
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError
-from drakegrasp.frames import Array
+from drakegrasp.frames import Array, invert_pose, transform_points
 from drakegrasp.pictures.style import (
     INK,
-    Panel,
     add_axes,
     draw_colour_bar,
     draw_finger_legend,
-    draw_panel,
+    draw_marks,
     draw_sample,
     read_far,
     save_figure,
     show_image,
 )
 from drakegrasp.vision.camera import Picture
+
+#: Colours of the x, y and z axes of a frame.
+AXIS_COLOURS = ("#D62728", "#2CA02C", "#1F4FD8")
+
+
+class Triad(NamedTuple):
+    """A frame {A} to draw over a picture.
+
+    Attributes:
+        label: Its letter.
+        X_WA: (4, 4), its pose.
+        length: Of its axes [m].
+    """
+
+    label: str
+    X_WA: Array
+    length: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Panel:
+    """A picture, and what to draw over it.
+
+    Attributes:
+        title: Text above the picture.
+        picture: The picture.
+        triads: Frames.
+        lines: Dashed polylines, each (n, 3) in {W} [m].
+        points: By name, points (3,) in {W} [m].
+        arrows: By name, tail (3,) and tip (3,) in {W} [m], drawn in the colours of the fingers.
+    """
+
+    title: str
+    picture: Picture
+    triads: Sequence[Triad] = ()
+    lines: Sequence[Array] = ()
+    points: Mapping[str, Array] = field(default_factory=dict)
+    arrows: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+
+
+def draw_panel(axes: Axes, panel: Panel) -> None:
+    """Draw lines, frames, points and arrows of a panel over its picture."""
+    picture, halo = panel.picture, [withStroke(linewidth=3.0, foreground="white")]
+    for line in panel.lines:
+        axes.plot(*picture.pixels(line).T, color=INK, linewidth=0.9, linestyle=(0, (5, 3)))
+    for triad in panel.triads:
+        tips = triad.X_WA[:3, 3] + triad.length * triad.X_WA[:3, :3].T
+        # Draw the farthest axis first, so that nearer ones cover it.
+        depths = transform_points(invert_pose(picture.X_WC), tips)[:, 2]
+        for k in np.argsort(-depths):
+            ends = picture.pixels(np.vstack([triad.X_WA[:3, 3], tips[k]]))
+            axes.plot(*ends.T, color=AXIS_COLOURS[k], linewidth=2.2, solid_capstyle="round",
+                      path_effects=halo, zorder=5)  # fmt: skip
+    draw_marks(
+        axes,
+        picture,
+        points=panel.points,
+        arrows=panel.arrows,
+        labels={triad.label: triad.X_WA[:3, 3] for triad in panel.triads},
+        obstacles=[
+            t.X_WA[:3, 3] + f * t.length * t.X_WA[:3, :3].T for t in panel.triads for f in (0.5, 1)
+        ],
+    )
 
 
 def hero_figure(

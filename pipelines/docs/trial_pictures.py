@@ -10,13 +10,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from doc_figures import find_sample
+from doc_figures import Panel, Triad, find_sample
 
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.frames import X_WT, make_pose, transform_points, unpack_pose
 from drakegrasp.pictures.rendered import frustum, load_trial
 from drakegrasp.pictures.still_scene import NO_SHADOWS, StillScene, camera_pose
-from drakegrasp.pictures.style import Panel, Triad
 from drakegrasp.vision.camera import Picture
 
 #: Edge of the table where the world's origin below it must be seen [m].

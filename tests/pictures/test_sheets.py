@@ -13,7 +13,7 @@ import pytest
 from doc_figures import find_sample, frames_figure, hero_figure
 from helpers.datasets import MISSING, OTO
 from helpers.machine import needs_egl
-from helpers.scripts import PIPELINES
+from helpers.scripts import PIPELINES, load_script
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
@@ -29,10 +29,8 @@ from drakegrasp.grasp import pack_grasp
 from drakegrasp.pictures import sheets
 from drakegrasp.pictures.sheets import (
     class_sheets,
-    contact_sheet,
     draw_sheet,
     scene_views,
-    spread_over_objects,
 )
 from drakegrasp.pictures.style import draw_contacts
 from drakegrasp.vision.camera import intrinsics, project
@@ -79,33 +77,26 @@ def write_data_file(path: Path, names: list[str], split: str = "train") -> None:
                     dataset[:] = values.get(field.name, 0.0)
 
 
-def test_contact_sheet_draws_all_samples_of_all_splits(tmp_path: Path) -> None:
+def test_contact_sheet_of_the_demo(tmp_path: Path) -> None:
+    contact_sheet = load_script("demo").contact_sheet
     path, png = tmp_path / "grasping_oto.hdf5", tmp_path / "sheet.png"
+    write_data_file(path, [])
+    with pytest.raises(DataError, match="at least one sample"):
+        contact_sheet(path, png)
     write_data_file(path, ["1_mug_small", "1_mug_small", "2_box"], split="test")
+    with pytest.raises(DataError, match="at least one sample"):
+        contact_sheet(path, png, split="valid")
+    assert not png.exists()
     assert contact_sheet(path, png) == 3
     height, width = imread(png).shape[:2]
     assert width > 1000
     assert 150 < height < width / 3
-
-
-def test_contact_sheet_has_no_more_lines_than_asked_for(tmp_path: Path) -> None:
-    path, png = tmp_path / "grasping_oto.hdf5", tmp_path / "sheet.png"
+    # No more lines than asked for, and the same bytes again.
     write_data_file(path, ["1_mug"] * 9)
     assert contact_sheet(path, png, rows=2) == 6
     first = png.read_bytes()
     assert contact_sheet(path, png, rows=2, split="train") == 6
     assert png.read_bytes() == first
-
-
-def test_contact_sheet_refuses_a_file_without_samples(tmp_path: Path) -> None:
-    path, png = tmp_path / "grasping_oto.hdf5", tmp_path / "sheet.png"
-    write_data_file(path, [])
-    with pytest.raises(DataError, match="at least one sample"):
-        contact_sheet(path, png)
-    write_data_file(path, ["1_mug"], split="train")
-    with pytest.raises(DataError, match="at least one sample"):
-        contact_sheet(path, png, split="valid")
-    assert not png.exists()
 
 
 def test_dots_are_where_the_contacts_project(tmp_path: Path) -> None:
@@ -126,6 +117,7 @@ def test_dots_are_where_the_contacts_project(tmp_path: Path) -> None:
 
 
 def test_samples_are_spread_over_objects() -> None:
+    spread_over_objects = load_script("demo").spread_over_objects
     names = ["10_can"] * 4 + ["2_mug"] * 3 + ["1_box"]
     assert spread_over_objects(names, 3) == [7, 4, 0]
     assert spread_over_objects(names, 5) == [7, 4, 5, 0, 1]
