@@ -165,42 +165,39 @@ def _responsibility(card: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _record_set(table: HubTable, path: str) -> dict[str, Any]:
-    columns, name = table.columns, path.removesuffix(".parquet")
+    name, fields = path.removesuffix(".parquet"), []
+    for column, field in table.columns.items():
+        source: dict[str, Any] = {"fileObject": {"@id": path}, "extract": {"column": column}}
+        if field.sample:
+            source["transform"] = {"jsonPath": "bytes"}
+        fields.append(
+            {
+                "@type": "cr:Field",
+                "@id": f"{name}/{column}",
+                "name": column,
+                "description": f"{field.meaning} [{field.unit}]".removesuffix(" [-]"),
+                "dataType": _croissant_type(field),
+                "repeated": bool(field.axes) and not field.sample,
+                "source": source,
+            }
+        )
     return {
         "@type": "cr:RecordSet",
         "@id": name,
         "name": name,
         "description": table.what,
-        "field": [_croissant_field(name, path, column, field) for column, field in columns.items()],
+        "field": fields,
     }
 
 
-def _croissant_field(
-    record_set: str, path: str, column: str, field: Field | None
-) -> dict[str, Any]:
-    source: dict[str, Any] = {"fileObject": {"@id": path}, "extract": {"column": column}}
-    if field is None or field.sample:  # an image: the bytes of a PNG file
-        source["transform"] = {"jsonPath": "bytes"}
-        kind, repeated = "sc:ImageObject", False
-    else:
-        kind = "sc:Text" if field.dtype == "str" else _CROISSANT_TYPES[np.dtype(field.dtype).kind]
-        repeated = bool(field.axes)
-    meaning = f"PNG file of the {column}."
-    if field is not None:
-        meaning = f"{field.meaning}{'' if field.unit == '-' else f' [{field.unit}]'}"
-    return {
-        "@type": "cr:Field",
-        "@id": f"{record_set}/{column}",
-        "name": column,
-        "description": meaning,
-        "dataType": kind,
-        "repeated": repeated,
-        "source": source,
-    }
+def _croissant_type(field: Field) -> str:
+    if field.sample:
+        return "sc:ImageObject"
+    return "sc:Text" if field.dtype == "str" else _CROISSANT_TYPES[np.dtype(field.dtype).kind]
 
 
-#: Fields by the names of columns. An image is None, or a field that is an image.
-Columns = Mapping[str, Field | None]
+#: Fields by the names of columns; those that are images (`sample`) are PNG files.
+Columns = Mapping[str, Field]
 #: Rows in a file, which takes about 150 MB, and in a group of rows, which is read as a whole.
 FILE_ROWS, GROUP_ROWS = 4000, 100
 
@@ -232,6 +229,7 @@ class HubTable:
             folder: Of all configurations.
             wrote: Called with the number of rows of each group that is written.
         """
+        import pyarrow as pa
         import pyarrow.parquet as pq
 
         schema, files = _schema(self.columns), -(-self.count // FILE_ROWS)
@@ -240,18 +238,12 @@ class HubTable:
             path = f"{self.config}/{self.split}-{number:05d}-of-{files:05d}.parquet"
             (folder / self.config).mkdir(exist_ok=True)
             with pq.ParquetWriter(folder / path, schema) as writer:
-                for group in self._groups(rows, schema):
+                for start in rows[::GROUP_ROWS]:
+                    content = self.read(start, min(start + GROUP_ROWS, rows.stop))
+                    group = pa.Table.from_pydict(dict(content), schema=schema)
                     writer.write_table(group, row_group_size=GROUP_ROWS)
                     wrote(len(group))
             yield self, path
-
-    def _groups(self, rows: range, schema: pa.Schema) -> Iterator[pa.Table]:
-        """Yield the rows as tables of `GROUP_ROWS`."""
-        import pyarrow as pa
-
-        for start in range(rows.start, rows.stop, GROUP_ROWS):
-            content = self.read(start, min(start + GROUP_ROWS, rows.stop))
-            yield pa.Table.from_pydict(dict(content), schema=schema)
 
 
 def png_cell(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> dict[str, Any]:
@@ -270,7 +262,7 @@ def _schema(columns: Columns) -> pa.Schema:
     features: dict[str, Any] = {}
     fields = []
     for name, field in columns.items():
-        if field is None or field.sample:
+        if field.sample:
             kind = pa.struct({"bytes": pa.binary(), "path": pa.string()})
             features[name] = {"_type": "Image"}
         else:
@@ -362,7 +354,7 @@ def _read(
         "class_name": np.array(data.classes, dtype=object)[objects].tolist(),
     }
     for name, field in columns.items():
-        if field is not None and name not in found and not field.sample:
+        if name not in found and not field.sample:
             table, at = (own, rows) if field.name in own else (scenes, scene)
             found[name] = table[field.name][at].tolist()
     if group == "views":
@@ -378,11 +370,14 @@ HELP = (
     "pip install 'drakegrasp[hub]'"
 )
 
-#: Columns that are images, made of the fields `images` and `masks`, and what they hold.
+#: Columns of samples that are images, made of the fields `images` and `masks`.
 IMAGES = {
-    "image": "colour, 8-bit PNG",
-    "depth": "16-bit PNG in units of 0.1 mm",
-    "mask": "8-bit PNG, 255 where the object is seen, else 0",
+    name: Field(name, "", "uint8", "-", "C", meaning, sample=True)
+    for name, meaning in (
+        ("image", "colour, 8-bit PNG"),
+        ("depth", "16-bit PNG in units of 0.1 mm"),
+        ("mask", "8-bit PNG, 255 where the object is seen, else 0"),
+    )
 }
 #: The files of a folder, in words.
 FILES = {
@@ -396,8 +391,14 @@ CONVENTIONS = {
 }
 #: What a data file says of its camera: intrinsics [px] and the range of depths [m].
 _CAMERA = ("K", "near", "far")
-#: What the other fields are called here, where it is not their last name.
+#: What fields are called here, where it is not their last name.
 NAMES = {"grasps": "grasp", "grasps_held": "grasp_held"}
+#: Columns of samples.
+COLUMNS: Columns = IMAGES | {
+    NAMES.get(field.name, field.name.rpartition("/")[2]): field
+    for field in DATA_FIELDS
+    if not field.sample
+}
 
 
 def write_hub(out: Path, folder: Path, progress: Report, *, publication: Publication) -> int:
@@ -435,15 +436,6 @@ def write_hub(out: Path, folder: Path, progress: Report, *, publication: Publica
     return samples
 
 
-def columns() -> Columns:
-    """Return the fields of the columns by the columns' names; None for an image."""
-    found: dict[str, Field | None] = dict.fromkeys(IMAGES)
-    for field in DATA_FIELDS:
-        if not field.sample:
-            found[NAMES.get(field.name, field.name.rpartition("/")[2])] = field
-    return found
-
-
 def _card(
     out: Path, tables: Sequence[HubTable], card: Mapping[str, Any], publication: Publication
 ) -> str:
@@ -458,7 +450,7 @@ def _card(
     content["samples_by_camera"] = {c: {s: rows[c, s] for s in SPLITS} for c in CAMERAS}
     with open_samples(out / DATA_FILES["oto"]) as data:
         content["camera"] = {key: np.asarray(data.attrs[key]).tolist() for key in _CAMERA}
-    content["columns"] = _described(columns())
+    content["columns"] = _described(COLUMNS)
     content["columns_of"] = {name: _described(configs[name]) for name in scenes}
 
     # The head names the files of each configuration and split.
@@ -486,9 +478,7 @@ def _card(
 def _described(columns: Columns) -> dict[str, tuple[str, str, str, str]]:
     """Return shape, unit, frame and meaning of columns, by their names."""
     return {
-        name: ("", "", "", IMAGES[name])
-        if field is None
-        else (" x ".join(map(str, field.axes)), field.unit, field.frame, field.meaning)
+        name: (" x ".join(map(str, field.axes)), field.unit, field.frame, field.meaning)
         for name, field in columns.items()
     }
 
@@ -502,8 +492,8 @@ def _sample_table(out: Path, camera: str, split: str) -> HubTable:
         cells = [encode_images(*pair) for pair in zip(images, masks, strict=True)]
         return {name: [each[name] for each in cells] for name in IMAGES} | {
             name: data.rows(field.name, start, stop).tolist()
-            for name, field in columns().items()
-            if field is not None
+            for name, field in COLUMNS.items()
+            if not field.sample
         }
 
     return HubTable(
@@ -511,7 +501,7 @@ def _sample_table(out: Path, camera: str, split: str) -> HubTable:
         split=split,
         what=f"Samples of split {split} as camera {camera} sees them.",
         count=len(data),
-        columns=columns(),
+        columns=COLUMNS,
         read=read,
     )
 
