@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,7 +33,7 @@ from drakegrasp.cli.options import (
     parse_request,
 )
 from drakegrasp.cluster.connect import dashboard_line
-from drakegrasp.cluster.kinds import ClusterRequest, cluster_of, describe
+from drakegrasp.cluster.kinds import REMOTE, Local, cluster_of, describe
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.hand.description import load_hand
 
@@ -40,18 +41,12 @@ from drakegrasp.hand.description import load_hand
 @click.command(
     cls=OneCommand, help=__doc__, context_settings={"help_option_names": ["-h", "--help"]}
 )
-@described
+@partial(described, request=Local)
 @click.argument("where", nargs=-1, metavar="[HOST...|ADDRESS|PATH]")
 def main(
     where: tuple[str, ...],
     times: Path | None,
     kind: Annotated[str, Named("clusters")] = "local",
-    workers: int | None = None,
-    cores: int | None = None,
-    memory: str | None = None,
-    walltime: str | None = None,
-    interface: str | None = None,
-    host: str | None = None,
     dry_run: bool = False,
     **options: Any,
 ) -> None:
@@ -71,20 +66,9 @@ def main(
         --dry-run: Only print what would run.
     """
     tls = chosen_tls(options)
+    own = {name: options.pop(name) for name in (*REMOTE, "walltime")}
     request = parse_request(options)
-    cluster = cluster_of(
-        ClusterRequest(
-            kind=kind,
-            where=where,
-            workers=workers,
-            cores=cores,
-            memory=memory,
-            walltime=walltime,
-            host=host,
-            interface=interface,
-            **tls,
-        )
-    )
+    cluster = cluster_of(kind, where=where, **own, **tls)
 
     # Say what will run before anything starts.
     click.echo("\n".join(describe(cluster)))

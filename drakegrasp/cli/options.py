@@ -90,11 +90,11 @@ def described(function: F, request: type | None = None) -> F:
 
     Args:
         function: The command.
-        request: Dataclass whose fields are more parameters of it.
+        request: Dataclass whose fields are parameters, too, of those that it does not have.
     """
     text, _, section = inspect.cleandoc(function.__doc__ or "").partition(_SECTION)
     function.__doc__ = text
-    own = (function,) if request is None else (function, request)
+    own = (function,) if request is None else (request, function)
     return _with_options(list(_options(section, *own)))(function)
 
 

@@ -1,7 +1,7 @@
 """Kinds of clusters by name, as `pipelines/submit_build.py --cluster` takes them.
 
-In: a `ClusterRequest`. Out: lines for the user, and a Dask client while a block runs. A kind is a
-class in a module of its own and a line in pyproject.toml; those of this machine and of a running
+In: the options of a kind. Out: lines for the user, and a Dask client while a block runs. A kind is
+a class in a module of its own and a line in pyproject.toml; those of this machine and of a running
 scheduler are here. Workers on other machines inherit nothing, so each kind sends them
 `dask_settings`; nothing listens beyond this machine unless `host` or `interface` says so.
 """
@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
 import dask
 from dask.utils import parse_bytes
@@ -35,12 +36,14 @@ REMOTE = ("workers", "cores", "memory", "host", "interface")
 MOST_MEMORY = 10**15
 
 
-@dataclass(frozen=True, kw_only=True)
-class ClusterRequest:
-    """The requested workers, as on the command line of `pipelines/submit_build.py`.
+@dataclass(kw_only=True)
+class Local:
+    """Workers on this machine, as on the command line of the script; the base of all kinds.
 
     Attributes:
-        kind: A name of the registry.
+        follow: Least and largest number of words that follow the kind, and what they are.
+        options: The options that it has.
+        kind: Its name in the registry.
         where: Hosts, the address of a scheduler, or its file.
         workers: Number of processes in all.
         cores: Number of cores of each host or job, with a worker on each.
@@ -53,6 +56,8 @@ class ClusterRequest:
             private key. Without them, workers that are started get some that are made for this run.
     """
 
+    follow: ClassVar[tuple[int, float, str]] = (0, 0, "nothing")
+    options: ClassVar[tuple[str, ...]] = ("workers", "memory")
     kind: str
     where: tuple[str, ...] = ()
     workers: int | None = None
@@ -64,44 +69,30 @@ class ClusterRequest:
     tls: bool = True
     tls_files: tuple[Path, Path, Path] | None = None
 
-
-class Local:
-    """Workers on this machine; the base of all kinds.
-
-    Attributes:
-        follow: Least and largest number of words that follow the kind, and what they are.
-        options: The options that it has.
-        request: What is asked for.
-    """
-
-    follow: tuple[int, float, str] = (0, 0, "nothing")
-    options: tuple[str, ...] = ("workers", "memory")
-
-    def __init__(self, request: ClusterRequest) -> None:
+    def __post_init__(self) -> None:
         """Refuse what a cluster of this kind cannot be.
 
         Raises:
             ConfigError: If the request contradicts itself, or lacks something.
             MachineError: If a package is missing.
         """
-        self.request = request
         least, most, what = self.follow
-        if not least <= len(request.where) <= most:
-            got = " ".join(request.where) or "nothing"
-            raise ConfigError(f"--cluster {request.kind} must be followed by {what}, got {got}")
+        if not least <= len(self.where) <= most:
+            got = " ".join(self.where) or "nothing"
+            raise ConfigError(f"--cluster {self.kind} must be followed by {what}, got {got}")
         for name in (*REMOTE, "walltime"):
-            value = getattr(request, name)
+            value = getattr(self, name)
             if value is not None and name not in self.options:
-                raise ConfigError(f"--{name} must not be given with --cluster {request.kind}")
+                raise ConfigError(f"--{name} must not be given with --cluster {self.kind}")
             if name in ("workers", "cores") and value is not None and value < 1:
                 raise ConfigError(f"{name} must be at least 1, got {value}")
-        chosen_security(request.tls, request.tls_files, elsewhere=type(self) is not Local)
-        if request.memory is not None:
-            memory_bytes(request.memory)
+        chosen_security(self.tls, self.tls_files, elsewhere=type(self) is not Local)
+        if self.memory is not None:
+            memory_bytes(self.memory)
 
     def count(self) -> int | None:
         """Return how many workers there will be; None if that is known only when they start."""
-        return self.request.workers
+        return self.workers
 
     def line(self) -> str:
         """Return what will be started, in words."""
@@ -117,18 +108,17 @@ class Local:
         Args:
             out: Directory that all machines see; certificates for this run are written there.
         """
-        asked = self.request
-        return connect(asked.workers, tls_files=asked.tls_files, memory=asked.memory)
+        return connect(self.workers, tls_files=self.tls_files, memory=self.memory)
 
 
 class Running(Local):
     """The workers of a scheduler that runs, by its address."""
 
-    follow, options = (1, 1, "its address"), ()
+    follow, options, how = (1, 1, "its address"), (), "scheduler"
 
     def line(self) -> str:
         """Return what will be used, in words."""
-        return f"the workers of {' '.join(self.request.where)}"
+        return f"the workers of {' '.join(self.where)}"
 
     def count(self) -> int | None:
         """Return how many workers the scheduler has."""
@@ -137,25 +127,20 @@ class Running(Local):
 
     def connected(self, out: Path) -> AbstractContextManager[Client]:
         """Return what connects to the scheduler when it is entered."""
-        asked = self.request
-        return connect(None, asked.where[0], tls=asked.tls, tls_files=asked.tls_files)
+        found: dict[str, Any] = {self.how: self.where[0]}
+        return connect(**found, tls=self.tls, tls_files=self.tls_files)
 
 
 class RunningFile(Running):
     """The workers of a scheduler that runs, by the file that it wrote."""
 
-    follow = (1, 1, "its path")
-
-    def connected(self, out: Path) -> AbstractContextManager[Client]:
-        """Return what connects to the scheduler when it is entered."""
-        asked = self.request
-        return connect(None, None, asked.where[0], tls=asked.tls, tls_files=asked.tls_files)
+    follow, how = (1, 1, "its path"), "scheduler_file"
 
 
 class Remote(Local):
     """Workers that are started on other machines; a kind says how in `start`."""
 
-    options: tuple[str, ...] = REMOTE
+    options: ClassVar[tuple[str, ...]] = REMOTE
 
     def start(self, security: Security | None) -> SpecCluster:
         """Start scheduler and workers."""
@@ -172,9 +157,9 @@ class Remote(Local):
             ConfigError: If it is not said where to listen.
         """
         for name in ("host", "interface"):
-            if (value := getattr(self.request, name)) is not None:
+            if (value := getattr(self, name)) is not None:
                 return {name: value}
-        if self.request.where and all(map(is_loopback, self.request.where)):
+        if self.where and all(map(is_loopback, self.where)):
             return {"host": LOOPBACK}
         if self.listens():
             return {}
@@ -212,28 +197,27 @@ class Remote(Local):
 
     @contextmanager
     def _security(self, out: Path) -> Iterator[Security | None]:
-        asked = self.request
-        if asked.tls and asked.tls_files is None:
+        if self.tls and self.tls_files is None:
             with private_directory(out) as folder:
                 yield security_of(make_certificates(folder))
         else:
-            yield chosen_security(asked.tls, asked.tls_files, elsewhere=True)
+            yield chosen_security(self.tls, self.tls_files, elsewhere=True)
 
 
-def cluster_of(request: ClusterRequest) -> Local:
-    """Return the cluster that is asked for; nothing is started.
+def cluster_of(kind: str, **options: Any) -> Local:
+    """Return the cluster that is asked for, see the attributes of `Local`; nothing is started.
 
     Raises:
-        ConfigError: If the request contradicts itself, or lacks something.
+        ConfigError: If the options contradict each other, or lack something.
         MachineError: If a package is missing.
     """
-    found: Local = registry.find("clusters", request.kind)(request)
+    found: Local = registry.find("clusters", kind)(kind=kind, **options)
     return found
 
 
 def describe(cluster: Local) -> list[str]:
     """Return what will be started, in lines for the user, with a warning of an open port."""
-    tls = cluster.request.tls
+    tls = cluster.tls
     lines = [cluster.line(), f"connections: {'TLS' if tls else 'not encrypted'}"]
     if not tls and cluster.is_open():
         lines.append(

@@ -22,7 +22,7 @@ from distributed.security import Security
 from tornado.ioloop import PeriodicCallback
 
 from drakegrasp.cluster.connect import LOOPBACK, NANNY_PRELOAD, dask_settings
-from drakegrasp.cluster.kinds import REMOTE, ClusterRequest, Remote, memory_bytes
+from drakegrasp.cluster.kinds import REMOTE, Remote, memory_bytes
 from drakegrasp.errors import ConfigError, MachineError
 
 #: Memory of a worker, if neither the user nor jobqueue.yaml gives it.
@@ -41,19 +41,19 @@ class Slurm(Remote):
 
     options = (*REMOTE, "walltime")
 
-    def __init__(self, request: ClusterRequest) -> None:
+    def __post_init__(self) -> None:
         """Refuse a walltime that is none, and jobs without a number of workers."""
-        super().__init__(request)
-        if request.walltime is not None:
-            walltime_seconds(request.walltime)
-        if request.workers is None:
+        super().__post_init__()
+        if self.walltime is not None:
+            walltime_seconds(self.walltime)
+        if self.workers is None:
             raise ConfigError("--workers must be given with --cluster slurm")
         self.listening()
-        self.cores = int(request.cores or jobqueue("cores") or 1)
-        self.jobs = math.ceil(request.workers / self.cores)
+        self.per_job = int(self.cores or jobqueue("cores") or 1)
+        self.jobs = math.ceil(self.workers / self.per_job)
         # None: jobqueue.yaml says that of a job; the queue has a limit.
-        self.memory = request.memory or (None if jobqueue("memory") else WORKER_MEMORY)
-        self.walltime = request.walltime or jobqueue("walltime")
+        self.memory = self.memory or (None if jobqueue("memory") else WORKER_MEMORY)
+        self.walltime = self.walltime or jobqueue("walltime")
 
     def listens(self) -> bool:
         """Return whether jobqueue.yaml says where the scheduler listens."""
@@ -62,25 +62,25 @@ class Slurm(Remote):
 
     def count(self) -> int:
         """Return how many workers there will be."""
-        return self.cores * self.jobs
+        return self.per_job * self.jobs
 
     def line(self) -> str:
         """Return what each job asks for, in words."""
         memory = "memory as in jobqueue.yaml" if self.memory is None else f"{self.memory} each"
         walltime = f"walltime {self.walltime or 'as the queue has it'}"
-        return f"{self.count()} workers in SLURM jobs of {self.cores}, {memory}, {walltime}"
+        return f"{self.count()} workers in SLURM jobs of {self.per_job}, {memory}, {walltime}"
 
     def start(self, security: Security | None) -> SpecCluster:
         """Submit the jobs, if SLURM would run them, and others in place of those that end."""
         # Whatever is None or not named here is as the user's jobqueue.yaml says.
-        memory = None if self.memory is None else f"{self.cores * memory_bytes(self.memory)}B"
+        memory = None if self.memory is None else f"{self.per_job * memory_bytes(self.memory)}B"
         cluster = SLURMCluster(
             job_cls=QuotedJob,
-            cores=self.cores,
-            processes=self.cores,
+            cores=self.per_job,
+            processes=self.per_job,
             memory=memory,
-            walltime=self.request.walltime,
-            interface=self.request.interface,
+            walltime=self.walltime,
+            interface=self.interface,
             security=security,
             worker_extra_args=[
                 *(jobqueue("worker-extra-args") or ()),

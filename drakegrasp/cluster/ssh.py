@@ -10,7 +10,7 @@ from distributed.security import Security
 
 from drakegrasp.cluster.certificates import server_options
 from drakegrasp.cluster.connect import LOOPBACK, start_environment
-from drakegrasp.cluster.kinds import ClusterRequest, Remote
+from drakegrasp.cluster.kinds import Remote
 from drakegrasp.errors import ConfigError
 
 #: A scheduler on another machine ends by itself after this time without work: its client was
@@ -23,10 +23,10 @@ class Ssh(Remote):
 
     follow = (1, math.inf, "the names of the hosts")
 
-    def __init__(self, request: ClusterRequest) -> None:
+    def __post_init__(self) -> None:
         """Refuse hosts with a user's name, and numbers of workers that do not fit."""
-        super().__init__(request)
-        for host in request.where:
+        super().__post_init__()
+        for host in self.where:
             if "@" in host:
                 raise ConfigError(
                     f"a host must be a name or address, got {host!r}: the user and "
@@ -34,7 +34,7 @@ class Ssh(Remote):
                 )
 
         # Each host has as many workers as the others.
-        hosts, workers, cores = len(request.where), request.workers, request.cores
+        hosts, workers, cores = len(self.where), self.workers, self.cores
         if cores is not None and workers not in (None, hosts * cores):
             raise ConfigError(
                 f"--workers must be --cores times the number of hosts, {hosts * cores}, or "
@@ -54,12 +54,12 @@ class Ssh(Remote):
 
     def count(self) -> int:
         """Return how many workers there will be."""
-        return len(self.request.where) * self.per_host
+        return len(self.where) * self.per_host
 
     def line(self) -> str:
         """Return what will be started, in words."""
-        hosts = dict.fromkeys(self.request.where)
-        on = f"{' '.join(hosts)}, scheduler on {self.request.where[0]}"
+        hosts = dict.fromkeys(self.where)
+        on = f"{' '.join(hosts)}, scheduler on {self.where[0]}"
         return f"{self.count()} workers over ssh on {on}"
 
     def start(self, security: Security | None) -> SpecCluster:
@@ -80,14 +80,14 @@ class Ssh(Remote):
         worker = {
             "n_workers": self.per_host,
             "nthreads": 1,
-            "memory_limit": self.request.memory or "auto",
+            "memory_limit": self.memory or "auto",
             "env": start_environment(),
             **self.workers_listening(),
             **server,
         }
         scheduler = {"port": 0, "dashboard_address": f"{LOOPBACK}:0", "idle_timeout": IDLE_TIME}
         return SSHCluster(
-            [self.request.where[0], *self.request.where],
+            [self.where[0], *self.where],
             worker_options=worker,
             scheduler_options={**scheduler, **self.listening(), **server},
             security=security,

@@ -22,7 +22,7 @@ from server.ssh import running_sshd
 
 from drakegrasp.cluster import slurm as jobs
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT
-from drakegrasp.cluster.kinds import ClusterRequest, cluster_of
+from drakegrasp.cluster.kinds import cluster_of
 from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
@@ -157,11 +157,11 @@ def test_slurm_workers_have_their_settings_and_are_replaced(
     for name in ("SLURM_CONF", "SBATCH_EXPORT"):
         monkeypatch.setenv(name, slurm[name])
     monkeypatch.setattr(jobs, "REFILL_SECONDS", 2.0)
-    request = ClusterRequest(kind="slurm", workers=3, cores=1, walltime="00:20:00", tls=False)
+    cluster = cluster_of("slurm", workers=3, cores=1, walltime="00:20:00", tls=False)
     # Over the defaults of dask-jobqueue, which another test's import may have read already.
     yaml = dask.config.collect(paths=[slurm["DASK_CONFIG"]], env={})
     settings_of_site = dask.config.merge(dask.config.config, yaml)
-    with dask.config.set(settings_of_site), cluster_of(request).connected(tmp_path) as client:
+    with dask.config.set(settings_of_site), cluster.connected(tmp_path) as client:
         client.wait_for_workers(3, timeout=PATIENCE)
         check_settings(client, 3, "tcp")
         for worker in settings(client).values():
@@ -231,8 +231,8 @@ def test_ssh_workers_have_their_settings(
     monkeypatch.setenv("HOME", ssh["HOME"])
     for name in WORKER_ENVIRONMENT:
         monkeypatch.delenv(name, raising=False)
-    request = ClusterRequest(kind="ssh", where=("127.0.0.1", "127.0.0.1"), workers=2)
-    with cluster_of(request).connected(tmp_path) as client:
+    cluster = cluster_of("ssh", where=("127.0.0.1", "127.0.0.1"), workers=2)
+    with cluster.connected(tmp_path) as client:
         client.wait_for_workers(2, timeout=PATIENCE)
         check_settings(client, 2, "tls")
     wait_until(lambda: not remote_processes(), "the end of the workers", tmp_path / "none")

@@ -12,7 +12,6 @@ import pytest
 
 from drakegrasp.cluster.certificates import security_of
 from drakegrasp.cluster.connect import dask_settings
-from drakegrasp.cluster.kinds import ClusterRequest
 from drakegrasp.errors import MachineError
 
 pytest.importorskip("dask_jobqueue")
@@ -59,9 +58,9 @@ def test_job_has_the_memory_of_all_its_workers(monkeypatch: pytest.MonkeyPatch) 
         raise MachineError("no SLURM here")
 
     monkeypatch.setattr(slurm, "_refuse_bad_job", refuse)
-    request = ClusterRequest(kind="slurm", workers=6, cores=3, memory="2GB", host="127.0.0.1")
+    cluster = Slurm(kind="slurm", workers=6, cores=3, memory="2GB", host="127.0.0.1")
     with pytest.raises(MachineError, match="no SLURM here"):
-        Slurm(request).start(None)
+        cluster.start(None)
     (script,) = scripts
     lines = [line.removeprefix("#SBATCH ").split("=") for line in script.splitlines()]
     said = {line[0]: line[1] for line in lines if len(line) == 2}

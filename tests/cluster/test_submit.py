@@ -30,7 +30,7 @@ from drakegrasp.cluster import connect as connecting
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.certificates import make_certificates, private_directory
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect, dask_settings
-from drakegrasp.cluster.kinds import ClusterRequest, cluster_of
+from drakegrasp.cluster.kinds import cluster_of
 from drakegrasp.cluster.slurm import _exports, walltime_seconds
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.generation.pipeline import build
@@ -114,10 +114,9 @@ def test_workers_elsewhere_need_a_certificate_unless_told_otherwise(
 
     monkeypatch.setattr(registry.find("clusters", kind), "start", start)
     where = ("node",) if kind == "ssh" else ()
-    request = ClusterRequest(
-        kind=kind, where=where, workers=1, host="10.0.0.1", tls=choice != "none", tls_files=own
+    cluster = cluster_of(
+        kind, where=where, workers=1, host="10.0.0.1", tls=choice != "none", tls_files=own
     )
-    cluster = cluster_of(request)
     with pytest.raises(MachineError, match="started"), cluster.connected(tmp_path / "out"):
         pass
     assert not list(tmp_path.glob("out/.tls-*"))
@@ -371,11 +370,11 @@ def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
     join = [*command, "distributed.cli.dask_worker", *tls, "--scheduler-file", str(file)]
     worker = subprocess.Popen([*join, "--nthreads", "1"], env=plain, stderr=subprocess.DEVNULL)
     try:
-        request = ClusterRequest(kind="scheduler-file", where=(str(file),), tls_files=files)
+        cluster = cluster_of("scheduler-file", where=(str(file),), tls_files=files)
         while not file.exists():
             scheduler.poll()
             assert scheduler.returncode is None
-        with cluster_of(request).connected(tmp_path) as client:
+        with cluster.connected(tmp_path) as client:
             client.wait_for_workers(1, timeout=60)
             with admitted_workers(client, load_config()):
                 assert client.run_on_scheduler(saturation) == 1.0
