@@ -69,7 +69,7 @@ WALLS = {
         "exchange.mjcf",
     ),
     "coacd": ("mjcf.scene",),
-    "pyarrow": ("exchange", "verification.prediction"),
+    "pyarrow": ("exchange",),
     "torch": ("dataset.torch_samples",),
 }
 #: Modules that name a type of a library for the type checker alone: what callers give or get.

@@ -15,7 +15,6 @@ from drakegrasp.cluster.connect import Workers
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.exchange.dexgraspbench import fitted_postures, write_grasps
-from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.protocols.postures import describe, prepare_trials, verify_postures, versions
 from drakegrasp.protocols.protocol import Lift, find_protocol
@@ -25,7 +24,7 @@ from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.scoring.references import REFERENCES
 from drakegrasp.scoring.run import Request, Score
 from drakegrasp.scoring.run import score as score_request
-from drakegrasp.scoring.verdict import Ranked, Verdict, protocol_verdict, ranked_sets, verdict_of
+from drakegrasp.scoring.verdict import Verdict, protocol_verdict, ranked_sets, verdict_of
 from drakegrasp.simulation.attempts import Attempts
 from drakegrasp.verification.placing import (
     dataset_config,
@@ -120,7 +119,7 @@ def score(
     )
 
     # Its verdicts, by this process or workers, and the card.
-    def try_all(grasps: Array | Attempts, chosen: Sequence[int], deliver: Deliver) -> None:
+    def try_all(grasps: Attempts, chosen: Sequence[int], deliver: Deliver) -> None:
         placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
         if peer:
             keep = Path(scratch if out is None else out) / CONVEX_PARTS
@@ -142,7 +141,7 @@ def score(
     return scored
 
 
-def _method(files: object, dataset: GraspDataset) -> tuple[str, tuple[Ranked, ...]]:
+def _method(files: object, dataset: GraspDataset) -> tuple[str, tuple[Attempts, ...]]:
     """Return the name and the predictions of another method."""
     given = [files] if isinstance(files, str | Path) else files
     if not isinstance(given, list | tuple) or not given:

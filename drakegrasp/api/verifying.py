@@ -22,6 +22,7 @@ from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.config import Config
 from drakegrasp.dataset.reader import GraspDataset, Sample
 from drakegrasp.errors import GraspError
+from drakegrasp.exchange.contacts import HDF5_SUFFIXES
 from drakegrasp.frames import as_numbers
 from drakegrasp.hand.settings import override_config
 from drakegrasp.runtime.executor import count_workers, run_here
@@ -33,7 +34,6 @@ from drakegrasp.verification.placing import (
     place_on_object,
     place_on_rows,
 )
-from drakegrasp.verification.prediction import HDF5_SUFFIXES
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.verify import PlacedGrasp, ResultCallback, ignore_result, verify_batch
 

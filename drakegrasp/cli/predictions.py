@@ -160,7 +160,7 @@ def _verify_by_lift(
     request: VerifyRequest, workers: dict[str, Any], as_json: bool, quiet: bool
 ) -> None:
     from drakegrasp.api.verifying import run_verification
-    from drakegrasp.cli.placing import place_requested, requested_rows
+    from drakegrasp.cli.placing import place_requested
     from drakegrasp.cli.tables import make_console, verdict_table
     from drakegrasp.verification.hints import count_hints
     from drakegrasp.verification.result_files import (
@@ -173,8 +173,7 @@ def _verify_by_lift(
 
     # All input is read and checked before anything is simulated.
     out = request.out
-    grasps, config = place_requested(request)
-    rows = None if out is None else requested_rows(request, len(grasps))
+    grasps, config, rows = place_requested(request)
 
     def print_line(index: int, result: Verification) -> None:
         write_json_line(index, result, sys.stdout)
@@ -303,7 +302,7 @@ def _own_files(request: VerifyRequest, folder: Path, execute: Executor, report: 
     from drakegrasp.runtime.environment import require_mujoco
 
     require_mujoco("mujoco", "coacd")
-    placed, config = place_requested(request)
+    placed, config, _ = place_requested(request)
     placed.sort(key=lambda grasp: grasp.index)
     hand, postures = load_hand(config.hand_source), fitted_postures(placed, execute)
     path, files = write_grasps(postures, hand, folder, execute=execute, report=report)

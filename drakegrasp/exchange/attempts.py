@@ -23,6 +23,7 @@ import numpy.typing as npt
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError, MachineError, listed, one_line
+from drakegrasp.exchange.contacts import read_contacts
 from drakegrasp.exchange.dexgraspbench import read_dexgraspbench
 from drakegrasp.exchange.isaac_grasp import read_isaac_grasp
 from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
@@ -38,7 +39,8 @@ from drakegrasp.simulation.attempts import (
     taken,
     xyzw_poses,
 )
-from drakegrasp.verification.placing import choose_rows
+from drakegrasp.verification.placing import choose_rows, read_several
+from drakegrasp.verification.prediction import read_grasps
 
 #: What a file says of all its rows together.
 _OF_FILE = ("frame", "link", "joints", "hand")
@@ -58,8 +60,15 @@ _KNOWN = (
 )
 
 
-def read_attempts(path: Path, hand: Hand, *, of: str | GraspDataset | None = None) -> Attempts:
-    """Return the postures of a file, or of all files of a folder, as one table.
+def read_attempts(
+    path: Path,
+    hand: Hand,
+    *,
+    of: str | GraspDataset | None = None,
+    split: str | None = None,
+    several: bool = False,
+) -> Attempts:
+    """Return the postures of a file, or of all files of a folder, or contacts, as one table.
 
     A row that is none stays in the table, with the reason; in a folder a file may be none.
 
@@ -69,13 +78,24 @@ def read_attempts(path: Path, hand: Hand, *, of: str | GraspDataset | None = Non
         of: Name of the object of rows that name none; None: each must. Or the split of a dataset
             whose rows they are for: then `row` says which, or they are one for each row, or
             exported samples, of which those of the split count. Their objects and the poses of the
-            frame "camera" are those of the rows; `Attempts.of_row` has the rows.
+            frame "camera" are those of the rows; `Attempts.of_row` has the rows. Contacts name no
+            object, so they must be of something.
+        split: Group of an HDF5 file of contacts; that of the dataset if it is for one.
+        several: Whether the contacts are for rows of a dataset, of which each may have several
+            (n, m, 6k), with a confidence.
 
     Raises:
         GraspError: If it is no file of postures of this hand, or names no object.
         DataError: If the dataset cannot be used.
         MachineError: If a package is missing that the format needs.
     """
+    if of is not None and not holds_postures(path):
+        data = of if isinstance(of, GraspDataset) else None
+        said = read_contacts(path, split=data.split if data else split, axes=3 if several else 2)
+        with named(path):
+            if several and data is not None:
+                return read_several(**said, fingers=hand.num_fingers, data=data)
+            return read_grasps(said["grasps"], hand.num_fingers, rows=said["rows"])
     if isinstance(of, GraspDataset):
         return _for_rows(path, hand, of)
     if not path.is_dir():

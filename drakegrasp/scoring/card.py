@@ -150,10 +150,10 @@ def _set_of(
     outcomes = sorted({v.outcome for v in verdicts})
     reference = REFERENCES.get(judged.name)
     measured = estimates(judged, grouping, draws, oracle=oracle)
-    of_postures = any(ranked.table is not None for ranked in judged.ranked)
+    of_postures = any(ranked.grasps is None for ranked in judged.ranked)
     return {
         "what": reference.words if reference else "postures" if of_postures else "predictions",
-        "files": [{"name": r.name, "sha256": r.sha256} for r in judged.ranked],
+        "files": [{"name": r.file, "sha256": r.sha256} for r in judged.ranked],
         "predictions": len(verdicts),
         "measures": {name: asdict(value) for name, value in measured.items()},
         "held_within_mm": dict(zip(map(str, CURVE_MM), curve(judged, grouping), strict=True)),

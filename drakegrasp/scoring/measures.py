@@ -16,8 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.frames import Array
-from drakegrasp.scoring.verdict import Ranked, Verdict
+from drakegrasp.scoring.verdict import Verdict
 from drakegrasp.seeding import Stream, object_key
+from drakegrasp.simulation.attempts import Attempts
 
 #: Resamples, and the share of them that an interval holds.
 RESAMPLES, LEVEL = 2000, 0.95
@@ -146,7 +147,7 @@ class Judged:
     """
 
     name: str
-    ranked: tuple[Ranked, ...]
+    ranked: tuple[Attempts, ...]
     verdicts: tuple[tuple[Verdict, ...], ...]
 
     def by_row(self) -> list[dict[int, list[Verdict]]]:
@@ -154,7 +155,7 @@ class Judged:
         found = []
         for ranked, verdicts in zip(self.ranked, self.verdicts, strict=True):
             rows: dict[int, list[Verdict]] = {}
-            for row, verdict in zip(ranked.rows.tolist(), verdicts, strict=True):
+            for row, verdict in zip(ranked.of_row.tolist(), verdicts, strict=True):
                 rows.setdefault(row, []).append(verdict)
             found.append(rows)
         return found
@@ -220,7 +221,7 @@ def estimates(
         found[name] = draws.estimate(grouping.means(first_table(judged, grouping, name)))
 
     # The k best of each row, and an object's best row.
-    most = max(int(ranked.ranks.max()) + 1 for ranked in judged.ranked)
+    most = max(int(ranked.rank.max()) + 1 for ranked in judged.ranked)
     seeds = judged.by_row()
     for k in KS:
         if 1 < k <= most:
@@ -313,7 +314,7 @@ def coverage(judged: Judged, own: Mapping[int, Array], grouping: Grouping) -> fl
     place = {row: i for i, row in enumerate(grouping.rows)}
     counted: dict[int, list[Array]] = {}
     for ranked, verdicts in zip(judged.ranked, judged.verdicts, strict=True):
-        for row, verdict in zip(ranked.rows.tolist(), verdicts, strict=True):
+        for row, verdict in zip(ranked.of_row.tolist(), verdicts, strict=True):
             if verdict.counted and verdict.contacts:
                 found = counted.setdefault(int(grouping.objects[place[row]]), [])
                 found.append(np.array(verdict.contacts).reshape(-1, 3))

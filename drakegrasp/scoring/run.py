@@ -26,15 +26,12 @@ from drakegrasp.scoring.benchmark import read_benchmark, rows_digest
 from drakegrasp.scoring.card import card_of, card_text
 from drakegrasp.scoring.measures import Grouping, Judged, seconds
 from drakegrasp.scoring.references import REFERENCES, Scene
-from drakegrasp.scoring.verdict import Ranked, Verdict, VerdictFile, rank, verdict_key
+from drakegrasp.scoring.verdict import Verdict, VerdictFile, rank_array, verdict_key
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.attempts import Attempts, join_attempts
 
-#: Tries grasps (n, 6k), or n postures, on rows (n,) and calls back with the place of each and its
-#: verdict.
-Verify: TypeAlias = Callable[
-    [Array | Attempts, Sequence[int], Callable[[int, Verdict], None]], object
-]
+#: Tries n attempts on rows (n,) and calls back with the place of each and its verdict.
+Verify: TypeAlias = Callable[[Attempts, Sequence[int], Callable[[int, Verdict], None]], object]
 #: Files of a score.
 CARD_JSON, CARD_TEXT, CARD_PICTURE, VERDICTS = "card.json", "card.md", "card.png", "verdicts.jsonl"
 
@@ -97,9 +94,9 @@ class Request:
 
     data: GraspDataset
     train: GraspDataset
-    predictions: tuple[Ranked, ...]
+    predictions: tuple[Attempts, ...]
     name: str
-    against: tuple[str, tuple[Ranked, ...]] | None
+    against: tuple[str, tuple[Attempts, ...]] | None
     references: tuple[str, ...]
     per_object: int | None
     config: Config
@@ -126,7 +123,7 @@ def score(request: Request, verify: Verify, folder: Path | None) -> Score:
     rows = _chosen_rows(request)
     grouping = _grouping(request.data, rows)
     methods = [(request.name, request.predictions), *_methods_against(request)]
-    sets = [(name, tuple(each.of_rows(rows) for each in own)) for name, own in methods if own]
+    sets = [(name, tuple(_of_rows(each, rows) for each in own)) for name, own in methods if own]
     sets += _reference_rows(request, rows)
     if not sets:
         raise GraspError("there must be predictions or reference rows to score, got none")
@@ -179,7 +176,7 @@ def _refuse_other_train(data: GraspDataset, train: GraspDataset) -> None:
         )
 
 
-def _methods_against(request: Request) -> list[tuple[str, tuple[Ranked, ...]]]:
+def _methods_against(request: Request) -> list[tuple[str, tuple[Attempts, ...]]]:
     """Return the other method if there is one.
 
     Raises:
@@ -201,19 +198,13 @@ def _chosen_rows(request: Request) -> list[int]:
     data, predictions = request.data, (*request.predictions, *others)
     if request.per_object is not None and request.per_object < 1:
         raise GraspError(f"per_object must be 1 or more, got {request.per_object}")
-    numbers = data.column("grasps").shape[1]
-    for each in predictions:
-        if each.table is None and each.grasps.shape[1] != numbers:
-            raise GraspError(
-                f"{each.name}: a grasp must be {numbers} numbers, got {each.grasps.shape[1]}"
-            )
 
     # Those of the predictions; all of a method are for the same.
-    rows = np.unique(predictions[0].rows) if predictions else np.arange(len(data))
+    rows = np.unique(predictions[0].of_row) if predictions else np.arange(len(data))
     for other in predictions[1:]:
-        if not np.array_equal(np.unique(other.rows), rows):
+        if not np.array_equal(np.unique(other.of_row), rows):
             raise GraspError(
-                f"{other.name}: must have predictions for the rows of {predictions[0].name}, "
+                f"{other.file}: must have predictions for the rows of {predictions[0].file}, "
                 "got other rows"
             )
     if not len(rows):
@@ -244,22 +235,23 @@ def _grouping(data: GraspDataset, rows: Sequence[int]) -> Grouping:
     )
 
 
-def _reference_rows(request: Request, rows: Sequence[int]) -> list[tuple[str, tuple[Ranked, ...]]]:
+def _reference_rows(
+    request: Request, rows: Sequence[int]
+) -> list[tuple[str, tuple[Attempts, ...]]]:
     """Return the reference rows that can be made."""
     scene = Scene(data=request.data, rows=rows, train=request.train)
-    made: list[tuple[str, tuple[Ranked, ...]]] = []
+    made: list[tuple[str, tuple[Attempts, ...]]] = []
     for name in request.references:
         reference = REFERENCES[name]
         if reference.trained and not len(request.train):
             continue
         grasps = reference.make(scene)
-        ranked = rank(name, grasps, length=len(request.data), rows=np.asarray(rows))
-        made.append((name, (ranked,)))
+        made.append((name, (rank_array(name, grasps, request.data, rows),)))
     return made
 
 
 def _verdicts(
-    sets: Sequence[Ranked],
+    sets: Sequence[Attempts],
     request: Request,
     settings: Mapping[str, Any],
     verify: Verify,
@@ -271,53 +263,57 @@ def _verdicts(
     content = f"{request.data.content} {request.data.camera}"
     keys = [
         [
-            verdict_key(settings, content + _frame(each), row, grasp)
-            for row, grasp in zip(each.rows.tolist(), each.grasps, strict=True)
+            verdict_key(settings, content + _frame(each), row, numbers)
+            for row, numbers in zip(each.of_row.tolist(), each.numbers(), strict=True)
         ]
         for each in sets
     ]
     known = VerdictFile(None if folder is None else folder / VERDICTS)
-    missing: dict[str, tuple[Ranked, int]] = {}
-    for each, own_keys in zip(sets, keys, strict=True):
+    missing: dict[str, tuple[int, int]] = {}
+    for k, own_keys in enumerate(keys):
         for i, key in enumerate(own_keys):
             if key not in known.verdicts:
-                missing.setdefault(key, (each, i))
+                missing.setdefault(key, (k, i))
 
     # Try it, object by object; each verdict is kept as soon as it is known.
-    if missing:
-        objects = request.data.column("object_props/object_name").tolist()
-        resting = request.data.column("grasp_props/resting").tolist()
-        ordered = sorted(missing, key=lambda key: _place(_row(*missing[key]), objects, resting))
-        # Contacts of all sets together, postures file by file.
-        parts: dict[int, list[str]] = {}
-        for key in ordered:
-            own_table = missing[key][0].table
-            parts.setdefault(0 if own_table is None else id(own_table), []).append(key)
-        try:
-            for part in parts.values():
-                chosen = [missing[key] for key in part]
-                table, places = chosen[0][0].table, [i for _, i in chosen]
+    objects = request.data.column("object_props/object_name").tolist()
+    resting = request.data.column("grasp_props/resting").tolist()
+    ordered = sorted(
+        (*_place(int(sets[k].of_row[i]), objects, resting), k, i) for k, i in missing.values()
+    )
+    try:
+        for part in _parts(sets):
+            start = dict(zip(part, np.cumsum([0, *(len(sets[k]) for k in part)]), strict=False))
+            chosen = [(row, k, i) for _, _, row, k, i in ordered if k in start]
+            if chosen:
+                table = join_attempts([sets[k] for k in part])
                 verify(
-                    np.array([each.grasps[i] for each, i in chosen])
-                    if table is None
-                    else table.at(places),
-                    [_row(*each) for each in chosen],
-                    partial(_keep, known, part),
+                    table.at([start[k] + i for _, k, i in chosen]),
+                    [row for row, _, _ in chosen],
+                    partial(_keep, known, [keys[k][i] for _, k, i in chosen]),
                 )
-        finally:
-            known.close()
+    finally:
+        known.close()
     left = [key for key in missing if key not in known.verdicts]
     if left:
         raise MachineError(f"each prediction must have a verdict, got none for {len(left)}")
     return [tuple(known.verdicts[key] for key in each) for each in keys]
 
 
-def _row(ranked: Ranked, i: int) -> int:
-    return int(ranked.rows[i])
+def _parts(sets: Sequence[Attempts]) -> list[list[int]]:
+    """Return which sets are tried together: contacts of all, postures file by file."""
+    contacts = [k for k, each in enumerate(sets) if each.grasps is not None]
+    postures = [[k] for k, each in enumerate(sets) if each.grasps is None]
+    return [*([contacts] if contacts else []), *postures]
 
 
-def _frame(ranked: Ranked) -> str:
-    return "" if ranked.table is None else f" posture in {ranked.table.frame}"
+def _of_rows(table: Attempts, rows: Sequence[int]) -> Attempts:
+    """Return the predictions for some rows."""
+    return table.at(np.flatnonzero(np.isin(table.of_row, rows)).tolist())
+
+
+def _frame(table: Attempts) -> str:
+    return "" if table.grasps is not None else f" posture in {table.frame}"
 
 
 def _keep(known: VerdictFile, keys: Sequence[str], index: int, verdict: Verdict) -> None:

@@ -50,8 +50,14 @@ MOST_POSES = 1e6
 UNTOLD = -1
 #: How far the length of a quaternion may be from one.
 UNIT_TOLERANCE = 1e-3
-#: What of a table decides nothing of a build.
-_UNDECIDING = ("invalid", "conditions", "of_row", "confidence", "link", "X_FG_xyzw")
+#: What of a table of postures decides a build. Why a row is none follows from the others, and from
+#: the meshes; a build draws its own conditions.
+_DECIDING = (
+    *("objects", "resting", "X_TO", "X_FG", "q_grasp", "q_pregrasp", "q_squeeze", "frame", "X_TC"),
+    *("scale", "log_density", "said", "preshape", "row"),
+)
+#: What a table says of all its rows together.
+_OF_ALL = ("frame", "link", "file", "sha256")
 #: What an attempt may have drawn, in the order of `Attempts.conditions`.
 CONDITIONS = ("friction_hand", "friction_table", "mass")
 
@@ -59,6 +65,8 @@ CONDITIONS = ("friction_hand", "friction_table", "mass")
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Attempts:
     """n postures of hands with j joints, in the plant's order; made by `make_attempts`.
+
+    Or n grasps of k contacts, whose wrist and joints are not told; made by `read_grasps`.
 
     Attributes:
         objects: (n,), name of the object of each.
@@ -82,6 +90,12 @@ class Attempts:
         confidence: (n,), of predictions: greater is better.
         link: Whether the file speaks of the palm link, as is told in hints.
         X_FG_xyzw: (n, 4, 4), likewise: X_FG if its quaternions were meant x, y, z, w.
+        grasps: (n, 6k), of contacts: the numbers as they were given; None of postures.
+        points, normals: (n, k, 3), contact points [m] and unit normals in the frame of the
+            caller; NaN in rows that are no grasp.
+        normalised: (n,), whether a normal was not of unit length.
+        rank: (n,), of predictions for a score: 0 for the best of its row.
+        file, sha256: Where predictions for a score are from, and the hash of that.
     """
 
     objects: tuple[str, ...]
@@ -104,6 +118,13 @@ class Attempts:
     confidence: Any = None
     link: bool = False
     X_FG_xyzw: Array | None = None
+    grasps: Array | None = None
+    points: Array | None = None
+    normals: Array | None = None
+    normalised: npt.NDArray[np.bool_] | None = None
+    rank: Any = None
+    file: str = ""
+    sha256: str = ""
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -111,7 +132,7 @@ class Attempts:
     def __iter__(self) -> Iterator[tuple[str, Any]]:
         """Yield name and values of each column that the table has."""
         for f in fields(self):
-            if f.name not in ("frame", "link") and (value := getattr(self, f.name)) is not None:
+            if f.name not in _OF_ALL and (value := getattr(self, f.name)) is not None:
                 yield f.name, value
 
     def of_object(self, name: str) -> Attempts:
@@ -160,7 +181,7 @@ class Attempts:
     def nameless(self) -> str:
         """How many rows name no resting pose, and what becomes of them; empty if none."""
         rows = [i for i in range(len(self)) if not (self.invalid[i] or self.names_pose(i))]
-        if not rows:
+        if not rows or self.grasps is not None:
             return ""
         return (
             f"{len(rows):,} of {len(self):,} rows of the postures name no resting pose: each is "
@@ -180,7 +201,9 @@ class Attempts:
         return known if named == UNTOLD else known[named : named + 1]
 
     def numbers(self) -> Array:
-        """Return all numbers (n, m) that say what each posture is, NaN where it lacks some."""
+        """Return all numbers (n, m) that say what each row is, NaN where it lacks some."""
+        if self.grasps is not None:
+            return self.grasps
         X = [X for X in (self.X_FG, self.X_TC) if X is not None]
         q = [self.q_grasp, self.q_pregrasp, self.q_squeeze]
         return np.column_stack([*(each.reshape(len(self), 16) for each in X), *q])
@@ -208,15 +231,12 @@ class Attempts:
     def digest(self) -> str:
         """Return a hash (16 hex digits) of all that decides a build."""
         digest = hashlib.sha256()
-        for f in fields(self):
-            # Why a row is none follows from the others, and from the meshes; a build draws its own
-            # conditions. A table without preshapes or poses is as before there were any.
-            value = getattr(self, f.name)
-            if f.name in _UNDECIDING:
+        for name in _DECIDING:
+            # A table without preshapes or poses is as before there were any.
+            value = getattr(self, name)
+            if name == "preshape" and not any(value):
                 continue
-            if f.name == "preshape" and not any(value):
-                continue
-            if f.name == "X_TO" and np.isnan(value).all():
+            if name == "X_TO" and np.isnan(value).all():
                 continue
             is_array = isinstance(value, np.ndarray)
             digest.update(value.tobytes() if is_array else json.dumps(value).encode())

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,7 @@ from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import GraspError, HandError
 from drakegrasp.frames import (
     Array,
+    as_numbers,
     invert_pose,
     read_pose,
     rotate_vectors,
@@ -49,9 +51,11 @@ from drakegrasp.simulation.placement import (
 from drakegrasp.simulation.posture import Posture
 from drakegrasp.simulation.settle import find_resting_poses
 from drakegrasp.verification.hints import known_frames
-from drakegrasp.verification.prediction import GraspRows, frame_poses, read_grasps
+from drakegrasp.verification.prediction import frame_poses, read_grasps
 from drakegrasp.verification.verify import METHODS, PlacedGrasp
 
+#: The row of a split for each of n grasps, or one for all; None: all rows, in order.
+RowChoice: TypeAlias = Sequence[int] | npt.NDArray[np.int64] | int | None
 #: What to call the frames of a dataset's cameras: of the data file's, and of the other file's.
 CAMERA, OTHER_CAMERA = "the camera's frame (camera)", "the frame of the dataset's other camera"
 #: Poses of an object at rest that differ by less are one: what is left of rounding in a file.
@@ -76,13 +80,13 @@ def place_on_object(
     Raises:
         GraspError: As `drakegrasp.verify_grasps`.
     """
-    if not isinstance(grasps, Attempts):
-        rows = _read(grasps, method, placed.config)
+    table = _read(grasps, method, placed.config)
+    if table.grasps is not None:
         given = None if X_TC is None else read_pose(X_TC, "X_TC")
         return _placed(
             placed,
-            np.arange(len(rows.invalid)),
-            rows,
+            np.arange(len(table)),
+            table,
             frame=frame,
             X_TC=given,
             stated=given,
@@ -91,7 +95,7 @@ def place_on_object(
             config=placed.config,
         )
 
-    named = replace(grasps, objects=(placed.model.name,) * len(grasps))
+    named = replace(table, objects=(placed.model.name,) * len(table))
     things, config = [placed], placed.config
     if config.objects.resting_poses > 1:
         others = find_resting_poses(placed.model, config)[1:]
@@ -102,7 +106,7 @@ def place_on_object(
 def place_on_rows(
     grasps: npt.ArrayLike | Attempts,
     dataset: GraspDataset,
-    rows: Sequence[int] | int | None = None,
+    rows: RowChoice = None,
     *,
     frame: str = "camera",
     hand: str | Path | None = None,
@@ -121,13 +125,13 @@ def place_on_rows(
     """
     # Read all grasps before any object: a wrong number is reported at once.
     used = dataset_config(dataset, config, hand, overrides)
-    read = grasps if isinstance(grasps, Attempts) else _read(grasps, method, used)
-    chosen = choose_rows(dataset, rows, len(read.invalid))
+    read = _read(grasps, method, used)
+    chosen = choose_rows(dataset, read.of_row if rows is None else rows, len(read))
 
     # Each object in each resting pose once, with its grasps.
     found, cameras = list[PlacedGrasp](), cameras_of_rows(dataset, chosen)
     for placed, indices in objects_of_rows(dataset, chosen):
-        if isinstance(read, Attempts):
+        if read.grasps is None:
             lying = _as_it_lies(read, placed.model.name)
             found += _placed_postures(lying, indices.tolist(), [placed], used, cameras=cameras)
             continue
@@ -251,17 +255,19 @@ def _refuse_other_hand(dataset: GraspDataset, config: Config) -> None:
         )
 
 
-def _read(grasps: npt.ArrayLike, method: str, config: Config) -> GraspRows:
-    """Return the rows of numbers as grasps of the configuration's hand."""
+def _read(grasps: npt.ArrayLike | Attempts, method: str, config: Config) -> Attempts:
+    """Return a table of attempts: as it is given, or of contacts of the configuration's hand."""
     if method not in METHODS:
         raise GraspError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    if isinstance(grasps, Attempts):
+        return grasps
     return read_grasps(grasps, load_hand(config.hand_source).num_fingers)
 
 
 def _placed(
     placed: PlacedObject,
     indices: npt.NDArray[np.int64],
-    rows: GraspRows,
+    table: Attempts,
     *,
     frame: str,
     X_TC: Array | None,
@@ -271,12 +277,12 @@ def _placed(
     snap_points: bool,
     config: Config,
 ) -> list[PlacedGrasp]:
-    """Return the grasps of one object: those of the rows with the given indices.
+    """Return the contacts of one object: those of the rows with the given indices.
 
     Args:
         placed: The object.
-        indices: (n,), into the rows of numbers.
-        rows: All of them.
+        indices: (n,), into the rows of the table.
+        table: Of contacts.
         frame: Of the numbers, see `frame_poses`.
         X_TC: Of the camera, see `frame_poses`.
         stated: X_TC if a caller states it, who may mean another pose by it.
@@ -285,6 +291,9 @@ def _placed(
         snap_points: Of each `PlacedGrasp`.
         config: Of each `PlacedGrasp`.
     """
+    assert table.points is not None and table.normals is not None
+    assert table.normalised is not None
+
     # The frame of the numbers in {O}, and others that they could be in.
     count = len(indices)
     X_OM = placed.X_OM
@@ -299,12 +308,12 @@ def _placed(
         PlacedGrasp(
             index=int(index),
             placed=placed,
-            p_OQ=transform_points(X_OA[i], rows.points[index]),
-            nhat_Q_O=rotate_vectors(X_OA[i], rows.normals[index]),
+            p_OQ=transform_points(X_OA[i], table.points[index]),
+            nhat_Q_O=rotate_vectors(X_OA[i], table.normals[index]),
             method=method,
             config=config,
-            invalid=rows.invalid[index],
-            normalised=bool(rows.normalised[index]),
+            invalid=table.invalid[index],
+            normalised=bool(table.normalised[index]),
             snap_points=snap_points,
             X_OA=X_OA[i],
             frames=others(i),
@@ -345,9 +354,7 @@ def as_drawn(
     return tried
 
 
-def choose_rows(
-    dataset: GraspDataset, rows: Sequence[int] | int | None, count: int
-) -> npt.NDArray[np.int64]:
+def choose_rows(dataset: GraspDataset, rows: RowChoice, count: int) -> npt.NDArray[np.int64]:
     """Return the row (n,) of the dataset's split for each of `count` grasps; one may be for all.
 
     Raises:
@@ -378,6 +385,44 @@ def choose_rows(
             f"got {wrong[0]}"
         )
     return chosen
+
+
+def read_several(
+    grasps: npt.ArrayLike,
+    data: GraspDataset,
+    *,
+    fingers: int,
+    rows: RowChoice = None,
+    confidence: npt.ArrayLike | None = None,
+) -> Attempts:
+    """Return predicted contacts for rows of a split, of which each may have several.
+
+    Args:
+        grasps: (n, 6k), or (n, m, 6k), m per row. NaN stays: it is a bad prediction, not a mistake
+            of the caller.
+        data: The split.
+        fingers: Number of fingers, k.
+        rows: (n,), the row that each is for, which may come several times; all rows in order if
+            None.
+        confidence: (n,) or (n, m), greater is better.
+
+    Raises:
+        GraspError: If shapes do not fit each other, or a row does not exist.
+    """
+    array = as_numbers(grasps, "grasps must be numbers")
+    if array.ndim not in (2, 3) or array.size == 0:
+        raise GraspError(f"grasps must be (n, 6k), or (n, m, 6k) for m per row, got {array.shape}")
+    of_row = np.repeat(choose_rows(data, rows, len(array)), array[0, ..., 0].size)
+    stated = None
+    if confidence is not None:
+        stated = as_numbers(confidence, "confidence must be numbers")
+        if stated.shape != array.shape[:-1]:
+            raise GraspError(
+                f"confidence must be {array.shape[:-1]}, one per grasp, got {stated.shape}"
+            )
+        stated = stated.ravel()
+    flat = array.reshape(-1, array.shape[-1])
+    return read_grasps(flat, fingers, rows=of_row, confidence=stated)
 
 
 def place_on_dataset(

@@ -73,7 +73,7 @@ def gallery(predictions: Path, data: Path, card: Path) -> Figure:
     # The first choice for each view, the surest first.
     ranked, verdicts = judged.ranked[0], judged.verdicts[0]
     order = np.argsort(-np.asarray(ranked.confidence), kind="stable")
-    first = [i for i in order.tolist() if ranked.ranks[i] == 0]
+    first = [i for i in order.tolist() if ranked.rank[i] == 0]
 
     line = 0.75 * WIDE + 0.34
     figure = Figure(figsize=(ACROSS * (WIDE + GAP) + 0.2, 2 * LINES * line + 0.1))
@@ -84,7 +84,7 @@ def gallery(predictions: Path, data: Path, card: Path) -> Figure:
             top = (kind * LINES + down) * line + 0.3
             axes = add_axes(figure, 0.1 + across * (WIDE + GAP), top, WIDE, 0.75 * WIDE)
             # The surest of a row comes first in the file.
-            row = int(ranked.rows[i])
+            row = int(ranked.of_row[i])
             item, place = views[row], int(np.flatnonzero(row_of == row)[0])
             draw(axes, item, X_OG[place], COLOURS[kind])
             outcome = "a sample" if good else verdicts[i].outcome.replace("_", " ")

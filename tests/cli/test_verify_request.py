@@ -12,7 +12,7 @@ from helpers.commands import run
 from helpers.datasets import OTO, make_dataset
 from helpers.hands import write_with_optional_fingers
 
-from drakegrasp.cli.placing import place_requested, requested_rows
+from drakegrasp.cli.placing import place_requested
 from drakegrasp.cli.predictions import VerifyRequest
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
@@ -43,7 +43,7 @@ def test_rows_are_tried_with_their_own_friction_and_mass(
     drawn: Path, overrides: tuple[str, ...]
 ) -> None:
     data = GraspDataset(drawn / OTO, split="test")
-    grasps, config = place_requested(request(drawn, overrides=overrides))
+    grasps, config, _ = place_requested(request(drawn, overrides=overrides))
     assert len(grasps) == len(data) > 0
     for grasp in grasps:
         row = data[grasp.index]
@@ -59,7 +59,7 @@ def test_rows_are_tried_with_their_own_friction_and_mass(
 
 def test_a_value_that_is_set_wins_over_the_drawn_one(drawn: Path) -> None:
     data = GraspDataset(drawn / OTO, split="test")
-    grasps, _ = place_requested(request(drawn, overrides=("physics.friction_hand=0.9",)))
+    grasps, _, _ = place_requested(request(drawn, overrides=("physics.friction_hand=0.9",)))
     for grasp in grasps:
         assert grasp.config.physics.friction_hand == 0.9
         assert grasp.placed.model.friction is None  # which would win
@@ -69,7 +69,7 @@ def test_a_value_that_is_set_wins_over_the_drawn_one(drawn: Path) -> None:
 
 
 def test_a_given_configuration_draws_nothing(drawn: Path) -> None:
-    grasps, config = place_requested(request(drawn, config="paper"))
+    grasps, config, _ = place_requested(request(drawn, config="paper"))
     assert config == load_config("paper")
     assert {grasp.config for grasp in grasps} == {config}
     masses = [e.mass for e in read_manifest(drawn).objects]
@@ -91,7 +91,7 @@ def test_postures_of_rows_are_tried_with_the_friction_and_mass_of_their_rows(
     rows = np.arange(len(data))[::-1]
     path = posture_file(tmp_path / "p.npz", data, row=rows)
     given = VerifyRequest(grasps=path, dataset=drawn / OTO, split="train")
-    grasps, _ = place_requested(given)
+    grasps, _, told = place_requested(given)
     assert sorted(grasp.index for grasp in grasps) == list(range(len(data)))
     for grasp in grasps:
         row = data[int(rows[grasp.index])]
@@ -100,7 +100,6 @@ def test_postures_of_rows_are_tried_with_the_friction_and_mass_of_their_rows(
         assert grasp.config.physics.friction_hand == pytest.approx(
             float(row.conditions["friction_hand"])
         )
-    told = requested_rows(given, len(grasps))
     assert told is not None
     assert told.row.tolist() == rows.tolist()
 
@@ -111,7 +110,7 @@ def test_postures_without_rows_are_tried_on_the_objects_that_they_name(
     data = GraspDataset(drawn / OTO, split="train")
     names = ["cup", *data.column("object_props/object_name")[1:]]
     path = posture_file(tmp_path / "p.npz", data, object=names)
-    grasps, _ = place_requested(VerifyRequest(grasps=path, dataset=drawn / OTO))
+    grasps, _, _ = place_requested(VerifyRequest(grasps=path, dataset=drawn / OTO))
     found = {grasp.index: grasp for grasp in grasps}
     assert [found[i].placed.model.name for i in range(len(data))] == names
     assert found[0].invalid.startswith("object must be one of 1_box_a, 2_box_b, 3_brick, got 'cup'")
@@ -138,7 +137,7 @@ def test_postures_of_a_mesh_are_those_that_name_it(
         with pytest.raises(GraspError, match=words):
             place_requested(given)
         return
-    grasps, _ = place_requested(given)
+    grasps, _, _ = place_requested(given)
     assert [grasp.index for grasp in grasps] == list(range(count))
     told = capsys.readouterr().err
     assert words in told and f"{count} of {count} rows of the postures name no resting" in told
@@ -173,14 +172,14 @@ def test_a_hand_whose_files_have_changed_is_refused_unless_it_is_named(
     out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=[f"hand={hand.name}"])
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    grasps, used = place_requested(request(out))
+    grasps, used, _ = place_requested(request(out))
     assert grasps and used.hand == str(hand)
 
     # A change since then.
     hand.write_text(f"{hand.read_text()}\n# changed\n")
     with pytest.raises(HandError, match="files of the hand must be those of the dataset"):
         place_requested(request(out))
-    grasps, used = place_requested(request(out, hand=f"../{hand.name}"))
+    grasps, used, _ = place_requested(request(out, hand=f"../{hand.name}"))
     assert grasps and load_hand(used.hand).name == "optional"
 
 
@@ -199,7 +198,7 @@ def test_grasps_of_others_are_tried_on_rows_that_leave_fingers_out(tmp_path: Pat
         file["test/grasp_props/unused"][:] = 0b001
         predicted = file["test/grasps"][:]
     np.save(tmp_path / "predicted.npy", predicted)
-    grasps, _ = place_requested(
+    grasps, _, _ = place_requested(
         request(out, grasps=tmp_path / "predicted.npy", dataset=out / OTO, split="test")
     )
     assert len(grasps) == len(predicted) > 0
@@ -217,11 +216,10 @@ def test_the_rows_of_an_array_are_those_of_the_option(drawn: Path, tmp_path: Pat
     np.save(tmp_path / "rows.npy", [2, 0, 1])
     for rows in ("2,0-1", str(tmp_path / "rows.npy")):
         asked = request(drawn, **given, rows=rows)
-        grasps, _ = place_requested(asked)
+        grasps, _, stated = place_requested(asked)
         masses = {grasp.index: grasp.placed.model.mass for grasp in grasps}
         true = data.column("object_props/work2mass")[[2, 0, 1], 0]
         assert [masses[i] for i in range(3)] == pytest.approx(true.tolist())
-        stated = requested_rows(asked, 3)
         assert stated is not None
         assert stated.row.tolist() == [2, 0, 1]
     for rows in ("2,0", "2,x,1", "-1", "1-", "0-99999999999"):

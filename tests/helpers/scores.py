@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from drakegrasp.scoring.measures import Grouping, Judged
-from drakegrasp.scoring.verdict import Verdict, rank, verdict_of
+from drakegrasp.scoring.verdict import Verdict, rank_array, verdict_of
+from drakegrasp.simulation.attempts import Attempts
 
 FAILS = Verdict(
     outcome="dropped",
@@ -36,12 +38,32 @@ def verdict(word: str, error: float = 0.004, confidence: float = 0.0) -> Verdict
     return Verdict(**(held | ({"sample": True, "precision": True} if word == "sample" else {})))
 
 
+class Rows:
+    """A split of so many rows, of a hand with three fingers."""
+
+    split, path = "test", Path("data.hdf5")
+
+    def __init__(self, length: int) -> None:
+        self.length = length
+
+    def __len__(self) -> int:
+        return self.length
+
+    def column(self, name: str) -> np.ndarray:
+        return np.zeros((self.length, 18))
+
+
+def ranked_array(name: str, grasps: Any, *, length: int, **stated: Any) -> Attempts:
+    """Return predictions for a split of so many rows, in the order of rows and ranks."""
+    return rank_array(name, grasps, Rows(length), **stated)  # type: ignore[arg-type]
+
+
 def judged(name: str, *seeds: Sequence[Sequence[str]]) -> Judged:
     """Return a set whose seeds state a word for each rank of each row."""
     ranked, verdicts = [], []
     for rows in seeds:
         grasps = np.zeros((len(rows), len(rows[0]), 18))
-        ranked.append(rank(name, grasps, length=len(rows)))
+        ranked.append(ranked_array(name, grasps, length=len(rows)))
         verdicts.append(tuple(verdict(word) for row in rows for word in row))
     return Judged(name=name, ranked=tuple(ranked), verdicts=tuple(verdicts))
 
@@ -64,7 +86,7 @@ class FakeVerify:
         self.holds, self.asked, self.stop_after = holds, 0, stop_after
 
     def __call__(self, grasps: Any, rows: Sequence[int], on_result: Any) -> None:
-        for index, grasp in enumerate(grasps):
+        for index, grasp in enumerate(grasps.numbers()):
             if self.stop_after is not None and index == self.stop_after:
                 raise KeyboardInterrupt
             self.asked += 1

@@ -16,7 +16,7 @@ from helpers.pages import Tags
 from helpers.predictions import write_predictions
 from starlette.testclient import TestClient
 
-from drakegrasp.cli.placing import requested_rows
+from drakegrasp.cli.placing import place_requested
 from drakegrasp.cli.predictions import VerifyRequest
 from drakegrasp.dataset.predicted_rows import read_predicted_rows
 from drakegrasp.dataset.reader import GraspDataset
@@ -188,7 +188,7 @@ def test_results_say_which_rows_were_asked_for(out: Path, tmp_path: Path) -> Non
         (data.path, "train", np.arange(len(data))),
     ):
         request = VerifyRequest(grasps=path, dataset=data.path, split=split)
-        asked = requested_rows(request, len(wanted))
+        _, _, asked = place_requested(request)
         assert asked is not None
         with h5py.File(tmp_path / "r.h5", "w") as file:
             asked.write(file)
@@ -196,4 +196,3 @@ def test_results_say_which_rows_were_asked_for(out: Path, tmp_path: Path) -> Non
         assert read is not None
         assert (read.split, read.camera, read.row.tolist()) == ("train", "oto", wanted.tolist())
         assert read.trial_id.tolist() == data.column("trial_id")[wanted].tolist()
-    assert requested_rows(VerifyRequest(grasps=tmp_path / "p.h5", mesh=Path("a.obj")), 3) is None

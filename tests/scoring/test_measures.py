@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.scores import grouping, judged, verdict
+from helpers.scores import grouping, judged, ranked_array, verdict
 
 from drakegrasp.scoring.measures import (
     Judged,
@@ -20,7 +20,6 @@ from drakegrasp.scoring.measures import (
     first_table,
     resample,
 )
-from drakegrasp.scoring.verdict import rank
 
 DRAWS = resample([f"object {i}" for i in range(3)])
 
@@ -35,7 +34,7 @@ def test_an_object_with_many_rows_counts_no_more_than_another() -> None:
 
 
 def test_the_headline_asks_for_a_sample_with_contacts_where_they_were_asked_for() -> None:
-    ranked = rank("net", np.zeros((3, 18)), length=3)
+    ranked = ranked_array("net", np.zeros((3, 18)), length=3)
     verdicts = (verdict("sample"), verdict("sample", error=0.03), verdict("held"))
     one = Judged(name="net", ranked=(ranked,), verdicts=(verdicts,))
     assert first_table(one, grouping(0, 1, 2), "headline").tolist() == [[1, 0, 0]]
@@ -102,14 +101,14 @@ def test_training_seeds_of_both_sets_widen_a_difference() -> None:
 
 
 def test_the_curve_rises_with_the_distance() -> None:
-    ranked = rank("net", np.zeros((2, 18)), length=2)
+    ranked = ranked_array("net", np.zeros((2, 18)), length=2)
     verdicts = (verdict("held", error=0.012), verdict("held", error=0.05))
     values = curve(Judged(name="n", ranked=(ranked,), verdicts=(verdicts,)), grouping(0, 1))
     assert values == [0.0] * 3 + [0.5] * 7 + [1.0] * 3
 
 
 def test_calibration_groups_by_confidence() -> None:
-    ranked = rank("net", np.zeros((10, 18)), length=10, confidence=np.arange(10) / 10)
+    ranked = ranked_array("net", np.zeros((10, 18)), length=10, confidence=np.arange(10) / 10)
     verdicts = tuple(verdict("fails" if i < 5 else "sample") for i in range(10))
     one = Judged(name="n", ranked=(ranked,), verdicts=(verdicts,))
     groups = calibration(one)
@@ -118,7 +117,7 @@ def test_calibration_groups_by_confidence() -> None:
 
 
 def test_diversity_is_one_along_a_line_and_falls_with_directions() -> None:
-    ranked = rank("net", np.zeros((4, 18)), length=4)
+    ranked = ranked_array("net", np.zeros((4, 18)), length=4)
 
     def variance(postures: np.ndarray) -> list[float] | None:
         held = tuple(replace(verdict("sample"), posture=tuple(p)) for p in postures)
@@ -129,7 +128,7 @@ def test_diversity_is_one_along_a_line_and_falls_with_directions() -> None:
 
 
 def test_coverage_is_of_own_grasps_with_a_good_one_near() -> None:
-    ranked = rank("net", np.zeros((3, 18)), length=3)
+    ranked = ranked_array("net", np.zeros((3, 18)), length=3)
     near = replace(verdict("sample"), contacts=(0.01,) * 9)
     one = Judged(
         name="n", ranked=(ranked,), verdicts=((near, verdict("fails"), verdict("sample")),)

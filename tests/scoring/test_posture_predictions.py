@@ -17,7 +17,7 @@ from drakegrasp.frames import invert_pose, unpack_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.scoring.run import VERDICTS
-from drakegrasp.scoring.verdict import rank_postures
+from drakegrasp.scoring.verdict import rank_file
 from drakegrasp.simulation.posture import joint_order
 from drakegrasp.verification.placing import place_on_rows
 
@@ -63,17 +63,13 @@ def test_postures_of_rows_are_ranked_and_bad_ones_keep_their_reason(
         confidence=[0.2, 0.5, 0.9, 0.1],
         object=[names[0], names[1], names[2], "cup"],
     )
-    ranked = rank_postures(tmp_path / "p.npz", data)
-    assert ranked.rows.tolist() == [0, 1, 2, 2]
-    assert ranked.ranks.tolist() == [0, 0, 0, 1]
-    assert ranked.table is not None
-    assert ranked.table.row.tolist() == [1, 3, 2, 0]
-    assert ranked.table.invalid[0] == ranked.table.invalid[3] == ""
-    assert ranked.table.invalid[1] == f"object must be that of row 1, {names[3]}, got cup"
-    assert ranked.table.invalid[2] == "q_grasp must be finite numbers, got others"
-    few = ranked.of_rows([2])
-    assert few.table is not None
-    assert few.table.row.tolist() == [2, 0]
+    ranked = rank_file(tmp_path / "p.npz", data)
+    assert ranked.of_row.tolist() == [0, 1, 2, 2]
+    assert ranked.rank.tolist() == [0, 0, 0, 1]
+    assert ranked.row.tolist() == [1, 3, 2, 0]
+    assert ranked.invalid[0] == ranked.invalid[3] == ""
+    assert ranked.invalid[1] == f"object must be that of row 1, {names[3]}, got cup"
+    assert ranked.invalid[2] == "q_grasp must be finite numbers, got others"
 
 
 def test_posture_in_the_frame_of_the_rows_camera_is_that_in_the_objects(
@@ -86,8 +82,7 @@ def test_posture_in_the_frame_of_the_rows_camera_is_that_in_the_objects(
     # An object lies as in its row, whatever the file says.
     given |= {"X_FG": X_CG, "resting": np.full(len(rows), 7)}
     np.savez(tmp_path / "p.npz", **given, frame="camera")
-    table = rank_postures(tmp_path / "p.npz", data).table
-    assert table is not None
+    table = rank_file(tmp_path / "p.npz", data)
     placed = sorted(place_on_rows(table, data, rows.tolist()), key=lambda g: g.index)
     for grasp, X_OG, row in zip(placed, X_OGs, rows.tolist(), strict=True):
         assert grasp.posture is not None
@@ -109,7 +104,7 @@ def test_what_belongs_to_no_row_is_refused(
 ) -> None:
     np.savez(tmp_path / "p.npz", **(own_postures(data, np.array([0, 1])) | changes))
     with pytest.raises(GraspError, match=words) as caught:
-        rank_postures(tmp_path / "p.npz", data)
+        rank_file(tmp_path / "p.npz", data)
     assert str(caught.value).startswith(str(tmp_path / "p.npz"))
 
 

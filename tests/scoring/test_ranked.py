@@ -7,35 +7,36 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from helpers.scores import ranked_array
 
 from drakegrasp.errors import GraspError
-from drakegrasp.scoring.verdict import rank, read_ranked
+from drakegrasp.exchange.contacts import read_contacts
 
 GRASPS = np.arange(2 * 3 * 18, dtype=float).reshape(2, 3, 18)
 
 
 def test_predictions_of_a_row_are_ranked_by_confidence_and_equal_ones_keep_their_order() -> None:
-    ranked = rank("a", GRASPS, length=2, confidence=[[0.1, 0.9, 0.9], [0.5, 0.4, 0.6]])
-    assert ranked.rows.tolist() == [0, 0, 0, 1, 1, 1]
-    assert ranked.ranks.tolist() == [0, 1, 2, 0, 1, 2]
+    ranked = ranked_array("a", GRASPS, length=2, confidence=[[0.1, 0.9, 0.9], [0.5, 0.4, 0.6]])
+    assert ranked.of_row.tolist() == [0, 0, 0, 1, 1, 1]
+    assert ranked.rank.tolist() == [0, 1, 2, 0, 1, 2]
     np.testing.assert_array_equal(
         ranked.grasps, [GRASPS[0, 1], GRASPS[0, 2], GRASPS[0, 0], *GRASPS[1, [2, 0, 1]]]
     )
 
 
 def test_without_confidence_the_order_is_the_rank() -> None:
-    ranked = rank("a", GRASPS, length=2)
+    ranked = ranked_array("a", GRASPS, length=2)
     np.testing.assert_array_equal(ranked.grasps, GRASPS.reshape(6, 18))
     assert ranked.confidence is None
 
 
 def test_a_confidence_that_is_no_number_ranks_last() -> None:
-    ranked = rank("a", GRASPS[:1], length=1, confidence=[[np.nan, 0.2, 0.3]])
+    ranked = ranked_array("a", GRASPS[:1], length=1, confidence=[[np.nan, 0.2, 0.3]])
     np.testing.assert_array_equal(ranked.grasps[-1], GRASPS[0, 0])
 
 
 def test_bad_numbers_stay_as_they_are_failures_of_the_network() -> None:
-    assert np.isnan(rank("a", np.full((2, 18), np.nan), length=2).grasps).all()
+    assert np.isnan(ranked_array("a", np.full((2, 18), np.nan), length=2).grasps).all()
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".h5", ".parquet"])
@@ -44,7 +45,7 @@ def test_all_formats_give_the_same_predictions(tmp_path: Path, suffix: str) -> N
     rows = np.array([4, 4, 4, 7, 7, 7])
     if suffix == ".npy":
         np.save(path, GRASPS)
-        ranked = read_ranked(path, length=2, split="test")
+        ranked = ranked_array("a", **read_contacts(path, axes=3), length=2)
         np.testing.assert_array_equal(ranked.grasps, flat)
         return
     if suffix == ".h5":
@@ -56,24 +57,24 @@ def test_all_formats_give_the_same_predictions(tmp_path: Path, suffix: str) -> N
 
         table = {"grasps": flat.tolist(), "rows": rows, "confidence": confidence}
         pq.write_table(pa.table(table), path)
-    ranked = read_ranked(path, length=9, split="test")
-    assert ranked.rows.tolist() == rows.tolist()
+    ranked = ranked_array("a", **read_contacts(path, split="test"), length=9)
+    assert ranked.of_row.tolist() == rows.tolist()
     np.testing.assert_array_equal(ranked.grasps, flat[[2, 1, 0, 5, 4, 3]])
-    assert len(ranked.sha256) == 64
+    assert len(ranked.sha256) == 64 and ranked.file == "a"
 
 
 @pytest.mark.parametrize(
     ("rows", "confidence", "message"),
     [
-        (None, None, "for each of the 5 rows of the split, got 2"),
-        ([0, 5], None, "rows must be 0 to 4, got 5"),
-        ([0.0, 1.0], None, "rows must be one whole number per entry"),
+        (None, None, "for each of the 5 rows of test in data.hdf5, got 2"),
+        ([0, 5], None, "rows must be 0 to 4 of test in data.hdf5, got 5"),
+        ([0.0, 1.0], None, "rows must be whole numbers"),
         ([0, 1], [0.5, 0.5], r"confidence must be \(2, 3\)"),
     ],
 )
 def test_what_does_not_fit_is_refused(rows: object, confidence: object, message: str) -> None:
     with pytest.raises(GraspError, match=message):
-        rank("a", GRASPS, length=5, rows=rows, confidence=confidence)
+        ranked_array("a", GRASPS, length=5, rows=rows, confidence=confidence)
 
 
 @pytest.mark.parametrize("name", ["a.npy", "a.h5", "a.parquet", "a.txt"])
@@ -81,4 +82,4 @@ def test_a_file_of_something_else_is_refused_by_name(tmp_path: Path, name: str) 
     path = tmp_path / name
     path.write_bytes(b"something else")
     with pytest.raises(GraspError, match=name):
-        read_ranked(path, length=2, split="test")
+        read_contacts(path, split="test")

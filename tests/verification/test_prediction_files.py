@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drakegrasp.errors import GraspError
-from drakegrasp.verification.prediction import read_numbers, read_predictions
+from drakegrasp.exchange.contacts import read_contacts, read_numbers
 
 NUMBERS = np.random.default_rng(0).normal(size=(4, 18)).round(6)
 
@@ -57,17 +57,17 @@ def _hdf5_in_a_group(path: Path) -> Path:
     "make", [_npy, _npy_single, _csv, _csv_with_header, _hdf5, _hdf5_in_a_group]
 )
 def test_every_format_gives_the_same_numbers(tmp_path: Path, make: Callable[[Path], Path]) -> None:
-    found = read_predictions(make(tmp_path))
-    np.testing.assert_allclose(found.grasps, NUMBERS, atol=1e-6)
-    assert found.grasps.dtype == np.float64
-    assert (found.rows is not None) == (make is _hdf5_in_a_group)
+    found = read_contacts(make(tmp_path))
+    np.testing.assert_allclose(found["grasps"], NUMBERS, atol=1e-6)
+    assert found["grasps"].dtype == np.float64
+    assert (found["rows"] is not None) == (make is _hdf5_in_a_group)
 
 
 def test_one_grasp_may_be_a_vector_or_a_line(tmp_path: Path) -> None:
     np.save(tmp_path / "one.npy", NUMBERS[0])
     (tmp_path / "one.csv").write_text(",".join(map(str, NUMBERS[0])))
     for name in ("one.npy", "one.csv"):
-        assert np.array_equal(read_predictions(tmp_path / name).grasps, NUMBERS[:1])
+        assert np.array_equal(read_contacts(tmp_path / name)["grasps"], NUMBERS[:1])
 
 
 @pytest.fixture
@@ -79,27 +79,27 @@ def splits(tmp_path: Path) -> Path:
 
 
 def test_split_chooses_the_group(splits: Path) -> None:
-    test, valid = (read_predictions(splits, split=name) for name in ("test", "valid"))
-    assert np.array_equal(test.grasps, NUMBERS[:1])
-    assert test.rows is not None
-    assert test.rows.tolist() == [5]
-    assert np.array_equal(valid.grasps, NUMBERS[1:])
-    assert valid.rows is None
+    test, valid = (read_contacts(splits, split=name) for name in ("test", "valid"))
+    assert np.array_equal(test["grasps"], NUMBERS[:1])
+    assert test["rows"] is not None
+    assert test["rows"].tolist() == [5]
+    assert np.array_equal(valid["grasps"], NUMBERS[1:])
+    assert valid["rows"] is None
 
 
 def test_group_that_was_not_asked_for_is_never_taken(splits: Path, tmp_path: Path) -> None:
     with pytest.raises(GraspError, match=r"in /train or at the root, got them in /test, /valid"):
-        read_predictions(splits, split="train")
+        read_contacts(splits, split="train")
     with pytest.raises(GraspError, match=r"root or in one group, got .*; choose with --split"):
-        read_predictions(splits)
+        read_contacts(splits)
     with h5py.File(tmp_path / "valid.h5", "w") as file:
         file["valid/grasps"] = NUMBERS
     with pytest.raises(GraspError, match="got them in /valid; choose with --split"):
-        read_predictions(tmp_path / "valid.h5", split="test")
+        read_contacts(tmp_path / "valid.h5", split="test")
 
 
 def test_root_is_taken_for_any_split(tmp_path: Path) -> None:
-    assert len(read_predictions(_hdf5(tmp_path), split="valid").grasps) == 4
+    assert len(read_contacts(_hdf5(tmp_path), split="valid")["grasps"]) == 4
 
 
 def _missing(path: Path) -> Path:
@@ -188,7 +188,7 @@ def _absurd(path: Path) -> Path:
 )
 def test_bad_file_is_one_line(tmp_path: Path, make: Callable[[Path], Path], words: str) -> None:
     with pytest.raises(GraspError, match=words) as raised:
-        read_predictions(make(tmp_path))
+        read_contacts(make(tmp_path))
     assert "\n" not in str(raised.value)
 
 
