@@ -89,6 +89,7 @@ def read_attempts(
         DataError: If the dataset cannot be used.
         MachineError: If a package is missing that the format needs.
     """
+    # Contacts, which name nothing that they are of.
     if of is not None and not holds_postures(path):
         data = of if isinstance(of, GraspDataset) else None
         said = read_contacts(path, split=data.split if data else split, axes=3 if several else 2)
@@ -96,6 +97,8 @@ def read_attempts(
             if several and data is not None:
                 return read_several(**said, fingers=hand.num_fingers, data=data)
             return read_grasps(said["grasps"], hand.num_fingers, rows=said["rows"])
+
+    # Postures of a file, or of all files of a folder.
     if isinstance(of, GraspDataset):
         return _for_rows(path, hand, of)
     if not path.is_dir():
