@@ -45,7 +45,8 @@ def firm(count: int = 2, mass: float = 1.0) -> dict[str, npt.NDArray[Any]]:
 
 
 def test_scales_are_those_of_the_docs() -> None:
-    """See docs/reference/outcomes.md."""
+    """See docs/reference/outcomes.md; gravity is the simulator's."""
+    assert module.GRAVITY == settle.GRAVITY
     assert {name: round(scale, 9) for name, scale in SCALES.items()} == {
         "penetration": 4e-3,
         "normal_angle": round(np.pi / 6.0, 9),
@@ -145,10 +146,6 @@ def test_normals_are_of_the_fingers_that_a_preshape_uses() -> None:
     columns["closed_touching"][:, 2] = False
     columns["unused"][1] = 0b100
     np.testing.assert_allclose(suspicion(columns).values["normal_sum"], [2.0 / 3.0, 1.0])
-
-
-def test_gravity_is_the_simulators() -> None:
-    assert module.GRAVITY == settle.GRAVITY
 
 
 @pytest.mark.parametrize("fingers", [2, 3, 4])

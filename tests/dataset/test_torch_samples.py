@@ -94,13 +94,6 @@ def test_a_batch_that_somebody_changed_is_collated_as_it_is(
     assert all(torch.equal(batch[name], plain[name]) for name in plain)
 
 
-def test_a_sample_of_a_batch_is_copied_as_a_plain_dictionary(data: GraspDataset) -> None:
-    row = data.to_torch(("grasps",)).__getitems__([0, 1])[1]
-    copied = pickle.loads(pickle.dumps(row))
-    assert type(copied) is dict
-    assert torch.equal(copied["grasps"], row["grasps"])
-
-
 def shared_and_first(rows: list[dict[str, Any]]) -> tuple[bool, torch.Tensor]:
     """Return whether the samples lie in shared memory already, and the first image."""
     return rows[0]["images"].is_shared(), rows[0]["images"]
@@ -171,3 +164,7 @@ def test_a_pickle_holds_neither_file_nor_columns(data: GraspDataset) -> None:
     content = pickle.dumps(samples)
     assert len(content) < 2000
     assert (pickle.loads(content)[0]["grasps"] == samples[0]["grasps"]).all()
+    row = samples.__getitems__([0, 1])[1]
+    copied = pickle.loads(pickle.dumps(row))
+    assert type(copied) is dict  # of a batch, too
+    assert torch.equal(copied["grasps"], row["grasps"])
