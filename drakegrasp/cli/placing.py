@@ -15,8 +15,7 @@ import numpy.typing as npt
 from drakegrasp.cli.console import say
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.predicted_rows import PredictedRows
-from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.reader import GraspDataset, PredictedRows
 from drakegrasp.errors import DataError, GraspError, listed
 from drakegrasp.exchange.attempts import has_rows, holds_postures, read_attempts
 from drakegrasp.exchange.contacts import HDF5_SUFFIXES, read_numbers

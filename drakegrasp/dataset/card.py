@@ -214,7 +214,12 @@ def _hand_licences(config: Config) -> dict[str, str]:
     if (known := _known_hand(config)) is None:
         return {}
     folder = known[1]
-    found = {place: _first_line(folder.content(place)) for place in folder.licences}
+    found = {}
+    for place in folder.licences:
+        # The first line of the text that says something, shortened.
+        text = folder.content(place).decode(errors="replace")
+        lines = (printable(line.strip()) for line in text.splitlines())
+        found[place] = next(filter(None, lines), "")[:LONGEST_LINE]
     return found or ({"LICENSE": OWN_LICENCE} if config.hand in hand_names() else {})
 
 
@@ -245,15 +250,13 @@ def _loads(data: Path, config: Config) -> dict[str, Any]:
     return {"fingertip_loads": loads}
 
 
-def _first_line(text: bytes) -> str:
-    """Return the first line of a text that says something, shortened."""
-    lines = (printable(line.strip()) for line in text.decode(errors="replace").splitlines())
-    return next(filter(None, lines), "")[:LONGEST_LINE]
-
-
 def _counts(data: Path, funnel: Funnel) -> dict[str, Any]:
     """Return the numbers of attempts, grasps and samples: of all, by class, object and split."""
-    samples = _samples_by_object(data)
+    with open_samples(data) as file:
+        samples = {
+            split: dict(Counter(read_names(file[split]["object_props/object_name"])))
+            for split in SPLITS
+        }
     rows = {name: _row(funnel, samples, [i]) for i, name in enumerate(funnel.names)}
     members: dict[str, list[int]] = {}
     for i, name in enumerate(funnel.classes):
@@ -301,15 +304,6 @@ def _row(
         "samples": int(funnel.samples[places].sum()),
         **{split: sum(samples[split].get(name, 0) for name in names) for split in SPLITS},
     }
-
-
-def _samples_by_object(data: Path) -> dict[str, dict[str, int]]:
-    """Return the numbers of samples by split and object; the files were read before."""
-    found = {}
-    with open_samples(data) as file:
-        for split in SPLITS:
-            found[split] = dict(Counter(read_names(file[split]["object_props/object_name"])))
-    return found
 
 
 # As files

@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
@@ -111,7 +110,7 @@ class SplitCount:
     """A row of the paper's Table III: numbers of samples, objects and classes of a split.
 
     `effective` is how many of the samples count where those that are alike count once, see
-    `assembly.weights.effective_number`; NaN in files of an older schema.
+    `assembly.split.effective_number`.
     """
 
     split: str
@@ -337,17 +336,12 @@ def splits_of(path: Path) -> list[SplitCount]:
             SplitCount(
                 split=split,
                 samples=len(file[split]["grasps"]),
-                effective=_effective(file[split]),
+                effective=effective_number(file[split]["grasp_props/weight"][:]),
                 objects=len(set(read_names(file[split]["object_props/object_name"]))),
                 classes=len(set(read_names(file[split]["object_props/class_name"]))),
             )
             for split in SPLITS
         ]
-
-
-def _effective(group: h5py.Group) -> float:
-    weights = group.get("grasp_props/weight")
-    return np.nan if weights is None else effective_number(weights[:])
 
 
 def counts_as_dict(out: Path) -> dict[str, Any]:

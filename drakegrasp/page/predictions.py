@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.dataset.opening import differences, opened, read_codes, refuse_first
-from drakegrasp.dataset.predicted_rows import PredictedRows, read_predicted_rows
+from drakegrasp.dataset.reader import PredictedRows, read_predicted_rows
 from drakegrasp.dataset.schema import (
     CAMERAS,
     TRIAL_FIELDS,

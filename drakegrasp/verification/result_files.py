@@ -20,7 +20,7 @@ import numpy as np
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray, write_field
 from drakegrasp.dataset.manifest import finger_names, installed_versions, origin_attributes
-from drakegrasp.dataset.predicted_rows import PredictedRows
+from drakegrasp.dataset.reader import PredictedRows
 from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, sizes
 from drakegrasp.errors import DataError
 from drakegrasp.frames import pack_pose

@@ -9,8 +9,7 @@ import h5py
 import numpy as np
 
 from drakegrasp.dataset.hdf5 import write_field
-from drakegrasp.dataset.predicted_rows import PredictedRows
-from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.reader import GraspDataset, PredictedRows
 from drakegrasp.dataset.schema import SCHEMA_VERSION, VERIFICATION_FIELDS, sizes
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.outcomes import Outcome

@@ -18,8 +18,7 @@ from starlette.testclient import TestClient
 
 from drakegrasp.cli.placing import place_requested
 from drakegrasp.cli.predictions import VerifyRequest
-from drakegrasp.dataset.predicted_rows import read_predicted_rows
-from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.reader import GraspDataset, read_predicted_rows
 from drakegrasp.errors import DataError
 from drakegrasp.page.app import Inspection, make_app
 
