@@ -157,8 +157,7 @@ class Attempts:
             GraspError: If the frame is "mesh" and its pose is not known.
         """
         X_OG = multiply(self._frame_in_object(i, X_TO, X_OM), self.X_FG[i])
-        before, after = _given(self.q_pregrasp[i]), _given(self.q_squeeze[i])
-        return Posture(X_OG, self.q_grasp[i], before, after, self.preshape[i] or None)
+        return _posture(self, i, X_OG)
 
     def _frame_in_object(self, i: int, X_TO: Array, X_OM: Array | None) -> Array:
         """Return the pose (4, 4) of the frame of a row in {O}."""
@@ -438,12 +437,7 @@ def _in_order(
 
 def _joint_rows(values: Any, shape: tuple[int, int], stage: str, turning: list[bool]) -> Array:
     """Return joint positions as numbers (n, m), of which those that turn are in radians."""
-    try:
-        rows = np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        raise GraspError(f"{stage} joints must be numbers, got something else") from None
-    if rows.shape != shape:
-        raise GraspError(f"{stage} joints must be of shape {shape}, got {rows.shape}")
+    rows = _array(values, shape, f"{stage} joints")
 
     # In degrees most rows have a joint beyond a whole turn.
     angles = rows[:, turning]
@@ -454,6 +448,17 @@ def _joint_rows(values: Any, shape: tuple[int, int], stage: str, turning: list[b
             "degrees"
         )
     return rows
+
+
+def _array(values: Any, shape: tuple[int, ...], name: str) -> Array:
+    """Return numbers of a shape."""
+    try:
+        array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise GraspError(f"{name} must be numbers of shape {shape}, got something else") from None
+    if array.shape != shape:
+        raise GraspError(f"{name} must be of shape {shape}, got {array.shape}")
+    return array
 
 
 def _numbers(
@@ -471,12 +476,7 @@ def _numbers(
     """
     if value is None:
         return np.full(shape, np.nan)
-    try:
-        array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        raise GraspError(f"{name} must be numbers of shape {shape}, got something else") from None
-    if array.shape != shape:
-        raise GraspError(f"{name} must be of shape {shape}, got {array.shape}")
+    array = _array(value, shape, name)
     rows = array.reshape(len(array), -1)
     missing = np.isnan(rows)
     if each:
@@ -641,9 +641,12 @@ def given_candidates(
     )
 
 
-def _given(q: Array) -> Array | None:
-    """Return joint positions (j,), or None for a stage that a row lacks."""
-    return None if np.isnan(q).any() else q
+def _posture(rows: Attempts | Table, i: int, X_OG: Array) -> Posture:
+    """Return the posture of a row; NaN stands for a stage that it lacks."""
+    before, after = (
+        None if np.isnan(q).any() else q for q in (rows.q_pregrasp[i], rows.q_squeeze[i])
+    )
+    return Posture(X_OG, rows.q_grasp[i], before, after, str(rows.preshape[i]) or None)
 
 
 def posture_attempts(
@@ -662,20 +665,9 @@ def posture_attempts(
     assert given is not None
 
     for i in indices:
-        before, after = _given(given.q_pregrasp[i]), _given(given.q_squeeze[i])
-        shape = str(given.preshape[i]) or None
-        posture = Posture(candidates.X_OG[i], given.q_grasp[i], before, after, shape)
-        start = start_of(posture, hand)
-        yield Attempt(
+        yield replace(
+            start_of(_posture(given, i, candidates.X_OG[i]), hand),
             candidate=i,
-            standoff_index=0,
-            standoff=np.nan,
-            spread=start.spread,
-            closing=start.closing,
-            path=start.path,
-            preshape=start.preshape,
-            unused=start.unused,
-            X_OG=posture.X_OG,
             seed=Stream(seed, object_key(name), i).key,
             resting=int(candidates.resting[i]),
             source=Source.POSTURES,

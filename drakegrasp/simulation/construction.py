@@ -7,6 +7,9 @@ The hand hangs on three prismatic joints from the world and on a frame that is w
 That frame's rotation is set in the context: the palm's orientation is exact and constant, and the
 plant needs no rotational wrist joints (our own construction).
 
+Friction and mass are values of a scene's context: they are set for an attempt without building it
+anew, and the results are the same bits as those of a scene that is built with them.
+
 Three traps of Drake 1.51.1 shape this module. Geometry on the world body crashes as soon as a
 joint is locked, so the table is a body of its own. `AddMultibodyPlantSceneGraph` leaks the plant.
 Sampled output ports report the contacts of the step before.
@@ -14,7 +17,7 @@ Sampled output ports report the contacts of the step before.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -71,6 +74,7 @@ from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.conditions import Materials
 from drakegrasp.simulation.scene import Motor, ObjectScene, Scene, joint_limits
 from drakegrasp.vision.camera import object_colour
 
@@ -95,6 +99,9 @@ RESOLUTION_HINT = 0.005
 #: Frames per simulated second in Meshcat [Hz]. A power of two makes their times exact, so that
 #: rounding merges no two of them.
 MESHCAT_RATE = 32.0
+
+#: Group and name of a shape's coefficient of friction.
+FRICTION = ("material", "coulomb_friction")
 
 
 def build_scene(
@@ -603,3 +610,81 @@ def _filter_within_hand(
     manager.Apply(CollisionFilterDeclaration().ExcludeBetween(others, every_tip))
     for tip in tips:
         manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(tip)))
+
+
+# Friction and mass of a scene that is built
+
+
+def set_materials(scene: Scene, materials: Materials) -> None:
+    """Give a scene the friction and mass of an attempt; nothing is done where it has them.
+
+    Args:
+        scene: Of the object and a hand.
+        materials: What the scene has from now on.
+    """
+    if scene.object.get_mass(scene.context) != materials.mass:
+        inertia = object_inertia(scene.model, materials.mass)
+        scene.object.SetSpatialInertiaInBodyFrame(scene.context, inertia)
+    for geometry, mu in list(_coefficients(scene, materials)):
+        _set_friction(scene, geometry, mu)
+
+
+def copy_materials(scene: Scene, before: Scene) -> None:
+    """Give a scene the friction and mass of another one of the same object and hand."""
+    if scene.object.get_mass(scene.context) != before.object.get_mass(before.context):
+        inertia = before.object.CalcSpatialInertiaInBodyFrame(before.context)
+        scene.object.SetSpatialInertiaInBodyFrame(scene.context, inertia)
+    for geometry, other in zip(_geometries(scene), _geometries(before), strict=True):
+        _set_friction(scene, geometry, _friction(before, other))
+
+
+def _set_friction(scene: Scene, geometry: GeometryId, mu: float) -> None:
+    """Give a shape its own coefficient of friction, if it has another one."""
+    # Assigning properties computes the shape's hydroelastic form again, which takes time.
+    if _friction(scene, geometry) == mu:
+        return
+    properties = ProximityProperties(_properties(scene, geometry))
+    properties.UpdateProperty(*FRICTION, CoulombFriction(mu, mu))
+    scene.scene_graph.AssignRole(
+        scene.scene_graph.GetMyMutableContextFromRoot(scene.simulator.get_mutable_context()),
+        scene.plant.get_source_id(),
+        geometry,
+        properties,
+        RoleAssign.kReplace,
+    )
+
+
+def _friction(scene: Scene, geometry: GeometryId) -> float:
+    return float(_properties(scene, geometry).GetProperty(*FRICTION).dynamic_friction())
+
+
+def _properties(scene: Scene, geometry: GeometryId) -> ProximityProperties:
+    return scene.plant.EvalSceneGraphInspector(scene.context).GetProximityProperties(geometry)
+
+
+def _coefficients(scene: Scene, materials: Materials) -> Iterator[tuple[GeometryId, float]]:
+    """Yield each shape with its own coefficient of friction."""
+    physics = scene.physics.model_copy(
+        update={
+            "friction_hand": materials.friction_hand,
+            "friction_table": materials.friction_table,
+        }
+    )
+    hand = partner_friction(physics.friction_hand, physics)
+    own = {
+        scene.object.index(): object_friction(physics),
+        scene.table.index(): partner_friction(physics.friction_table, physics),
+    }
+    for body in _bodies(scene):
+        for geometry in scene.plant.GetCollisionGeometriesForBody(body):
+            yield geometry, own.get(body.index(), hand)
+
+
+def _geometries(scene: Scene) -> list[GeometryId]:
+    geometries = scene.plant.GetCollisionGeometriesForBody
+    return [geometry for body in _bodies(scene) for geometry in geometries(body)]
+
+
+def _bodies(scene: Scene) -> list[RigidBody]:
+    """Return object, table and the links of the hand."""
+    return [scene.object, scene.table, *scene.links]

@@ -30,6 +30,7 @@ from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle, transform_points
 from drakegrasp.hand.finger_sweep import pad_points
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.construction import copy_materials
 from drakegrasp.simulation.contacts import (
     Contacts,
     Way,
@@ -38,7 +39,6 @@ from drakegrasp.simulation.contacts import (
     read_contacts,
 )
 from drakegrasp.simulation.drive import disengage, drive_of, engage, hand_over
-from drakegrasp.simulation.materials import copy_materials
 from drakegrasp.simulation.scene import (
     Scene,
     TrialLimits,

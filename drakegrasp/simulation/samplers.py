@@ -132,14 +132,6 @@ def ray_meets_box(p_OG: Array, z_O: Array, half: Array) -> npt.NDArray[np.bool_]
 # Combinations of angles
 
 
-def _axes(config: CandidateConfig) -> tuple[Axes, Axes]:
-    """Return the global and the local angles."""
-    return (
-        (config.global_x_deg, config.global_y_deg, config.global_z_deg),
-        (config.local_x_deg, config.local_y_deg, config.local_z_deg),
-    )
-
-
 @lru_cache(maxsize=1)
 def _distinct_combinations(global_deg: Axes, local_deg: Axes) -> tuple[Numbers, Numbers]:
     """Return the first combination (n,) of each distinct pose, and how many (n,) give it.

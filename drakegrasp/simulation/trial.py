@@ -22,6 +22,7 @@ from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Attempt, JointPath
 from drakegrasp.simulation.conditions import Materials, usual_materials
+from drakegrasp.simulation.construction import set_materials
 from drakegrasp.simulation.contacts import (
     Contacts,
     Way,
@@ -31,7 +32,6 @@ from drakegrasp.simulation.contacts import (
 )
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.lift import Lift, lift
-from drakegrasp.simulation.materials import set_materials
 from drakegrasp.simulation.scene import (
     Scene,
     TrialLimits,
