@@ -483,7 +483,7 @@ def _given_start(
     """Return the positions (j,) of the joints from which a posture closes."""
     attempt = find_attempt(prepared, **identity, config=task.config)
     if attempt.path is not None:
-        return attempt.path.start
+        return attempt.path[0]
     shaped = hand.at(attempt.preshape)
     closing = np.zeros(shaped.num_fingers) if attempt.closing is None else attempt.closing
     return _positions(task, shaped, attempt.spread, closing)

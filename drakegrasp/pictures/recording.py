@@ -85,7 +85,7 @@ def record_attempt(
         hand = load_hand(config.hand_source).at(attempt.preshape)
         scene = build_scene(model, config.physics, hand, meshcat=meshcat)
         # An attempt that fails before it is simulated is shown at its start.
-        q = None if attempt.path is None else attempt.path.start
+        q = None if attempt.path is None else attempt.path[0]
         pose = attempt.X_OG, attempt.spread, attempt.closing
         show_start(meshcat, scene, X_TO, config, *pose, q=q)
         record = run_attempt(scene, X_TO, attempt, config, is_visible=lambda: is_visible)

@@ -96,24 +96,6 @@ class Candidates:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class JointPath:
-    """Positions (j,) of all joints [rad or m], in the plant's order, that a trial goes through.
-
-    Attributes:
-        start: Where the trial begins.
-        grasp: Where the fingers hold the object.
-        squeeze: Where motors of their own go on to, and press.
-        own_motors: Whether each joint has a motor of its own; else the hand file's close the
-            fingers until they stop, and what they do not move keeps its place.
-    """
-
-    start: Array
-    grasp: Array
-    squeeze: Array
-    own_motors: bool
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Attempt:
     """What a trial starts from, and how a dataset counts it.
 
@@ -129,7 +111,11 @@ class Attempt:
         ray_hits: Whether the palm ray meets the object; true if no ray places the palm.
         conditions: Friction, mass, looks and cameras; None are the usual ones.
         audited: Whether the closed hand is lifted in any case, whatever its chance and its image.
-        path: Of a posture that spread and closing cannot say: the positions of all joints.
+        path: Of a posture that spread and closing cannot say: positions (3, j) of all joints
+            [rad or m], in the plant's order: where the trial begins, where the fingers hold the
+            object, and where motors of their own go on to, and press.
+        own_motors: Whether each joint has a motor of its own; else the hand file's close the
+            fingers until they stop, and what they do not move keeps its place.
         preshape: Index of the hand's preshape; None if all fingers close.
         unused: Fingers that the preshape leaves out, see `Hand.unused_in`.
         candidate: Index of the candidate of its object.
@@ -151,7 +137,8 @@ class Attempt:
     ray_hits: bool = True
     conditions: Conditions | None = None
     audited: bool = False
-    path: JointPath | None = None
+    path: Array | None = None
+    own_motors: bool = False
     preshape: int | None = None
     unused: int = 0
     candidate: int = 0
@@ -165,11 +152,6 @@ class Attempt:
     parent: int = 0
     generation: int = 0
     posture_row: float = np.nan
-
-    @property
-    def own_motors(self) -> bool:
-        """Whether each joint has a motor of its own, see `JointPath`."""
-        return self.path is not None and self.path.own_motors
 
 
 class Sampler(Protocol):

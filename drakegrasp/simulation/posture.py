@@ -24,7 +24,7 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import coordinate_limits, open_together
 from drakegrasp.hand.parsing import position_order
 from drakegrasp.runtime.environment import one_thread
-from drakegrasp.simulation.candidates import Attempt, JointPath
+from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.placement import PlacedObject, config_for, refuse_other_objects
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
@@ -236,7 +236,8 @@ def _start_of(posture: Posture, hand: Hand) -> Attempt:
         X_OG=posture.X_OG,
         spread=spread,
         closing=closing,
-        path=JointPath(start=start, grasp=grasp, squeeze=squeeze, own_motors=own_motors),
+        path=np.stack([start, grasp, squeeze]),
+        own_motors=own_motors,
     )
 
 

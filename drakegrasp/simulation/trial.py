@@ -20,7 +20,7 @@ from drakegrasp.errors import MachineError, first_line
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Attempt, JointPath
+from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.conditions import Materials, usual_materials
 from drakegrasp.simulation.construction import set_materials
 from drakegrasp.simulation.contacts import (
@@ -144,9 +144,7 @@ def run_attempt(
         OSError: If a file of the hand cannot be read.
     """
     drive_of(scene.hand, config.lift)
-    path = attempt.path
-    if path is not None and path.own_motors and scene.own_motors is not None:
-        scene = scene.own_motors()
+    scene, path = _scene_for(scene, attempt), attempt.path
     required = scene.hand.required
     X_TO = np.asarray(X_TO, dtype=float)
     start = TrialRecord(outcome=Outcome.RAY_MISS, X_TO=X_TO, X_OG=attempt.X_OG)
@@ -169,7 +167,7 @@ def run_attempt(
         # Place: object and palm stand still, the fingers are where the attempt starts them.
         limits = start_limits(config)
         set_materials(scene, _materials(scene, attempt))
-        q = None if path is None else path.start
+        q = None if path is None else path[0]
         reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing, q=q)
         if open_hand_collides(scene):
             return replace(start, outcome=Outcome.START_COLLISION)
@@ -184,7 +182,7 @@ def run_attempt(
             reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=prediction.closing)
             if way is not None:
                 way.look(scene)
-        if path is not None and path.own_motors:
+        if path is not None and attempt.own_motors:
             _follow_path(scene, limits, config, path, way)
         else:
             _close(scene, limits, config, prediction, way)
@@ -212,6 +210,13 @@ def run_attempt(
     # A failed assertion within Drake arrives as SystemExit, everything else as RuntimeError.
     except (Exception, SystemExit) as error:
         return _failed(start, error)
+
+
+def _scene_for(scene: Scene, attempt: Attempt) -> Scene:
+    """Return the scene of the motors that an attempt has."""
+    if attempt.own_motors and scene.own_motors is not None:
+        return scene.own_motors()
+    return scene
 
 
 def has_only_scraped(record: TrialRecord) -> bool:
@@ -242,8 +247,7 @@ def lift_on(
         config: See `run_attempt`.
         is_visible: See `run_attempt`.
     """
-    if attempt.path is not None and attempt.path.own_motors and scene.own_motors is not None:
-        scene = scene.own_motors()
+    scene = _scene_for(scene, attempt)
     close = config.close.model_copy(update={"scrape_depth": None})
     rules = config.model_copy(update={"close": close})
     try:
@@ -303,10 +307,8 @@ def start_meetings(scene: Scene, X_TO: Array, attempt: Attempt) -> dict[str, lis
         X_TO: Resting pose of the object, (4, 4).
         attempt: The attempt.
     """
-    path, X_WO = attempt.path, multiply(X_WT, X_TO)
-    if path is not None and path.own_motors and scene.own_motors is not None:
-        scene = scene.own_motors()
-    q, X_WG = None if path is None else path.start, multiply(X_WO, attempt.X_OG)
+    scene, X_WO = _scene_for(scene, attempt), multiply(X_WT, X_TO)
+    q, X_WG = None if attempt.path is None else attempt.path[0], multiply(X_WO, attempt.X_OG)
     reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing, q=q)
     return open_hand_meets(scene)
 
@@ -365,7 +367,7 @@ def _close(
 
 
 def _follow_path(
-    scene: Scene, limits: TrialLimits, config: Config, path: JointPath, way: Way | None
+    scene: Scene, limits: TrialLimits, config: Config, path: Array, way: Way | None
 ) -> None:
     """Move each joint by its own motor to the grasp and on to the squeeze, until all have stopped.
 
@@ -374,7 +376,7 @@ def _follow_path(
     # The way of the driven joints, in the order of their motors.
     names = hand_joint_names(scene)
     moved = [names.index(joint.name()) for joint in scene.closing_joints]
-    places = [q[moved] for q in (path.start, path.grasp, path.squeeze)]
+    places = [q[moved] for q in path]
     speed = scene.closing_units * float((scene.hand.closing_speed / scene.hand.closing_unit).min())
     lasts = [float((np.abs(b - a) / speed).max()) for a, b in pairwise(places)]
     stages = [i for i, seconds in enumerate(lasts) if seconds > 0.0]

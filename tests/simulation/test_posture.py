@@ -114,28 +114,22 @@ def test_joint_off_its_coupling_by_more_than_a_degree_has_a_motor(joint, off_deg
     q = {name: good.copy() for name in ("q_grasp", "q_pregrasp", "q_squeeze")}
     q[stage][joint_order(hand).index(joint)] += np.deg2rad(off_deg)
     start = start_of(Posture(X, **q), hand)
-    assert (start.path is not None and start.path.own_motors) == own
+    assert start.own_motors == own
 
 
-def test_joint_of_the_preshape_is_locked_where_the_grasp_has_it():
+@pytest.mark.parametrize(
+    ("joint", "own", "pregrasp"),
+    [("thumb_roll_joint", False, None), ("ring_mcp_joint", True, np.full(16, 0.3))],
+)
+def test_joint_that_no_motor_moves_is_locked_where_the_grasp_has_it(joint, own, pregrasp):
+    """Of the preshape where the hand file's motors close, or without a motor of its own."""
     hand = load_hand("allegro")
-    posture = posture_of(hand, 0.0, [0.5, 0.5, 0.5])
-    at = joint_order(hand).index("thumb_roll_joint")
-    posture.q_grasp[at] += 0.1
-    path = start_of(posture, hand).path
-    assert path is not None
-    assert not path.own_motors
-    assert path.start[at] == posture.q_grasp[at]
-
-
-def test_joint_without_a_motor_is_locked_where_the_grasp_has_it():
-    hand = load_hand("allegro")
-    at = joint_order(hand).index("ring_mcp_joint")
-    pregrasp, grasp = np.full(16, 0.3), np.full(16, 0.6)
-    path = start_of(Posture(X, grasp, pregrasp), hand).path
-    assert path is not None
-    assert path.own_motors
-    assert path.start[at] == 0.6
+    at = joint_order(hand).index(joint)
+    grasp = np.full(16, 0.6) if own else posture_of(hand, 0.0, [0.5, 0.5, 0.5]).q_grasp
+    grasp[at] += 0.1
+    start = start_of(Posture(X, grasp, pregrasp), hand)
+    assert start.own_motors == own
+    assert start.path[0, at] == grasp[at]
 
 
 def test_spread_beyond_its_limit_is_brought_within():
@@ -147,11 +141,10 @@ def test_spread_beyond_its_limit_is_brought_within():
 
 def test_joints_beyond_their_limits_are_brought_within():
     hand = load_hand("allegro")
-    path = start_of(Posture(X, np.full(16, 3.0)), hand).path
-    assert path is not None
+    _, grasp, _ = start_of(Posture(X, np.full(16, 3.0)), hand).path
     upper = dict(zip(hand.joint_names, hand.joint_limits[:, 1], strict=True))
-    np.testing.assert_array_equal(path.grasp, [upper[name] for name in joint_order(hand)])
-    assert (opened(path.grasp, hand) <= path.grasp).all()
+    np.testing.assert_array_equal(grasp, [upper[name] for name in joint_order(hand)])
+    assert (opened(grasp, hand) <= grasp).all()
 
 
 # The trial
@@ -197,7 +190,7 @@ def test_closed_hand_given_back_is_the_same_trial(scene, cube, config, held, giv
 @pytest.mark.parametrize("drive", ["worm", "torque", "locked"])
 def test_joints_with_motors_of_their_own_hold_the_cube(scene, cube, config, held, uncoupled, drive):
     start = start_of(uncoupled, scene.hand)
-    assert start.path.own_motors
+    assert start.own_motors
     rules = config.model_copy(update={"lift": config.lift.model_copy(update={"drive": drive})})
     record = run_attempt(scene, standing(cube), start, rules)
     assert record.outcome is Outcome.SUCCESS
@@ -241,7 +234,7 @@ def test_hand_that_stays_short_of_the_object_touches_nothing(scene, cube, config
     start = start_of(Posture(given.X_OG, short, given.q_pregrasp, short), scene.hand)
     record = run_attempt(scene, standing(cube), start, config)
     assert record.outcome is Outcome.MISSING_FINGERTIP
-    np.testing.assert_allclose(record.closed.q, start.path.squeeze, atol=0.01)
+    np.testing.assert_allclose(record.closed.q, start.path[2], atol=0.01)
 
 
 @pytest.mark.sim
