@@ -23,7 +23,6 @@ from drakegrasp.runtime.files import disk_full_named
 from drakegrasp.runtime.journal import (
     GIVE_UP_DEATHS,
     PREPARE,
-    Journal,
     Verdict,
     inject_fault,
     open_journal,
@@ -68,54 +67,47 @@ def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
         DiskFullError: If there is no room for the object's files.
         MachineError: If something other than the mesh kills the process again and again.
     """
-    out, source, config = task.out, task.source, task.config
+    out, name, config = task.out, task.source.name, task.config
     with disk_full_named(out):
         # The worker or the client may have died before the manifest named the object.
-        entry = _entry_there(task, config)
+        entry = _entry_there(task)
         if entry is not None:
-            return source.name, entry
-
+            return name, entry
         if not task.restartable:
-            return source.name, _prepared_entry(task)
+            return name, _prepared_entry(task)
 
         # With a journal, a mesh that kills its process is found and refused.
         release_memory()
         identity = {
-            "name": source.name,
+            "name": name,
             "mesh_sha256": task.mesh_sha256,
             "config_hash": config.simulation_hash(),
         }
-        path = model_path(out, source.name).with_suffix(".journal")
-        with open_journal(path, identity) as journal:
-            return source.name, _prepared_or_refused(task, journal)
+        with open_journal(model_path(out, name).with_suffix(".journal"), identity) as journal:
+            verdict = journal.verdict(PREPARE)
+            if verdict is not None:
+                # More memory may help, so the next build tries again.
+                again = verdict is Verdict.VANISHED
+                return name, _refused(task, f"preparing it {verdict.value}", again=again)
+            if journal.in_crash_loop:
+                raise MachineError(
+                    f"{name}: the worker died {GIVE_UP_DEATHS} times in a row while preparing it; "
+                    "is there enough memory? The same command goes on from here"
+                )
+            with journal.step(PREPARE, PREPARE_SECONDS):
+                inject_fault(name)
+                return name, _prepared_entry(task)
 
 
-def _entry_there(task: PrepareTask, config: Config) -> ObjectEntry | None:
+def _entry_there(task: PrepareTask) -> ObjectEntry | None:
     """Return the entry of an object whose files are complete, or None."""
     try:
-        prepared = load_prepared(task.out, task.source.name, config)
+        prepared = load_prepared(task.out, task.source.name, task.config)
     except DrakegraspError:
         return None
     model = prepared.model
     same = (model.class_name, model.mesh_sha256) == (task.source.class_name, task.mesh_sha256)
     return prepared.entry() if same else None
-
-
-def _prepared_or_refused(task: PrepareTask, journal: Journal) -> ObjectEntry | RefusedMesh:
-    name = task.source.name
-    verdict = journal.verdict(PREPARE)
-    if verdict is not None:
-        # More memory may help, so the next build tries again.
-        again = verdict is Verdict.VANISHED
-        return _refused(task, f"preparing it {verdict.value}", again=again)
-    if journal.in_crash_loop:
-        raise MachineError(
-            f"{name}: the worker died {GIVE_UP_DEATHS} times in a row while preparing it; is "
-            "there enough memory? The same command goes on from here"
-        )
-    with journal.step(PREPARE, PREPARE_SECONDS):
-        inject_fault(name)
-        return _prepared_entry(task)
 
 
 def _prepared_entry(task: PrepareTask) -> ObjectEntry | RefusedMesh:

@@ -117,7 +117,11 @@ def make_scenes_locked(
 
     rows, tables = Counter[str](), dict[str, list[Columns]]()
     with disk_full_named(out), atomic_hdf5(out / SCENES_FILE) as file:
-        file.attrs.update(_attributes(manifest, trials))
+        # Those of trials.hdf5 that say of what it was made.
+        origin = config, manifest.versions, manifest.fingers, manifest.joints
+        file.attrs.update(origin_attributes(*origin))
+        file.attrs.update({"near": config.scenes.near, "far": config.scenes.far})
+        file.attrs.update({key: trials.attributes[key] for key in ("signature", "shards")})
         progress(0, len(tasks))
         for done, (own, images) in enumerate(in_order(execute)(make_scenes_of, tasks), start=1):
             _write_images(file, images, rows["views"], config)
@@ -211,17 +215,6 @@ def split_objects(manifest: Manifest, present: Sequence[set[int]]) -> list[int]:
         first = min((ranks[g] for g in others if found[g] == {valid}), default=2.0)
         validating = {group for group in others if ranks[group] >= first}
     return [test if g in tested else valid if g in validating else train for g in groups]
-
-
-def _attributes(manifest: Manifest, trials: Trials) -> dict[str, object]:
-    """Return the attributes of the file: those of trials.hdf5 that say of what it was made."""
-    config = manifest.config
-    return {
-        **origin_attributes(config, manifest.versions, manifest.fingers, manifest.joints),
-        "near": config.scenes.near,
-        "far": config.scenes.far,
-        **{key: trials.attributes[key] for key in ("signature", "shards")},
-    }
 
 
 # Writing
