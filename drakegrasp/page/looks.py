@@ -308,16 +308,31 @@ def attempt_scene(
     """
     # The start always; closed and lifted as far as the attempt got.
     X_TO, spread = unpack_pose(row["X_TO"]), float(row["spread"])
-    X_TG = multiply(X_TO, unpack_pose(row["X_OG"]))
-    states: dict[str, Any] = {"start": {"links": hand.poses(X_TG, None, spread), "contacts": []}}
-    if np.isfinite(row["time_close"]):
-        links = hand.poses(X_TG, row["closed_q"], spread)
-        states["closed"] = {"links": links, "contacts": contacts_of(row, "closed_", X_TO)}
-    if np.isfinite(row["time_lift"]) and np.isfinite(row["X_OG_lifted"]).all():
-        X_TG_held = multiply(X_TO, unpack_pose(row["X_OG_lifted"]))
-        links = hand.poses(X_TG_held, row["lifted_q"], spread)
-        states["lifted"] = {"links": links, "contacts": contacts_of(row, "lifted_", X_TO)}
+    start = hand.poses(multiply(X_TO, unpack_pose(row["X_OG"])), None, spread)
+    states = {"start": {"links": start, "contacts": []}} | hand_states(row, X_TO, hand)
     return make_scene(snapshot, int(snapshot.table.object[i]), X_TO, states, hand)
+
+
+def hand_states(
+    row: Mapping[str, Any], X_TO: Array, hand: HandView, kind: str = ""
+) -> dict[str, Any]:
+    """Return the states `closed` and `lifted` of a 3D view, as far as a row got.
+
+    Args:
+        row: Of the dataset or of verdicts; one of verdicts may lack columns.
+        X_TO: (4, 4), resting pose of the object.
+        hand: Of the dataset.
+        kind: See `contacts_of`.
+    """
+    states = {}
+    for name, palm in (("closed", "X_OG"), ("lifted", "X_OG_lifted")):
+        X_OG, q = row.get(palm), row.get(f"{name}_q")
+        if X_OG is None or q is None or not (np.isfinite(X_OG).all() and np.isfinite(q).all()):
+            continue
+        links = hand.poses(multiply(X_TO, unpack_pose(X_OG)), q, 0.0)
+        contacts = contacts_of(row, f"{name}_", X_TO, kind)
+        states[name] = {"links": links, "contacts": contacts}
+    return states
 
 
 def make_scene(
@@ -342,10 +357,25 @@ def make_scene(
     }
 
 
-def contacts_of(row: Mapping[str, Any], when: str, X_TO: Array) -> list[dict[str, Any]]:
-    """Return the contacts of a row in {T}; `when` begins the names of its columns."""
-    points, normals, forces = (row[f"{when}{name}"] for name in ("p_OQ", "nhat_Q_O", "f_Q_O"))
-    return contacts_in_table(points, normals, forces, X_TO)
+def contacts_of(
+    row: Mapping[str, Any], when: str, X_TO: Array, kind: str = ""
+) -> list[dict[str, Any]]:
+    """Return the contacts of a row in {T}; none if it lacks them.
+
+    Args:
+        row: Of the dataset or of verdicts.
+        when: With what the names of its columns begin.
+        X_TO: (4, 4), resting pose of the object.
+        kind: Of the contacts, as the view tells them apart; those of another than `force` have no
+            forces.
+    """
+    points, normals, forces = (row.get(f"{when}{name}") for name in ("p_OQ", "nhat_Q_O", "f_Q_O"))
+    if kind not in ("", "force") and points is not None:
+        forces = np.zeros_like(points)
+    if points is None or normals is None or forces is None:
+        return []
+    contacts = contacts_in_table(points, normals, forces, X_TO)
+    return [{"kind": kind, **c} for c in contacts] if kind else contacts
 
 
 def contacts_in_table(

@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import multiply, norm
+from drakegrasp.arithmetic import norm
 from drakegrasp.dataset.opening import differences, opened, read_codes, refuse_first
 from drakegrasp.dataset.reader import PredictedRows, read_predicted_rows
 from drakegrasp.dataset.schema import (
@@ -40,7 +40,8 @@ from drakegrasp.page.looks import (
     HandView,
     Look,
     contact_dots,
-    contacts_in_table,
+    contacts_of,
+    hand_states,
     make_scene,
     read_look,
     read_rows,
@@ -282,21 +283,16 @@ class Predictions(Gallery):
         # Everything is on the object in the resting pose of the row.
         X_TO = unpack_pose(row["X_TO"])
         marks = [
-            *_contacts("true", row, "closed_", X_TO),
-            *_contacts("asked", verdict, "", X_TO),
-            *_contacts("reached", verdict, "closed_", X_TO),
+            *contacts_of(row, "closed_", X_TO, "true"),
+            *contacts_of(verdict, "", X_TO, "asked"),
+            *contacts_of(verdict, "closed_", X_TO, "reached"),
         ]
 
         # The hand as far as the trial got, and that of the dataset.
-        states, tried = {}, {"closed": ("X_OG", "closed_q"), "lifted": ("X_OG_lifted", "lifted_q")}
-        for name, (palm, q) in tried.items():
-            links = _hand(hand, X_TO, verdict.get(palm), verdict.get(q))
-            if links is not None:
-                forces = _contacts("force", verdict, f"{name}_", X_TO)
-                states[name] = {"links": links, "contacts": [*marks, *forces]}
-        own = _hand(hand, X_TO, row["X_OG"], row["closed_q"]) or []
-        forces = _contacts("force", row, "closed_", X_TO)
-        states["dataset's grasp"] = {"links": own, "contacts": [*marks, *forces]}
+        states = hand_states(verdict, X_TO, hand, "force")
+        states["dataset's grasp"] = hand_states(row, X_TO, hand, "force")["closed"]
+        for state in states.values():
+            state["contacts"] = [*marks, *state["contacts"]]
         return make_scene(self.snapshot, int(self.table.object[i]), X_TO, states, hand)
 
 
@@ -386,22 +382,3 @@ def _fingers(verdict: Mapping[str, Any], row: Mapping[str, Any]) -> list[list[st
 
 def _lengths(vectors: Array | None) -> Array | None:
     return None if vectors is None else np.linalg.norm(vectors, axis=-1)
-
-
-def _hand(
-    hand: HandView, X_TO: Array, X_OG: Array | None, q: Array | None
-) -> list[list[float]] | None:
-    """Return the poses of the links; None if the trial did not get so far."""
-    if X_OG is None or q is None or not (np.isfinite(X_OG).all() and np.isfinite(q).all()):
-        return None
-    return hand.poses(multiply(X_TO, unpack_pose(X_OG)), q, 0.0)
-
-
-def _contacts(kind: str, source: Mapping[str, Any], when: str, X_TO: Array) -> list[dict[str, Any]]:
-    """Return the contacts of a kind; those of the kind `force` with their forces."""
-    points, normals, forces = (source.get(f"{when}{n}") for n in ("p_OQ", "nhat_Q_O", "f_Q_O"))
-    if kind != "force" and points is not None:
-        forces = np.zeros_like(points)
-    if points is None or normals is None or forces is None:
-        return []
-    return [{"kind": kind, **c} for c in contacts_in_table(points, normals, forces, X_TO)]
