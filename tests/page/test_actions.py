@@ -48,21 +48,13 @@ def test_undo_leaves_what_another_server_decided_since(tmp_path: Path) -> None:
     assert ours.undo() is None
 
 
-def test_an_equal_decision_is_nothing_to_undo(tmp_path: Path) -> None:
+def test_each_page_undoes_its_own_and_an_equal_decision_is_none(tmp_path: Path) -> None:
     file = DecisionFile(tmp_path)
-    file.decide(A, "rejected")
-    file.decide(A, "rejected")
-    assert file.undo() == Undo(A, "", done=True)
-    assert file.read().of(A) == ""
-    assert file.undo() is None
-
-
-def test_each_page_undoes_its_own(tmp_path: Path) -> None:
-    file = DecisionFile(tmp_path)
-    file.decide(A, "rejected", "first")
-    file.decide(B, "rejected", "second")
+    for key, page in ((A, "first"), (A, "first"), (B, "second")):
+        file.decide(key, "rejected", page)
     assert file.undo("third") is None
     assert file.undo("first") == Undo(A, "", done=True)
+    assert file.undo("first") is None
     assert file.read().rejected == {B}
 
 

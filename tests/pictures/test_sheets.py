@@ -263,7 +263,7 @@ def titles(pages: list) -> list[str]:
     return [text.get_text() for page in pages for axes in page.axes for text in axes.texts]
 
 
-def test_each_class_has_its_first_sample(sound: Path) -> None:
+def test_each_class_has_its_first_sample(sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pages, trials = class_sheets(sound / OTO)
     first: dict[str, int] = {}
     with h5py.File(sound / OTO, "r") as file:
@@ -275,17 +275,9 @@ def test_each_class_has_its_first_sample(sound: Path) -> None:
     assert trials == first
     assert list(trials) == ["box", "brick"]
     assert titles(pages) == ["box", f"trial {first['box']}", "brick", f"trial {first['brick']}"]
-
-
-def test_many_classes_fill_pages(sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Many classes fill pages.
     monkeypatch.setattr(sheets, "PER_PAGE", 1)
-    pages, _ = class_sheets(sound / OTO)
-    assert len(pages) == 2
-
-
-def test_a_file_without_samples_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="must be a data file"):
-        class_sheets(tmp_path / OTO)
+    assert (len(pages), len(class_sheets(sound / OTO)[0])) == (1, 2)
 
 
 @pytest.mark.sim
@@ -307,5 +299,6 @@ def test_each_view_shows_the_contacts_of_a_sample_of_its_scene(out: Path) -> Non
 
 
 def test_a_file_that_is_missing_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"scenes\.hdf5: must be the scenes of a dataset"):
-        scene_views(tmp_path / "scenes.hdf5")
+    for draw, line in ((class_sheets, "a data file"), (scene_views, "the scenes of a dataset")):
+        with pytest.raises(DataError, match=rf"missing\.hdf5: must be {line}"):
+            draw(tmp_path / "missing.hdf5")
