@@ -55,6 +55,18 @@ TORSION_RADIUS = 0.0029
 MovingJoint: TypeAlias = tuple[Joint, mujoco.MjsBody, dict[str, Any]]
 
 
+def make_spec(time_step: float, impratio: float, noslip_iterations: int) -> mujoco.MjSpec:
+    """Return an empty model with the solver's settings: elliptic cones, implicit steps [s]."""
+    spec = mujoco.MjSpec()
+    spec.memory = MEMORY
+    spec.option.timestep = time_step
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = impratio
+    spec.option.noslip_iterations = noslip_iterations
+    return spec
+
+
 def add_links(
     spec: mujoco.MjSpec,
     hand: Hand,

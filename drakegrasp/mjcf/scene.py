@@ -23,12 +23,12 @@ from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import SLIDE, Hand
 from drakegrasp.hand.parsing import joint_slides
 from drakegrasp.mjcf.links import (
-    MEMORY,
     RIGID,
     STIFF,
     TIME_STEP,
     add_couplings,
     add_links,
+    make_spec,
     pair_friction,
     set_inertia,
 )
@@ -156,26 +156,13 @@ def build_mujoco_scene(model: ObjectModel, hand: Hand, config: Config) -> Mujoco
     """Return object, table and hand as a model of MuJoCo."""
     config = config.model_copy(update={"physics": model.own_physics(config.physics)})
     parts = convex_parts(model)
-    spec = _spec()
+    spec = make_spec(TIME_STEP, FRICTION_STIFFNESS, NOSLIP_ITERATIONS)
+    spec.compiler.degree, spec.compiler.balanceinertia = False, True
+    spec.option.tolerance = 1e-10
     _add_table(spec, config)
     _add_object(spec, model, parts, config)
     spreads = _add_hand(spec, hand, config)
     return MujocoScene(model=spec.compile(), spreads=tuple(spreads), parts=len(parts))
-
-
-def _spec() -> mujoco.MjSpec:
-    """Return an empty model with the solver's settings."""
-    spec = mujoco.MjSpec()
-    spec.memory = MEMORY
-    spec.compiler.degree = False
-    spec.compiler.balanceinertia = True
-    spec.option.timestep = TIME_STEP
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = FRICTION_STIFFNESS
-    spec.option.noslip_iterations = NOSLIP_ITERATIONS
-    spec.option.tolerance = 1e-10
-    return spec
 
 
 def _add_table(spec: mujoco.MjSpec, config: Config) -> None:

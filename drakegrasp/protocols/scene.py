@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from drakegrasp.errors import HandError, MeshError, one_line
 from drakegrasp.frames import Array
-from drakegrasp.mjcf.links import MEMORY
+from drakegrasp.mjcf.links import make_spec
 from drakegrasp.protocols.files import ObjectFolder
 from drakegrasp.protocols.protocol import MujocoProtocol
 
@@ -60,7 +60,8 @@ class ProtocolScene:
             MeshError: If a part of the object cannot be used.
         """
         self.mass = protocol.object_mass(thing.volume)
-        spec = _spec(protocol)
+        spec = make_spec(protocol.time_step, protocol.impratio, protocol.noslip_iterations)
+        spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_GRAVITY
         _add_hand(spec, protocol, hand)
         if protocol.lift is not None:
             spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=_PLANE)
@@ -160,19 +161,6 @@ class ProtocolScene:
             pair = bodies[contact.geom1], bodies[contact.geom2]
             (with_object if self._object in pair else others).append(-contact.dist)
         return max(with_object), max(others)
-
-
-def _spec(protocol: MujocoProtocol) -> mujoco.MjSpec:
-    """Return an empty model with the solver's settings; nothing has weight."""
-    spec = mujoco.MjSpec()
-    spec.memory = MEMORY
-    spec.option.timestep = protocol.time_step
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_GRAVITY
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.noslip_iterations = protocol.noslip_iterations
-    spec.option.impratio = protocol.impratio
-    return spec
 
 
 def _read_hand(path: Path) -> mujoco.MjSpec:

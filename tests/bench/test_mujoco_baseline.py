@@ -26,7 +26,7 @@ import mujoco
 from drakegrasp.bench import mujoco_baseline
 from drakegrasp.bench.mujoco_baseline import MujocoBaseline
 from drakegrasp.mjcf import scene as mujoco_scene
-from drakegrasp.mjcf.links import STIFF, TIME_STEP, TORSION_RADIUS, pair_friction
+from drakegrasp.mjcf.links import STIFF, TIME_STEP, TORSION_RADIUS, make_spec, pair_friction
 from drakegrasp.mjcf.scene import build_mujoco_scene
 
 pytestmark = pytest.mark.sim
@@ -162,7 +162,8 @@ def test_friction_is_that_of_coulomb(pinched: ObjectModel) -> None:
 @pytest.mark.parametrize("coefficient", [0.3, 0.71, 1.5])
 def test_sphere_turns_on_a_plane_beyond_friction_times_torsion_radius(coefficient: float) -> None:
     """What a model says of turning is torque per normal force, whatever the coefficient."""
-    radius, force, spec = 0.02, 10.0, mujoco_scene._spec()
+    radius, force = 0.02, 10.0
+    spec = make_spec(TIME_STEP, mujoco_scene.FRICTION_STIFFNESS, mujoco_scene.NOSLIP_ITERATIONS)
     spec.option.gravity = [0.0, 0.0, 0.0]
     surface = {"friction": pair_friction(coefficient), "solref": STIFF, "condim": 4}
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1.0, 1.0, 0.1], **surface)
