@@ -208,7 +208,7 @@ def test_wrong_rows_are_refused(test_split: GraspDataset, rows: list | None, wor
         ({"on": "cup.obj"}, r"rows must be given with a GraspDataset only, got \[0\]"),
         ({"config": "paper"}, "config must be a Config, see load_config, got a str"),
         ({"config": {}}, "config must be a Config, see load_config, got a dict"),
-        ({"frame": "palm"}, "frame must be one of object, camera, table, got 'palm'"),
+        ({"frame": "palm"}, "frame must be one of object, camera, table, mesh, got 'palm'"),
         ({"rows": []}, r"rows must be one per grasp \(1\), got 0"),
         # Its objects are prepared: what the configuration says of them could not be kept.
         (

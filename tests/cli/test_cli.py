@@ -136,7 +136,7 @@ REFUSED = [
         "--objects-seed must be used with --objects",
     ),
     ("bench-set {tmp}/bench --only 99_chair_1", "'99_chair_1'"),
-    ("verify gone.npy --object cube.obj", "gone.npy: must be a file of grasps, got none"),
+    ("verify gone.npy --object cube.obj", "cube.obj: must be a mesh file"),
     ("verify a.npy --object gone.obj", "gone.obj: must be a mesh file"),
     ("verify a.npy", "--object MESH or --dataset FILE must be given"),
     ("verify a.npy --dataset a.npy", "a.npy: must be a data file of drakegrasp"),
