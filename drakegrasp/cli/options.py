@@ -17,6 +17,7 @@ from __future__ import annotations
 import inspect
 import os
 import re
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import UnionType
@@ -27,6 +28,9 @@ import click
 from drakegrasp import registry
 from drakegrasp.errors import first_line
 from drakegrasp.generation.request import BUILTIN, BuildRequest
+
+if sys.flags.optimize > 1:
+    sys.exit("error: python must run without -OO, which leaves out the docstrings with the options")
 
 F = TypeVar("F", bound=Callable[..., Any])
 #: An option in a docstring: its names, what stands for the value, its parameter, and its help.
