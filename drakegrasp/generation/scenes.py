@@ -58,7 +58,7 @@ from drakegrasp.simulation.candidates import Source
 from drakegrasp.simulation.conditions import Conditions, conditions_from, usual_materials
 from drakegrasp.simulation.scene_cache import cached_renderer
 from drakegrasp.vision.camera import RING, Lens, draw_viewpoint, fixed_viewpoints, visible_contacts
-from drakegrasp.vision.rendering import Renderer, capture, paint
+from drakegrasp.vision.rendering import Renderer, paint, render
 
 #: Columns that count rows of other groups, which a task counts from its object's first.
 _ROWS_OF = {
@@ -405,7 +405,7 @@ def _picture(
     renderer: Renderer, lens: Lens, X_TO: Array, X_TC: Array, images: dict[str, list[bytes]]
 ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint8]]:
     """Render a view, add its packed images to lists, and return its depth image and its mask."""
-    seen = capture(renderer, lens, X_TO, X_TC)
+    seen = render(renderer, X_TO, X_TC, lens)
     far = np.where(np.isfinite(seen.depth), np.rint(seen.depth / DEPTH_UNIT), 0)
     depth = far.astype(np.uint16)
     stored = {"rgb": seen.rgb, "depth": depth, "mask": seen.mask}

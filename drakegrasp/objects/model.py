@@ -374,7 +374,7 @@ def _mistake(values: dict[str, Any]) -> str | None:
 AHEAD = 2e-3
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class ContactFit:
     """How n contacts lie on the full mesh.
 
@@ -398,28 +398,19 @@ def fit_contacts(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> ContactFit
         nhat_Q_O: (n, 3), unit normals out of the object.
     """
     # Points that there are.
-    distance, angle = np.full((2, len(p_OQ)), np.nan)
+    fit = ContactFit(*np.full((2, len(p_OQ)), np.nan))
     there = np.asarray(np.isfinite(p_OQ).all(axis=1))
-    if there.any():
-        distance[there], angle[there] = _fit(model, p_OQ[there], nhat_Q_O[there])
-    return ContactFit(distance=distance, normal_angle=angle)
-
-
-def _fit(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> tuple[Array, Array]:
-    """Return distances and angles (n,), as in `ContactFit`, of contacts that all exist."""
-    mesh = model.visual
-    known = np.asarray(np.isfinite(nhat_Q_O).all(axis=1))
-    ahead = p_OQ + AHEAD * np.where(known[:, None], nhat_Q_O, 0.0)
+    if not there.any():
+        return fit
+    p, n, mesh = p_OQ[there], nhat_Q_O[there], model.visual
 
     # The faces nearest to the points, and to those ahead of them.
-    _, distance, here = mesh.nearest.on_surface(p_OQ)
-    _, _, there = mesh.nearest.on_surface(ahead)
-    cosine = np.maximum(
-        dot(nhat_Q_O, mesh.face_normals[here]), dot(nhat_Q_O, mesh.face_normals[there])
-    )
-
-    angle = np.where(known, np.arccos(np.clip(cosine, -1.0, 1.0)), np.pi)
-    return np.asarray(distance), angle
+    known = np.asarray(np.isfinite(n).all(axis=1))
+    _, fit.distance[there], own = mesh.nearest.on_surface(p)
+    _, _, ahead = mesh.nearest.on_surface(p + AHEAD * np.where(known[:, None], n, 0.0))
+    cosine = np.maximum(dot(n, mesh.face_normals[own]), dot(n, mesh.face_normals[ahead]))
+    fit.normal_angle[there] = np.where(known, np.arccos(np.clip(cosine, -1.0, 1.0)), np.pi)
+    return fit
 
 
 #: Memory of a worker that prepares a small mesh [B], of which 240 MB are there before; and of each

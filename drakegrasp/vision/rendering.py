@@ -210,20 +210,22 @@ def drawn_mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike, name: str) -> Mesh
     return Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", name)))
 
 
-def render(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> RenderedView:
+def render(
+    renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike, lens: Lens | None = None
+) -> RenderedView:
     """Return the images of an object at X_TO (4, 4) from a camera at X_TC (4, 4).
+
+    Args:
+        renderer: From `build_renderer`.
+        X_TO: Pose of the object (4, 4).
+        X_TC: Pose of the camera (4, 4).
+        lens: Of the camera; that of the renderer's configuration if None.
 
     Raises:
         BlankImageError: If the image is blank, which means that OpenGL failed.
     """
-    return capture(renderer, Lens.of(renderer.config), X_TO, X_TC)
-
-
-def capture(
-    renderer: Renderer, lens: Lens, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike
-) -> RenderedView:
-    """Return what a camera with a lens of its own sees; arguments and errors as for `render`."""
     # Place the object.
+    lens = lens or Lens.of(renderer.config)
     plant = renderer.plant
     plant_context = plant.GetMyMutableContextFromRoot(renderer.context)
     plant.SetFreeBodyPose(plant_context, renderer.object, RigidTransform(multiply(X_WT, X_TO)))

@@ -183,9 +183,9 @@ def two_scenes() -> bytes:
     return g.pack(parts, [{"mesh": 0}, {"mesh": 0, "translation": [3, 0, 0]}])
 
 
-def using(extension: str) -> bytes:
+def using(extension: str, key: str = "extensionsUsed") -> bytes:
     def edit(g: Glb) -> list[dict[str, Any]]:
-        g.extra["extensionsUsed"] = [extension]
+        g.extra[key] = [extension]
         if "draco" in extension:
             del g.accessors[0]["bufferView"]
             g.accessors[0]["extensions"] = {extension: {}}
@@ -249,6 +249,7 @@ READ: dict[str, tuple[str, str | bytes, tuple[float, float]]] = {
         ]),
         TWO,
     ),
+    "glb, looks": ("a.glb", using("KHR_materials_unlit", "extensionsRequired"), ONE),
     "glb, quantized": ("a.glb", quantized_glb(), ONE),
 }  # fmt: skip
 
@@ -299,6 +300,13 @@ REFUSED: dict[str, tuple[str, str | bytes, str]] = {
     ),
     "glb, bent by joints": ("a.glb", skinned_glb(1.0), "a skin out of its bind pose"),
     "glb, draco": ("a.glb", using("KHR_draco_mesh_compression"), "extension KHR_draco"),
+    "glb, unknown": ("a.glb", using("EXT_my_shape", "extensionsRequired"), "extension EXT_my_sha"),
+    "glb, crowded": ("a.glb", edited_glb(lambda g: [{}] * 10_001), "10,001 nodes, more than 10"),
+    "glb, long place": (
+        "a.glb",
+        edited_glb(lambda g: [{"mesh": 0, "translation": [0.0] * 100_000}]),
+        "a node whose translation is not 3 numbers",
+    ),
     "glb, instances": ("a.glb", using("EXT_mesh_gpu_instancing"), "extension EXT_mesh_gpu"),
     "glb, other file": (
         "a.glb",
