@@ -69,7 +69,8 @@ def test_cards_carry_what_filters_need(site: Path, first: str) -> None:
     assert card["data-hold"] == "held precision stable"
     assert [card["data-label"] for card in predictions] == ["2", "3", "1", "0"]
     verdicts = [str(card["data-verdict"]).split()[0] for card in predictions]
-    assert verdicts == ["fails", "fails", "held", "held"] and predictions[2]["data-error"] == "12"
+    assert verdicts == ["fails", "fails", "held", "held"]
+    assert predictions[2]["data-contact-error"] == "12"
     assert "2 of 4" in (site / "prediction" / "3.html").read_text(encoding="utf-8")
 
 
