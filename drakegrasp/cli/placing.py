@@ -100,7 +100,8 @@ def _posture_dataset(request: VerifyRequest) -> Path | None:
         rows=request.rows,
     )
     if (request.mesh is None) == (request.dataset is None):
-        raise GraspError("--object MESH or --dataset FILE must be given with postures, one of them")
+        must = "--object MESH or --dataset FILE must be given with postures, one of them"
+        raise GraspError(f"{request.grasps}: {must}")
     if request.dataset is not None:
         given = {"units": request.units, "hand": request.hand, "config": request.config}
         _refuse_given("left out with postures and --dataset", **given)
