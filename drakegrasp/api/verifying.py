@@ -186,11 +186,11 @@ def verify_grasps(
         show: Whether to show progress on standard error.
 
     Raises:
-        GraspError: If the array is none of grasps, `on` is nothing of these, an argument does not
-            go with it, rows do not exist or are not one per grasp, or a frame, pose or method
+        GraspError: If the array does not hold grasps, `on` is nothing of these, an argument does
+            not go with it, rows do not exist or are not one per grasp, or a frame, pose or method
             cannot be used.
         MeshError: If a mesh cannot be simulated or does not come to rest.
-        ConfigError: If config is none, or the object was prepared with other values.
+        ConfigError: If config is not one, or the object was prepared with other values.
         HandError: If the hand cannot be used.
         DataError: If the dataset cannot be used, or has changed since the sample was read.
         MachineError: If a worker would give other results than this machine.
@@ -289,7 +289,7 @@ def place_object(
     Raises:
         MeshError: If the mesh cannot be simulated or does not come to rest.
         GraspError: If X_TO is no pose or does not stand on the table.
-        ConfigError: If config is none, or an object was placed before with other values.
+        ConfigError: If config is not one, or an object was placed before with other values.
         HandError: If the hand cannot be used.
     """
     used = config_for(mesh, config)

@@ -42,7 +42,7 @@ class Slurm(Remote):
     options = (*REMOTE, "walltime")
 
     def __post_init__(self) -> None:
-        """Refuse a walltime that is none, and jobs without a number of workers."""
+        """Refuse a malformed walltime, and jobs without a number of workers."""
         super().__post_init__()
         if self.walltime is not None:
             walltime_seconds(self.walltime)

@@ -440,7 +440,7 @@ passed all filters; *in effect* their number where those with almost the same pa
 
 def _bears(content: Mapping[str, Any]) -> str:
     lines = "\n".join(f"* {line}." for line in content["p_hold"]["in_words"])
-    return f"""## How much a grasp bears
+    return f"""## How much disturbance a grasp tolerates
 
 A share of the lifts is repeated with noise on the palm's pose, friction and mass (`p_hold_samples`
 of `p_hold_repeats`, law in the setting `certify`). Intervals are of 95 %; a grasp counts for the

@@ -24,7 +24,7 @@ from drakegrasp.filters import Removal
 
 #: Probability that the true share lies in an interval.
 CONFIDENCE = 0.95
-#: A grasp bears much if so large a share of its repeats are samples.
+#: A grasp is robust if at least this share of its repeats are samples.
 MUCH = 0.5
 #: Columns of `/trials` from which the predictors follow.
 COLUMNS = (
@@ -109,7 +109,7 @@ def bearing(columns: Mapping[str, npt.NDArray[Any]]) -> Bearing | None:
 
 
 def predictors(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, Array]:
-    """Return what of a lift may tell how much it bears: (n,) each, larger for what bears more.
+    """Return what of a lift may predict its p_hold: (n,) each, larger for a larger one.
 
     Args:
         columns: Rows of `/trials`, by the names of COLUMNS.

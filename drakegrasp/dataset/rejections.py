@@ -75,7 +75,7 @@ class Decisions:
         """Return the decisions with another one for an attempt; empty text withdraws it.
 
         Raises:
-            ValueError: If the decision is none.
+            ValueError: If it is not a decision.
         """
         if decision not in ("rejected", "kept", ""):
             raise ValueError(f"decision must be rejected, kept or empty, got {decision!r}")

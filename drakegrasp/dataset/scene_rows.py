@@ -32,7 +32,7 @@ from drakegrasp.seeding import Stream
 
 Columns = dict[str, AnyArray]
 
-#: Outcomes of lifts to a verdict; `table_contact` after closing is none.
+#: Outcomes of lifts to a verdict; `table_contact` after closing is not one.
 LIFTED = (Outcome.SUCCESS, *LOST, Outcome.TABLE_CONTACT)
 #: Fields of /grasps that are columns of /trials, by their names here.
 _COPIED = {f.name: f.of for f in SCENE_GRASP_FIELDS if f.of} | {

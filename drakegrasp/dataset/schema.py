@@ -411,8 +411,8 @@ CONDITION_FIELDS: tuple[Field, ...] = (
           of="conditions.sensor.seed"),
 )
 
-#: How much a lifted attempt bears; see `drakegrasp.simulation.robustness`. Files of builds that do
-#: not certify lack these, see `stored_fields`.
+#: How much disturbance a lifted attempt tolerates; see `drakegrasp.simulation.robustness`. Files of
+#: builds that do not certify lack these, see `stored_fields`.
 HOLD_FIELDS: tuple[Field, ...] = tuple(
     replace(field, stage=Stage.LIFTED, some=True, optional=True)
     for field in (

@@ -70,7 +70,7 @@ def read_attempts(
 ) -> Attempts:
     """Return the postures of a file, or of all files of a folder, or contacts, as one table.
 
-    A row that is none stays in the table, with the reason; in a folder a file may be none.
+    A bad row stays in the table, with the reason; so does a bad file of a folder.
 
     Args:
         path: The file or the folder.
@@ -360,7 +360,7 @@ def _of_arrays(arrays: Mapping[str, Any], nameless: bool) -> dict[str, Any]:
 
 
 def _leading_on(arrays: Mapping[str, Any], unknown: Sequence[str]) -> str:
-    """Return what to do with arrays that are none of postures; empty if nobody knows."""
+    """Return what to do with arrays that are not postures; empty if nobody knows."""
     for name in unknown:
         shape = np.shape(arrays[name])
         if name == "grasps" or (len(shape) == 2 and shape[1] % 6 == 0):
@@ -455,7 +455,7 @@ def _parquet() -> Any:
 
 
 def _read_columns(path: Path) -> tuple[dict[str, list[Any]], list[str]]:
-    """Return the columns of a table, and for each row why it is none, or an empty text."""
+    """Return the columns of a table, and for each row why it is bad, or an empty text."""
     if path.suffix.lower() == ".parquet":
         parquet = _parquet()
         try:
@@ -537,7 +537,7 @@ def _of_columns(
 def _floats(
     columns: Mapping[str, list[Any]], name: str, invalid: list[str]
 ) -> npt.NDArray[np.float64]:
-    """Return a column as numbers; an empty cell is NaN, and `invalid` says which are none."""
+    """Return a column as numbers; an empty cell is NaN; `invalid` says which are not numbers."""
     values = np.full(len(columns[name]), np.nan)
     for i, cell in enumerate(columns[name]):
         try:

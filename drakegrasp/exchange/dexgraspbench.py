@@ -275,7 +275,7 @@ def read_dexgraspbench(path: Path, hand: Hand) -> dict[str, Any]:
     }
 
 
-#: An object on the table, and a posture in {O}; or why there is none, for a row that is no grasp.
+#: An object on the table, and a posture in {O}; or the reason, for a bad row.
 PlacedPosture: TypeAlias = tuple[PlacedObject, Posture | str]
 
 

@@ -165,6 +165,7 @@ def _responsibility(card: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _record_set(table: HubTable, path: str) -> dict[str, Any]:
+    # A field for each column; images are read from the bytes of their cells.
     name, fields = path.removesuffix(".parquet"), []
     for column, field in table.columns.items():
         source: dict[str, Any] = {"fileObject": {"@id": path}, "extract": {"column": column}}
@@ -181,6 +182,7 @@ def _record_set(table: HubTable, path: str) -> dict[str, Any]:
                 "source": source,
             }
         )
+
     return {
         "@type": "cr:RecordSet",
         "@id": name,

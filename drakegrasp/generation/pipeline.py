@@ -193,7 +193,7 @@ def build_locked(
         execute: Does the work.
         dead: Who held the lock before and died, as `build_lock` yields it.
         postures: What is tried instead of palm poses of samplers; the configuration knows it by
-            its digest, see `posture_config`. Rows that are none are told, and left out.
+            its digest, see `posture_config`. Bad rows are reported and left out.
         pool: The executor's processes, as for `build`.
         show: Whether to show progress on standard error.
 

@@ -224,7 +224,8 @@ def refuse_impossible(root: Element) -> None:
     """Refuse limits and mimics of URDF or SDFormat of which a parser says where in it they fail.
 
     Raises:
-        HandError: If a lower limit is above its upper one, or a joint follows what is none.
+        HandError: If a lower limit is above its upper one, or a joint follows one that does not
+            exist.
     """
     joints = {joint.get("name", ""): joint for joint in root.iter("joint")}
     for name, joint in joints.items():

@@ -77,7 +77,7 @@ def add_links(
 ) -> Iterator[MovingJoint]:
     """Add the links of a hand; yield each joint that moves, which the caller adds to its body.
 
-    A joint of the preshape is none in MuJoCo: its body stands where the joint would put it.
+    A joint of the preshape does not exist in MuJoCo: its body stands where the joint would put it.
 
     Args:
         spec: To which shapes are added.

@@ -92,7 +92,7 @@ class DecisionFile:
             page: Which page decides, for `undo`.
 
         Raises:
-            ValueError: If the decision is none.
+            ValueError: If it is not a decision.
             DataError: If the file is something else by now.
             OSError: If it cannot be written.
         """

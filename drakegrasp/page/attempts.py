@@ -321,7 +321,7 @@ def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, s
 
 
 def _bears(row: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return how much an attempt bears; nothing where that was not tried."""
+    """Return how much disturbance an attempt tolerates; nothing if not tried."""
     probability, half = row["p_hold_probability"], row["p_hold_half_step"]
     if np.isnan(probability):
         return []

@@ -233,7 +233,7 @@ class Gallery(ABC):
         """Return what an address asks for.
 
         Raises:
-            DataError: If a value is none that can be asked for.
+            DataError: If a value cannot be asked for.
         """
         # Texts that must be one of a few; names of objects may be any.
         params = params or {}

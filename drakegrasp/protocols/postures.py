@@ -68,7 +68,7 @@ def verify_postures(
     """Yield the verdicts on files, in their order, each with the digests of hand and object.
 
     Args:
-        files: Of DexGraspBench's format; a text says why a grasp is none.
+        files: Of DexGraspBench's format; a text says why a row is not a grasp.
         trials: From `prepare_trials`.
         execute: Runs the trials.
 

@@ -97,7 +97,7 @@ def count_workers(workers: int | None) -> int:
     """Return how many processes of this machine to start: one per core if None.
 
     Raises:
-        ConfigError: If the number is none that anybody means.
+        ConfigError: If the number makes no sense.
     """
     if workers is not None and workers < 1:
         raise ConfigError(f"workers must be at least 1, got {workers}")

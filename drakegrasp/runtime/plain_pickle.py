@@ -155,7 +155,7 @@ def read_plain_pickle(path: Path) -> Any:
     """Return the object of a .npy file that holds one.
 
     Raises:
-        GraspError: If the file is none, is too large, or its object is of anything but plain
+        GraspError: If the file is not one, is too large, or its object is of anything but plain
             values.
     """
     try:

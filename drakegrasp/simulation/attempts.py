@@ -1,7 +1,7 @@
 """Attempts from outside: many postures of several objects, and the palm poses of a build from them.
 
 In: what a file, a network or another tool says of n grasps. Out: one table, `Attempts`, in which a
-row that is none keeps the reason and spoils no other. It is plain data and can be sent to another
+bad row keeps the reason and spoils no other. It is plain data and can be sent to another
 process. A build makes its `Candidates` and the `Attempt` of each from it, a verdict and a score put
 its rows on their objects.
 """
@@ -364,7 +364,7 @@ def join_attempts(parts: Sequence[Attempts | str]) -> Attempts:
     """Return the rows of some tables, one after the other.
 
     Args:
-        parts: Tables of one hand; a text says why a file is none, and becomes one row.
+        parts: Tables of one hand; a text says why a file is bad, and becomes one row.
 
     Raises:
         GraspError: If no part is a table, or they are in different frames.
@@ -375,7 +375,7 @@ def join_attempts(parts: Sequence[Attempts | str]) -> Attempts:
     if len(frames := {table.frame for table in tables}) > 1:
         raise GraspError(f"files must be in one frame, got {', '.join(sorted(frames))}")
 
-    # Whatever the numbers of a row are that is none: nobody reads them.
+    # The numbers of a bad row do not matter: nobody reads them.
     nothing = replace(tables[0].at([0]), objects=("",), said=("",))
     whole = [p if isinstance(p, Attempts) else replace(nothing, invalid=(p,)) for p in parts]
     joined: dict[str, Any] = {}
@@ -552,7 +552,7 @@ def xyzw_poses(positions: npt.ArrayLike, quaternions: npt.ArrayLike) -> Array:
 def _poses(
     value: npt.ArrayLike | None, count: int, name: str, bad: list[str], *, some: bool = False
 ) -> Array:
-    """Return poses (n, 4, 4); `bad` gets the reason for each that is none, see `_numbers`."""
+    """Return poses (n, 4, 4); `bad` gets the reason for each that is not one, see `_numbers`."""
     array = _numbers(value, (count, 4, 4), name, bad, some=some).copy()
     for i, X in enumerate(array):
         if bad[i] or (some and np.isnan(X).all()):

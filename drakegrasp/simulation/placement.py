@@ -94,7 +94,7 @@ def place_object(
     Raises:
         MeshError: If the mesh cannot be simulated or does not come to rest.
         GraspError: If X_TO is no pose or does not stand on the table.
-        ConfigError: If config is none, or an object was placed before with other values.
+        ConfigError: If config is not one, or an object was placed before with other values.
     """
     # Check the arguments that do not depend on the kind of mesh.
     config = config_for(mesh, config)

@@ -95,7 +95,7 @@ def make_posture(
         preshape: Name of one of the hand's preshapes; None: all fingers close.
 
     Raises:
-        GraspError: If a pose is none, a vector has another length or is not finite, a joint is
+        GraspError: If a pose is not one, a vector has another length or is not finite, a joint is
             missing, the hand has no such preshape, or the frame is unknown or lacks its pose.
     """
     preshape_index(hand, preshape)
@@ -297,7 +297,7 @@ def run_trial(placed: PlacedObject, posture: Posture, config: Config | None = No
         config: Hand, physics and lift; that of the placed object if None.
 
     Raises:
-        GraspError: If the posture is none of the hand, or `placed` is no placed object.
+        GraspError: If the posture is not of the hand, or `placed` is no placed object.
         ConfigError: If the object was placed with other values, or the hand cannot have the drive.
         HandError: If the hand cannot be used.
     """

@@ -1,9 +1,9 @@
-"""How much a grasp bears: the attempt is repeated, disturbed, and with less friction.
+"""How much disturbance a grasp tolerates: repeats with noise, and with less friction.
 
 In: an attempt that was lifted. Out: how many of its repeats hold, and would be
 samples, with noise on palm pose, friction and mass; whether it would be a sample at half the time
 step; and the least friction at which it holds without noise, at half the step. Repeats have the
-trial's own step: its error is numerics, and told apart. The lift that was stored is none of them.
+trial's own step: its error is numerics, and kept separate. The stored lift is not counted.
 The noise depends on the attempt's own seed alone.
 """
 

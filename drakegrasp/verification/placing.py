@@ -2,7 +2,7 @@
 
 In: numbers in one of three frames or postures, with an object, with the objects of a dataset, or
 with rows of one. Out: a `PlacedGrasp` for each. Every mistake of the caller is found here, before
-anything is simulated; a row that is no grasp is none of them.
+anything is simulated; a bad row is not a mistake of the caller.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ def read_grasps(
         confidence: (n,), greater is better.
 
     Raises:
-        GraspError: If the array is none of such rows at all.
+        GraspError: If the array does not hold such rows.
     """
     # 6k numbers in each row that has as many.
     size = 6 * fingers

@@ -208,7 +208,7 @@ def _flow(value: Any) -> str:
 GRIPS, FRAMES, SHARES = 6, 2, (0.0, 0.25, 0.5, 0.75, 1.0)
 #: Postures at which links of different fingers are compared.
 POSTURES = 24
-#: A pinch that costs more than this is none: fingers that pass each other.
+#: A pinch that costs more than this is not a pinch: fingers that pass each other.
 WORST = 2.4
 #: Files of a vendor that say what may be done with the model.
 LICENCES = ("LICENSE*", "LICENCE*", "COPYING*", "NOTICE*")

@@ -100,7 +100,7 @@ def draft_tree(
     """Return the hand file of a grip.
 
     Raises:
-        HandError: If no effort of the motors is known, or a setting is none.
+        HandError: If no effort of the motors is known, or a setting is malformed.
     """
     grip = _in_order(grip, frame)
     limits, forces = _closing_limits(model, grip, answers.effort)

@@ -77,7 +77,7 @@ class Decisions:
         successes: The successes.
         removal: (n,) uint8, the `Removal` of each.
         splits: Indices of the samples of each split among the successes, in rising order.
-        weights: (n,), weight of each sample; NaN where a success is none.
+        weights: (n,), weight of each sample; NaN for a success that is not one.
     """
 
     successes: Table

@@ -20,7 +20,7 @@ from drakegrasp.outcomes import Stage
 UNIT_TOLERANCE = 1e-5
 #: What is positive, for a least value.
 POSITIVE = 5e-324
-#: Least and largest value of fields; NaN is none.
+#: Least and largest value of fields; NaN has no limits.
 RANGES = {
     **dict.fromkeys(("slip", "slip_released", "certified_friction"), (0.0, np.inf)),
     **dict.fromkeys(("turn", "turn_released"), (0.0, np.pi)),
@@ -104,7 +104,7 @@ def derived(batch: Batch, fields: Sequence[Field]) -> Iterator[Violation]:
 
 
 def rigid(batch: Batch, fields: Sequence[Field]) -> Iterator[Violation]:
-    """Poses are rigid motions, and normals have length one; those that are NaN are none."""
+    """Poses are rigid motions, and normals have length one; NaN means there is none."""
     for f in fields:
         if f.name not in batch.columns:
             continue
