@@ -263,7 +263,10 @@ def test_bar_ends_where_the_build_does(whole: Path, ends: dict[str, int], expect
     counts = Counts(replace(manifest, config=changed), None, report)
     header = replace(next(manifest.headers()), start=0, stop=1)
     samples = None if "max_grasps" in ends else 2
-    counts.add(header, {Outcome.SUCCESS: 2, Outcome.RAY_MISS: 1}, samples=samples)
+    outcomes = {Outcome.SUCCESS: 2, Outcome.RAY_MISS: 1}
+    counts.add(
+        UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={}, samples=samples)
+    )
     assert (shown["done"], shown["total"]) == (3, expected)
     if "samples" in ends:
         assert shown[f"of {ends['samples']:,} samples"] == 2

@@ -132,7 +132,7 @@ def test_plan_keeps_what_the_file_said(dataset, table):
     config = posture_config(load_config(), table)
     kept = load_prepared(dataset, NAME, config).candidates.postures
     np.testing.assert_array_equal(kept.q_pregrasp, table.q_pregrasp)
-    assert kept.said == ("mine", "", "", "")
+    assert kept.said.tolist() == ["mine", "", "", ""]
 
 
 def test_plan_whose_texts_are_nested_too_deeply_is_refused_in_a_line(dataset, table, tmp_path):

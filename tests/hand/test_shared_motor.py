@@ -85,7 +85,7 @@ def test_a_posture_that_the_motor_cannot_reach_gets_motors_of_its_own(
     tmp_path: Path, q: tuple[float, float], own_motors: bool
 ) -> None:
     start = start_of(Posture(np.eye(4), np.array(q)), shared(tmp_path))
-    assert (start.path is not None and start.path.own_motors) == own_motors
+    assert start.own_motors == own_motors
     assert start.closing is None or np.ptp(start.closing) == 0.0
 
 

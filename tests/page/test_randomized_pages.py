@@ -41,9 +41,9 @@ def imbalance(out: Path) -> np.ndarray:
 
 
 def test_suspicion_is_of_the_drawn_mass(drawn: Path) -> None:
-    table, expected = Catalog(drawn).current().table, imbalance(drawn)
+    snapshot, expected = Catalog(drawn).current(), imbalance(drawn)
     for i in (0, 3, 11):
-        assert table.value("imbalance", i) == pytest.approx(expected[i], rel=1e-6)
+        assert snapshot.value("imbalance", i) == pytest.approx(expected[i], rel=1e-6)
 
 
 def test_the_filters_of_suspicion_are_of_the_drawn_mass(drawn: Path, tmp_path: Path) -> None:
