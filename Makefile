@@ -58,8 +58,8 @@ demo: $(STAMP)   ## a small dataset of built-in objects, its funnel and a contac
 	$(BIN)/drakegrasp doctor
 	$(BIN)/python pipelines/demo.py $(DEMO)
 
-test: $(DEV)   ## the tests of every change: the first tier
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+test: $(DEV)   ## the tests of every change: the first tier, but for the pages in Chromium
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not server and not nightly and not browser'
 
 test-fast: $(DEV)  ## of these the ones without simulations and clusters
 	$(BIN)/python -m pytest -n 2 -m 'not sim and not cluster and not slow and not nightly'

@@ -59,6 +59,7 @@ def test_newest_blas_kernel_changes_no_draw() -> None:
     assert set(check(drawn_with(OPENBLAS_CORETYPE=kernel))["blas"]) <= {kernel}
 
 
+@pytest.mark.nightly
 def test_oldest_cpu_draws_the_same() -> None:
     """Without any instruction beyond the least, in BLAS, in NumPy and in the C library's sines."""
     settings = {"OPENBLAS_CORETYPE": "Prescott"}

@@ -223,14 +223,14 @@ every_command = pytest.mark.parametrize(
 
 @every_command
 def test_files(base: Path, tmp_path: Path, file: str, command: str) -> None:
-    """A third of the kinds with the first command, a quick one, and a few with each other one.
+    """A fifth of the kinds with the first command, a quick one, and a few with each other one.
 
     All of them read a file by the same function, whose kinds go by the fields of the schema.
     """
     kinds, commands = FILES[file]
     k = commands.index(command)
     # The whole dataset is checked for each.
-    share = 40 if command == "check" else 20 if k else 3
+    share = 40 if command == "check" else 20 if k else 5
     walk(base, tmp_path, file, kinds[k % share :: share], command)
 
 

@@ -108,6 +108,7 @@ def test_what_belongs_to_no_row_is_refused(
     assert str(caught.value).startswith(str(tmp_path / "p.npz"))
 
 
+@pytest.mark.nightly
 @pytest.mark.sim
 @pytest.mark.slow
 def test_own_samples_given_back_as_postures_come_out_as_stored(
