@@ -718,17 +718,26 @@ def with_whole_lifts(config: Config) -> Config:
     return config.model_copy(update={"lift": lift})
 
 
+#: Samplers of the preset `fast` before it had `above`.
+_FAST_BEFORE = ("normals",) * 7 + ("rotations",)
+
+
 def continued(config: Config, known: Config) -> Config:
     """Return the configuration with which a build continues a dataset: by the rules it began with.
 
     Args:
-        config: Of the build. A rule that it only has by default gives way to that of the dataset.
+        config: Of the build. What it only has by default, or by the preset `fast`, gives way to
+            what the dataset began with.
         known: Of the dataset.
     """
     by_default = config.close.scrape_depth == CloseConfig().scrape_depth
     if known.close.scrape_depth is None and by_default:
         close = config.close.model_copy(update={"scrape_depth": None})
-        return config.model_copy(update={"close": close})
+        config = config.model_copy(update={"close": close})
+    by_preset = list(config.candidates.methods) == read_settings("fast")["candidates"]["method"]
+    if known.candidates.method == _FAST_BEFORE and by_preset:
+        candidates = config.candidates.model_copy(update={"method": _FAST_BEFORE})
+        config = config.model_copy(update={"candidates": candidates})
     return config
 
 

@@ -495,6 +495,16 @@ def test_rule_that_a_dataset_lacks_stays_off_when_it_goes_on() -> None:
     assert continued(load_config(), stated) == load_config()
 
 
+def test_dataset_of_the_preset_before_goes_on_with_its_samplers() -> None:
+    before = "candidates.method=[normals,normals,normals,normals,normals,normals,normals,rotations]"
+    old, now = load_config("fast", [before]), load_config("fast")
+    assert "above" in now.candidates.methods
+    assert continued(now, old) == old
+    other = load_config("fast", ["candidates.method=normals"])
+    assert continued(other, old) == other
+    assert continued(now, other) == now
+
+
 def test_dataset_that_an_older_version_certified_is_read_as_it_is() -> None:
     """Its shards have that hash; nothing is drawn for what it does not have."""
     tree = load_config(overrides=["certify.repeats=2", "close.scrape_depth=null"]).to_dict()
