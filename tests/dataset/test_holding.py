@@ -98,4 +98,5 @@ def test_interval_stands_beside_k_of_n_and_the_predictor_beside_p_hold(out: Path
     assert f"ranks these samples best (AUC {holding.predictor[1]:.2f})" in said
     card = json.loads((out / "DATACARD.json").read_text(encoding="utf-8"))
     assert card["p_hold"]["groups"]["samples"]["drawn"] == 9
-    assert "## How much disturbance a grasp tolerates" in (out / "DATACARD.md").read_text(encoding="utf-8")
+    text = (out / "DATACARD.md").read_text(encoding="utf-8")
+    assert "## How much disturbance a grasp tolerates" in text
