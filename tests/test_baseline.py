@@ -286,17 +286,17 @@ def assert_assessed(out: Path, scenes: Path) -> None:
 def assert_drawn(out: Path, scenes: Path) -> None:
     """The gallery has the first prediction of each view, the surest first, samples above."""
     with h5py.File(out / "p.h5", "r+") as file:
-        ranked = Namespace(rows=file["row"][:], confidence=file["row"][:] * 7 % 11 / 11.0)
+        ranked = Namespace(of_row=file["row"][:], confidence=file["row"][:] * 7 % 11 / 11.0)
         file["confidence"][:] = ranked.confidence
-    ranked.ranks = np.arange(len(ranked.rows)) % 2
-    verdicts = [Namespace(counted=row % 3 == 0, outcome="dropped") for row in ranked.rows]
+    ranked.rank = np.arange(len(ranked.of_row)) % 2
+    verdicts = [Namespace(counted=row % 3 == 0, outcome="dropped") for row in ranked.of_row]
     judged = Namespace(ranked=(ranked,), verdicts=(verdicts,))
     with mock.patch("gallery.judge", return_value=judged):
         pictures = gallery(out / "p.h5", scenes, out / "card").axes
     for good, colour in zip((True, False), COLOURS, strict=True):
         titles = [axes.title for axes in pictures if axes.title.get_color() == colour]
         said = [float(title.get_text().rsplit(" ", 1)[1]) for title in titles]
-        sure = ranked.confidence[::2][(ranked.rows[::2] % 3 == 0) == good]
+        sure = ranked.confidence[::2][(ranked.of_row[::2] % 3 == 0) == good]
         assert len(said) > 1
         assert said == [round(float(each), 2) for each in sorted(sure, reverse=True)][:12]
     done = script("gallery.py", out / "p.h5", scenes, out / "card", out / "gallery.png")
