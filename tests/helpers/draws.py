@@ -21,12 +21,14 @@ from threadpoolctl import threadpool_info
 
 from drakegrasp.config import BuiltinConfig, SplitConfig
 from drakegrasp.dataset.assembly.split import split_samples
+from drakegrasp.frames import make_pose
 from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.seeding import Stream
 from drakegrasp.shapes.catalog import export_builtin
+from drakegrasp.simulation.above import Above
 from drakegrasp.simulation.candidates import (
     make_attempts,
     normal_candidates,
@@ -42,6 +44,8 @@ from drakegrasp.vision.depth_sensor import DepthSensor, spoil_depth
 REAL = ("24_mug_final", "42_wineglass_final", "110_bunny_final")
 #: Attempts whose predictions by geometry are hashed.
 PREDICTED = 600
+#: A resting pose of exact numbers: 3, 4, 5 are a right triangle.
+R_WO = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
 
 
 def digest(*parts: object) -> str:
@@ -95,6 +99,8 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     ]
     yield "conditions", digest(*(np.array([d[name] for d in drawn]) for name in drawn[0]))
     yield "normals", digest(normal_candidates(model, 1000, Stream(7)))
+    above = Above(model, make_pose(R_WO, [0.1, 0.2, 0.3]), config.candidates, Stream(7))
+    yield "above", digest(above.poses(1000), np.array(above.log_density))
     predictions = predict(model, hand, prepared.X_TO, attempts[:PREDICTED], config.screen)
     yield (
         "predictions",
