@@ -13,19 +13,21 @@ import numpy as np
 import pytest
 from helpers import pins
 
-EXPECTED = Path(pins.__file__).with_name("pins.npz")
-
-
-@pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> pins.Pins:
-    return pins.everything(tmp_path_factory.mktemp("pins"))
+FOLDER = Path(pins.__file__).parent
 
 
 @pytest.mark.sim
-@pytest.mark.slow
+def test_nothing_of_a_few_pins_has_changed(tmp_path: Path) -> None:
+    found = pins.summaries(pins.few(tmp_path))
+    assert pins.far(found, pins.read_values(FOLDER / "few_pins.npz")) == []
+
+
+@pytest.mark.nightly
+@pytest.mark.sim
 @pytest.mark.timeout(1800)
-def test_nothing_that_is_pinned_has_changed(found: pins.Pins) -> None:
-    assert pins.far(pins.summaries(found), pins.read_values(EXPECTED)) == []
+def test_nothing_that_is_pinned_has_changed(tmp_path: Path) -> None:
+    found = pins.summaries(pins.everything(tmp_path))
+    assert pins.far(found, pins.read_values(FOLDER / "pins.npz")) == []
 
 
 def test_differences_are_told_by_name() -> None:

@@ -18,7 +18,6 @@ import pytest
 import trimesh
 from helpers.assertions import assert_same_dataset
 from helpers.builds import FAST, finish, start_build, wait_for_shards, workers_of
-from helpers.tiers import in_second_tier
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
@@ -38,7 +37,7 @@ from drakegrasp.vision import rendering
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
-UNITS = 28
+UNITS = 12
 
 
 @pytest.fixture(scope="module")
@@ -85,16 +84,37 @@ def assert_clean(out: Path, *patterns: str) -> None:
 
 
 @pytest.mark.cluster
-@pytest.mark.parametrize("kills", [3, in_second_tier(20)])
-def test_random_kills_change_nothing(
-    meshes: Path, undisturbed: Path, tmp_path: Path, kills: int
-) -> None:
-    """All of four workers are killed while objects are prepared, and some times one of them.
+def test_a_killed_worker_changes_nothing(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    begin(out, undisturbed, units=1)
+    process = start_build(meshes, out, workers=1)
+    while not list(out.glob("shards/*/*.journal")):
+        assert process.poll() is None
+        time.sleep(0.02)
+    (worker,) = workers_of(process.pid)
+    os.kill(worker, signal.SIGKILL)
+    # A journal outlives its process.
+    assert list(out.glob("shards/*/*.journal"))
+    said, _ = finish(process)
+    assert "2 work units simulated" in said
+    assert_same_dataset(undisturbed, out)
+    assert_clean(out)
+    done = [(e["object"], e["start"]) for e in events(out, "unit done")]
+    assert len(done) == len(set(done)) == 2
+
+
+@pytest.mark.nightly
+@pytest.mark.cluster
+def test_random_kills_change_nothing(meshes: Path, tmp_path: Path) -> None:
+    """All of four workers are killed while objects are prepared, and many times one of them.
 
     However quick they are: at the latest with the next shard.
     """
-    out, rng, killed = tmp_path / "out", random.Random(0), 0
-    process = start_build(meshes, out, workers=4)
+    more, units, kills = "candidates.max=14", 28, 20
+    undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
+    config = load_config(overrides=[*FAST, more])
+    build(find_meshes(meshes), undisturbed, config, run_here, show=False)
+    process, rng, killed = start_build(meshes, out, 4, "--set", more), random.Random(0), 0
     while not list(out.glob("objects/*.journal")):
         assert process.poll() is None
         time.sleep(0.05)
@@ -112,11 +132,11 @@ def test_random_kills_change_nothing(
             killed += 1
     said, _ = finish(process)
     assert killed == kills
-    assert f"{UNITS} work units simulated\n" in said
+    assert f"{units} work units simulated\n" in said
     assert_same_dataset(undisturbed, out)
     assert_clean(out)
     done = [(e["object"], e["start"]) for e in events(out, "unit done")]
-    assert len(done) == len(set(done)) == UNITS
+    assert len(done) == len(set(done)) == units
 
 
 @pytest.mark.nightly

@@ -10,9 +10,9 @@ import pytest
 from helpers.scripts import load_script
 
 
+@pytest.mark.nightly
 @pytest.mark.cluster
 @pytest.mark.sim
-@pytest.mark.slow
 def test_killed_client_leaves_one_state_and_the_same_command_finishes(tmp_path: Path) -> None:
     script = load_script("measurements/interruptions")
     meshes, reference = tmp_path / "meshes", tmp_path / "reference"

@@ -12,11 +12,11 @@ from pathlib import Path
 
 from drakegrasp.runtime.journal import VARIABLE
 
-#: Units of half a second, so that none goes with another and a build can be stopped in time; of ten
-#: attempts one succeeds.
+#: Six units of half a second for each object, so that none goes with another and a build can be
+#: stopped in time; of six attempts one succeeds.
 FAST = [
     "screen.mode=off",
-    "candidates.max=14",
+    "candidates.max=6",
     "candidates.global_x_deg=[0]",
     "candidates.global_y_deg=[0]",
     "candidates.global_z_deg=[0,45,90]",

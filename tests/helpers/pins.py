@@ -7,7 +7,8 @@ every array that comes out. On one machine all are equal to the bit:
     python tests/helpers/pins.py FILE               compares with them, and names what differs
 
 `tests/test_pins.py` compares on any machine, see docs/explanation/determinism.md, with
-`tests/helpers/pins.npz`, which `--values` writes. Only public names and files are used.
+`tests/helpers/pins.npz`, which `--values` writes, and on every change a few of them
+with `tests/helpers/few_pins.npz`, which `--few` writes.
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ import numpy as np
 import trimesh
 
 import drakegrasp
+from drakegrasp.generation.pipeline import build as build_here
+from drakegrasp.runtime.executor import run_here
+from drakegrasp.shapes.catalog import builtin_sources
 
 #: Arrays by name: "build/trials/slip", "score/sets/...".
 Pins: TypeAlias = dict[str, np.ndarray]
@@ -113,6 +117,22 @@ def everything(folder: Path) -> Pins:
     for preset, candidates in UNITS.items():
         found |= build(folder / preset, preset, candidates, [UNIT_OBJECT])
     return found | benchmark(folder / "bench1")
+
+
+def few(folder: Path) -> Pins:
+    """Return a few pins in seconds, of one work unit of preset `fast`; `folder` is empty."""
+    rules = ["candidates.max=2", "unit_candidates=2", "objects.resting_poses=1"]
+    rules += [
+        f"{name}=1" for name in ("builtin.per_class", "refine.children", "refine.generations")
+    ]
+    config, out = drakegrasp.load_config("fast", overrides=rules), folder / "out"
+    sources = builtin_sources(folder / "meshes", config.builtin, only=OBJECTS[:1])
+    build_here(sources, out, config, run_here, show=False)
+    split = most_samples(out)
+    data = drakegrasp.GraspDataset(out / "grasping_oto.hdf5", split=split)
+    drakegrasp.score([], data, references=["own"], per_object=1, out=folder / "score", workers=1)
+    card = json.loads((folder / "score" / "card.json").read_text())
+    return dataset(out, "few") | calls(out, split) | leaves(card, "score")
 
 
 def build(
@@ -302,11 +322,15 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("hashes", type=Path, help="file of the hashes (.json)")
+    parser.add_argument("--few", type=Path, help="write the values of a few pins (.npz), no others")
     parser.add_argument("--update", action="store_true", help="write it, and do not compare")
     parser.add_argument("--values", type=Path, help="write what other machines compare with (.npz)")
     parser.add_argument("--keep", type=Path, help="empty folder for what is made  [default: none]")
     arguments = parser.parse_args()
     with TemporaryDirectory() as folder:
+        if arguments.few:
+            write_values(arguments.few, few(Path(folder)))
+            return 0
         found = everything(arguments.keep or Path(folder))
     hashes = {name: digest(value) for name, value in sorted(found.items())}
     if arguments.values:
