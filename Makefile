@@ -18,7 +18,7 @@ export LP_NUM_THREADS := 0
 export DRAKE_ALLOW_NETWORK := none
 
 .PHONY: FORCE help install demo test test-fast test-nightly test-browser test-torch test-cluster \
-	lint format docs docs-pages package clean
+	lint format docs docs-pages package release clean
 
 help:            ## what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -111,11 +111,15 @@ docs-pages: $(DEV)  ## write the pages of the docs that are made from code
 	$(BIN)/python pipelines/docs/builtin_objects.py docs/reference/builtin-objects.md
 	$(BIN)/python pipelines/docs/example_gallery.py docs/examples/index.md
 
-# The wheel is built from the sdist, so what the sdist lacks the wheel lacks, too.
+# The wheel is built from the sdist, so what the sdist lacks the wheel lacks as well.
 package: $(DEV)  ## sdist and wheel in dist/, and the wheel tried in an empty environment
 	rm -rf dist
 	$(BIN)/python -m build . >/dev/null
-	$(BIN)/python pipelines/try_package.py dist
+	$(BIN)/python pipelines/try_package.py dist/*.whl
+
+release: package ## what `package` does with the sdist as well, and the command that tags the version
+	$(BIN)/python pipelines/try_package.py dist/*.tar.gz
+	$(BIN)/python pipelines/release.py
 
 clean:           ## remove what was made here
 	rm -rf $(VENV) $(DEMO) site build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -1,4 +1,4 @@
-"""Install the wheel of a folder into an empty environment, and build a tiny dataset with it.
+"""Install archives of the package into empty environments, and build a tiny dataset in each.
 
 The dependencies come from where pip is set up to take them. Nothing of the checkout is on the path,
 and everything is written to a temporary folder.
@@ -24,28 +24,35 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("dist", type=Path, help="folder with one sdist and one wheel")
-    dist = parser.parse_args(argv).dist.absolute()
-    (sdist,), (wheel,) = dist.glob("*.tar.gz"), dist.glob("*.whl")
-    version = wheel.name.split("-")[1]
-    if sdist.name != f"drakegrasp-{version}.tar.gz":
-        raise SystemExit(f"{sdist.name} and {wheel.name} must be of one version")
+    parser.add_argument("archives", type=Path, nargs="+", help="a wheel or an sdist")
+    for archive in parser.parse_args(argv).archives:
+        try_archive(archive.absolute())
+        sys.stdout.write(f"{archive.name}: installed, built a dataset and checked it\n")
+    return 0
 
+
+def try_archive(archive: Path) -> None:
+    """Install an archive into an environment of its own, and use it there.
+
+    Raises:
+        SystemExit: If a command fails, or what runs is not of the archive.
+    """
+    version = archive.name.removesuffix(".tar.gz").split("-")[1]
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         venv.create(folder / "environment", with_pip=True)
         python = folder / "environment" / "bin" / "python"
         command = python.with_name("drakegrasp")
         # Most modules of the dependencies are never imported here: compiling them takes longer.
-        run(folder, python, "-m", "pip", "install", "--quiet", "--no-compile", wheel)
+        run(folder, python, "-m", "pip", "install", "--quiet", "--no-compile", archive)
 
-        # What runs is the wheel.
+        # What runs is the archive's.
         printed = run(folder, command, "--version")
         if version not in printed.split():
             raise SystemExit(f"drakegrasp --version must print {version}, got {printed!r}")
         module = run(folder, python, "-c", "import drakegrasp; print(drakegrasp.__file__)").strip()
         if not Path(module).is_relative_to(folder):
-            raise SystemExit(f"drakegrasp must be imported from the wheel, got {module}")
+            raise SystemExit(f"drakegrasp must be imported from {archive.name}, got {module}")
 
         # It sees the machine, builds, and finds nothing wrong with what it built.
         run(folder, command, "doctor")
@@ -54,8 +61,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         options = ("--candidates", "10", "--workers", "1", "--quiet")
         run(folder, command, "build", "--objects", "meshes", "--out", "out", *options)
         run(folder, command, "check", "out")
-    sys.stdout.write(f"{wheel.name}: installed, built a dataset and checked it\n")
-    return 0
 
 
 def run(folder: Path, *words: str | Path) -> str:

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import subprocess
 import sys
-import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
 import trimesh
-import yaml
+from helpers.scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[1]
-VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
+release = load_script("release")
+VERSION = release.read_version(ROOT)
 
 pytestmark = pytest.mark.slow
 
@@ -92,13 +91,14 @@ def test_environment_runs_the_wheel_and_not_the_checkout(installed: Path, tmp_pa
     assert version == VERSION
 
 
-def test_version_is_the_newest_of_the_changelog_and_that_to_cite() -> None:
-    released = re.findall(
-        r"^## (\S+) \((\S+)\)$", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE
-    )
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
-    assert released[0] == (VERSION, str(citation["date-released"]))
-    assert citation["version"] == VERSION
+def test_changelog_and_citation_agree_with_the_version(tmp_path: Path) -> None:
+    assert release.disagreements(ROOT) == []
+    for name in ("pyproject.toml", "CHANGELOG.md", "CITATION.cff"):
+        text = (ROOT / name).read_text("utf-8")
+        (tmp_path / name).write_text(text.replace(f'version = "{VERSION}"', 'version = "9.0.0"'))
+    citation, changelog = release.disagreements(tmp_path)
+    assert "must be 9.0.0" in citation
+    assert "must be 9.0.0 (" in changelog
 
 
 @pytest.mark.nightly

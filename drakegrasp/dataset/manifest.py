@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -55,8 +56,12 @@ from drakegrasp.runtime.files import probe_folder, refuse_half_replaced, write_a
 
 #: Packages whose versions may change a result.
 VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "h5py")
-#: Versions that must not change within a dataset, nor between a client and its workers.
+#: Versions that must not change within a dataset, nor between a client and its workers. A dataset
+#: may be of another version of drakegrasp, if that gives the same results.
 REQUIRED_VERSIONS = ("drakegrasp", "drake", "hand")
+#: The oldest version of drakegrasp whose results are equal to those of this one. A change by which
+#: the same settings give other values sets it to the version in which it is released.
+RESULTS_SINCE = "0.2.0"
 
 
 def _refuse_no_pose(packed: tuple[float, ...]) -> tuple[float, ...]:
@@ -287,6 +292,23 @@ def installed_versions(config: Config) -> dict[str, str]:
     return {**packages, "hand": hand_digest(config.hand_source)}
 
 
+def other_version(then: Mapping[str, str], now: Mapping[str, str]) -> str | None:
+    """Return the first of `REQUIRED_VERSIONS` by which results may differ, or None."""
+    pairs = ((name, then.get(name, ""), now.get(name, "")) for name in REQUIRED_VERSIONS)
+    return next((name for name, a, b in pairs if not same_results(name, a, b)), None)
+
+
+def same_results(name: str, *versions: str) -> bool:
+    """Return whether two versions of one package are equal, or both of ours give equal results."""
+    since, *numbers = (
+        [int(number) for number in re.findall(r"\d+", text)[:3]]
+        for text in (RESULTS_SINCE, *versions, metadata.version("drakegrasp"))
+    )
+    *theirs, now = numbers
+    ours = name == "drakegrasp" and all(since <= version <= now for version in theirs)
+    return len(set(versions)) == 1 or ours
+
+
 def origin_attributes(
     config: Config, versions: dict[str, str], fingers: Mapping[str, bool], joints: Sequence[str]
 ) -> dict[str, Any]:
@@ -469,12 +491,13 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
             f"{out}: must be of one seed to be built on, got a merged dataset of several; build on "
             "those that it was merged of"
         )
-    for name in REQUIRED_VERSIONS:
-        if manifest.versions.get(name) != installed[name] and not (same_hand and name == "hand"):
-            raise DataError(
-                f"{out}: must be continued with {name} {manifest.versions.get(name)}, which made "
-                f"it, got {installed[name]}; choose another --out"
-            )
+    if same_hand:  # version 0.2 had another digest of the same files
+        installed["hand"] = manifest.versions["hand"]
+    if (name := other_version(manifest.versions, installed)) is not None:
+        raise DataError(
+            f"{out}: must be continued with {name} {manifest.versions.get(name)}, which made it, "
+            f"got {installed[name]}; choose another --out"
+        )
     return manifest
 
 

@@ -21,10 +21,10 @@ from drakegrasp.dataset.assembly.survey import headers_by_object
 from drakegrasp.dataset.filtering import own_filters
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (
-    REQUIRED_VERSIONS,
     Manifest,
     ObjectEntry,
     differences,
+    other_version,
     read_manifest,
     with_postprocessing,
     write_manifest,
@@ -116,12 +116,11 @@ def _refuse_differences(manifests: Mapping[Path, Manifest]) -> None:
                 f"{out}: must be of the configuration of {first} but for the seed, got one that "
                 f"differs in {differing}"
             )
-        for name in REQUIRED_VERSIONS:
-            if manifest.versions.get(name) != known.versions.get(name):
-                raise DataError(
-                    f"{out}: must be of {name} {known.versions.get(name)}, as {first} is, "
-                    f"got {manifest.versions.get(name)}"
-                )
+        if (name := other_version(manifest.versions, known.versions)) is not None:
+            raise DataError(
+                f"{out}: must be of {name} {known.versions.get(name)}, as {first} is, "
+                f"got {manifest.versions.get(name)}"
+            )
 
 
 def _with_hand_of(known: Config, config: Config) -> Config:

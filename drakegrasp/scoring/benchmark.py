@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.manifest import differences, read_manifest
+from drakegrasp.dataset.manifest import differences, read_manifest, same_results
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, MeshError
@@ -161,6 +161,6 @@ def read_benchmark(out: Path, config: Config, versions: Mapping[str, str]) -> di
         "other_versions": {
             name: f"{versions.get(name)}, published with {version}"
             for name, version in stated.items()
-            if versions.get(name) != version
+            if not same_results(name, version, versions.get(name, ""))
         },
     }

@@ -10,6 +10,7 @@ import pytest
 
 from drakegrasp.dataset.manifest import (
     DIGEST,
+    RESULTS_SINCE,
     Manifest,
     ObjectEntry,
     RefusedMesh,
@@ -189,20 +190,28 @@ def test_filters_may_change_but_not_the_physics(manifest: Manifest) -> None:
         with_postprocessing(manifest, ["physics.time_step=0.004", "filters.max_slip=0.001"])
 
 
-@pytest.mark.parametrize("name", ["drakegrasp", "drake", "hand"])
-def test_dataset_of_other_versions_is_not_continued(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("drakegrasp", "0.1.9"),
+        ("drakegrasp", "99.0"),
+        ("drakegrasp", "other"),
+        ("drake", "other"),
+        ("hand", "other"),
+    ],
+)
+def test_dataset_of_other_results_is_not_continued(tmp_path: Path, name: str, version: str) -> None:
     """The package, the simulator and the hand's files decide what comes out."""
     config = load_config()
-    versions = installed_versions(config)
+    versions = {**installed_versions(config), name: version}
     write_manifest(Manifest(config=config, versions=versions), tmp_path)
-    assert claim_directory(tmp_path, config) is not None
-    write_manifest(Manifest(config=config, versions={**versions, name: "other"}), tmp_path)
-    with pytest.raises(DataError, match=rf"must be continued with {name} other, which made it"):
+    with pytest.raises(DataError, match=rf"must be continued with {name} {version}, which made it"):
         claim_directory(tmp_path, config)
 
 
-def test_dataset_of_another_version_of_a_reader_is_continued(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "version"), [("drakegrasp", RESULTS_SINCE), ("h5py", "other")])
+def test_dataset_of_equal_results_is_continued(tmp_path: Path, name: str, version: str) -> None:
     config = load_config()
-    versions = {**installed_versions(config), "h5py": "other"}
+    versions = {**installed_versions(config), name: version}
     write_manifest(Manifest(config=config, versions=versions), tmp_path)
     assert claim_directory(tmp_path, config) is not None

@@ -1,0 +1,78 @@
+"""Check that a release agrees with itself, and print the commands that tag and send it.
+
+`make release` runs this after it has built and tried the archives. Nothing is sent anywhere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+#: Lines of the changelog's section of a release, so that users read it.
+SECTION_LINES = 60
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the script; return its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.parse_args(argv)
+    version, faults = read_version(ROOT), disagreements(ROOT)
+    if git("status", "--porcelain"):
+        faults.append("the work tree must have no changes: commit them first")
+    if git("tag", "--list", f"v{version}"):
+        faults.append(f"there must be no tag v{version} yet: raise the version in pyproject.toml")
+    if faults:
+        raise SystemExit("\n".join(faults))
+    sys.stdout.write(
+        f"{version} can be released:\n"
+        f"  git tag --annotate v{version} --message 'drakegrasp {version}'\n"
+        f"  git push origin v{version}\n"
+    )
+    return 0
+
+
+def read_version(root: Path) -> str:
+    """Return the version of the package, which `pyproject.toml` states."""
+    stated = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))
+    return stated["project"]["version"]
+
+
+def disagreements(root: Path) -> list[str]:
+    """Return how the changelog and the citation disagree with the version, a line each."""
+    version = read_version(root)
+    _, *sections = re.split(r"^## ", (root / "CHANGELOG.md").read_text("utf-8"), flags=re.M)
+    newest = sections[0].splitlines() if sections else [""]
+    citation = yaml.safe_load((root / "CITATION.cff").read_text("utf-8"))
+    title = f"{version} ({citation['date-released']})"
+    faults = []
+    if str(citation["version"]) != version:
+        faults.append(f"CITATION.cff: version must be {version}, got {citation['version']}")
+    if newest[0] != title:
+        faults.append(f"CHANGELOG.md: the first section must be {title}, got {newest[0]}")
+    if len(newest) >= SECTION_LINES:
+        faults.append(
+            f"CHANGELOG.md: the first section must have fewer than {SECTION_LINES} lines, "
+            f"got {len(newest)}"
+        )
+    return faults
+
+
+def git(*words: str) -> str:
+    """Return what a git command prints."""
+    return subprocess.run(
+        ["git", *words], cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True
+    ).stdout.strip()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
