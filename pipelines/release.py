@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def read_version(root: Path) -> str:
     """Return the version of the package, which `pyproject.toml` states."""
     stated = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))
-    return stated["project"]["version"]
+    return str(stated["project"]["version"])
 
 
 def disagreements(root: Path) -> list[str]:
