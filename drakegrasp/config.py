@@ -26,6 +26,7 @@ from pydantic import (
     Field,
     PrivateAttr,
     ValidationError,
+    ValidationInfo,
     create_model,
     field_validator,
     model_validator,
@@ -207,6 +208,8 @@ class SettleConfig(_Section):
     )
 
 
+#: Context of a validation: the values are those of a dataset.
+_STORED = "stored"
 #: Name and digest of a class of the user's own, as `drakegrasp.registry` makes them.
 _OWN_CLASS = re.compile(r"[^/\\:]+\.py:[A-Za-z_]\w*@[0-9a-f]{16}")
 
@@ -233,24 +236,33 @@ class _ExtensibleSection(_Section):
         return section
 
 
-def _samplers(value: Any) -> str | tuple[str, ...]:
+def _samplers(value: Any, info: ValidationInfo) -> str | tuple[str, ...]:
     """Return the name of a sampler, or the names of those that take turns."""
     names = value if isinstance(value, list | tuple) else [value]
-    if not names or not all(map(_is_sampler, names)):
+    if not names or not all(_is_named("samplers", name, info) for name in names):
         known = ", ".join(registry.names("samplers"))
         raise ValueError(f"must be one of {known}, FILE.py:NAME, or a list of them, got {value!r}")
     return tuple(names) if names is value else str(value)
 
 
-def _is_sampler(name: object) -> bool:
-    return is_own_class(name) or (isinstance(name, str) and registry.is_known("samplers", name))
+def _is_named(kind: registry.Kind, name: object, info: ValidationInfo) -> bool:
+    """Return whether a value names a class of the user's own, or what the registry has.
+
+    What a dataset was made with need not be installed where it is read.
+    """
+    if not isinstance(name, str):
+        return False
+    stored = info.context == _STORED and name.isprintable() and name != ""
+    return is_own_class(name) or stored or registry.is_known(kind, name)
 
 
-def _own_filters(value: Any) -> tuple[str, ...]:
+def _own_filters(value: Any, info: ValidationInfo) -> tuple[str, ...]:
     """Return the names of the user's own filters; none for null."""
     names = value if isinstance(value, list | tuple) else [] if value is None else [value]
-    if not all(map(is_own_class, names)):
-        raise ValueError(f"must be FILE.py:NAME, or a list of them, got {value!r}")
+    if not all(_is_named("rules", name, info) for name in names):
+        rules = ", ".join((*registry.names("rules"), "FILE.py:NAME"))
+        must = f"one of {rules}" if registry.names("rules") else rules
+        raise ValueError(f"must be {must}, or a list of them, got {value!r}")
     return tuple(names)
 
 
@@ -493,7 +505,7 @@ def _filter_config() -> type[_Filters]:
         kind = _KINDS[limit.kind] | None if limit.off == "null" else _KINDS[limit.kind]
         told = _told_unless(limit.default) if limit.later else Decides()
         settings[name] = (Annotated[kind, told], limit.default)
-    # Filters of the user's own, `file.py:Name` each.
+    # Filters of the user's own: `file.py:Name`, or the name of a rule of another package.
     own = Annotated[tuple[str, ...], BeforeValidator(_own_filters), _told_unless(())]
     settings["own"] = (own, ())
     doc = "Which successes become samples, decided when the files are assembled; null: no limit."
@@ -741,14 +753,18 @@ def continued(config: Config, known: Config) -> Config:
     return config
 
 
-def parse_config(tree: dict[str, Any]) -> Config:
+def parse_config(tree: dict[str, Any], context: str | None = None) -> Config:
     """Return the configuration that a tree of plain values describes.
+
+    Args:
+        tree: The values.
+        context: `_STORED` if they are those of a dataset.
 
     Raises:
         ConfigError: See `load_config`.
     """
     try:
-        return Config.model_validate(tree)
+        return Config.model_validate(tree, context=context)
     except ValidationError as error:
         # A bad item of a list also makes the list too short: report the first mistake only.
         mistakes: dict[Any, Any] = {}
@@ -777,7 +793,7 @@ def parse_stored(tree: Any) -> Config:
         tree = {**tree, "certify": {"share": None, **certify}}
     if isinstance(tree, dict) and isinstance(close := tree.get("close"), dict):
         tree = {**tree, "close": {"scrape_depth": None, **close}}
-    return parse_config(tree)
+    return parse_config(tree, _STORED)
 
 
 def read_settings(source: str | Path) -> dict[str, Any]:

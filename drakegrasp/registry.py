@@ -1,9 +1,18 @@
-"""What is looked up by name: samplers, protocols, exporters, kinds of clusters, hands of others.
+"""What is looked up by name: samplers, rules, protocols, formats, hands, kinds of clusters.
 
 Each is an entry point of an installed package in the group `drakegrasp.KIND`. Ours stand in
 pyproject.toml like anybody's, and are loaded when they are asked for: a new one is one module and
-one line. A hand of another package is the path of its hand file. In a checkout pyproject.toml
-itself is read, so that no line in it waits for an installation.
+one line. In a checkout pyproject.toml itself is read, so that no line in it waits for an
+installation.
+
+clusters: a subclass of `cluster.kinds.Local`.
+exporters: a function (dataset, folder, progress) that returns the number of samples.
+hands: the path of a hand file.
+importers: a function (path, hand) that returns arguments of `simulation.attempts.make_attempts`, or
+    None for a file of another format. The name ends with the suffix of the files.
+protocols: a subclass of `protocols.protocol.MujocoProtocol`.
+rules: a `filters.Rule`. Those of the package are `filters.RULES`: each has a limit and a code.
+samplers: a `simulation.candidates.Sampler`, or a class as a file of the user's own has it.
 
 A class of the user's own is named `file.py:Name`, and imported from the file's text. A
 configuration keeps the name without folders, followed by 16 digits of the file's SHA-256, so that a
@@ -31,7 +40,9 @@ from typing import Any, Literal, TypeAlias
 from drakegrasp.errors import ConfigError, MachineError, listed, one_line
 
 #: What has names; a group of entry points is `drakegrasp.` and one of these.
-Kind: TypeAlias = Literal["clusters", "exporters", "hands", "protocols", "samplers"]
+Kind: TypeAlias = Literal[
+    "clusters", "exporters", "hands", "importers", "protocols", "rules", "samplers"
+]
 #: Processes keep so many imported files.
 _KEPT_FILES = 32
 _PROJECT = Path(__file__).resolve().parent.parent / "pyproject.toml"
@@ -55,14 +66,19 @@ def find(kind: Kind, name: str) -> Any:
         MachineError: If a library is missing that it needs.
     """
     entry = _entry(kind, name)
+    package = "drakegrasp" if entry.dist is None else entry.dist.name
+    whose = "" if entry.dist is None else f" of the package {package}"
     try:
         return entry.load()
     except ModuleNotFoundError as error:
-        extra = "".join(f": pip install 'drakegrasp[{extra}]'" for extra in entry.extras)
-        raise MachineError(f"{error.name} must be installed{extra}") from None
-    except Exception as error:
+        extra = "".join(f": pip install '{package}[{extra}]'" for extra in entry.extras)
+        needs = whose and f" for {name}{whose}"
+        raise MachineError(f"{error.name} must be installed{needs}{extra}") from None
+    except (Exception, SystemExit) as error:
         got = f"{type(error).__name__} ({one_line(error)})"
-        raise ConfigError(f"{kind}: {name} must be loaded from {entry.value}, got {got}") from error
+        raise ConfigError(
+            f"{kind}: {name}{whose} must be loaded from {entry.value}, got {got}"
+        ) from error
 
 
 def summary(kind: Kind, name: str) -> str:
@@ -150,28 +166,34 @@ def own_class(
         )
     found = _import(stored, code[stored])
     name = stored.partition("@")[0]
-    if not _accepts(found, arguments):
+    if not accepts(found, arguments):
         raise ConfigError(f"{name}: must take ({', '.join(arguments)}), got other arguments")
-    if not _accepts(getattr(found, method, None), ("self", *takes)):
+    if not accepts(getattr(found, method, None), ("self", *takes)):
         listed = ", ".join(("self", *takes))
         raise ConfigError(f"{name}: must have a method {method}({listed}), got none like it")
     return found
 
 
 def run_own(stored: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call code of the user's own.
+    """Call code of the user's own, or of another package.
+
+    Args:
+        stored: Its name in a configuration.
+        function: What is called.
+        arguments: By position.
 
     Raises:
-        ConfigError: If it raises an error, with the line of the file.
+        ConfigError: If it raises an error, with the line of the user's file.
     """
     try:
         return function(*arguments)
     except Exception as error:
-        file, _, name = stored.partition("@")[0].partition(":")
-        raise ConfigError(f"{file}:{name}: must run, got {_described(error, file)}") from error
+        place = stored.partition("@")[0]
+        got = _described(error, place.partition(":")[0])
+        raise ConfigError(f"{place}: must run, got {got}") from error
 
 
-def _accepts(function: object, arguments: Sequence[str]) -> bool:
+def accepts(function: object, arguments: Sequence[str]) -> bool:
     """Return whether something can be called with so many arguments by position."""
     try:
         inspect.signature(function).bind(*arguments)  # type: ignore[arg-type]

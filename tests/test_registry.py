@@ -4,15 +4,24 @@ from __future__ import annotations
 
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from drakegrasp import registry
+from drakegrasp.config import parse_config, parse_stored
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import MODELS, hand_names
+from drakegrasp.hand.settings import load_config
 
-KINDS: tuple[registry.Kind, ...] = ("clusters", "exporters", "protocols", "samplers")
+KINDS: tuple[registry.Kind, ...] = (
+    "clusters",
+    "exporters",
+    "importers",
+    "protocols",
+    "samplers",
+)
 
 
 @pytest.fixture
@@ -23,8 +32,12 @@ def theirs(monkeypatch: pytest.MonkeyPatch) -> None:
         "glb": "json:loads",
         "gone": "no_such_library:write [hub]",
         "old": "json:no_such_function",
+        "sad": "json:no_such_function",
+        "bad": "no_such_library:write [fast]",
     }
     entries = {name: EntryPoint(name, value, "") for name, value in values.items()}
+    for name in ("sad", "bad"):
+        entries[name]._for(SimpleNamespace(name="their-package"))  # type: ignore[attr-defined]
     monkeypatch.setattr(registry, "_theirs", lambda kind: entries)
 
 
@@ -53,7 +66,7 @@ def test_an_installation_without_a_checkout_has_the_same_names(
 @pytest.mark.usefixtures("theirs")
 def test_names_of_others_follow_and_take_none_of_ours() -> None:
     names = registry.names("exporters")
-    assert names[0] == "hf" and names[-3:] == ("usd", "gone", "old")
+    assert names[0] == "hf" and names[-5:] == ("usd", "gone", "old", "sad", "bad")
     assert registry.find("exporters", "usd").__name__ == "dumps"
     assert registry.find("exporters", "glb").__name__ == "write_glb"
     assert registry.summary("exporters", "glb").startswith("a 3D scene")
@@ -71,6 +84,13 @@ def test_names_of_others_follow_and_take_none_of_ours() -> None:
             r"no_such_library must be .*: pip install 'drakegrasp\[hub\]'",
             MachineError,
         ),
+        ("sad", "exporters: sad of the package their-package must be loaded from", ConfigError),
+        (
+            "bad",
+            r"no_such_library must be installed for bad of the package their-package: pip install "
+            r"'their-package\[fast\]'",
+            MachineError,
+        ),
     ],
 )
 def test_what_cannot_be_used_is_one_line(name: str, words: str, kind: type[Exception]) -> None:
@@ -84,3 +104,16 @@ def test_hand_of_another_package_is_used_by_its_name(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(registry, "_theirs", lambda kind: {"claw": entry})
     assert "claw" in hand_names()
     assert load_hand("claw").joint_names == load_hand("franka").joint_names
+
+
+def test_a_dataset_opens_where_its_sampler_and_its_rule_are_not_installed() -> None:
+    tree = load_config().to_dict()
+    tree["candidates"]["method"] = ["ring", "normals"]
+    tree["filters"]["own"] = ["calm"]
+    config = parse_stored(tree)
+    assert config.candidates.methods == ("ring", "normals")
+    assert config.filters.own == ("calm",)
+    with pytest.raises(ConfigError, match=r"candidates\.method: must be one of rotations"):
+        parse_config(tree)
+    with pytest.raises(ConfigError, match=r"filters\.own: must be FILE\.py:NAME, or a list"):
+        load_config("paper", ["filters.own=calm"])

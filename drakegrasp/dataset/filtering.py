@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.config import FilterConfig
-from drakegrasp.errors import ConfigError
-from drakegrasp.filters import Flags, Removal, first_removal, is_outlier
+from drakegrasp import registry
+from drakegrasp.config import FilterConfig, is_own_class
+from drakegrasp.errors import ConfigError, listed
+from drakegrasp.filters import Flags, Removal, Rule, first_removal, is_outlier
 from drakegrasp.registry import own_class, run_own
 from drakegrasp.table import Table
 
 #: The setting that names filters of the user's own.
 _OWN = "filters.own"
+#: Which successes a filter keeps, (n,) of bool if it does as it should.
+_Keep: TypeAlias = Callable[[Table], Any]
 
 
 def judge_successes(
@@ -57,16 +60,30 @@ def judge_successes(
     return removal
 
 
-def own_filters(config: FilterConfig) -> list[type[Any]]:
-    """Return the classes of the user's own filters.
+def own_filters(config: FilterConfig) -> list[_Keep]:
+    """Return the filters that the configuration names: classes of a file, rules of packages.
 
     Raises:
-        ConfigError: If one cannot be imported, or is of another signature.
+        ConfigError: If one cannot be imported, or is something else.
     """
-    return [
-        own_class(name, config.code, key=_OWN, method="keep", takes=("successes",))
-        for name in config.own
-    ]
+    return [_own_filter(name, config) for name in config.own]
+
+
+def _own_filter(name: str, config: FilterConfig) -> _Keep:
+    if is_own_class(name):
+        found = own_class(name, config.code, key=_OWN, method="keep", takes=("successes",))
+        return lambda successes: found().keep(successes)
+    rule = registry.find("rules", name)
+    if not isinstance(rule, Rule):
+        raise ConfigError(f"rules: {name} must be a Rule, got {type(rule).__name__}")
+
+    def keep(successes: Table) -> Flags:
+        if missing := [column for column in rule.needs if not successes.has(column)]:
+            columns = listed(sorted(successes.names))
+            raise ConfigError(f"{name}: needs must be some of {columns}, got {listed(missing)}")
+        return np.asarray(~rule.refuses(successes, config))
+
+    return keep
 
 
 def own_setting(config: FilterConfig) -> str:
@@ -85,8 +102,8 @@ def _removed_by_own(config: FilterConfig, successes: Table) -> Flags:
     removed = np.zeros(due, dtype=np.bool_)
     if due == (0,):
         return removed
-    for name, found in zip(config.own, own_filters(config), strict=True):
-        kept = np.asarray(run_own(name, lambda found=found: found().keep(successes)))
+    for name, keep in zip(config.own, own_filters(config), strict=True):
+        kept = np.asarray(run_own(name, keep, successes))
         if kept.dtype != np.bool_ or kept.shape != due:
             raise ConfigError(
                 f"{name.partition('@')[0]}: keep must return {due} of bool, "

@@ -1,14 +1,16 @@
 """One way from files of others to attempts: postures of our own layouts and of other tools.
 
 In: a file, or a folder of files, the hand that they are for, and what they are of. Out: one table,
-`Attempts`, or an error in one line that names the file and what is wrong. Formats of other tools
-are in the modules that write them. docs/how-to/postures.md lists the layouts.
+`Attempts`, or an error in one line that names the file and what is wrong. Each format is an
+importer of the registry, found by the suffix of the file. Our own layouts are here; those of other
+tools are in the modules that write them. docs/how-to/postures.md lists the layouts.
 """
 
 from __future__ import annotations
 
 import csv
 import hashlib
+import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import chain
@@ -20,12 +22,11 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp import registry
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import GraspError, MachineError, listed, one_line
+from drakegrasp.errors import DrakegraspError, GraspError, MachineError, listed, one_line
 from drakegrasp.exchange.contacts import read_contacts
-from drakegrasp.exchange.dexgraspbench import read_dexgraspbench
-from drakegrasp.exchange.isaac_grasp import read_isaac_grasp
 from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
@@ -123,19 +124,39 @@ def _raw(path: Path, hand: Hand, *, nameless: bool = False) -> dict[str, Any]:
         GraspError: If it is no file of postures.
         MachineError: If a package is missing that the format needs.
     """
-    suffix = path.suffix.lower()
     if not path.is_file():
         raise GraspError(f"postures must be a file or a folder of files, got {str(path)!r}")
-    if suffix in ARRAYS:
-        return _of_arrays(_read_arrays(path), nameless)
-    if suffix in TABLES:
-        return _of_columns(*_read_columns(path), nameless)
-    if suffix == ".npy":
-        return read_dexgraspbench(path, hand)
-    if suffix in YAMLS:
-        return read_isaac_grasp(path, hand)
-    known = ", ".join((*ARRAYS, *TABLES, ".npy", *YAMLS))
-    raise GraspError(f"must be a file of postures ({known}), got another")
+
+    # Formats of other packages know their files, and leave the others to ours.
+    for name in reversed(registry.names("importers")):
+        if Path(name).suffix == path.suffix.lower():
+            read = registry.find("importers", name)
+            takes = inspect.signature(read).parameters
+            try:
+                raw = read(path, hand, **({"nameless": nameless} if "nameless" in takes else {}))
+            except DrakegraspError:
+                raise
+            except Exception as error:
+                got = f"{type(error).__name__} ({one_line(error)})"
+                raise GraspError(f"must be readable by the importer {name}, got {got}") from error
+            if raw is not None:
+                return dict(raw)
+    raise GraspError(f"must be a file of postures ({', '.join(suffixes())}), got another")
+
+
+def suffixes() -> tuple[str, ...]:
+    """Return the suffixes of files of postures."""
+    return tuple(dict.fromkeys(Path(name).suffix for name in registry.names("importers")))
+
+
+def read_arrays(path: Path, hand: Hand, nameless: bool = False) -> dict[str, Any]:
+    """Return the postures of arrays in our own layout, which may name no object if `nameless`."""
+    return _of_arrays(_read_arrays(path), nameless)
+
+
+def read_columns(path: Path, hand: Hand, nameless: bool = False) -> dict[str, Any]:
+    """Return the postures of a table, which may name no object if `nameless`."""
+    return _of_columns(*_read_columns(path), nameless)
 
 
 def _named(raw: dict[str, Any], of: str | None) -> dict[str, Any]:
@@ -244,7 +265,7 @@ def holds_postures(path: Path) -> bool:
         raise
     except Exception as error:  # parsers raise all kinds of exceptions on foreign bytes
         raise GraspError(f"{path}: {one_line(error)}") from None
-    return suffix == ARRAYS[0] or suffix in YAMLS
+    return suffix in suffixes() and suffix not in (".npy", *ARRAYS[1:], *TABLES)
 
 
 def has_rows(path: Path) -> bool:
@@ -267,8 +288,10 @@ def files_in(folder: Path) -> list[Path]:
     Raises:
         GraspError: If there is none.
     """
-    for suffixes in ((".npy",), YAMLS):
-        paths = (path for path in folder.rglob("*") if path.suffix.lower() in suffixes)
+    known = (".npy", *YAMLS, *ARRAYS, *TABLES)
+    others = [(suffix,) for suffix in suffixes() if suffix not in known]
+    for group in ((".npy",), YAMLS, *others):
+        paths = (path for path in folder.rglob("*") if path.suffix.lower() in group)
         if found := sorted(paths):
             return found
     raise GraspError(f"{folder}: must hold .npy or .yaml files of grasps, got none")

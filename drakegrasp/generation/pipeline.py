@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from drakegrasp.config import Config, continued, is_own_class
+from drakegrasp.config import Config, continued
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.assembly.split import rank_in_split
 from drakegrasp.dataset.card import write_card
@@ -63,8 +63,8 @@ from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
 from drakegrasp.simulation.attempts import Attempts, misfits
+from drakegrasp.simulation.candidates import found_sampler
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.samplers import own_sampler
 
 #: By how much a rank may be off the border of a split that depends on which objects have samples.
 NEAR_BORDER = 0.05
@@ -168,8 +168,8 @@ def refuse_unusable(config: Config) -> None:
             the user's own cannot be used.
     """
     refuse_two_ends(config)
-    for name in filter(is_own_class, config.candidates.methods):
-        own_sampler(name, config.candidates.code)
+    for name in config.candidates.methods:
+        found_sampler(name, config.candidates)
     own_filters(config.filters)
 
 

@@ -37,7 +37,13 @@ from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.conditions import Conditions
-from drakegrasp.simulation.samplers import OwnPoses, above_table, make_poses, rotation_candidates
+from drakegrasp.simulation.samplers import (
+    OwnPoses,
+    above_table,
+    make_poses,
+    own_sampler,
+    rotation_candidates,
+)
 from drakegrasp.table import Table
 
 #: Surface points that `normals` draws together; another number is another draw.
@@ -242,7 +248,7 @@ def sample_candidates(
     resting = np.asarray(X_TO, dtype=float).reshape(-1, 4, 4)
     places = [(k, method) for method in config.methods for k in range(len(resting))]
     samplers = {
-        (k, method): _sampler(method)(
+        (k, method): found_sampler(method, config)(
             model, resting[k], config, _sampler_stream(model.name, seed, k, method)
         )
         for k, method in dict.fromkeys(places)
@@ -288,13 +294,25 @@ def _refuse_far(method: str, model: ObjectModel, poses: Array, distance: Array) 
         )
 
 
-def _sampler(method: str) -> Callable[[ObjectModel, Array, CandidateConfig, Stream], Sampler]:
-    """Return the sampler of a name: one of the package, or of the user's own."""
+def found_sampler(
+    method: str, config: CandidateConfig
+) -> Callable[[ObjectModel, Array, CandidateConfig, Stream], Sampler]:
+    """Return the sampler of a name: one of the registry, or of the user's own.
+
+    Another package may give a class such as the user's own, which takes (model, X_TO, stream).
+
+    Raises:
+        ConfigError: If it cannot be imported, or is of another signature.
+    """
     if is_own_class(method):
-        return partial(OwnPoses, method)
-    found: Callable[[ObjectModel, Array, CandidateConfig, Stream], Sampler]
+        return partial(OwnPoses, method, own_sampler(method, config.code))
     found = registry.find("samplers", method)
-    return found
+    if registry.accepts(found, ("model", "X_TO", "stream")):
+        return partial(OwnPoses, method, found)
+    if not registry.accepts(found, ("model", "X_TO", "config", "stream")):
+        raise ConfigError(f"{method}: must take (model, X_TO, stream), got other arguments")
+    sampler: Callable[[ObjectModel, Array, CandidateConfig, Stream], Sampler] = found
+    return sampler
 
 
 def _source(method: str) -> Source:

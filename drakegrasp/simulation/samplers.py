@@ -12,7 +12,7 @@ docs/explanation/sampling.md has an example.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from itertools import islice
 from typing import Any
@@ -236,21 +236,28 @@ class OwnPoses:
     """
 
     def __init__(
-        self, stored: str, model: ObjectModel, X_TO: Array, config: CandidateConfig, stream: Stream
+        self,
+        stored: str,
+        found: Callable[[ObjectModel, Array, Stream], Any],
+        model: ObjectModel,
+        X_TO: Array,
+        config: CandidateConfig,
+        stream: Stream,
     ) -> None:
         """Draw the poses.
 
         Args:
             stored: Its name in the configuration.
+            found: The class.
             model: The object.
             X_TO: Its resting pose, (4, 4).
-            config: Number of poses, and the text of the class.
+            config: Number of poses.
             stream: Its random numbers.
 
         Raises:
             ConfigError: If it cannot be run, or yields something other than poses.
         """
-        found, name = own_sampler(stored, config.code), stored.partition("@")[0]
+        name = stored.partition("@")[0]
         sampler = run_own(stored, found, model, X_TO, stream)
         made = run_own(stored, lambda: list(islice(sampler.poses(), config.max)))
         self._poses = np.array([_pose(f"{name}: pose {i}", X) for i, X in enumerate(made)]).reshape(
