@@ -18,7 +18,7 @@ from drakegrasp.cli.console import say
 from drakegrasp.config import Config
 from drakegrasp.dataset.holding import holding_lines, holding_of
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, DATA_FILES
+from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
 from drakegrasp.dataset.shortfall import objects_without_samples, split_shortfall
 from drakegrasp.dataset.statistics import (
     NO_NAME,
@@ -31,7 +31,6 @@ from drakegrasp.dataset.statistics import (
     count_unfinished,
     held_note,
     preshapes_of,
-    split_rule_of,
 )
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import counted, printable
@@ -421,14 +420,14 @@ def print_stats(out: Path) -> None:
         table = funnel_table(funnel, compact=True)
     console.print(table)
     console.print(hold_table(funnel))
-    config = read_manifest(out).config
+    manifest = read_manifest(out)
+    config, rule = manifest.config, manifest.split_rule
     if preshapes := preshapes_of(funnel, config):
         console.print(preshape_table(preshapes))
     console.print()
     if unfinished is None:
         splits = count_splits(out)
         console.print(split_table(splits))
-        rule = split_rule_of(out / DATA_FILES["oto"])
         say(split_line(rule, funnel, splits))
         for line in barren_lines(funnel, config):
             say(line)

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
 from drakegrasp.arithmetic import norm
@@ -30,7 +31,6 @@ from drakegrasp.dataset.statistics import (
     Funnel,
     funnel_of,
     held_note,
-    split_rule_of,
     splits_of,
 )
 from drakegrasp.dataset.trials import Trials
@@ -79,6 +79,14 @@ LIMITS = (
 )
 
 
+#: The settings that a reader asks for first.
+SETTINGS = (
+    *("candidates.method", "candidates.max", "candidates.standoffs", "physics.friction_hand"),
+    *("physics.friction_table", "objects.mass", "lift.drive", "filters.require"),
+    *("filters.max_slip", "filters.max_turn_deg", "camera.size"),
+)
+#: What is known of a hand whose files are there: its file, and the folder of all of them.
+KnownHand = tuple[HandFile, HandFolder]
 #: The files of a dataset that a reader needs, in words.
 FILES = {
     "grasping_oto.hdf5, grasping_otm.hdf5": "the samples, as each camera sees them",
@@ -117,9 +125,15 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
         DataError: If one of the files is missing or damaged.
     """
     # The manifest has more objects than the files while a build goes on that adds some.
-    attempts = Trials(trials, any_name=True)
-    funnel, holding = funnel_of(attempts), holding_of(attempts)
+    attempts, config = Trials(trials, any_name=True), manifest.config
+    funnel, holding, hand = funnel_of(attempts), holding_of(attempts), _known_hand(config)
     entries = [entry for entry in manifest.objects if entry.name in funnel.names]
+    with open_samples(data) as file:
+        rule, counts = str(file.attrs.get("split_by", "class")), _counts(file, funnel)
+        # Entries of the card that most datasets lack.
+        more = {"fingertip_loads": _loads(file, hand and rated_load(hand[0]))}
+    if holding is not None:
+        more["p_hold"] = {"in_words": holding_lines(holding), **asdict(holding)}
 
     # The known limits, and one that follows from the counts.
     limits = [*LIMITS]
@@ -128,26 +142,20 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
 
     return {
         "title": f"Simulated grasps of {len(entries)} object{'s' * (len(entries) != 1)}",
-        "hand": Path(manifest.config.hand).stem,
+        "hand": Path(config.hand).stem,
         "hand_digest": manifest.versions.get("hand", ""),
-        "hand_licences": _hand_licences(manifest.config),
+        "hand_licences": _hand_licences(config, hand),
         "fingers": list(manifest.fingers),
         "joints": list(manifest.joints),
         "schema_version": SCHEMA_VERSION,
-        "seeds": sorted({entry.config_in(manifest.config).seed for entry in entries}),
-        "config_hash": manifest.config.simulation_hash(),
-        "settings": _settings(manifest.config),
-        "split_by": split_rule_of(data),
+        "seeds": sorted({entry.config_in(config).seed for entry in entries}),
+        "config_hash": config.simulation_hash(),
+        "settings": _settings(config, hand),
+        "split_by": rule,
         "versions": manifest.versions,
         "licences": licences(entries),
-        "counts": _counts(data, funnel),
-        **_loads(data, manifest.config),
-        # The same bytes as before there were repeats, where there are none.
-        **(
-            {}
-            if holding is None
-            else {"p_hold": {"in_words": holding_lines(holding), **asdict(holding)}}
-        ),
+        "counts": counts,
+        **{key: value for key, value in more.items() if value is not None},
         "refused": {mesh.name: mesh.reason for mesh in manifest.refused},
         "files": FILES,
         "conventions": CONVENTIONS,
@@ -175,27 +183,17 @@ def licences(entries: Iterable[ObjectEntry]) -> dict[str, list[str]]:
     return dict(sorted(found.items()))
 
 
-def _settings(config: Config) -> dict[str, Any]:
+def _settings(config: Config, hand: KnownHand | None) -> dict[str, Any]:
     """Return the settings that a reader asks for first; the manifest has all of them."""
-    keys = {
-        "candidates": ("method", "max", "standoffs"),
-        "physics": ("friction_hand", "friction_table"),
-        "objects": ("mass",),
-        "lift": ("drive",),
-        "filters": ("require", "max_slip", "max_turn_deg"),
-        "camera": ("size",),
-    }
     tree = config.to_dict()
-    settings = {f"{room}.{key}": tree[room][key] for room, names in keys.items() for key in names}
-
+    settings = {key: tree[room][name] for key in SETTINGS for room, name in [key.split(".")]}
     # Labels depend on the drive. The file of an older dataset's hand may be elsewhere now.
     if config.lift.drive is None:
-        known = _known_hand(config)
-        settings["lift.drive"] = known[0].drive if known else "that of the hand file"
+        settings["lift.drive"] = hand[0].drive if hand else "that of the hand file"
     return settings
 
 
-def _known_hand(config: Config) -> tuple[HandFile, HandFolder] | None:
+def _known_hand(config: Config) -> KnownHand | None:
     """Return the hand of the dataset or the package; None if it is neither's, or has changed."""
     source = config.hand_source
     if not isinstance(source, CarriedHand) and config.hand not in hand_names():
@@ -209,59 +207,46 @@ def _known_hand(config: Config) -> tuple[HandFile, HandFolder] | None:
         return None
 
 
-def _hand_licences(config: Config) -> dict[str, str]:
+def _hand_licences(config: Config, hand: KnownHand | None) -> dict[str, str]:
     """Return the first line of each licence of a hand, by the name of its file."""
-    if (known := _known_hand(config)) is None:
+    if hand is None:
         return {}
-    folder = known[1]
     found = {}
-    for place in folder.licences:
+    for place in hand[1].licences:
         # The first line of the text that says something, shortened.
-        text = folder.content(place).decode(errors="replace")
+        text = hand[1].content(place).decode(errors="replace")
         lines = (printable(line.strip()) for line in text.splitlines())
         found[place] = next(filter(None, lines), "")[:LONGEST_LINE]
     return found or ({"LICENSE": OWN_LICENCE} if config.hand in hand_names() else {})
 
 
-def _loads(data: Path, config: Config) -> dict[str, Any]:
-    """Return how the samples' forces compare with the hand's rated load; nothing if it is unknown.
+def _loads(file: h5py.File, rated: float | None) -> dict[str, Any] | None:
+    """Return how the samples' forces compare with the hand's rated load, if it is known.
 
     A fingertip's force is the larger one of after closing and after the lift.
     """
-    known = _known_hand(config)
-    rated = None if known is None else rated_load(known[0])
     if rated is None:
-        return {}
-
-    with open_samples(data) as file:
-        forces = np.concatenate(
-            [
-                np.maximum(
-                    *(norm(file[split][f"grasp_props/f_Q_C{when}"][:]) for when in ("", "_held"))
-                )
-                for split in SPLITS
-            ]
-        )
+        return None
+    forces = [
+        np.maximum(*(norm(file[split][f"grasp_props/f_Q_C{when}"][:]) for when in ("", "_held")))
+        for split in SPLITS
+    ]
     # A finger that a preshape leaves out has none.
-    largest = np.nan_to_num(forces).max(axis=1, initial=0.0)
-    loads = {"rated_N": rated, "above": int((largest > rated).sum()), "samples": len(forces)}
-    if len(forces):
+    largest = np.nan_to_num(np.concatenate(forces)).max(axis=1, initial=0.0)
+    loads = {"rated_N": rated, "above": int((largest > rated).sum()), "samples": len(largest)}
+    if len(largest):
         loads["median_N"] = round(float(np.median(largest)), 1)
-    return {"fingertip_loads": loads}
+    return loads
 
 
-def _counts(data: Path, funnel: Funnel) -> dict[str, Any]:
+def _counts(file: h5py.File, funnel: Funnel) -> dict[str, Any]:
     """Return the numbers of attempts, grasps and samples: of all, by class, object and split."""
-    with open_samples(data) as file:
-        samples = {
-            split: dict(Counter(read_names(file[split]["object_props/object_name"])))
-            for split in SPLITS
-        }
-    rows = {name: _row(funnel, samples, [i]) for i, name in enumerate(funnel.names)}
+    samples = {
+        split: Counter(read_names(file[split]["object_props/object_name"])) for split in SPLITS
+    }
     members: dict[str, list[int]] = {}
     for i, name in enumerate(funnel.classes):
         members.setdefault(name, []).append(i)
-
     outcomes, removals = funnel.outcomes.sum(axis=0), funnel.removals.sum(axis=0)
     return {
         "all": _row(funnel, samples, range(len(funnel.names))),
@@ -276,33 +261,34 @@ def _counts(data: Path, funnel: Funnel) -> dict[str, Any]:
                 "objects": row.objects,
                 "classes": row.classes,
             }
-            for row in splits_of(data)
+            for row in splits_of(file)
         },
         "classes": {
             name: {"objects": len(places), **_row(funnel, samples, places)}
             for name, places in sorted(members.items())
         },
         "objects": {
-            name: {"class": kind, **rows[name]}
-            for name, kind in zip(funnel.names, funnel.classes, strict=True)
+            name: {"class": funnel.classes[i], **_row(funnel, samples, [i])}
+            for i, name in enumerate(funnel.names)
         },
     }
 
 
 def _row(
-    funnel: Funnel, samples: dict[str, dict[str, int]], objects: Iterable[int]
+    funnel: Funnel, samples: Mapping[str, Counter[str]], objects: Sequence[int]
 ) -> dict[str, int]:
     """Return the counts of some objects together."""
-    places = list(objects)
-    names = [funnel.names[i] for i in places]
+    counts = {
+        "attempts": funnel.outcomes,
+        "held": funnel.outcomes[:, Outcome.SUCCESS],
+        "precision": funnel.precision,
+        "stable": funnel.stable,
+        "refined": funnel.refined[:, 2],
+        "samples": funnel.samples,
+    }
     return {
-        "attempts": int(funnel.outcomes[places].sum()),
-        "held": int(funnel.outcomes[places, Outcome.SUCCESS].sum()),
-        "precision": int(funnel.precision[places].sum()),
-        "stable": int(funnel.stable[places].sum()),
-        "refined": int(funnel.refined[places, 2].sum()),
-        "samples": int(funnel.samples[places].sum()),
-        **{split: sum(samples[split].get(name, 0) for name in names) for split in SPLITS},
+        **{name: int(values[objects].sum()) for name, values in counts.items()},
+        **{split: sum(samples[split][funnel.names[i]] for i in objects) for split in SPLITS},
     }
 
 
@@ -340,16 +326,8 @@ def card_text(content: Mapping[str, Any]) -> str:
         content: As `card_content` gives it; that of an export also has the samples by camera, the
             camera, the columns, and those of scenes (`exchange.hub.folder`).
     """
-    sections = [_what, _files, _how, _licences, _how_many, _limits]
-    if content.get("fingertip_loads", {}).get("samples"):
-        sections.insert(-1, _pressed)
-    if "p_hold" in content:
-        sections.insert(-1, _bears)
-    if "scenes" in content:
-        sections.insert(sections.index(_limits), _scenes)
-    if "columns" in content:
-        sections += [_cameras, _columns]
-    text = "\n\n".join(section(content) for section in sections)
+    sections = [section(content) for key, section in SECTIONS if key in content]
+    text = "\n\n".join(filter(None, sections))
     return f"# {_plain(content['title'])}\n\n{text}\n"
 
 
@@ -462,11 +440,13 @@ a verdict. No object is in two splits.
 
 
 def _pressed(content: Mapping[str, Any]) -> str:
-    rated, above, samples, median = content["fingertip_loads"].values()
+    rated, above, samples, *median = content["fingertip_loads"].values()
+    if not samples:
+        return ""
     return f"""## Forces and the hand
 
 The maker allows {rated:.1f} N at a fingertip. In {above:,} of {samples:,} samples one presses
-harder, after closing or after the lift; the median of the largest force is {median:.1f} N. The
+harder, after closing or after the lift; the median of the largest force is {median[0]:.1f} N. The
 setting `physics.finger_load` makes the motors weaker."""
 
 
@@ -501,6 +481,22 @@ def _columns(content: Mapping[str, Any]) -> str:
         f"{title}\n\n{_table(heads, [(f'`{name}`', *column) for name, column in columns.items()])}"
         for title, columns in tables.items()
     )
+
+
+#: The sections of the card in order, each with the key that content must have for it.
+SECTIONS: tuple[tuple[str, Callable[[Mapping[str, Any]], str]], ...] = (
+    ("conventions", _what),
+    ("files", _files),
+    ("settings", _how),
+    ("licences", _licences),
+    ("counts", _how_many),
+    ("fingertip_loads", _pressed),
+    ("p_hold", _bears),
+    ("scenes", _scenes),
+    ("limits", _limits),
+    ("columns", _cameras),
+    ("columns", _columns),
+)
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

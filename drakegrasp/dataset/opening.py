@@ -318,8 +318,8 @@ def differences(
             dataset = datasets.get(f.name)
             if dataset is not None:
                 yield from _of_field(f"{place}/{f.name}", dataset, f, rows, lengths)
-                attributes = dict(h5py.Dataset(dataset).attrs)
-                yield from _of_words(f"{place}/{f.name}", attributes, f, meanings, thorough)
+                words = h5py.Dataset(dataset).attrs  # each is read when it is asked for
+                yield from _of_words(f"{place}/{f.name}", words, f, meanings, thorough)
             elif not f.optional or f.name in file[name]:
                 path = f"{place}/{f.name}"
                 yield Difference(path=path, what="the dataset must be there", got="none")
@@ -431,10 +431,11 @@ def _of_words(
     if not thorough:
         return
     for key, value in (("unit", field.unit), ("frame", field.frame)):
-        if not (isinstance(attrs.get(key), str) and attrs[key] == value):
-            what, got = f"attribute {key} must be {value!r}", repr(attrs.get(key))
-            yield Difference(path=path, what=what, got=got, text_only=True)
-    if not str(attrs.get("meaning", "")):
+        got = attrs.get(key)
+        if not (isinstance(got, str) and got == value):
+            what = f"attribute {key} must be {value!r}"
+            yield Difference(path=path, what=what, got=repr(got), text_only=True)
+    if not str("" if said is None else said):
         what = "attribute meaning must be there"
         yield Difference(path=path, what=what, got="none", text_only=True)
 

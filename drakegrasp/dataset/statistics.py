@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 
@@ -316,32 +317,22 @@ def count_splits(out: Path) -> list[SplitCount]:
     Raises:
         DataError: If the data files are missing or damaged.
     """
-    return splits_of(out / DATA_FILES["oto"])
+    with open_samples(out / DATA_FILES["oto"]) as file:
+        return splits_of(file)
 
 
-def split_rule_of(path: Path) -> str:
-    """Return by what the samples of a data file are split, `class` or `object`.
-
-    Raises:
-        DataError: If the file is missing or damaged.
-    """
-    with open_samples(path) as file:
-        return str(file.attrs.get("split_by", "class"))
-
-
-def splits_of(path: Path) -> list[SplitCount]:
+def splits_of(file: h5py.File) -> list[SplitCount]:
     """Return what a data file tells of its splits, as `count_splits`."""
-    with open_samples(path) as file:
-        return [
-            SplitCount(
-                split=split,
-                samples=len(file[split]["grasps"]),
-                effective=effective_number(file[split]["grasp_props/weight"][:]),
-                objects=len(set(read_names(file[split]["object_props/object_name"]))),
-                classes=len(set(read_names(file[split]["object_props/class_name"]))),
-            )
-            for split in SPLITS
-        ]
+    return [
+        SplitCount(
+            split=split,
+            samples=len(file[split]["grasps"]),
+            effective=effective_number(file[split]["grasp_props/weight"][:]),
+            objects=len(set(read_names(file[split]["object_props/object_name"]))),
+            classes=len(set(read_names(file[split]["object_props/class_name"]))),
+        )
+        for split in SPLITS
+    ]
 
 
 def counts_as_dict(out: Path) -> dict[str, Any]:

@@ -17,6 +17,7 @@ import re
 import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -281,8 +282,13 @@ def _mentions(path: Path) -> list[str]:
 
 def _described(path: Path) -> Mapping[str, Any]:
     """Return the keys of a hand file; none if it is not one."""
+    return _keys_of(path.read_bytes())
+
+
+@lru_cache(maxsize=8)  # a command asks for those of one hand a dozen times
+def _keys_of(content: bytes) -> Mapping[str, Any]:
     try:
-        tree = parse_yaml(path.read_bytes())
+        tree = parse_yaml(content)
     except (yaml.YAMLError, UnicodeDecodeError):
         return {}
     return tree if isinstance(tree, dict) else {}
