@@ -95,7 +95,7 @@ LIMITS = {
         30.0, "positive", "between a contact's mean normal and the object's nearest face", "null"
     ),
     # As thresholds the score and its parts also remove sound grasps: they are off.
-    "max_suspicion": Limit(None, "positive", "score of dataset/suspicion.py", "null"),
+    "max_suspicion": Limit(None, "positive", "score of dataset/quality.py", "null"),
     "max_penetration": Limit(None, "positive", "[m], of the object in a fingertip", "null"),
     "max_imbalance": Limit(
         None, "positive", "of the fingertips' forces, as a share of the weight", "null"

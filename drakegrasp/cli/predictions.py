@@ -361,7 +361,7 @@ def score(
     from drakegrasp.api.scoring import score as score_predictions
     from drakegrasp.cli.tables import make_console, score_table
     from drakegrasp.dataset.manifest import read_manifest
-    from drakegrasp.dataset.scene_rows import open_rows
+    from drakegrasp.dataset.scenes import open_rows
     from drakegrasp.errors import DataError, GraspError
     from drakegrasp.exchange.attempts import holds_postures
     from drakegrasp.scoring.references import REFERENCES

@@ -16,10 +16,9 @@ from rich.table import Table
 
 from drakegrasp.cli.console import say
 from drakegrasp.config import Config
-from drakegrasp.dataset.holding import holding_lines, holding_of
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
-from drakegrasp.dataset.shortfall import objects_without_samples, split_shortfall
+from drakegrasp.dataset.quality import holding_lines, holding_of
 from drakegrasp.dataset.statistics import (
     NO_NAME,
     Funnel,
@@ -30,7 +29,9 @@ from drakegrasp.dataset.statistics import (
     count_splits,
     count_unfinished,
     held_note,
+    objects_without_samples,
     preshapes_of,
+    split_shortfall,
 )
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import counted, printable

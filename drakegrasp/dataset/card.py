@@ -20,12 +20,11 @@ import numpy as np
 from drakegrasp.arithmetic import norm
 from drakegrasp.config import CarriedHand, Config
 from drakegrasp.dataset.hdf5 import read_names
-from drakegrasp.dataset.holding import holding_lines, holding_of
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
 from drakegrasp.dataset.opening import open_samples
 from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, SCENES_FILE, TRIALS_FILE
-from drakegrasp.dataset.scene_rows import refuse_other_state
-from drakegrasp.dataset.scenes import SceneDataset, count_scenes
+from drakegrasp.dataset.quality import holding_lines, holding_of
+from drakegrasp.dataset.scenes import SceneDataset, count_scenes, refuse_other_state
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, SPLITS
 from drakegrasp.dataset.statistics import (
     Funnel,
@@ -247,6 +246,7 @@ def _counts(file: h5py.File, funnel: Funnel) -> dict[str, Any]:
     members: dict[str, list[int]] = {}
     for i, name in enumerate(funnel.classes):
         members.setdefault(name, []).append(i)
+
     outcomes, removals = funnel.outcomes.sum(axis=0), funnel.removals.sum(axis=0)
     return {
         "all": _row(funnel, samples, range(len(funnel.names))),

@@ -1,4 +1,4 @@
-"""The lock of a dataset's directory: one build at a time.
+"""The lock of a dataset's directory, one build at a time, and the log of its builds.
 
 `build.lock` in the directory is a line of JSON that names the process that builds there. The
 process holds the kernel's lock (flock) on the file and removes it at the end of the build. A
@@ -12,6 +12,10 @@ alive; the message says which file to remove if it is dead.
 
 The library filelock is no substitute: its flock names no holder, so a refusal could not say who
 builds, and a build could not report whose lock it took over.
+
+`log.jsonl` has the events of the builds with their times, a line of JSON each. People, their tools
+and the estimate of the remaining time read it. No data come from it, and it is the only file of a
+dataset that depends on the clock.
 """
 
 from __future__ import annotations
@@ -23,11 +27,13 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from io import FileIO
 from pathlib import Path
+from typing import Any
 
 from drakegrasp.errors import DataError
+from drakegrasp.foreign_files import parse_json, refuse_irregular
 from drakegrasp.runtime.environment import Process, this_process
 from drakegrasp.runtime.files import (
     LIST_NAME,
@@ -38,7 +44,7 @@ from drakegrasp.runtime.files import (
     sweep_temporary,
 )
 
-FILE_NAME = "build.lock"
+LOCK_FILE = "build.lock"
 #: Folders that a build makes in the directory.
 FOLDERS = ("builtin", "hand", "objects", "shards")
 #: Directories that a thread of this process holds, and the lock of this set.
@@ -87,7 +93,7 @@ def build_lock(out: Path) -> Iterator[Holder | None]:
     # First among the threads of this process, then among all processes.
     key = _claim(out)
     try:
-        file, before = _take(out / FILE_NAME)
+        file, before = _take(out / LOCK_FILE)
     except BaseException:
         _held.discard(key)
         raise
@@ -96,7 +102,7 @@ def build_lock(out: Path) -> Iterator[Holder | None]:
         complete_replacement(out)
         yield before
     finally:
-        (out / FILE_NAME).unlink(missing_ok=True)
+        (out / LOCK_FILE).unlink(missing_ok=True)
         file.close()
         _held.discard(key)
         if made:
@@ -116,7 +122,7 @@ def _claim(out: Path) -> str:
     with _claiming:
         if key in _held:
             raise _refusal(
-                out / FILE_NAME, None, certain=True, who="this process, which has it already"
+                out / LOCK_FILE, None, certain=True, who="this process, which has it already"
             )
         _held.add(key)
     return key
@@ -128,7 +134,7 @@ def tidy(out: Path) -> None:
     For commands that only read. Nothing happens where a process builds, or where this one may not
     write.
     """
-    leftovers = (out / FILE_NAME, out / LIST_NAME)
+    leftovers = (out / LOCK_FILE, out / LIST_NAME)
     if any(map(os.path.lexists, leftovers)) or any(stale_temporary(out)):
         with suppress(DataError, OSError), build_lock(out):
             sweep_temporary(out)
@@ -219,3 +225,59 @@ def _refusal(
     if not certain:
         advice = f"wait for it, or remove {path.name} there if it is dead"
     return DataError(f"{path.parent}: must be built by one process at a time, got {who}; {advice}")
+
+
+LOG_FILE = "log.jsonl"
+
+
+class BuildLog:
+    """The log of a directory's builds.
+
+    Args:
+        out: Directory of the dataset.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self._path = out / LOG_FILE
+
+    def __call__(self, event: str, **facts: Any) -> None:
+        """Append an event in one write, so that a crash leaves whole lines.
+
+        Args:
+            event: Name of the event, e.g. "unit done".
+            facts: Its details, as JSON types.
+
+        Raises:
+            OSError: If the file cannot be written.
+            DataError: If it is a link.
+        """
+        now = datetime.now(UTC).isoformat(timespec="milliseconds")
+        line = json.dumps({"time": now, "event": event, **facts}, ensure_ascii=False)
+
+        # Other alphabets stay readable; what would steer a terminal becomes its code.
+        line = "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in line) + "\n"
+        descriptor = open_own(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+        try:
+            os.write(descriptor, line.encode())
+        finally:
+            os.close(descriptor)
+
+
+def read_log(out: Path) -> Iterator[dict[str, Any]]:
+    """Yield the events of a directory's builds, oldest first; none if there is no log.
+
+    A line that is no event is skipped, such as one that a full disk has cut off.
+    """
+    try:
+        refuse_irregular(out / LOG_FILE)
+        file = (out / LOG_FILE).open("rb")
+    except OSError:
+        return
+    with file:
+        for line in file:
+            try:
+                event = parse_json(line)
+            except ValueError:
+                continue
+            if isinstance(event, dict) and isinstance(event.get("event"), str):
+                yield event

@@ -35,9 +35,9 @@ from drakegrasp.config import (
     continued,
     parse_stored,
 )
-from drakegrasp.dataset import lock, log
 from drakegrasp.dataset.assembly.split import Rule, number_poses, split_rule
 from drakegrasp.dataset.json_files import Name, read_mapping, stated, validated
+from drakegrasp.dataset.lock import FOLDERS, LOCK_FILE, LOG_FILE, unwritable
 from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.schema import (
@@ -467,7 +467,7 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
         out.mkdir(parents=True, exist_ok=True)
         probe_folder(out)
     except OSError as error:
-        raise lock.unwritable(out, error) from None
+        raise unwritable(out, error) from None
 
     # Without a manifest it must be empty, but for what an interrupted build may leave.
     if not (out / FILE_NAME).exists():
@@ -507,7 +507,7 @@ def _refuse_other_files(out: Path) -> None:
     Raises:
         DataError: If there is one.
     """
-    own = (*lock.FOLDERS, lock.FILE_NAME, log.FILE_NAME)
+    own = (*FOLDERS, LOCK_FILE, LOG_FILE)
     names = (path.name for path in out.iterdir())
     others = sorted(name for name in names if not name.startswith(".") and name not in own)
     if others:
@@ -519,12 +519,12 @@ def _refuse_other_files(out: Path) -> None:
 
 def release_directory(out: Path) -> None:
     """Remove the files of a build that made nothing, and the directory if it is then empty."""
-    for name in (FILE_NAME, log.FILE_NAME):
+    for name in (FILE_NAME, LOG_FILE):
         (out / name).unlink(missing_ok=True)
     if not (out / HAND_FOLDER).is_symlink():
         shutil.rmtree(out / HAND_FOLDER, ignore_errors=True)
     # A directory with anything else in it was there before.
-    for folder in (*(out / name for name in lock.FOLDERS), out):
+    for folder in (*(out / name for name in FOLDERS), out):
         with suppress(OSError):
             folder.rmdir()
 

@@ -32,8 +32,7 @@ from drakegrasp.dataset.card import card_content, card_text
 from drakegrasp.dataset.opening import open_samples
 from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.scene_rows import refuse_other_state
-from drakegrasp.dataset.scenes import SceneDataset
+from drakegrasp.dataset.scenes import SceneDataset, refuse_other_state
 from drakegrasp.dataset.schema import (
     CAMERAS,
     DATA_FIELDS,

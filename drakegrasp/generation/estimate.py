@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from drakegrasp.config import Config, NonNegative, NonNegativeCount
 from drakegrasp.dataset.assembly.pack import TASK_ROWS
-from drakegrasp.dataset.log import FILE_NAME, read_log
+from drakegrasp.dataset.lock import LOG_FILE, read_log
 from drakegrasp.errors import ConfigError, DataError, counted, one_line
 from drakegrasp.foreign_files import read_json
 from drakegrasp.generation.request import BUILTIN, BuildRequest, refuse_unknown
@@ -326,5 +326,5 @@ def logged_times(out: Path, config: Config) -> StageTimes | None:
         look=seconds["look"] / successes if successes else MEASURED.look,
         successes=successes / attempts,
         source=f"{counted(attempts, 'attempt')} of {counted(len(objects), 'object')} in "
-        f"{out / FILE_NAME}",
+        f"{out / LOG_FILE}",
     )

@@ -27,8 +27,7 @@ from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manife
 from drakegrasp.dataset.opening import SCENE_TABLES, open_samples
 from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
-from drakegrasp.dataset.scene_rows import GRASPS_FOLLOW_FROM, grasps_of_trials
-from drakegrasp.dataset.scenes import count_scenes
+from drakegrasp.dataset.scenes import GRASPS_FOLLOW_FROM, count_scenes, grasps_of_trials
 from drakegrasp.dataset.schema import (
     DEPTH_UNIT,
     NO_PRESHAPE,

@@ -10,11 +10,10 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.filtering import own_setting
-from drakegrasp.dataset.holding import share_text
+from drakegrasp.dataset.assembly.decisions import own_setting
+from drakegrasp.dataset.quality import PARTS, share_text, suspicion
 from drakegrasp.dataset.rejections import FILE_NAME, Decisions
 from drakegrasp.dataset.schema import CAMERAS, SPLITS, TRIAL_FIELDS, Shown
-from drakegrasp.dataset.suspicion import PARTS, suspicion
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose

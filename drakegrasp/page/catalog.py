@@ -32,9 +32,9 @@ from drakegrasp.dataset.paths import (
     TRIALS_FILE,
     model_path,
 )
+from drakegrasp.dataset.quality import COLUMNS, PARTS, suspicion
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.shards import ShardHeader
-from drakegrasp.dataset.suspicion import COLUMNS, PARTS, suspicion
 from drakegrasp.dataset.trials import Stamp, TrialPart, Trials, shard_part, stamp
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import is_name, parse_json

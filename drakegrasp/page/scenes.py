@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.opening import refuse_other_codes
-from drakegrasp.dataset.scene_rows import refuse_other_state
-from drakegrasp.dataset.scenes import SceneDataset
+from drakegrasp.dataset.scenes import SceneDataset, refuse_other_state
 from drakegrasp.dataset.schema import SPLITS, VIEW_KINDS, Shown
 from drakegrasp.dataset.trials import Stamp
 from drakegrasp.errors import DataError

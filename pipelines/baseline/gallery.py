@@ -22,7 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import drakegrasp as dg
-from drakegrasp.dataset.scene_rows import SceneRows
+from drakegrasp.dataset.scenes import SceneRows
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.frames import invert_pose
 from drakegrasp.pictures.style import add_axes, hide_ticks, save_figure, shortened

@@ -29,7 +29,7 @@ import click
 from drakegrasp.api.building import build_dataset
 from drakegrasp.cli.options import shared
 from drakegrasp.config import Config
-from drakegrasp.dataset.log import read_log
+from drakegrasp.dataset.lock import read_log
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.shapes.catalog import export_builtin

@@ -25,9 +25,9 @@ import click
 import numpy as np
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.holding import wilson_interval
 from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.quality import wilson_interval
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal

@@ -26,9 +26,9 @@ from cross_check import Group, StoredLift, draw_lifts
 
 from drakegrasp.bench import mujoco_baseline
 from drakegrasp.bench.mujoco_baseline import MujocoBaseline
-from drakegrasp.dataset.holding import wilson_interval
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.quality import wilson_interval
 from drakegrasp.mjcf import links, scene
 from drakegrasp.mjcf.scene import convex_parts
 from drakegrasp.outcomes import Outcome

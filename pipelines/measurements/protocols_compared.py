@@ -23,7 +23,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.dataset.holding import wilson_interval
+from drakegrasp.dataset.quality import wilson_interval
 from drakegrasp.exchange.dexgraspbench import write_object
 from drakegrasp.protocols.files import read_dictionary
 

@@ -36,15 +36,15 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config, with_whole_lifts
-from drakegrasp.dataset.holding import (
-    COLUMNS,
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.quality import (
     MUCH,
+    PREDICTED_BY,
     area_under_roc,
     predictors,
     wilson_interval,
 )
-from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.filters import Removal
 from drakegrasp.frames import make_pose, rotation_about
@@ -222,7 +222,7 @@ def ranking(out: Path, ids: npt.NDArray[np.int64], rows: Sequence[Sequence[Found
     """Return how well numbers of stored lifts tell which samples bear half or more of the noise."""
     noisy = [[x["sample"] for x in row if x["change"] in ("palm", "together")] for row in rows]
     much = np.array([np.mean(own) >= MUCH for own in noisy])
-    told = predictors(Trials(out)[ids].columns(COLUMNS))
+    told = predictors(Trials(out)[ids].columns(PREDICTED_BY))
     areas = {name: area_under_roc(values, much) for name, values in told.items()}
     ranked = sorted(areas.items(), key=lambda pair: -pair[1])
     return {"bear half or more": int(much.sum()), "AUC": {k: round(v, 2) for k, v in ranked}}

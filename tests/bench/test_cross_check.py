@@ -19,7 +19,7 @@ from helpers.datasets import (
     make_dataset,
 )
 
-from drakegrasp.dataset.holding import wilson_interval
+from drakegrasp.dataset.quality import wilson_interval
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.outcomes import Outcome

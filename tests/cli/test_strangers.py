@@ -16,7 +16,7 @@ from helpers.commands import run
 from helpers.datasets import OTO, TRIALS, edit_manifest
 
 from drakegrasp.api.building import build_dataset
-from drakegrasp.dataset.log import BuildLog, read_log
+from drakegrasp.dataset.lock import BuildLog, read_log
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError

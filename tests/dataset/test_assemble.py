@@ -18,7 +18,7 @@ from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 from drakegrasp.dataset import hdf5, shards
 from drakegrasp.dataset.assemble import assemble, assemble_locked, summarise
 from drakegrasp.dataset.assembly import pack, survey
-from drakegrasp.dataset.lock import FILE_NAME, build_lock
+from drakegrasp.dataset.lock import LOCK_FILE, build_lock
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import ConfigError, DataError
@@ -71,7 +71,7 @@ def test_shard_without_a_success_has_trials_only(tmp_path: Path) -> None:
 def test_holder_of_the_lock_assembles_in_it(out: Path) -> None:
     with build_lock(out):
         assert assemble_locked(out, read_manifest(out)) == summarise(out)
-        assert (out / FILE_NAME).exists()
+        assert (out / LOCK_FILE).exists()
 
 
 @pytest.mark.parametrize("camera", CAMERAS)

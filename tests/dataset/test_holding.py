@@ -12,8 +12,8 @@ from click.testing import CliRunner
 from helpers.datasets import TRIALS, change, make_dataset, must_find, must_find_without_shards
 
 from drakegrasp.cli.main import main
-from drakegrasp.dataset.holding import (
-    COLUMNS,
+from drakegrasp.dataset.quality import (
+    PREDICTED_BY,
     area_under_roc,
     bearing,
     holding_of,
@@ -76,7 +76,7 @@ def test_area_is_the_share_of_pairs_in_order() -> None:
 
 
 def test_margin_of_a_force_on_the_cone_is_zero_and_of_one_along_the_normal_one(out: Path) -> None:
-    columns = Trials(out).where(outcome=Outcome.SUCCESS)[:3].columns(COLUMNS)
+    columns = Trials(out).where(outcome=Outcome.SUCCESS)[:3].columns(PREDICTED_BY)
     normals, friction = columns["lifted_nhat_Q_O"], columns["friction_hand"]
     across = np.roll(normals, 1, axis=2)
     for slope, margin in ((0.0, 1.0), (1.0, 0.0), (0.5, 0.5)):

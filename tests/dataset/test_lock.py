@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from drakegrasp.dataset import lock
-from drakegrasp.dataset.lock import FILE_NAME, build_lock
+from drakegrasp.dataset.lock import LOCK_FILE, build_lock
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.environment import this_process
 
@@ -71,7 +71,7 @@ def test_dead_build_is_taken_over_and_named(tmp_path: Path) -> None:
     with holder(tmp_path) as process:
         process.kill()
         process.wait()
-        assert (tmp_path / FILE_NAME).exists()
+        assert (tmp_path / LOCK_FILE).exists()
         with build_lock(tmp_path) as dead:
             assert dead is not None
             assert dead.process.pid == process.pid
@@ -80,14 +80,14 @@ def test_dead_build_is_taken_over_and_named(tmp_path: Path) -> None:
 
 
 def test_lock_file_without_content_is_nobodys(tmp_path: Path) -> None:
-    (tmp_path / FILE_NAME).write_text("")
+    (tmp_path / LOCK_FILE).write_text("")
     with build_lock(tmp_path) as dead:
         assert dead is None
 
 
 def test_lock_file_names_its_holder_and_goes_with_the_block(tmp_path: Path) -> None:
     with build_lock(tmp_path):
-        assert json.loads((tmp_path / FILE_NAME).read_text())["process"]["pid"] == os.getpid()
+        assert json.loads((tmp_path / LOCK_FILE).read_text())["process"]["pid"] == os.getpid()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -97,7 +97,7 @@ def test_lock_is_not_taken_twice_in_one_process(tmp_path: Path) -> None:
         message = "one process at a time, got this process, which has it already"
         with pytest.raises(DataError, match=message), build_lock(tmp_path / "."):
             raise AssertionError
-        assert (tmp_path / FILE_NAME).exists()
+        assert (tmp_path / LOCK_FILE).exists()
 
 
 def test_directory_in_which_nothing_was_made_goes_again(tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_without_locks_a_number_alone_is_no_process(
     monkeypatch.setattr(fcntl, "flock", refuse_lock)
     process = {**vars(this_process()), **change}
     content = {"process": process, "since": "2026-01-01T00:00:00", "command": []}
-    (tmp_path / FILE_NAME).write_text(json.dumps(content))
+    (tmp_path / LOCK_FILE).write_text(json.dumps(content))
     if taken:
         with build_lock(tmp_path) as dead:
             assert dead is not None
@@ -152,7 +152,7 @@ def test_lock_on_a_file_that_its_holder_removed_is_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Between opening the file and locking it; somebody may have made another one since."""
-    path, lock_file, tries = tmp_path / FILE_NAME, lock.lock_file, []
+    path, lock_file, tries = tmp_path / LOCK_FILE, lock.lock_file, []
 
     def late(file: FileIO) -> bool | None:
         if not tries:

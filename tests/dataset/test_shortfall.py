@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from drakegrasp.config import SplitConfig
-from drakegrasp.dataset.shortfall import (
+from drakegrasp.dataset.statistics import (
+    SplitCount,
+    count_funnel,
     objects_without_samples,
     split_shortfall,
     why_no_sample,
 )
-from drakegrasp.dataset.statistics import SplitCount, count_funnel
 from drakegrasp.filters import Removal
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from drakegrasp.dataset import suspicion as module
-from drakegrasp.dataset.suspicion import CAP, COLUMNS, PARTS, suspicion
+from drakegrasp.dataset import quality as module
+from drakegrasp.dataset.quality import CAP, COLUMNS, PARTS, suspicion
 from drakegrasp.frames import make_pose, pack_pose, rotation_about
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import settle

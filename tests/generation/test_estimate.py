@@ -12,7 +12,7 @@ from helpers.scripts import load_script
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drakegrasp.dataset.log import BuildLog
+from drakegrasp.dataset.lock import BuildLog
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.filters import Removal

@@ -20,8 +20,8 @@ from starlette.testclient import TestClient
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.assembly.decisions import judge_successes
 from drakegrasp.dataset.checks.run import check_dataset
-from drakegrasp.dataset.filtering import judge_successes
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 from drakegrasp.errors import ConfigError, DataError

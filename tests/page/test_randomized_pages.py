@@ -11,8 +11,8 @@ from helpers.datasets import TRIALS, make_dataset
 from helpers.pages import get
 from starlette.testclient import TestClient
 
+from drakegrasp.dataset.quality import GRAVITY
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.suspicion import GRAVITY
 from drakegrasp.frames import invert_pose, transform_points, unpack_pose
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.page.catalog import Catalog

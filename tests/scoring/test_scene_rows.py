@@ -11,7 +11,7 @@ import pytest
 from helpers.datasets import OTO, make_dataset
 
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.scene_rows import SceneRows, open_rows
+from drakegrasp.dataset.scenes import SceneRows, open_rows
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.frames import transform_points

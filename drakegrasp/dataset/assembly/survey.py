@@ -14,14 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from drakegrasp.config import CameraConfig, Config
-from drakegrasp.dataset.filtering import judge_successes
+from drakegrasp.config import CameraConfig
 from drakegrasp.dataset.hdf5 import read_column
 from drakegrasp.dataset.manifest import Manifest
+from drakegrasp.dataset.quality import COLUMNS, suspicion
 from drakegrasp.dataset.schema import CAMERAS, CERTIFICATE_FIELDS, sizes, sources_of, with_derived
 from drakegrasp.dataset.shards import ShardHeader, open_shard, read_trials
-from drakegrasp.dataset.suspicion import COLUMNS, suspicion
-from drakegrasp.filters import NEEDED, Removal
+from drakegrasp.filters import NEEDED
 from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp, unused_fingers
 from drakegrasp.outcomes import Outcome
@@ -134,18 +133,6 @@ def survey_object(task: SurveyTask) -> Survey:
         successes=join(parts),
         sizes=letters,
     )
-
-
-def count_samples(out: Path, header: ShardHeader, config: Config) -> int:
-    """Return how many successes of a shard pass the filters, but for that of outliers.
-
-    Raises:
-        DataError: If the shard is missing or damaged.
-    """
-    filters = config.filters.model_copy(update={"outlier_sigma": 0.0})
-    task = SurveyTask(out=str(out), object=0, headers=(header,), wanted=None, camera=config.camera)
-    removal = judge_successes(survey_object(task).successes, filters)
-    return int(np.count_nonzero(removal == Removal.KEPT))
 
 
 def shards_sha256(out: Path, manifest: Manifest, execute: Executor = run_here) -> str:

@@ -13,8 +13,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.checks.fields import UNIT_TOLERANCE
-from drakegrasp.dataset.checks.rows import AnyArray, Batch, Violation
+from drakegrasp.dataset.checks.rows import UNIT_TOLERANCE, AnyArray, Batch, Violation
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.frames import X_WT, Array, invert_pose
 from drakegrasp.objects.model import ObjectModel

@@ -16,9 +16,9 @@ import numpy as np
 from drakegrasp.config import Config, FilterConfig
 from drakegrasp.dataset.assembly.split import split_samples
 from drakegrasp.dataset.checks import images
-from drakegrasp.dataset.checks.fields import UNIT_TOLERANCE, complete, ranges, rigid
 from drakegrasp.dataset.checks.rows import (
     POSITION_TOLERANCE,
+    UNIT_TOLERANCE,
     AnyArray,
     Batch,
     CheckedFile,
@@ -27,7 +27,10 @@ from drakegrasp.dataset.checks.rows import (
     Rule,
     Task,
     Violation,
+    complete,
     of_file,
+    ranges,
+    rigid,
 )
 from drakegrasp.dataset.checks.trials import Dataset
 from drakegrasp.dataset.manifest import ObjectEntry

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.checks.fields import complete, ranges, rigid
 from drakegrasp.dataset.checks.images import (
     DEPTH_TOLERANCE,
     border_of,
@@ -33,13 +32,16 @@ from drakegrasp.dataset.checks.rows import (
     Findings,
     Task,
     Violation,
+    complete,
     of_file,
+    ranges,
+    rigid,
 )
 from drakegrasp.dataset.checks.samples import group_of
 from drakegrasp.dataset.checks.trials import Dataset
 from drakegrasp.dataset.manifest import ObjectEntry
 from drakegrasp.dataset.paths import TRIALS_FILE
-from drakegrasp.dataset.scene_rows import GRASPS_FOLLOW_FROM, LIFTED, grasps_of_trials
+from drakegrasp.dataset.scenes import GRASPS_FOLLOW_FROM, LIFTED, grasps_of_trials
 from drakegrasp.dataset.schema import (
     DEPTH_UNIT,
     SCENE_FIELDS,

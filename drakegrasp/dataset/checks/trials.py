@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from drakegrasp.config import CloseConfig, LiftConfig, RandomizeConfig
-from drakegrasp.dataset.checks.fields import complete, derived, ranges, rigid
 from drakegrasp.dataset.checks.rows import (
     POSITION_TOLERANCE,
     AnyArray,
@@ -26,7 +25,11 @@ from drakegrasp.dataset.checks.rows import (
     CheckedFile,
     Rule,
     Violation,
+    complete,
+    derived,
     of_file,
+    ranges,
+    rigid,
 )
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import FILE_NAME, model_path
