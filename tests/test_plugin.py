@@ -1,0 +1,150 @@
+"""The plugin of the docs: installed from its folder, found by name, and each part of it used."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.datasets import make_dataset
+from helpers.jaws import HAND, box_folder, jaws
+from helpers.objects import box_model
+from helpers.successes import good
+
+from drakegrasp import registry
+from drakegrasp.cluster.kinds import cluster_of
+from drakegrasp.dataset.filtering import judge_successes
+from drakegrasp.errors import ConfigError, GraspError
+from drakegrasp.exchange.attempts import read_attempts
+from drakegrasp.exchange.export import export_dataset, read_closed_grasps
+from drakegrasp.filters import Removal
+from drakegrasp.frames import invert_pose, make_pose
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import load_config
+from drakegrasp.protocols.protocol import DexGraspBench, find_protocol
+from drakegrasp.protocols.scene import ProtocolScene
+from drakegrasp.simulation.candidates import Source, sample_candidates
+
+FOLDER = Path(__file__).resolve().parents[1] / "docs" / "examples" / "plugin"
+PACKAGE = "drakegrasp-example-plugin"
+#: What the plugin adds, by kind.
+ADDED: dict[registry.Kind, str] = {
+    "clusters": "half",
+    "exporters": "palms",
+    "hands": "jaw",
+    "importers": "palms.palms",
+    "protocols": "slippery",
+    "rules": "calm",
+    "samplers": "down",
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder in which pip installed it, on the path of this process."""
+    folder = tmp_path_factory.mktemp("plugin")
+    source, site = folder / "source", folder / "site"
+    # In the checkout itself setuptools would leave a folder `build`.
+    shutil.copytree(FOLDER, source, ignore=shutil.ignore_patterns("__pycache__"))
+    pip = (sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation")
+    command = [*pip, "--no-index", "--target", str(site), str(source)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(site)
+        registry._theirs.cache_clear()
+        yield site
+    sys.modules.pop("example_plugin", None)
+    registry._theirs.cache_clear()
+
+
+def test_each_part_is_found_by_name() -> None:
+    for kind, name in ADDED.items():
+        assert registry.names(kind)[-1] == name
+        assert registry.find(kind, name) is not None
+
+
+def test_sampler_draws_palms_that_look_down(tmp_path: Path) -> None:
+    bar = box_model(tmp_path, np.array([0.10, 0.02, 0.03]))
+    X_TO = make_pose(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), [0.0, 0.0, 0.01])
+    rules = load_config("paper", ["candidates.method=down", "candidates.max=8"]).candidates
+    drawn, again = (sample_candidates(bar, X_TO, rules, seed=3) for _ in range(2))
+    np.testing.assert_allclose((X_TO @ drawn.X_OG)[:, 2, 2], -1.0, atol=1e-12)
+    np.testing.assert_array_equal(drawn.X_OG, again.X_OG)
+    assert len(np.unique(drawn.X_OG[:, 0, 0])) > 1
+    assert (drawn.source == Source.OWN).all()
+
+
+def test_rule_removes_what_turned_in_the_hand() -> None:
+    turn = np.deg2rad([1.0, 5.0, np.nan])
+    filters = load_config("paper", ["filters.own=calm"]).filters
+    removal = judge_successes(good(3).with_columns(turn=turn), filters)
+    assert removal.tolist() == [Removal.KEPT, Removal.OWN, Removal.TURNED]
+    with pytest.raises(ConfigError, match=r"calm: needs must be some of .*, got turn"):
+        judge_successes(good(3).only("trial_id", "slip"), filters)
+
+
+def test_protocol_has_numbers_of_its_own(tmp_path: Path) -> None:
+    (tmp_path / "hand.xml").write_text(HAND)
+    box = box_folder(tmp_path / "box", 0.04, 0.04, 0.04)
+    protocol, stored = find_protocol("slippery")
+    assert stored == "slippery"
+    for rules, held in ((DexGraspBench(), True), (protocol, False)):
+        scene = ProtocolScene(rules, tmp_path / "hand.xml", box)
+        assert rules.run(scene, jaws(0.01)).success == held
+
+
+def test_what_is_exported_is_imported(tmp_path: Path) -> None:
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes")
+    count = export_dataset(out, tmp_path / "palms", "palms")
+    grasps = list(read_closed_grasps(out))
+    assert count == len(grasps) > 1
+    (path,) = (tmp_path / "palms").iterdir()
+    for source in (path, path.parent):
+        found = read_attempts(source, load_hand("barrett"))
+        assert found.objects == tuple(grasp.object_name for grasp in grasps)
+        X_OG = [invert_pose(grasp.X_TO) @ grasp.X_TG for grasp in grasps]
+        np.testing.assert_allclose(found.X_FG, X_OG, atol=1e-12)
+        np.testing.assert_array_equal(found.q_grasp, [grasp.q for grasp in grasps])
+        assert not any(found.invalid)
+    path.write_text("no JSON")
+    with pytest.raises(GraspError, match=r"samples\.palms: must be readable by the importer"):
+        read_attempts(path, load_hand("barrett"))
+
+
+def test_hand_is_used_by_its_name() -> None:
+    assert load_hand("jaw").joint_names == ("left_slide", "right_slide")
+    assert load_config("paper", ["hand=jaw"]).candidates.standoffs == (0.01, 0.02)
+
+
+@pytest.mark.cluster
+def test_cluster_starts_its_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    with pytest.raises(ConfigError, match="--workers must not be given with --cluster half"):
+        cluster_of("half", workers=3)
+    with cluster_of("half").connected(tmp_path) as client:
+        client.wait_for_workers(1)
+        assert len(client.nthreads()) == 1
+
+
+def test_a_broken_plugin_is_one_line_with_its_name(
+    plugin: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "example_plugin", raising=False)
+    module = plugin / "example_plugin" / "__init__.py"
+    text = module.read_text()
+    module.write_text("raise SystemExit('no licence')")
+    try:
+        with pytest.raises(ConfigError) as told:
+            registry.find("samplers", "down")
+    finally:
+        module.write_text(text)
+    (line,) = str(told.value).splitlines()
+    assert (
+        f"samplers: down of the package {PACKAGE} must be loaded from example_plugin:Down" in line
+    )
+    assert "no licence" in line
