@@ -327,3 +327,9 @@ def test_python_of_the_docs_runs(
         assert verdict.split()[0] in ("True", "False")
         assert explanation.startswith("The grasp of ")
         assert {path.name for path in tmp_path.iterdir()} >= {"grasp.html", "grasp.png"}
+
+
+def test_the_table_of_scripts_names_every_script_and_no_other() -> None:
+    table = read(ROOT / "pipelines" / "README.md")
+    files = {path.name for path in (ROOT / "pipelines").rglob("*.py")}
+    assert set(re.findall(r"\b(\w+\.py)`", table)) == files

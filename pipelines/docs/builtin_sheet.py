@@ -1,7 +1,4 @@
-"""Draw the contact sheet of the built-in objects: the first object of every class, with its name.
-
-Usage: python pipelines/docs/builtin_sheet.py [--index N] [--objects-seed S] [--out PNG] [CLASS ...]
-"""
+"""Draw the contact sheet of the built-in objects: the first of every class, with its name."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Measure the overhead of a build, and the gain of a second worker.
 
 \b
-    python pipelines/measurements/build_overhead.py [--objects MESH_DIR] [--candidates N]
+    python pipelines/measurements/speed.py build [--objects MESH_DIR] [--candidates N]
         [--set KEY=VALUE]
 
 The script builds the same dataset with one worker and with two and reads the logs. With one
@@ -150,7 +150,3 @@ def main(objects: Path | None, units: str, overrides: tuple[str, ...], candidate
         "over the later one": round(max(halves) / whole, 3),
     }
     click.echo(json.dumps(figures, indent=1))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """How fast `drakegrasp inspect` shows a large dataset, and its memory.
 
 \b
-    python pipelines/measurements/inspect_speed.py OUT --grasps 50000 > inspect_speed.json
+    python pipelines/measurements/speed.py page OUT --grasps 50000 > inspect_speed.json
 
 The script repeats the attempts of the dataset OUT, with their images, under new numbers until there
 are as many grasps as asked for, and serves the result from a process of its own. It prints the
@@ -187,7 +187,3 @@ def _cpu_seconds(pid: int) -> float:
     """Return the CPU time of a process so far [s]."""
     fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / 100.0
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """How many random samples per second torch's DataLoader reads, beside h5py alone.
 
 \b
-    python pipelines/measurements/loader_speed.py OUT --samples 6000 > loader_speed.json
+    python pipelines/measurements/speed.py loader OUT --samples 6000 > loader_speed.json
 
 The samples of the dataset OUT, as they are compressed, are repeated until there are as many as
 asked for, in a temporary file of about 40 kB a sample. Images and grasps are read in random order:
@@ -140,7 +140,3 @@ def read_alone(path: Path, rows: npt.NDArray[np.int64]) -> None:
         for row in rows:
             for field in fields:
                 field[row]
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Measure how much memory preparing a mesh takes, by its faces: each mesh in a process of its own.
 
 \b
-    python pipelines/measurements/prepare_memory.py [--subdivisions N ...] [--kind KIND ...]
+    python pipelines/measurements/speed.py prepare [--subdivisions N ...] [--kind KIND ...]
 
 Balls of 10 cm are written as STL, OBJ and PLY (`stl`, `obj`, `ply`), and as PLY with noise and six
 holes (`open`). Prints a line of JSON for each: peak memory before and in all, what `drakegrasp
@@ -80,7 +80,3 @@ def main(subdivisions: tuple[int, ...], kinds: tuple[str, ...]) -> None:
                 )
             line = {"kind": kind, "faces": len(mesh.faces), **json.loads(child.stdout)}
             click.echo(json.dumps(line))
-
-
-if __name__ == "__main__":
-    main()

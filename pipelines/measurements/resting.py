@@ -1,11 +1,20 @@
-"""Prints how the objects of a directory come to rest: `python resting.py MESHES [UNITS]`."""
+"""How the objects of a directory come to rest: a line for each.
+
+\b
+    python pipelines/measurements/resting.py MESHES --units cm
+
+Prints the faces of its collision mesh, how deep it sinks into the table, its tilt, the simulated
+time until it rests, and notes.
+"""  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
 
-import sys
+from pathlib import Path
 
+import click
 import numpy as np
 
+from drakegrasp.cli.options import shared
 from drakegrasp.errors import MeshError
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import prepare_object
@@ -13,22 +22,25 @@ from drakegrasp.objects.sources import find_meshes
 from drakegrasp.simulation.settle import settle
 
 
-def main(meshes: str, units: str) -> None:
-    """Print a line per object: faces of its collision mesh, sink, tilt, simulated time, notes."""
+@click.command(help=__doc__)
+@click.argument("meshes", type=click.Path(path_type=Path, exists=True))
+@shared("--units")
+def main(meshes: Path, units: str) -> None:
+    """Run the script."""
     config = load_config()
     for source in find_meshes(meshes, units=units):
         try:
             model = prepare_object(source, config.objects)
             resting = settle(model, config)
         except MeshError as error:
-            sys.stdout.write(f"{source.name}: refused: {error}\n")
+            click.echo(f"{source.name}: refused: {error}")
             continue
-        sys.stdout.write(
+        click.echo(
             f"{source.name}: {len(model.collision_faces)} faces, {resting.sink * 1e3:.3f} mm deep, "
             f"tilted by {np.degrees(resting.tilt):.1f} degrees, rested after "
-            f"{resting.seconds:.2f} s {'; '.join(resting.notes)}\n"
+            f"{resting.seconds:.2f} s {'; '.join(resting.notes)}"
         )
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "m")
+    main()

@@ -1,7 +1,7 @@
 """How many items per second `SceneDataset` gives to two processes.
 
 \b
-    python pipelines/measurements/scene_speed.py OUT
+    python pipelines/measurements/speed.py scenes OUT
 
 Two processes take turns in the items of the training scenes of OUT: one round while views are read
 first, and one after that, for point clouds and for images. Prints JSON: items per second of wall
@@ -55,7 +55,3 @@ def read(task: tuple[Path, dict[str, Any], int]) -> list[tuple[int, float, float
             data[epoch, index]
         turns.append((len(own), time.perf_counter() - wall, time.process_time() - cpu))
     return turns
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Measure how much a verdict costs over mixed objects, by how many grasps an object has.
 
 \b
-    python pipelines/measurements/verify_speed.py OUT [OUT]... > speed.json
+    python pipelines/measurements/speed.py verdicts OUT [OUT]... > speed.json
 
 The script verifies samples of the datasets by method `hand` in this process: one of each object,
 then the others of each, at most six. A quarter of them are moved by 8 mm (standard deviation), so
@@ -79,7 +79,3 @@ def _measure(grasps: list[PlacedGrasp]) -> dict[str, object]:
         "median CPU seconds": round(float(np.median(seconds)), 3),
         "mean CPU seconds": round(float(np.mean(seconds)), 3),
     }
-
-
-if __name__ == "__main__":
-    main()

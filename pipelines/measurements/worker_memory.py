@@ -1,7 +1,7 @@
 """Measure how much memory one worker holds while it tries attempts on many objects.
 
 \b
-    python pipelines/measurements/worker_memory.py MESH_DIR [--only NAME ...]
+    python pipelines/measurements/speed.py worker MESH_DIR [--only NAME ...]
         [--trials N] [--set KEY=VALUE]
 
 The script builds a dataset with one worker process and reads its memory after every work unit,
@@ -126,7 +126,3 @@ def main(
         "growth over the last half, by these": round(means[1] / means[0] - 1.0, 4),
     }
     click.echo(json.dumps(figures, indent=1))
-
-
-if __name__ == "__main__":
-    main()
