@@ -22,8 +22,8 @@ from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.executor import processes
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.scoring.references import REFERENCES
-from drakegrasp.scoring.run import Request, Score
-from drakegrasp.scoring.run import score as score_request
+from drakegrasp.scoring.run import Method, Score
+from drakegrasp.scoring.run import score as score_predictions
 from drakegrasp.scoring.verdict import Verdict, protocol_verdict, ranked_sets, verdict_of
 from drakegrasp.simulation.attempts import Attempts
 from drakegrasp.verification.placing import (
@@ -104,21 +104,8 @@ def score(
         raise ConfigError(f"scheduler must be None with protocol {stored}, got one")
     if peer:
         require_mujoco("mujoco", "coacd")
-    request = Request(
-        data=dataset,
-        train=_training_rows(dataset, references) if train is None else train,
-        predictions=ranked,
-        name=name,
-        against=other,
-        references=tuple(references),
-        per_object=per_object,
-        config=dataset_config(dataset, overrides=settings),
-        overridden=tuple(overridden_keys(settings)),
-        again=again,
-        protocol={**describe(rule, stored), "versions": _versions()} if peer else None,
-    )
 
-    # Its verdicts, by this process or workers, and the card.
+    # The verdicts, by this process or workers.
     def try_all(grasps: Attempts, chosen: Sequence[int], deliver: Deliver) -> None:
         placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
         if peer:
@@ -135,13 +122,27 @@ def score(
         )
 
     with TemporaryDirectory() as scratch:
-        scored = score_request(request, try_all, None if out is None else Path(out))
+        scored = score_predictions(
+            dataset,
+            try_all,
+            train=_training_rows(dataset, references) if train is None else train,
+            predictions=ranked,
+            name=name,
+            against=other,
+            references=references,
+            per_object=per_object,
+            config=dataset_config(dataset, overrides=settings),
+            overridden=overridden_keys(settings),
+            again=again,
+            protocol={**describe(rule, stored), "versions": _versions()} if peer else None,
+            folder=None if out is None else Path(out),
+        )
     if out is not None:
         scored.save(Path(out))
     return scored
 
 
-def _method(files: object, dataset: GraspDataset) -> tuple[str, tuple[Attempts, ...]]:
+def _method(files: object, dataset: GraspDataset) -> Method:
     """Return the name and the predictions of another method."""
     given = [files] if isinstance(files, str | Path) else files
     if not isinstance(given, list | tuple) or not given:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
+
+import numpy as np
 
 from drakegrasp.errors import NAMED
 from drakegrasp.frames import Array
@@ -21,9 +22,7 @@ from drakegrasp.scoring.measures import (
     Estimate,
     Grouping,
     Judged,
-    Resampling,
-    by_class,
-    by_object,
+    by_name,
     calibration,
     coverage,
     curve,
@@ -113,8 +112,8 @@ def card_of(
         "warnings": _warnings(grouping, sets, dataset["split_rows"], known_objects),
         "sets": described,
         "above": _above(sets, tested, grouping, draws),
-        "by_class": {each.name: by_class(each, grouping) for each in sets},
-        "by_object": {each.name: by_object(each, grouping) for each in sets},
+        "by_class": {each.name: by_name(each, grouping, grouping.classes) for each in sets},
+        "by_object": {each.name: by_name(each, grouping, grouping.names) for each in sets},
         "dataset": dict(dataset),
         "settings": dict(settings),
         "again": again,
@@ -123,46 +122,48 @@ def card_of(
 
 
 def _above(
-    sets: Sequence[Judged], tested: Sequence[Judged], grouping: Grouping, draws: Resampling
-) -> dict[str, dict[str, Any]]:
+    sets: Sequence[Judged], tested: Sequence[Judged], grouping: Grouping, draws: Array
+) -> dict[str, dict[str, Estimate]]:
     """Return by how much each tested set is above each other; a pair is compared once."""
     found: dict[str, dict[str, Estimate]] = {}
     for one in tested:
         found[one.name] = {
-            other.name: -found[other.name][one.name]
+            other.name: _negative(found[other.name][one.name])
             if other.name in found
             else difference(one, other, grouping, draws)
             for other in sets
             if other is not one
         }
-    return {one: {k: asdict(v) for k, v in others.items()} for one, others in found.items()}
+    return found
+
+
+def _negative(of: Estimate) -> Estimate:
+    # Subtracting from zero keeps a zero without a sign.
+    return {"value": 0.0 - of["value"], "low": 0.0 - of["high"], "high": 0.0 - of["low"]}
 
 
 def _set_of(
     judged: Judged,
     grouping: Grouping,
     own: Mapping[int, Array],
-    draws: Resampling,
+    draws: Array,
     oracle: bool,
 ) -> dict[str, Any]:
     """Return what the card says of a set."""
-    verdicts = [verdict for each in judged.verdicts for verdict in each]
-    outcomes = sorted({v.outcome for v in verdicts})
-    reference = REFERENCES.get(judged.name)
-    measured = estimates(judged, grouping, draws, oracle=oracle)
+    table, reference = judged.table, REFERENCES.get(judged.name)
     of_postures = any(ranked.grasps is None for ranked in judged.ranked)
     return {
         "what": reference.words if reference else "postures" if of_postures else "predictions",
         "files": [{"name": r.file, "sha256": r.sha256} for r in judged.ranked],
-        "predictions": len(verdicts),
-        "measures": {name: asdict(value) for name, value in measured.items()},
+        "predictions": table.count,
+        "measures": estimates(judged, grouping, draws, oracle=oracle),
         "held_within_mm": dict(zip(map(str, CURVE_MM), curve(judged, grouping), strict=True)),
         "penetration": penetration(judged),
         "diversity": diversity(judged),
         "coverage": coverage(judged, own, grouping),
         "calibration": calibration(judged),
-        "outcomes": {name: sum(v.outcome == name for v in verdicts) for name in outcomes},
-        "invalid": dict(Counter(v.reason for v in verdicts if v.reason).most_common(NAMED)),
+        "outcomes": dict(sorted(Counter(table.outcome.tolist()).items())),
+        "invalid": dict(Counter(filter(None, table.reason.tolist())).most_common(NAMED)),
     }
 
 
@@ -184,13 +185,8 @@ def _warnings(
         found.append("no blind row stands beside the score, so it says little (--train)")
 
     # Verdicts that say nothing about the grasp.
-    unknown = sum(
-        verdict.outcome in ("solver_error", "timeout", "crashed")
-        for each in sets
-        for verdicts in each.verdicts
-        for verdict in verdicts
-    )
-    if unknown:
+    without = ("solver_error", "timeout", "crashed")
+    if unknown := sum(int(np.isin(each.table.outcome, without).sum()) for each in sets):
         found.append(f"{unknown} predictions have no verdict (solver error, timeout): they fail")
     return found
 
@@ -210,7 +206,13 @@ def card_text(card: Mapping[str, Any]) -> str:
     lines += [""] if card["warnings"] else []
 
     # The sets beside each other.
-    lines += _table(card, [name for name in card["measures"] if name != "objects"])
+    measures = [*(name for name in card["measures"] if name != "objects"), "objects"]
+    rows = []
+    for name, each in card["sets"].items():
+        first, *others = (each["measures"][measure] for measure in measures)
+        shares = [_interval(first), *(_percent(other["value"]) for other in others)]
+        rows.append([name, *shares, str(each["predictions"])])
+    lines += _table(["set", *measures, "predictions"], rows)
     drawn, level = card["intervals"]["drawn"], card["intervals"]["level"]
     within = (
         f"A contact must be within {card['limit_mm']:g} mm of the one asked for in the first two "
@@ -228,43 +230,28 @@ def card_text(card: Mapping[str, Any]) -> str:
     lines += _more(card)
 
     # By class.
-    names = list(card["sets"])
-    lines += ["## By class", "", _row(["class", *names]), _row(["---"] * (len(names) + 1))]
-    for name in next(iter(card["by_class"].values())):
-        lines.append(_row([name, *(_percent(card["by_class"][each][name]) for each in names)]))
-    return "\n".join([*lines, "", *_origin(card)]) + "\n"
-
-
-def _table(card: Mapping[str, Any], measures: Sequence[str]) -> list[str]:
-    head = ["set", *measures, "objects", "predictions"]
-    lines = [_row(head), _row(["---"] * len(head))]
-    for name, each in card["sets"].items():
-        values = each["measures"]
-        cells = [_interval(values[m]) if m == "headline" else _percent(values[m]["value"])
-                 for m in (*measures, "objects")]  # fmt: skip
-        lines.append(_row([name, *cells, str(each["predictions"])]))
-    return lines
+    sets, classes = card["by_class"], next(iter(card["by_class"].values()))
+    rows = [[name, *(_percent(each[name]) for each in sets.values())] for name in classes]
+    lines += ["## By class", "", *_table(["class", *sets], rows), "", *_origin(card)]
+    return "\n".join(lines) + "\n"
 
 
 def _more(card: Mapping[str, Any]) -> list[str]:
     """Return the lines on what stands beside the headline."""
     # The curve, and what is told of what counts.
-    names, lines = card["sets"], list[str]()
+    sets, lines = card["sets"], list[str]()
     if "protocol" not in card["settings"]:
+        curves = [each["held_within_mm"] for each in sets.values()]
+        rows = [[d, *(_percent(each[d]) for each in curves)] for d in map(str, CURVE_MM)]
         words = "Held with every contact within d of the one asked for [%]."
-        lines += ["## held(d)", "", words, ""]
-        lines += [_row(["d [mm]", *names]), _row(["---"] * (len(names) + 1))]
-        for limit in map(str, CURVE_MM):
-            cells = [_percent(each["held_within_mm"][limit]) for each in names.values()]
-            lines.append(_row([limit, *cells]))
-    lines += ["", "## Beside it", ""]
-    lines += [_row(["set", "penetration [mm]", "coverage [%]", "diversity"]), _row(["---"] * 4)]
-    for name, each in names.items():
+        lines += ["## held(d)", "", words, "", *_table(["d [mm]", *sets], rows)]
+    rows = []
+    for name, each in sets.items():
         depth = "-" if each["penetration"] is None else f"{1e3 * each['penetration']:.2f}"
-        variance = "-" if each["diversity"] is None else " ".join(
-            _percent(share) for share in each["diversity"]
-        )  # fmt: skip
-        lines.append(_row([name, depth, _percent(each["coverage"]), variance]))
+        variance = " ".join(map(_percent, each["diversity"] or ())) or "-"
+        rows.append([name, depth, _percent(each["coverage"]), variance])
+    lines += ["", "## Beside it", ""]
+    lines += _table(["set", "penetration [mm]", "coverage [%]", "diversity"], rows)
     lines += [
         "",
         f"Coverage: share of own grasps within {1e3 * COVER:g} mm of a prediction that counts. "
@@ -274,14 +261,13 @@ def _more(card: Mapping[str, Any]) -> list[str]:
     ]
 
     # Several predictions per row, and stated confidence.
-    for name, each in names.items():
-        more = {m: v for m, v in each["measures"].items() if m.startswith("success@")}
-        lines += [f"* {name}, {measure}: {_interval(value)}" for measure, value in more.items()]
+    for name, each in sets.items():
+        for measure, value in each["measures"].items():
+            if measure.startswith("success@"):
+                lines.append(f"* {name}, {measure}: {_interval(value)}")
         for group in each["calibration"]:
-            lines.append(
-                f"* {name}, confidence {group['confidence']:.3g}: {_percent(group['share'])} of "
-                f"{group['count']}"
-            )
+            share = f"{_percent(group['share'])} of {group['count']}"
+            lines.append(f"* {name}, confidence {group['confidence']:.3g}: {share}")
         lines += [f"* {name}, {n} no grasp: {why}" for why, n in each["invalid"].items()]
     for name, others in card["above"].items():
         for other, value in others.items():
@@ -302,8 +288,9 @@ def _origin(card: Mapping[str, Any]) -> list[str]:
     return [*lines, "", "Again:", "", f"    {card['again']}"]
 
 
-def _row(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table."""
+    return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows)]
 
 
 def _percent(share: float) -> str:

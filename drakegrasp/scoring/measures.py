@@ -9,8 +9,10 @@ drawn, too, apart from the objects (a two-level bootstrap). The draws come from 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -19,99 +21,48 @@ from drakegrasp.frames import Array
 from drakegrasp.scoring.verdict import Verdict
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.table import Table
 
-#: Resamples, and the share of them that an interval holds.
-RESAMPLES, LEVEL = 2000, 0.95
+#: A mean over objects by "value", and the ends of its interval by "low" and "high".
+Estimate: TypeAlias = dict[str, float]
+#: Resamples, the share of them that an interval holds, and the seed of their draws.
+RESAMPLES, LEVEL, SEED = 2000, 0.95, 0
 #: Decimals of values, so that sums in another order give the same text.
 DIGITS = 6
 
 
-@dataclass(frozen=True, kw_only=True)
-class Estimate:
-    """A mean over objects and its interval.
+def resample(clusters: Sequence[str]) -> Array:
+    """Return draws of objects: (B, objects), share of each in each resample; a row sums to 1.
 
-    Attributes:
-        value: The mean.
-        low, high: Ends of the interval of `LEVEL`.
+    Args:
+        clusters: Of each object what is drawn as one: its name, or its class.
     """
-
-    value: float
-    low: float
-    high: float
-
-    def __neg__(self) -> Estimate:
-        """Return the estimate of the negative mean."""
-        return Estimate(value=0.0 - self.value, low=0.0 - self.high, high=0.0 - self.low)
+    # How often each cluster is drawn; all its objects count as often.
+    names, members = np.unique(np.asarray(clusters), return_inverse=True)
+    shares = _drawn(len(names), "bootstrap", RESAMPLES)[:, members]
+    return np.asarray(shares / shares.sum(axis=1, keepdims=True))
 
 
-@dataclass(frozen=True, eq=False)
-class Resampling:
-    """Draws of objects that all sets of a score share.
+def _drawn(count: int, name: str, resamples: int) -> Array:
+    """Return (B, count), share of each of so many things in each resample, by draws of a name."""
+    stream = Stream(SEED, object_key(name), count)
+    drawn = stream.integers(count, resamples * count).reshape(resamples, count)
+    offset = np.arange(resamples)[:, None] * count
+    counts = np.bincount((drawn + offset).ravel(), minlength=resamples * count)
+    return counts.reshape(resamples, count) / count
 
-    Attributes:
-        weights: (B, objects), share of each object in each resample; a row sums to 1.
-        seed: Of the draws.
-    """
 
-    weights: Array
-    seed: int
-
-    def estimate(self, table: Array) -> Estimate:
-        """Return the mean of a table (training seeds, objects) over both, with its interval."""
-        return _estimate(float(table.mean()), self._means(table, "training seeds"))
-
-    def difference(self, table: Array, other: Array) -> Estimate:
-        """Return by how much the mean of a table is above that of another, of the same objects.
-
-        The training seeds of both are drawn, apart from each other.
-        """
-        values = self._means(table, "training seeds") - self._means(other, "other training seeds")
-        return _estimate(float(table.mean() - other.mean()), values)
-
-    def _means(self, table: Array, draws: str) -> Array:
-        """Return (B,), the mean of a table (training seeds, objects) in each resample."""
-        seeds = self._seed_weights(len(table), draws)
-        return np.asarray(np.einsum("bs,so,bo->b", seeds, table, self.weights))
-
-    def _seed_weights(self, count: int, draws: str) -> Array:
-        """Return (B, count), share of each training seed in each resample, by draws of a name."""
-        resamples = len(self.weights)
-        if count == 1:
-            return np.ones((resamples, 1))
-        stream = Stream(self.seed, object_key(draws), count)
-        drawn = stream.integers(count, resamples * count).reshape(resamples, count)
-        return _shares(drawn, count)
+def _means(table: Array, draws: Array, name: str = "training seeds") -> Array:
+    """Return (B,), the mean of a table (training seeds, objects) in each resample."""
+    count, resamples = len(table), len(draws)
+    seeds = np.ones((resamples, 1)) if count == 1 else _drawn(count, name, resamples)
+    return np.asarray(np.einsum("bs,so,bo->b", seeds, table, draws))
 
 
 def _estimate(value: float, resampled: Array) -> Estimate:
     """Return a value and the interval of its resamples (B,)."""
     low, high = np.quantile(resampled, [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0])
-    rounded = [round(float(v), DIGITS) + 0.0 for v in (value, low, high)]
-    return Estimate(value=rounded[0], low=rounded[1], high=rounded[2])
-
-
-def resample(clusters: Sequence[str], seed: int = 0) -> Resampling:
-    """Return draws of objects.
-
-    Args:
-        clusters: Of each object what is drawn as one: its name, or its class.
-        seed: Of the draws.
-    """
-    # How often each cluster is drawn.
-    names, members = np.unique(np.asarray(clusters), return_inverse=True)
-    stream = Stream(seed, object_key("bootstrap"), len(names))
-    drawn = stream.integers(len(names), RESAMPLES * len(names)).reshape(RESAMPLES, len(names))
-
-    # All objects of a cluster count as often as it was drawn.
-    weights = _shares(drawn, len(names))[:, members]
-    return Resampling(weights / weights.sum(axis=1, keepdims=True), seed)
-
-
-def _shares(drawn: np.ndarray, count: int) -> Array:
-    """Return (B, count), the share of each number 0..count-1 in each row (B, n)."""
-    offset = np.arange(len(drawn))[:, None] * count
-    counts = np.bincount((drawn + offset).ravel(), minlength=len(drawn) * count)
-    return counts.reshape(len(drawn), count) / drawn.shape[1]
+    return {"value": _rounded(value), "low": _rounded(low), "high": _rounded(high)}
 
 
 #: Numbers of predictions per row for which success is told.
@@ -124,16 +75,8 @@ BINS = 5
 COMPONENTS = 5
 #: A grasp covers another if its contacts are on average nearer than this [m].
 COVER = 0.02
-#: Measures of a row's best-ranked prediction, by name.
-FIRST: Mapping[str, Callable[[Verdict], bool]] = {
-    "headline": lambda v: v.counted,
-    "success": lambda v: v.success,
-    "sample": lambda v: v.sample,
-    "held": lambda v: v.held,
-    "precision": lambda v: v.precision,
-    "stable": lambda v: v.stable,
-    "held_any": lambda v: v.held_any,
-}
+#: Measures of a row's best-ranked prediction.
+FIRST = ("headline", "success", "sample", "held", "precision", "stable", "held_any")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -150,15 +93,25 @@ class Judged:
     ranked: tuple[Attempts, ...]
     verdicts: tuple[tuple[Verdict, ...], ...]
 
-    def by_row(self) -> list[dict[int, list[Verdict]]]:
-        """Return by training seed the verdicts of each row, by rank."""
-        found = []
-        for ranked, verdicts in zip(self.ranked, self.verdicts, strict=True):
-            rows: dict[int, list[Verdict]] = {}
-            for row, verdict in zip(ranked.of_row.tolist(), verdicts, strict=True):
-                rows.setdefault(row, []).append(verdict)
-            found.append(rows)
-        return found
+    @cached_property
+    def table(self) -> Table:
+        """All predictions of all seeds: `seed`, `row` and `rank`, and what their verdicts say.
+
+        That is each attribute of `Verdict`, NaN for None, and `headline`: whether it counts in it.
+        """
+        flat = [verdict for verdicts in self.verdicts for verdict in verdicts]
+        said: dict[str, Any] = {
+            f.name: [getattr(verdict, f.name) for verdict in flat] for f in fields(Verdict)
+        }
+        lengths = {name: np.array(said[name], float) for name in ("contact_error", "penetration")}
+        several = {name: np.fromiter(said[name], object) for name in ("contacts", "posture")}
+        return Table(
+            said | lengths | several,
+            seed=np.repeat(np.arange(len(self.ranked)), [len(each) for each in self.ranked]),
+            row=np.concatenate([each.of_row for each in self.ranked]),
+            rank=np.concatenate([each.rank for each in self.ranked]),
+            headline=[verdict.counted for verdict in flat],
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -177,31 +130,27 @@ class Grouping:
     names: tuple[str, ...]
     classes: tuple[str, ...]
 
+    def best_of_rows(self, judged: Judged, good: npt.ArrayLike, most: int = 1) -> Array:
+        """Return (training seeds, rows), whether one of the `most` best of each row is good.
+
+        Args:
+            judged: The set; a row without prediction fails.
+            good: Of all its predictions, in the order of its table.
+            most: So many of each row count.
+        """
+        table, found = judged.table, np.zeros((len(judged.ranked), len(self.rows)))
+        kept = table[np.asarray(good, dtype=bool) & (table.rank < most)]
+        found[kept.seed, np.searchsorted(self.rows, kept.row)] = 1.0
+        return found
+
     def means(self, values: npt.ArrayLike) -> Array:
         """Return (..., objects) means over the rows of each object of values (..., rows)."""
         member = np.eye(len(self.names))[self.objects]
         return np.asarray(np.asarray(values, dtype=float) @ member / member.sum(axis=0))
 
-    def best(self, values: npt.ArrayLike) -> Array:
-        """Return (..., objects) the largest value of each object's rows."""
-        array = np.asarray(values, dtype=float)
-        members = [self.objects == index for index in range(len(self.names))]
-        return np.stack([array[..., own].max(axis=-1) for own in members], axis=-1)
-
-
-def first_table(judged: Judged, grouping: Grouping, name: str) -> Array:
-    """Return (training seeds, rows) of a measure of `FIRST`; a row without prediction fails."""
-    measure = FIRST[name]
-    return np.array(
-        [
-            [float(row in rows and measure(rows[row][0])) for row in grouping.rows]
-            for rows in judged.by_row()
-        ]
-    )
-
 
 def estimates(
-    judged: Judged, grouping: Grouping, draws: Resampling, *, oracle: bool
+    judged: Judged, grouping: Grouping, draws: Array, *, oracle: bool
 ) -> dict[str, Estimate]:
     """Return the measures of a set that have intervals, by name.
 
@@ -211,50 +160,46 @@ def estimates(
     Args:
         judged: The set.
         grouping: Of the rows.
-        draws: Of objects.
+        draws: Of objects, see `resample`.
         oracle: Whether more wrist poses than the first were tried.
     """
-    found = {}
+    table, by_row = judged.table, dict[str, Array]()
     for name in FIRST:
-        if name == "held_any" and not oracle:
-            continue
-        found[name] = draws.estimate(grouping.means(first_table(judged, grouping, name)))
-
-    # The k best of each row, and an object's best row.
-    most = max(int(ranked.rank.max()) + 1 for ranked in judged.ranked)
-    seeds = judged.by_row()
+        if name != "held_any" or oracle:
+            by_row[name] = grouping.best_of_rows(judged, table[name])
     for k in KS:
-        if 1 < k <= most:
-            table = [
-                [float(any(v.counted for v in rows.get(row, [])[:k])) for row in grouping.rows]
-                for rows in seeds
-            ]
-            found[f"success@{k}"] = draws.estimate(grouping.means(table))
-    best = grouping.best(first_table(judged, grouping, "headline"))
-    return found | {"objects": draws.estimate(best)}
+        if 1 < k <= int(table.rank.max()) + 1:
+            by_row[f"success@{k}"] = grouping.best_of_rows(judged, table.headline, k)
+    by_object = {name: grouping.means(values) for name, values in by_row.items()}
+    by_object["objects"] = (by_object["headline"] > 0.0).astype(float)
+    return {
+        name: _estimate(float(values.mean()), _means(values, draws))
+        for name, values in by_object.items()
+    }
 
 
-def difference(one: Judged, other: Judged, grouping: Grouping, draws: Resampling) -> Estimate:
-    """Return by how much the headline of a set is above that of another, object by object."""
-    tables = [grouping.means(first_table(each, grouping, "headline")) for each in (one, other)]
-    return draws.difference(*tables)
+def difference(one: Judged, other: Judged, grouping: Grouping, draws: Array) -> Estimate:
+    """Return by how much the headline of a set is above that of another, object by object.
+
+    The training seeds of both are drawn, apart from each other.
+    """
+    ours, theirs = _headlines(one, grouping), _headlines(other, grouping)
+    resampled = _means(ours, draws) - _means(theirs, draws, "other training seeds")
+    return _estimate(float(ours.mean() - theirs.mean()), resampled)
+
+
+def _headlines(judged: Judged, grouping: Grouping) -> Array:
+    """Return (training seeds, objects), the headline of each object."""
+    return grouping.means(grouping.best_of_rows(judged, judged.table.headline))
 
 
 def curve(judged: Judged, grouping: Grouping) -> list[float]:
     """Return held(d) at `CURVE_MM`: held with every contact within d of the one asked for."""
-    values = []
+    table, values = judged.table, []
     for limit in CURVE_MM:
-        table = [
-            [float(row in rows and _within(rows[row][0], 1e-3 * limit)) for row in grouping.rows]
-            for rows in judged.by_row()
-        ]
-        values.append(_rounded(grouping.means(table).mean()))
+        within = table.held & (table.contact_error <= 1e-3 * limit)
+        values.append(_rounded(grouping.means(grouping.best_of_rows(judged, within)).mean()))
     return values
-
-
-def _within(verdict: Verdict, limit: float) -> bool:
-    error = verdict.contact_error
-    return verdict.held and error is not None and error <= limit
 
 
 def calibration(judged: Judged) -> list[dict[str, float]]:
@@ -265,14 +210,13 @@ def calibration(judged: Judged) -> list[dict[str, float]]:
     """
     if any(ranked.confidence is None for ranked in judged.ranked):
         return []
-    stated = np.concatenate([r.confidence for r in judged.ranked if r.confidence is not None])
-    counted = np.array([v.counted for verdicts in judged.verdicts for v in verdicts], dtype=float)
+    stated = np.concatenate([ranked.confidence for ranked in judged.ranked])
     order = np.argsort(stated, kind="stable")
     order = order[np.isfinite(stated[order])]
     return [
         {
             "confidence": _rounded(stated[group].mean()),
-            "share": _rounded(counted[group].mean()),
+            "share": _rounded(judged.table.headline[group].mean()),
             "count": len(group),
         }
         for group in np.array_split(order, BINS)
@@ -282,8 +226,9 @@ def calibration(judged: Judged) -> list[dict[str, float]]:
 
 def penetration(judged: Judged) -> float | None:
     """Return the mean over tried predictions of the deepest penetration after closing [m]."""
-    depths = [v.penetration for vs in judged.verdicts for v in vs if v.penetration is not None]
-    return _rounded(np.mean(depths)) if depths else None
+    depths = judged.table.penetration
+    depths = depths[~np.isnan(depths)]
+    return _rounded(depths.mean()) if depths.size else None
 
 
 def diversity(judged: Judged) -> list[float] | None:
@@ -293,7 +238,7 @@ def diversity(judged: Judged) -> list[float] | None:
     in the headline, as DexGraspBench does (JYChen18/DexGraspBench, 1e7a5a6); the lower, the more
     diverse. None if fewer than three count.
     """
-    kept = [v.posture for vs in judged.verdicts for v in vs if v.counted and v.posture]
+    kept = [posture for posture in judged.table.posture[judged.table.headline] if posture]
     if len(kept) < 3:
         return None
     postures = np.array(kept)
@@ -311,13 +256,11 @@ def coverage(judged: Judged, own: Mapping[int, Array], grouping: Grouping) -> fl
         grouping: Of the rows.
     """
     # What counts, by object.
-    place = {row: i for i, row in enumerate(grouping.rows)}
+    kept = judged.table[judged.table.headline & judged.table.contacts.astype(bool)]
+    objects = grouping.objects[np.searchsorted(grouping.rows, kept.row)]
     counted: dict[int, list[Array]] = {}
-    for ranked, verdicts in zip(judged.ranked, judged.verdicts, strict=True):
-        for row, verdict in zip(ranked.of_row.tolist(), verdicts, strict=True):
-            if verdict.counted and verdict.contacts:
-                found = counted.setdefault(int(grouping.objects[place[row]]), [])
-                found.append(np.array(verdict.contacts).reshape(-1, 3))
+    for index, contacts in zip(objects.tolist(), kept.contacts, strict=True):
+        counted.setdefault(index, []).append(np.array(contacts).reshape(-1, 3))
 
     # Which own grasps have one near.
     covered = []
@@ -328,24 +271,9 @@ def coverage(judged: Judged, own: Mapping[int, Array], grouping: Grouping) -> fl
     return _rounded(grouping.means([covered]).mean())
 
 
-def seconds(judged: Judged) -> float:
-    """Return the median wall-clock time of a verdict [s]."""
-    return float(np.median([v.seconds for vs in judged.verdicts for v in vs]))
-
-
-def by_class(judged: Judged, grouping: Grouping) -> dict[str, float]:
-    """Return the mean of the headline over the objects of each class."""
-    return _by(judged, grouping, grouping.classes)
-
-
-def by_object(judged: Judged, grouping: Grouping) -> dict[str, float]:
-    """Return the headline of each object."""
-    return _by(judged, grouping, grouping.names)
-
-
-def _by(judged: Judged, grouping: Grouping, names: Sequence[str]) -> dict[str, float]:
-    values = grouping.means(first_table(judged, grouping, "headline")).mean(axis=0)
-    array = np.array(names)
+def by_name(judged: Judged, grouping: Grouping, names: Sequence[str]) -> dict[str, float]:
+    """Return the mean of the headline over the objects of each name, that of a class or its own."""
+    values, array = _headlines(judged, grouping).mean(axis=0), np.array(names)
     return {name: _rounded(values[array == name].mean()) for name in sorted(set(names))}
 
 

@@ -7,7 +7,7 @@ verdicts become a card. Who does the work is the caller's choice (`Verify`).
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from drakegrasp.grasp import unpack_grasp
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.scoring.benchmark import read_benchmark, rows_digest
 from drakegrasp.scoring.card import card_of, card_text
-from drakegrasp.scoring.measures import Grouping, Judged, seconds
+from drakegrasp.scoring.measures import Grouping, Judged
 from drakegrasp.scoring.references import REFERENCES, Scene
 from drakegrasp.scoring.verdict import Verdict, VerdictFile, rank_array, verdict_key
 from drakegrasp.seeding import Stream, object_key
@@ -32,6 +32,8 @@ from drakegrasp.simulation.attempts import Attempts, join_attempts
 
 #: Tries n attempts on rows (n,) and calls back with the place of each and its verdict.
 Verify: TypeAlias = Callable[[Attempts, Sequence[int], Callable[[int, Verdict], None]], object]
+#: The name of a method on a card, and its predictions by training seed.
+Method: TypeAlias = tuple[str, tuple[Attempts, ...]]
 #: Files of a score.
 CARD_JSON, CARD_TEXT, CARD_PICTURE, VERDICTS = "card.json", "card.md", "card.png", "verdicts.jsonl"
 
@@ -74,91 +76,92 @@ class Score:
         return [folder / name for name in contents]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Request:
-    """What is to be scored.
+def score(
+    data: GraspDataset,
+    verify: Verify,
+    *,
+    train: GraspDataset,
+    predictions: Sequence[Attempts],
+    name: str,
+    against: Method | None,
+    references: Sequence[str],
+    per_object: int | None,
+    config: Config,
+    overridden: Collection[str],
+    again: str,
+    protocol: Mapping[str, Any] | None = None,
+    folder: Path | None = None,
+) -> Score:
+    """Return the score of predictions.
 
-    Attributes:
+    Args:
         data: Its split has the rows.
+        verify: Tries grasps.
         train: Rows from which reference rows are made.
         predictions: By training seed; none scores the reference rows alone.
         name: Of the predictions, on the card.
-        against: Name and predictions of another method, for the same rows; None if there is none.
+        against: Name and predictions of another method, for the same rows.
         references: Names of the reference rows, in the order of the card.
         per_object: Rows of each object, at most; all if None.
         config: Of the verification.
         overridden: Paths of the keys that the caller sets; a row's own friction gives way to them.
         again: The command that makes the card again.
         protocol: Name, source, numbers and versions of a protocol in place of the lift.
-    """
-
-    data: GraspDataset
-    train: GraspDataset
-    predictions: tuple[Attempts, ...]
-    name: str
-    against: tuple[str, tuple[Attempts, ...]] | None
-    references: tuple[str, ...]
-    per_object: int | None
-    config: Config
-    overridden: tuple[str, ...]
-    again: str
-    protocol: Mapping[str, Any] | None = None
-
-
-def score(request: Request, verify: Verify, folder: Path | None) -> Score:
-    """Return the score of predictions.
-
-    Args:
-        request: What to score.
-        verify: Tries grasps.
         folder: Keeps verdicts, so that the same call goes on; nothing is kept if None.
 
     Raises:
-        GraspError: If there is nothing to score, the predictions are for different rows, or the
-            training rows are of another camera or hand.
+        GraspError: If there is nothing to score, the predictions are for different rows, the
+            training rows are of another camera or hand, or the card could not tell the other method
+            from the predictions.
     """
-    _refuse_other_train(request.data, request.train)
+    _refuse_other_train(data, train)
+    if against is not None and (not predictions or against[0] == name):
+        raise GraspError(
+            "against must be beside predictions whose file has another name, got "
+            f"{name if predictions else 'no predictions'}"
+        )
 
     # The rows, and what is scored on them.
-    rows = _chosen_rows(request)
-    grouping = _grouping(request.data, rows)
-    methods = [(request.name, request.predictions), *_methods_against(request)]
-    sets = [(name, tuple(_of_rows(each, rows) for each in own)) for name, own in methods if own]
-    sets += _reference_rows(request, rows)
+    methods = [(name, predictions), *([against] if against else [])]
+    rows = _chosen_rows(data, [each for _, own in methods for each in own], per_object)
+    grouping = _grouping(data, rows)
+    sets = {name: tuple(_of_rows(each, rows) for each in own) for name, own in methods if own}
+    scene = Scene(data=data, rows=rows, train=train)
+    for name in references:
+        if len(train) or not REFERENCES[name].trained:
+            sets[name] = (rank_array(name, REFERENCES[name].make(scene), data, rows),)
     if not sets:
         raise GraspError("there must be predictions or reference rows to score, got none")
 
     # Their verdicts: all predictions that have none are tried together.
-    versions = installed_versions(request.config)
+    versions = installed_versions(config)
     settings = {
-        "config": request.config.to_dict(),
-        "overridden": sorted(request.overridden),
+        "config": config.to_dict(),
+        "overridden": sorted(overridden),
         "versions": versions,
-        **({} if request.protocol is None else {"protocol": request.protocol}),
+        **({} if protocol is None else {"protocol": protocol}),
     }
-    verdicts = _verdicts([r for _, each in sets for r in each], request, settings, verify, folder)
-    judged, start = [], 0
-    for name, ranked in sets:
-        found = verdicts[start : start + len(ranked)]
-        judged.append(Judged(name=name, ranked=ranked, verdicts=tuple(found)))
-        start += len(ranked)
-
-    own = dict(zip(rows, own_contacts(request.data, rows), strict=True))
+    verdicts = _verdicts([each for own in sets.values() for each in own], data, settings, verify,
+                         folder)  # fmt: skip
+    judged = tuple(
+        Judged(name=name, ranked=own, verdicts=tuple(next(verdicts) for _ in own))
+        for name, own in sets.items()
+    )
     card = card_of(
         judged,
         grouping,
-        own,
-        dataset=_described(request.data, rows),
+        dict(zip(rows, own_contacts(data, rows), strict=True)),
+        dataset=_described(data, rows),
         settings=settings,
-        limit=request.config.verify.max_contact_error,
-        oracle=request.config.verify.max_tries > 1,
-        known_objects=_known_objects(grouping.names, request.data, request.train),
-        new_classes=not set(grouping.classes) & _texts(request.train, "class_name"),
-        benchmark=read_benchmark(request.data.path.parent, request.config, versions),
-        again=request.again,
+        limit=config.verify.max_contact_error,
+        oracle=config.verify.max_tries > 1,
+        known_objects=_known_objects(grouping.names, data, train),
+        new_classes=not set(grouping.classes) & _texts(train, "class_name"),
+        benchmark=read_benchmark(data.path.parent, config, versions),
+        again=again,
     )
-    times = {each.name: seconds(each) for each in judged}
-    return Score(card=card, seconds=times, sets=tuple(judged))
+    times = {each.name: float(np.median(each.table.seconds)) for each in judged}
+    return Score(card=card, seconds=times, sets=judged)
 
 
 def _refuse_other_train(data: GraspDataset, train: GraspDataset) -> None:
@@ -176,28 +179,12 @@ def _refuse_other_train(data: GraspDataset, train: GraspDataset) -> None:
         )
 
 
-def _methods_against(request: Request) -> list[tuple[str, tuple[Attempts, ...]]]:
-    """Return the other method if there is one.
-
-    Raises:
-        GraspError: If the card could not tell it from the predictions.
-    """
-    if request.against is None:
-        return []
-    if not request.predictions or request.against[0] == request.name:
-        raise GraspError(
-            "against must be beside predictions whose file has another name, got "
-            f"{request.name if request.predictions else 'no predictions'}"
-        )
-    return [request.against]
-
-
-def _chosen_rows(request: Request) -> list[int]:
+def _chosen_rows(
+    data: GraspDataset, predictions: Sequence[Attempts], per_object: int | None
+) -> list[int]:
     """Return the rows to score, in order: those of the predictions, some of each object."""
-    others = request.against[1] if request.against else ()
-    data, predictions = request.data, (*request.predictions, *others)
-    if request.per_object is not None and request.per_object < 1:
-        raise GraspError(f"per_object must be 1 or more, got {request.per_object}")
+    if per_object is not None and per_object < 1:
+        raise GraspError(f"per_object must be 1 or more, got {per_object}")
 
     # Those of the predictions; all of a method are for the same.
     rows = np.unique(predictions[0].of_row) if predictions else np.arange(len(data))
@@ -209,7 +196,7 @@ def _chosen_rows(request: Request) -> list[int]:
             )
     if not len(rows):
         raise GraspError(f"{data.path}: {data.split} must have rows to score, got none")
-    if request.per_object is None:
+    if per_object is None:
         return [int(row) for row in rows]
 
     # Drawn by the names of their objects, so other objects do not change them.
@@ -218,7 +205,7 @@ def _chosen_rows(request: Request) -> list[int]:
     for name in sorted(set(names.tolist())):
         own = rows[names == name]
         order = Stream(0, object_key(name), object_key("rows")).permutation(len(own))
-        chosen += [int(row) for row in own[order[: request.per_object]]]
+        chosen += [int(row) for row in own[order[:per_object]]]
     return sorted(chosen)
 
 
@@ -235,97 +222,61 @@ def _grouping(data: GraspDataset, rows: Sequence[int]) -> Grouping:
     )
 
 
-def _reference_rows(
-    request: Request, rows: Sequence[int]
-) -> list[tuple[str, tuple[Attempts, ...]]]:
-    """Return the reference rows that can be made."""
-    scene = Scene(data=request.data, rows=rows, train=request.train)
-    made: list[tuple[str, tuple[Attempts, ...]]] = []
-    for name in request.references:
-        reference = REFERENCES[name]
-        if reference.trained and not len(request.train):
-            continue
-        grasps = reference.make(scene)
-        made.append((name, (rank_array(name, grasps, request.data, rows),)))
-    return made
-
-
 def _verdicts(
     sets: Sequence[Attempts],
-    request: Request,
+    data: GraspDataset,
     settings: Mapping[str, Any],
     verify: Verify,
     folder: Path | None,
-) -> list[tuple[Verdict, ...]]:
-    """Return the verdicts of each of several sets of predictions."""
-    # What is to be tried, each once: two sets may have the same grasp.
+) -> Iterator[tuple[Verdict, ...]]:
+    """Return the verdicts of each of several sets of predictions; equal predictions share one."""
     # The files of the two cameras have the same content.
-    content = f"{request.data.content} {request.data.camera}"
-    keys = [
-        [
-            verdict_key(settings, content + _frame(each), row, numbers)
-            for row, numbers in zip(each.of_row.tolist(), each.numbers(), strict=True)
-        ]
-        for each in sets
-    ]
-    known = VerdictFile(None if folder is None else folder / VERDICTS)
-    missing: dict[str, tuple[int, int]] = {}
-    for k, own_keys in enumerate(keys):
-        for i, key in enumerate(own_keys):
-            if key not in known.verdicts:
-                missing.setdefault(key, (k, i))
+    content = f"{data.content} {data.camera}"
+    keys = []
+    for each in sets:
+        frame = "" if each.grasps is not None else f" posture in {each.frame}"
+        numbers = zip(each.of_row.tolist(), each.numbers(), strict=True)
+        keys.append([verdict_key(settings, content + frame, *of) for of in numbers])
 
-    # Try it, object by object; each verdict is kept as soon as it is known.
-    objects = request.data.column("object_props/object_name").tolist()
-    resting = request.data.column("grasp_props/resting").tolist()
-    ordered = sorted(
-        (*_place(int(sets[k].of_row[i]), objects, resting), k, i) for k, i in missing.values()
-    )
+    # Contacts of all sets are tried together, postures file by file; each verdict is kept as soon
+    # as it is known. Those of an object in a resting pose stand together: verdicts come in this
+    # order, in which none waits for another object.
+    known = VerdictFile(None if folder is None else folder / VERDICTS)
+    objects = data.column("object_props/object_name").tolist()
+    resting = data.column("grasp_props/resting").tolist()
+    contacts = [k for k, each in enumerate(sets) if each.grasps is not None]
+    postures = [[k] for k in range(len(sets)) if k not in contacts]
     try:
-        for part in _parts(sets):
-            start = dict(zip(part, np.cumsum([0, *(len(sets[k]) for k in part)]), strict=False))
-            chosen = [(row, k, i) for _, _, row, k, i in ordered if k in start]
-            if chosen:
-                table = join_attempts([sets[k] for k in part])
+        for part in [contacts, *postures] if contacts else postures:
+            table = join_attempts([sets[k] for k in part])
+            place = dict[str, tuple[str, int, int, int]]()
+            for i, key in enumerate(key for k in part for key in keys[k]):
+                row = int(table.of_row[i])
+                if key not in known.verdicts:
+                    place.setdefault(key, (objects[row], resting[row], row, i))
+            if tried := sorted(place, key=lambda key: place[key]):
+                chosen = [place[key] for key in tried]
                 verify(
-                    table.at([start[k] + i for _, k, i in chosen]),
-                    [row for row, _, _ in chosen],
-                    partial(_keep, known, [keys[k][i] for _, k, i in chosen]),
+                    table.at([i for *_, i in chosen]),
+                    [row for _, _, row, _ in chosen],
+                    partial(_keep, known, tried),
+                )
+            if missing := [key for key in tried if key not in known.verdicts]:
+                raise MachineError(
+                    f"each prediction must have a verdict, got none for {len(missing)}"
                 )
     finally:
         known.close()
-    left = [key for key in missing if key not in known.verdicts]
-    if left:
-        raise MachineError(f"each prediction must have a verdict, got none for {len(left)}")
-    return [tuple(known.verdicts[key] for key in each) for each in keys]
-
-
-def _parts(sets: Sequence[Attempts]) -> list[list[int]]:
-    """Return which sets are tried together: contacts of all, postures file by file."""
-    contacts = [k for k, each in enumerate(sets) if each.grasps is not None]
-    postures = [[k] for k, each in enumerate(sets) if each.grasps is None]
-    return [*([contacts] if contacts else []), *postures]
-
-
-def _of_rows(table: Attempts, rows: Sequence[int]) -> Attempts:
-    """Return the predictions for some rows."""
-    return table.at(np.flatnonzero(np.isin(table.of_row, rows)).tolist())
-
-
-def _frame(table: Attempts) -> str:
-    return "" if table.grasps is not None else f" posture in {table.frame}"
+    return (tuple(known.verdicts[key] for key in each) for each in keys)
 
 
 def _keep(known: VerdictFile, keys: Sequence[str], index: int, verdict: Verdict) -> None:
     known.add(keys[index], verdict)
 
 
-def _place(row: int, objects: Sequence[str], resting: Sequence[int]) -> tuple[str, int, int]:
-    """Return what orders rows so that those of an object in a resting pose stand together.
-
-    Verdicts come in the caller's order; in this one none waits for another object.
-    """
-    return objects[row], resting[row], row
+def _of_rows(table: Attempts, rows: Sequence[int]) -> Attempts:
+    """Return the predictions for some rows."""
+    return table.at(np.flatnonzero(np.isin(table.of_row, rows)).tolist())
 
 
 def _texts(data: GraspDataset, name: str) -> set[str]:

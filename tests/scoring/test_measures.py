@@ -10,14 +10,13 @@ from helpers.scores import grouping, judged, ranked_array, verdict
 
 from drakegrasp.scoring.measures import (
     Judged,
-    by_class,
+    by_name,
     calibration,
     coverage,
     curve,
     difference,
     diversity,
     estimates,
-    first_table,
     resample,
 )
 
@@ -28,8 +27,8 @@ def test_an_object_with_many_rows_counts_no_more_than_another() -> None:
     rows = [["sample"], ["fails"], ["fails"], ["fails"], ["sample"], ["sample"]]
     one = judged("net", rows)
     found = estimates(one, grouping(0, 0, 0, 0, 1, 2), DRAWS, oracle=False)
-    assert found["headline"].value == pytest.approx((0.25 + 1 + 1) / 3, abs=1e-6)
-    assert found["objects"].value == 1.0
+    assert found["headline"]["value"] == pytest.approx((0.25 + 1 + 1) / 3, abs=1e-6)
+    assert found["objects"]["value"] == 1.0
     assert "held_any" not in found
 
 
@@ -37,56 +36,58 @@ def test_the_headline_asks_for_a_sample_with_contacts_where_they_were_asked_for(
     ranked = ranked_array("net", np.zeros((3, 18)), length=3)
     verdicts = (verdict("sample"), verdict("sample", error=0.03), verdict("held"))
     one = Judged(name="net", ranked=(ranked,), verdicts=(verdicts,))
-    assert first_table(one, grouping(0, 1, 2), "headline").tolist() == [[1, 0, 0]]
-    assert first_table(one, grouping(0, 1, 2), "sample").tolist() == [[1, 1, 0]]
-    assert first_table(one, grouping(0, 1, 2), "success").tolist() == [[1, 0, 1]]
+    assert grouping(0, 1, 2).best_of_rows(one, one.table.headline).tolist() == [[1, 0, 0]]
+    assert grouping(0, 1, 2).best_of_rows(one, one.table.sample).tolist() == [[1, 1, 0]]
+    assert grouping(0, 1, 2).best_of_rows(one, one.table.success).tolist() == [[1, 0, 1]]
 
 
 def test_the_k_best_of_a_row_count_in_success_at_k_only() -> None:
     rows = [["fails", "sample", "fails"], ["fails", "fails", "sample"], ["sample"] * 3]
     one = judged("net", rows)
     found = estimates(one, grouping(0, 1, 2), DRAWS, oracle=False)
-    assert found["headline"].value == pytest.approx(1 / 3, abs=1e-6)
-    assert found["success@2"].value == pytest.approx(2 / 3, abs=1e-6)
+    assert found["headline"]["value"] == pytest.approx(1 / 3, abs=1e-6)
+    assert found["success@2"]["value"] == pytest.approx(2 / 3, abs=1e-6)
     assert "success@5" not in found
 
 
 def test_a_row_without_prediction_fails() -> None:
     one = judged("net", [["sample"]])
-    assert first_table(one, grouping(0, 1), "held").tolist() == [[1, 0]]
+    assert grouping(0, 1).best_of_rows(one, one.table.held).tolist() == [[1, 0]]
 
 
 def test_intervals_are_of_objects_and_come_again() -> None:
     one = judged("net", [["sample"], ["fails"], ["fails"]])
     found = estimates(one, grouping(0, 1, 2), DRAWS, oracle=False)["headline"]
-    assert (found.low, found.high) == (0.0, 1.0)
+    assert (found["low"], found["high"]) == (0.0, 1.0)
     again = estimates(one, grouping(0, 1, 2), resample(["a", "b", "c"]), oracle=False)
     assert again["headline"] == found
     # As one object there is nothing to draw.
     alone = estimates(one, grouping(0, 0, 0), resample(["a"]), oracle=False)["headline"]
-    assert alone.low == alone.value == alone.high
+    assert alone["low"] == alone["value"] == alone["high"]
 
 
 def test_objects_of_a_class_are_drawn_together() -> None:
     draws = resample(["a", "a", "b"])
-    np.testing.assert_array_equal(draws.weights[:, 0], draws.weights[:, 1])
-    np.testing.assert_allclose(draws.weights.sum(axis=1), 1.0)
-    assert set(np.round(draws.weights[:, 2], 6)) == {0.0, 0.333333, 1.0}
+    np.testing.assert_array_equal(draws[:, 0], draws[:, 1])
+    np.testing.assert_allclose(draws.sum(axis=1), 1.0)
+    assert set(np.round(draws[:, 2], 6)) == {0.0, 0.333333, 1.0}
 
 
 def test_a_difference_is_paired_by_object() -> None:
     """Two equal sets differ by nothing in every resample, however wide their own intervals are."""
     one = judged("net", [["sample"], ["fails"], ["fails"]])
     same = difference(one, one, grouping(0, 1, 2), DRAWS)
-    assert (same.value, same.low, same.high) == (0.0, 0.0, 0.0)
+    assert (same["value"], same["low"], same["high"]) == (0.0, 0.0, 0.0)
     less = judged("other", [["fails"], ["fails"], ["fails"]])
-    assert difference(one, less, grouping(0, 1, 2), DRAWS).value == pytest.approx(1 / 3, abs=1e-6)
+    assert difference(one, less, grouping(0, 1, 2), DRAWS)["value"] == pytest.approx(
+        1 / 3, abs=1e-6
+    )
 
 
 def test_training_seeds_widen_the_interval() -> None:
     good, bad = [["sample"]] * 3, [["fails"]] * 3
     one = estimates(judged("net", good, bad), grouping(0, 1, 2), DRAWS, oracle=False)["headline"]
-    assert (one.value, one.low, one.high) == (0.5, 0.0, 1.0)
+    assert (one["value"], one["low"], one["high"]) == (0.5, 0.0, 1.0)
 
 
 def test_training_seeds_of_both_sets_widen_a_difference() -> None:
@@ -95,9 +96,9 @@ def test_training_seeds_of_both_sets_widen_a_difference() -> None:
     spread = judged("spread", good, bad)
     for one, other in ((spread, judged("bad", bad)), (judged("good", good), spread)):
         found = difference(one, other, grouping(0, 1, 2), DRAWS)
-        assert (found.value, found.low, found.high) == (0.5, 0.0, 1.0)
+        assert (found["value"], found["low"], found["high"]) == (0.5, 0.0, 1.0)
     both = difference(spread, judged("other", good, bad), grouping(0, 1, 2), DRAWS)
-    assert (both.value, both.low, both.high) == (0.0, -1.0, 1.0)
+    assert (both["value"], both["low"], both["high"]) == (0.0, -1.0, 1.0)
 
 
 def test_the_curve_rises_with_the_distance() -> None:
@@ -138,5 +139,5 @@ def test_coverage_is_of_own_grasps_with_a_good_one_near() -> None:
 
 
 def test_classes_are_means_of_their_objects() -> None:
-    one = judged("net", [["sample"], ["fails"], ["fails"]])
-    assert by_class(one, grouping(0, 0, 1)) == {"class 0": 0.5, "class 1": 0.0}
+    one, rows = judged("net", [["sample"], ["fails"], ["fails"]]), grouping(0, 0, 1)
+    assert by_name(one, rows, rows.classes) == {"class 0": 0.5, "class 1": 0.0}

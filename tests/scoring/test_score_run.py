@@ -19,7 +19,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
 from drakegrasp.foreign_files import read_json
 from drakegrasp.scoring.card import card_text
-from drakegrasp.scoring.run import VERDICTS, Request, own_contacts, score
+from drakegrasp.scoring.run import VERDICTS, Score, own_contacts, score
 from drakegrasp.scoring.verdict import ranked_sets
 from drakegrasp.verification.placing import dataset_config, place_on_rows
 
@@ -31,10 +31,14 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> GraspDataset:
     return GraspDataset(out / OTO, split="test")
 
 
-def request_of(data: GraspDataset, /, given: Any = (), **changes: Any) -> Request:
+def scored(
+    data: GraspDataset, /, given: Any = (), *, tries: FakeVerify | None = None, **changes: Any
+) -> Score:
+    """Return the score of predictions beside two reference rows; own grasps hold."""
     name, ranked = ranked_sets(given, data)
     values: dict[str, Any] = {
         "data": data,
+        "verify": tries or FakeVerify(is_own(data)),
         "train": GraspDataset(data.path, split="train"),
         "predictions": ranked,
         "name": name,
@@ -45,7 +49,7 @@ def request_of(data: GraspDataset, /, given: Any = (), **changes: Any) -> Reques
         "overridden": ("verify.max_tries",),
         "again": "drakegrasp score",
     }
-    return Request(**(values | changes))
+    return score(**(values | changes))
 
 
 def is_own(data: GraspDataset) -> Any:
@@ -56,7 +60,7 @@ def is_own(data: GraspDataset) -> Any:
 def test_predictions_stand_beside_reference_rows_on_the_same_rows(data: GraspDataset) -> None:
     predicted = data.column("grasps").astype(float)
     predicted[::2] = np.nan
-    card = score(request_of(data, predicted), FakeVerify(is_own(data)), None).card
+    card = scored(data, predicted).card
     assert list(card["sets"]) == ["predictions", "own", "constant"]
     assert {each["predictions"] for each in card["sets"].values()} == {len(data)}
     shares = {name: each["measures"]["headline"]["value"] for name, each in card["sets"].items()}
@@ -70,17 +74,17 @@ def test_predictions_stand_beside_reference_rows_on_the_same_rows(data: GraspDat
 def test_an_interrupted_score_goes_on(data: GraspDataset, tmp_path: Path) -> None:
     """Also after a line that a crash cut off."""
     with pytest.raises(KeyboardInterrupt):
-        score(request_of(data), FakeVerify(is_own(data), stop_after=3), tmp_path)
+        scored(data, tries=FakeVerify(is_own(data), stop_after=3), folder=tmp_path)
     lines = (tmp_path / VERDICTS).read_bytes()
     (tmp_path / VERDICTS).write_bytes(lines[:-20])
 
     second = FakeVerify(is_own(data))
-    card = score(request_of(data), second, tmp_path).card
+    card = scored(data, tries=second, folder=tmp_path).card
     assert second.asked == 2 * len(data) - 2
     third = FakeVerify(is_own(data))
-    assert score(request_of(data), third, tmp_path).card == card
+    assert scored(data, tries=third, folder=tmp_path).card == card
     assert third.asked == 0
-    assert card == score(request_of(data), FakeVerify(is_own(data)), None).card
+    assert card == scored(data).card
 
 
 def other_friction(data: GraspDataset) -> dict[str, Any]:
@@ -101,13 +105,13 @@ def test_verdicts_of_other_rules_are_not_taken(
     data: GraspDataset, tmp_path: Path, change: Callable[[GraspDataset], dict[str, Any]]
 ) -> None:
     given, other = np.ones((len(data), 18)), FakeVerify(is_own(data))
-    score(request_of(data, given, references=()), FakeVerify(is_own(data)), tmp_path)
-    score(request_of(data, given, references=(), **change(data)), other, tmp_path)
+    scored(data, given, references=(), folder=tmp_path)
+    scored(data, given, references=(), **change(data), tries=other, folder=tmp_path)
     assert other.asked == len(data)
 
 
 def test_some_rows_of_each_object_are_the_same_for_all_sets(data: GraspDataset) -> None:
-    card = score(request_of(data, per_object=1), FakeVerify(is_own(data)), None).card
+    card = scored(data, per_object=1).card
     assert card["rows"] == card["objects"] == 2
     assert f"2 of the {len(data)} rows of the split were scored" in card["warnings"]
 
@@ -117,13 +121,13 @@ def test_files_of_several_training_seeds_are_one_set(data: GraspDataset, tmp_pat
     np.save(tmp_path / "a.npy", grasps)
     np.save(tmp_path / "b.npy", np.zeros_like(grasps))
     paths = [tmp_path / "a.npy", tmp_path / "b.npy"]
-    card = score(request_of(data, paths), FakeVerify(is_own(data)), None).card
+    card = scored(data, paths).card
     assert card["headline"]["a.npy and 1 more"]["value"] == 0.5
     assert card["intervals"]["training_seeds"] == 2
 
 
 def test_next_to_nothing_has_no_sign(data: GraspDataset) -> None:
-    card = score(request_of(data, data.column("grasps")), FakeVerify(is_own(data)), None).card
+    card = scored(data, data.column("grasps")).card
     card["above"]["predictions"]["own"] = {"value": 0.1, "low": -0.001, "high": 0.2}
     assert "* predictions above own: 10 (0 to 20)\n" in card_text(card)
 
@@ -132,8 +136,7 @@ def test_another_method_stands_beside_the_predictions(data: GraspDataset) -> Non
     """Of all seeds, on the same rows, and before the reference rows."""
     grasps, rest = data.column("grasps"), np.zeros((len(data), 18))
     other = ranked_sets(grasps, data)[1] + ranked_sets(rest, data)[1]
-    request = request_of(data, rest, against=("before", other), per_object=1)
-    card = score(request, FakeVerify(is_own(data)), None).card
+    card = scored(data, rest, against=("before", other), per_object=1).card
     assert list(card["sets"]) == ["predictions", "before", "own", "constant"]
     assert card["sets"]["before"]["predictions"] == 2 * card["rows"] == 4
     assert card["above"]["predictions"]["before"]["value"] == -0.5
@@ -148,15 +151,14 @@ def test_predictions_for_different_rows_are_refused(data: GraspDataset) -> None:
     other = ranked_sets(data.column("grasps")[:1], data, rows=[1])[1]
     for changes in ({"predictions": one + other}, {"predictions": one, "against": ("b", other)}):
         with pytest.raises(GraspError, match="must have predictions for the rows"):
-            score(request_of(data, **changes), FakeVerify(is_own(data)), None)
+            scored(data, **changes)
 
 
 def test_a_method_that_the_card_could_not_tell_is_refused(data: GraspDataset) -> None:
     name, grasps = ranked_sets(data.column("grasps"), data)
     for given, of in ((data.column("grasps"), name), ((), "no predictions")):
-        request = request_of(data, given, against=(name, grasps))
         with pytest.raises(GraspError, match=f"against must be .* has another name, got {of}"):
-            score(request, FakeVerify(is_own(data)), None)
+            scored(data, given, against=(name, grasps))
 
 
 def other_hand(data: GraspDataset) -> dict[str, Any]:
@@ -184,11 +186,11 @@ def test_what_cannot_be_scored_is_refused(
     data: GraspDataset, change: Callable[[GraspDataset], dict[str, Any]], message: str
 ) -> None:
     with pytest.raises(GraspError, match=message):
-        score(request_of(data, **change(data)), FakeVerify(is_own(data)), None)
+        scored(data, **change(data))
 
 
 def test_without_blind_rows_a_card_says_so(data: GraspDataset) -> None:
-    card = score(request_of(data, references=("own",)), FakeVerify(is_own(data)), None).card
+    card = scored(data, references=("own",)).card
     assert any(warning.startswith("no blind row") for warning in card["warnings"])
 
 
@@ -196,9 +198,9 @@ TRAINED_ON = "2 test objects are training objects, by their names"
 
 
 def test_objects_that_were_trained_on_are_a_warning(data: GraspDataset) -> None:
-    card = score(request_of(data, train=data), FakeVerify(is_own(data)), None).card
+    card = scored(data, train=data).card
     assert TRAINED_ON in card["warnings"]
-    other = score(request_of(data), FakeVerify(is_own(data)), None).card
+    other = scored(data).card
     assert not any("training objects" in warning for warning in other["warnings"])
 
 
@@ -212,10 +214,10 @@ def test_objects_of_equal_names_and_other_meshes_are_other_objects(
     changed = tuple(replace(each, mesh_sha256="0" * 64) for each in manifest.objects)
     write_manifest(replace(manifest, objects=changed), out)
     train = GraspDataset(out / OTO, split="test")
-    card = score(request_of(data, train=train), FakeVerify(is_own(data)), None).card
+    card = scored(data, train=train).card
     assert not any("training objects" in warning for warning in card["warnings"])
     (out / "manifest.json").unlink()
-    card = score(request_of(data, train=train), FakeVerify(is_own(data)), None).card
+    card = scored(data, train=train).card
     assert TRAINED_ON in card["warnings"]
 
 
@@ -232,10 +234,10 @@ def test_files_of_a_card_are_whole_and_come_again(data: GraspDataset, tmp_path: 
     confidence = np.linspace(0.9, 0.1, 5 * len(data)).reshape(len(data), 5)
     confidence[0, 4] = np.nan
     _, ranked = ranked_sets(predicted, data, confidence=confidence)
-    scored = score(request_of(data, predictions=ranked, name="net"), FakeVerify(is_own(data)), None)
-    paths = scored.save(tmp_path)
-    assert read_json(paths[0]) == scored.card
-    assert sum(group["count"] for group in scored.card["sets"]["net"]["calibration"]) == (
+    made = scored(data, predictions=ranked, name="net")
+    paths = made.save(tmp_path)
+    assert read_json(paths[0]) == made.card
+    assert sum(group["count"] for group in made.card["sets"]["net"]["calibration"]) == (
         5 * len(data) - 1
     )
     text = paths[1].read_text()
@@ -244,4 +246,4 @@ def test_files_of_a_card_are_whole_and_come_again(data: GraspDataset, tmp_path: 
     assert "confidence" in text
     picture = paths[2].read_bytes()
     assert picture.startswith(b"\x89PNG")
-    assert scored.save(tmp_path)[2].read_bytes() == picture
+    assert made.save(tmp_path)[2].read_bytes() == picture
