@@ -27,16 +27,15 @@ from drakegrasp.cluster.connect import connect
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError, MeshError
-from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.progress import silent
 from drakegrasp.verification.hints import find_hints
-from drakegrasp.verification.placing import place_on_object, place_on_rows
+from drakegrasp.verification.placing import PlacedGrasp, place_on_object, place_on_rows
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.result_files import write_results
-from drakegrasp.verification.verify import PlacedGrasp, verify_batch
+from drakegrasp.verification.verify import verify_batch
 
 pytestmark = pytest.mark.sim
 
@@ -159,18 +158,7 @@ def test_row_knows_the_frames_of_both_cameras(test_split: GraspDataset) -> None:
 
     def hints(grasps: np.ndarray, frame: str) -> set[str]:
         placed = place_on_rows(grasps, test_split, rows, frame=frame)
-        return {
-            hint
-            for g in placed
-            for hint in find_hints(
-                g.placed.model,
-                load_hand("barrett"),
-                g.p_OQ,
-                g.nhat_Q_O,
-                X_OA=g.X_OA,
-                frames=g.frames,
-            )
-        }
+        return {hint for g in placed for hint in find_hints(g, *g.contacts())}
 
     own = test_split.column("grasps")
     assert "the frame of the dataset's other camera" in hints(other.column("grasps"), "camera")

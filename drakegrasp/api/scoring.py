@@ -27,11 +27,11 @@ from drakegrasp.scoring.run import score as score_predictions
 from drakegrasp.scoring.verdict import Verdict, protocol_verdict, ranked_sets, verdict_of
 from drakegrasp.simulation.attempts import Attempts
 from drakegrasp.verification.placing import (
+    PlacedGrasp,
     dataset_config,
     overridden_keys,
     place_on_rows,
 )
-from drakegrasp.verification.verify import PlacedGrasp
 
 if TYPE_CHECKING:
     from distributed import Client

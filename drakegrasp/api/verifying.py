@@ -30,12 +30,9 @@ from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.simulation.placement import Placed, config_for
 from drakegrasp.simulation.placement import PlacedObject as ObjectOnTable
 from drakegrasp.simulation.placement import place_object as put_on_table
-from drakegrasp.verification.placing import (
-    place_on_object,
-    place_on_rows,
-)
+from drakegrasp.verification.placing import PlacedGrasp, place_on_object, place_on_rows
 from drakegrasp.verification.result import Verification
-from drakegrasp.verification.verify import PlacedGrasp, ResultCallback, ignore_result, verify_batch
+from drakegrasp.verification.verify import ResultCallback, ignore_result, verify_batch
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -230,12 +227,12 @@ def _place_on_rows(
     placed = place_on_rows(grasps, data, chosen, **how)
 
     # The object of a verdict can verify more grasps.
-    things = {id(grasp.placed): grasp.placed for grasp in placed}
+    things = {id(thing): thing for grasp in placed for thing in grasp.stands}
     doors = {
         key: PlacedObject(model=thing.model, X_TO=thing.X_TO, config=thing.config, X_OM=thing.X_OM)
         for key, thing in things.items()
     }
-    return [replace(grasp, placed=doors[id(grasp.placed)]) for grasp in placed]
+    return [replace(g, stands=tuple(doors[id(thing)] for thing in g.stands)) for g in placed]
 
 
 def _refuse_other_targets(on: object) -> None:

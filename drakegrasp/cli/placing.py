@@ -25,6 +25,7 @@ from drakegrasp.objects.sources import find_mesh
 from drakegrasp.simulation.attempts import Attempts
 from drakegrasp.simulation.placement import place_object
 from drakegrasp.verification.placing import (
+    PlacedGrasp,
     choose_rows,
     dataset_config,
     place_on_dataset,
@@ -32,7 +33,6 @@ from drakegrasp.verification.placing import (
     place_on_rows,
 )
 from drakegrasp.verification.result_files import refuse_unwritable
-from drakegrasp.verification.verify import PlacedGrasp
 
 if TYPE_CHECKING:
     from drakegrasp.cli.predictions import VerifyRequest

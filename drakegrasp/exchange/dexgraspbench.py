@@ -53,7 +53,8 @@ from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.simulation.attempts import quaternion_poses, xyzw_poses
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import Posture, joint_order
-from drakegrasp.verification.verify import PlacedGrasp, first_fit
+from drakegrasp.verification.placing import PlacedGrasp
+from drakegrasp.verification.verify import first_fit
 
 #: What `drakegrasp export --help` says of the format.
 HELP = (
@@ -346,17 +347,18 @@ def fitted_postures(
     grasps: Sequence[PlacedGrasp], execute: Executor = run_here
 ) -> list[PlacedPosture]:
     """Return the posture of each grasp, in the given order; of contacts the first wrist pose."""
-    contacts = [(i, g) for i, g in enumerate(grasps) if not g.invalid and g.posture is None]
+    contacts = [(i, g) for i, g in enumerate(grasps) if not g.invalid and g.method != "posture"]
     fitted = dict(execute(_fit, contacts))
-    return [
-        (g.placed, g.invalid or _told(g) or g.posture or fitted[i]) for i, g in enumerate(grasps)
-    ]
 
+    def posture_of(i: int, grasp: PlacedGrasp) -> Posture | str:
+        if grasp.invalid or i in fitted:
+            return grasp.invalid or fitted[i]
+        # Nobody named its resting pose.
+        if (count := len(grasp.stands)) > 1:
+            return f"resting must be 0 to {count - 1} with a protocol, got none"
+        return grasp.posture(grasp.placed)
 
-def _told(grasp: PlacedGrasp) -> str:
-    """Return why a posture cannot be tried: nobody named its resting pose; empty if it can."""
-    count = 1 + len(grasp.others)
-    return f"resting must be 0 to {count - 1} with a protocol, got none" if count > 1 else ""
+    return [(grasp.placed, posture_of(i, grasp)) for i, grasp in enumerate(grasps)]
 
 
 def _fit(task: tuple[int, PlacedGrasp]) -> tuple[int, Posture]:

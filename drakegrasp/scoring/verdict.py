@@ -28,9 +28,8 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.protocols.protocol import PostureVerdict
 from drakegrasp.simulation.attempts import Attempts
-from drakegrasp.verification.placing import dataset_config, read_several
+from drakegrasp.verification.placing import PlacedGrasp, dataset_config, read_several
 from drakegrasp.verification.result import Verification
-from drakegrasp.verification.verify import PlacedGrasp
 
 
 def rank(table: Attempts) -> Attempts:
@@ -217,7 +216,7 @@ def protocol_verdict(grasp: PlacedGrasp, found: PostureVerdict) -> Verdict:
         **dict.fromkeys(measures, found.success),
         contact_error=None,
         penetration=_rounded(found.penetration) if math.isfinite(found.penetration) else None,
-        contacts=_tuple(grasp.p_OQ),
+        contacts=_tuple(grasp.contacts()[0]),
         posture=(),
         seconds=0.0,
         reason=found.reason.partition(": ")[2] if outcome == Outcome.INVALID.label else "",

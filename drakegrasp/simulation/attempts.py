@@ -156,11 +156,11 @@ class Attempts:
         Raises:
             GraspError: If the frame is "mesh" and its pose is not known.
         """
-        X_OG = multiply(self._frame_in_object(i, X_TO, X_OM), self.X_FG[i])
+        X_OG = multiply(self.frame_pose(i, X_TO, X_OM), self.X_FG[i])
         return _posture(self, i, X_OG)
 
-    def _frame_in_object(self, i: int, X_TO: Array, X_OM: Array | None) -> Array:
-        """Return the pose (4, 4) of the frame of a row in {O}."""
+    def frame_pose(self, i: int, X_TO: Array, X_OM: Array | None) -> Array:
+        """Return the pose (4, 4) of the frame of a row in {O}; see `posture`."""
         if self.frame == "object":
             return np.eye(4)
         if self.frame == "mesh":

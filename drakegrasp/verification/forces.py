@@ -40,6 +40,7 @@ from drakegrasp.mesh.surfaces import winding_numbers
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.lift import lift_path
+from drakegrasp.table import Table
 
 #: Forces count as applying a wrench if their error is below this share of it.
 MAX_ERROR = 1e-7
@@ -334,41 +335,29 @@ def ferrari_canny(contacts: GraspContacts, *, friction: float, length: float) ->
     return epsilon if epsilon > ROUNDING else 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class ForceMargin:
-    """By what margin forces at the contacts hold the object.
-
-    Attributes:
-        smallest_friction: Smallest coefficient at which forces within the limits of the hand's
-            fingertips carry the lift; inf if none is enough.
-        epsilon: Of Ferrari and Canny at the configured friction, with torques divided by the
-            largest distance of the object's surface from its centre of mass; 0 without force
-            closure.
-    """
-
-    smallest_friction: float
-    epsilon: float
-
-
 def force_margin(
     model: ObjectModel, X_TO: npt.ArrayLike, contacts: GraspContacts, config: Config
-) -> ForceMargin:
-    """Return the margin of a grasp for the lift of the object.
+) -> tuple[float, float]:
+    """Return by what margin forces at the contacts of a grasp hold the object in its lift.
 
     Args:
         model: The object.
         X_TO: (4, 4), its resting pose.
         contacts: Of the grasp.
         config: Friction and lift.
+
+    Returns:
+        The epsilon of Ferrari and Canny at the configured friction, with torques divided by the
+        largest distance of the object's surface from its centre of mass, 0 without force closure;
+        and the smallest coefficient at which forces within the limits of the hand's fingertips
+        carry the lift, inf if none is enough.
     """
-    return ForceMargin(
-        smallest_friction=smallest_friction(contacts, lift_path(X_TO, config).wrenches(model)),
-        epsilon=ferrari_canny(
-            contacts,
-            friction=model.own_physics(config.physics).friction_hand,
-            length=characteristic_length(model.visual_vertices, model.p_OOcm),
-        ),
+    epsilon = ferrari_canny(
+        contacts,
+        friction=model.own_physics(config.physics).friction_hand,
+        length=characteristic_length(model.visual_vertices, model.p_OOcm),
     )
+    return epsilon, smallest_friction(contacts, lift_path(X_TO, config).wrenches(model))
 
 
 def smallest_friction(contacts: GraspContacts, wrenches_O: npt.ArrayLike) -> float:
@@ -422,45 +411,34 @@ MAX_DETOUR = 1e-3
 RING_POINTS = 8
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SurfaceContacts:
-    """Contacts of k fingertips on the surface, and how far the predicted ones are from them.
-
-    Attributes:
-        p_OQ: (k, 3), points of the surface in {O} [m].
-        nhat_Q_O: (k, 3), outward normals of the faces there, in {O}.
-        distance: (k,), of the predicted points from them [m].
-        inside: (k,), whether the predicted points are in the object.
-        angle: (k,), between the predicted normals and these [rad].
-    """
-
-    p_OQ: Array
-    nhat_Q_O: Array
-    distance: Array
-    inside: npt.NDArray[np.bool_]
-    angle: Array
-
-    @property
-    def off_surface(self) -> npt.NDArray[np.bool_]:
-        """(k,), whether a prediction is too far from the surface, or its normal from its own."""
-        return ~((self.distance <= MAX_DISTANCE) & (self.angle <= MAX_ANGLE))
+def surface_feet(triangles: Array, points: Array) -> Array:
+    """Return the point (n, m, 3) of each of m triangles that is nearest to each of n points."""
+    n, m = len(points), len(triangles)
+    near = trimesh.triangles.closest_point(
+        np.tile(triangles, (n, 1, 1)), np.repeat(points, m, axis=0)
+    )
+    return np.asarray(near).reshape(n, m, 3)
 
 
-def surface_contacts(
-    model: ObjectModel, p_OQ: npt.ArrayLike, nhat_Q_O: npt.ArrayLike
-) -> SurfaceContacts:
+def surface_contacts(model: ObjectModel, p_OQ: npt.ArrayLike, nhat_Q_O: npt.ArrayLike) -> Table:
     """Return the contacts that predicted points (k, 3) [m] and outward unit normals (k, 3) select.
 
     Args:
         model: The object.
         p_OQ: In {O}.
         nhat_Q_O: In {O}.
+
+    Returns:
+        `p_OQ` (k, 3), points of the surface in {O} [m], and `nhat_Q_O` (k, 3), outward normals of
+        the faces there; of the predicted points `distance` (k,) from them [m] and whether they are
+        `inside` (k,) the object; `angle` (k,) between the predicted normals and these [rad]; and
+        whether a prediction is `off_surface` (k,), by its distance or its angle.
     """
     points, normals = np.asarray(p_OQ, dtype=float), np.asarray(nhat_Q_O, dtype=float)
 
     # Nearest among the faces that agree with the normal, else among all. Beyond a wall's other side
     # no fingertip can be: a face that is much farther than the nearest one is not chosen.
-    feet = _feet(model.collision.triangles, points)
+    feet = surface_feet(model.collision.triangles, points)
     distance = np.linalg.norm(feet - points[:, None], axis=2)
     cosine = normals @ model.collision.face_normals.T
     near_enough = distance <= distance.min(axis=1, keepdims=True) + MAX_DETOUR
@@ -474,17 +452,19 @@ def surface_contacts(
     winding = winding_numbers(
         points, model.collision_vertices, model.collision_faces.astype(np.int64)
     )
-    along = np.clip(np.einsum("ij,ij->i", own, normals), -1.0, 1.0)
-    return SurfaceContacts(
+    away = np.linalg.norm(points - near, axis=1)
+    angle = np.arccos(np.clip(np.einsum("ij,ij->i", own, normals), -1.0, 1.0))
+    return Table(
         p_OQ=near,
         nhat_Q_O=own,
-        distance=np.linalg.norm(points - near, axis=1),
+        distance=away,
         inside=winding > 0.5,
-        angle=np.arccos(along),
+        angle=angle,
+        off_surface=~((away <= MAX_DISTANCE) & (angle <= MAX_ANGLE)),
     )
 
 
-def patch_points(model: ObjectModel, contacts: SurfaceContacts) -> tuple[Array, Array]:
+def patch_points(model: ObjectModel, contacts: Table) -> tuple[Array, Array]:
     """Return points (k, m, 3) [m] of the patches about k contacts, and normals (k, m, 3) there.
 
     A patch is its contact and a ring of `RING_POINTS` points about it, each with the normal of its
@@ -504,27 +484,18 @@ def patch_points(model: ObjectModel, contacts: SurfaceContacts) -> tuple[Array, 
 
     # A point of it is at most a radius from the surface, so at most two from the contact.
     triangles, face_normals = model.collision.triangles, model.collision.face_normals
-    arms = _feet(triangles, contacts.p_OQ) - contacts.p_OQ[:, None]
+    arms = surface_feet(triangles, contacts.p_OQ) - contacts.p_OQ[:, None]
     near = np.linalg.norm(arms, axis=2) <= 2.0 * TORSION_RADIUS + SAME_DISTANCE
     points, normals = [], []
     for i, circle in enumerate(circles):
         cosine = face_normals @ contacts.nhat_Q_O[i]
         faces = np.flatnonzero(near[i])
-        feet = _feet(triangles[faces], circle)
+        feet = surface_feet(triangles[faces], circle)
         distance = np.linalg.norm(feet - circle[:, None], axis=2)
         chosen = _nearest(distance, np.broadcast_to(cosine[faces], distance.shape))
         points.append(np.vstack([contacts.p_OQ[i], feet[np.arange(RING_POINTS), chosen]]))
         normals.append(np.vstack([contacts.nhat_Q_O[i], face_normals[faces[chosen]]]))
     return np.array(points), np.array(normals)
-
-
-def _feet(triangles: Array, points: Array) -> Array:
-    """Return the point (n, m, 3) of each of m triangles that is nearest to each of n points."""
-    n, m = len(points), len(triangles)
-    near = trimesh.triangles.closest_point(
-        np.tile(triangles, (n, 1, 1)), np.repeat(points, m, axis=0)
-    )
-    return np.asarray(near).reshape(n, m, 3)
 
 
 def _nearest(distance: Array, cosine: Array) -> npt.NDArray[np.int64]:
@@ -543,12 +514,12 @@ class ForceVerdict:
     """What forces at the contacts that a prediction selects can do.
 
     Attributes:
-        contacts: On the surface, and how far the prediction is from them.
+        contacts: On the surface, see `surface_contacts`.
         points: Forces at one point of each contact, for the harder of the lift's two wrenches.
         patches: Forces at the patches about them, likewise.
     """
 
-    contacts: SurfaceContacts
+    contacts: Table
     points: ContactForces
     patches: ContactForces
 
@@ -669,14 +640,17 @@ def hand_contacts(
     return _grasp(model, contacts, config, patches=len(contacts.p_OQ) < ENOUGH_POINTS)
 
 
-def _grasp(
-    model: ObjectModel, contacts: SurfaceContacts, config: Config, *, patches: bool
-) -> GraspContacts:
+def _grasp(model: ObjectModel, contacts: Table, config: Config, *, patches: bool) -> GraspContacts:
     """Return contacts as points or patches, with the limits of the hand's fingertips."""
     hand = within_load(load_hand(config.hand_source), config.physics.finger_load)
-    points = patch_points(model, contacts) if patches else (contacts.p_OQ, contacts.nhat_Q_O)
+    p_OQ, nhat_Q_O = contacts.p_OQ, contacts.nhat_Q_O
+    if patches:
+        p_OQ, nhat_Q_O = patch_points(model, contacts)
     return GraspContacts(
-        *points, model.p_OOcm, force_limit=fingertip_forces(hand, drive_of(hand, config.lift))
+        p_OQ,
+        nhat_Q_O,
+        model.p_OOcm,
+        force_limit=fingertip_forces(hand, drive_of(hand, config.lift)),
     )
 
 

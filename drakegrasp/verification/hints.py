@@ -1,30 +1,31 @@
 """What may be wrong with the numbers of a grasp that fails; nothing is changed by it.
 
-In: contacts or a posture in {O}, and the frames that the numbers could be in. Out: how the contacts
-lie on the surface, and hints in words. A hint says that the same numbers, read in another way,
-would fit much better: in another frame or unit, with normals that point the other way, with fingers
-in another order. All factors are own choices.
+In: a placed grasp. Out: how its contacts lie on the surface, and hints in words. A hint says that
+the same numbers, read in another way, would fit much better: in another frame or unit, with normals
+that point the other way, with fingers in another order. All factors are own choices.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from itertools import permutations
 from typing import TypeAlias
 
 import numpy as np
-import trimesh
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.errors import HandError
 from drakegrasp.frames import X_WT, Array, invert_pose, rotate_vectors, transform_points
 from drakegrasp.grasp import unused_fingers
-from drakegrasp.hand.description import Hand
+from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import fingertip_poses
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import Posture, joint_order, preshape_index
+from drakegrasp.table import Table
+from drakegrasp.verification.forces import surface_feet
+from drakegrasp.verification.placing import PlacedGrasp
 from drakegrasp.verification.wrist_problem import hand_constants
 from drakegrasp.verification.wrist_solver import make_postures, posture_misfit
 
@@ -33,26 +34,8 @@ from drakegrasp.verification.wrist_solver import make_postures, posture_misfit
 WALL = 0.005
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SurfaceFit:
-    """How k contacts lie on the surface that the hand meets.
-
-    Attributes:
-        distance: (k,), of the points from the surface [m].
-        nearest: (k, 3), the points of the surface nearest to them, in {O} [m].
-        agreement: (k,), cosine between each normal and the outward normal of a face next to its
-            point, of the face where it is largest; negative where the normal points inwards.
-        normals: (k, 3), outward unit normals in {O} of the faces nearest to the points.
-    """
-
-    distance: Array
-    nearest: Array
-    agreement: Array
-    normals: Array
-
-
-def fit_surface(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> SurfaceFit:
-    """Return how contacts lie on an object's surface.
+def fit_surface(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> Table:
+    """Return how k contacts lie on the surface that the hand meets.
 
     A predicted point may be beside an edge or on the wrong side of a thin wall, so each face that
     is at most `WALL` farther than the nearest one is next to it.
@@ -61,24 +44,23 @@ def fit_surface(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> SurfaceFit:
         model: The object.
         p_OQ: (k, 3), points in {O} [m].
         nhat_Q_O: (k, 3), unit normals in {O}.
-    """
-    # The point of each of m faces that is nearest to each contact.
-    triangles = model.collision.triangles
-    k, m = len(p_OQ), len(triangles)
-    points = np.repeat(p_OQ, m, axis=0)
-    near = trimesh.triangles.closest_point(np.tile(triangles, (k, 1, 1)), points)
-    distances = np.linalg.norm(near - points, axis=1).reshape(k, m)
 
-    # The nearest face, and the best of those next to the point.
+    Returns:
+        `distance` (k,) of the points from the surface [m]; `nearest` (k, 3), the points of it
+        nearest to them in {O} [m], and `normals` (k, 3), outward, of its faces there; `agreement`
+        (k,), cosine between each normal and the outward normal of a face next to its point, of the
+        face where it is largest; negative where the normal points inwards.
+    """
+    feet, rows = surface_feet(model.collision.triangles, p_OQ), np.arange(len(p_OQ))
+    distances = np.linalg.norm(feet - p_OQ[:, None], axis=2)
     face = distances.argmin(axis=1)
-    distance = distances[np.arange(k), face]
+    beside = distances <= distances[rows, face][:, None] + WALL
     cosine = nhat_Q_O @ model.collision.face_normals.T
-    beside = distances <= distance[:, None] + WALL
-    return SurfaceFit(
-        distance=distance,
-        nearest=near.reshape(k, m, 3)[np.arange(k), face],
-        agreement=np.where(beside, cosine, -1.0).max(axis=1),
+    return Table(
+        distance=distances[rows, face],
+        nearest=feet[rows, face],
         normals=model.collision.face_normals[face],
+        agreement=np.where(beside, cosine, -1.0).max(axis=1),
     )
 
 
@@ -89,7 +71,7 @@ FAR_POSTURE = 0.05
 #: Another reading fits much better if its points are at most this share as far from the surface
 #: (mean over the contacts), and no farther than `FAR`.
 MUCH_NEARER = 0.25
-#: Contacts of a hand are at least so far apart [m]: any that shrink come close to a small object.
+#: Contacts are at least so far apart [m]: any that shrink come close to a small object.
 LEAST_SPREAD = 0.01
 #: Normals agree with the surface if their mean cosine to its normals is above this, and point the
 #: wrong way if it is below zero and the reversed ones agree.
@@ -101,6 +83,7 @@ ON_SURFACE = 0.001
 MUCH_LIKER = 0.25
 #: What lengths may have been meant in, by the factors to metres.
 _UNITS = {
+    1.0: "",
     1e-3: "points in millimetres instead of metres",
     1e-2: "points in centimetres instead of metres",
     1e2: "points 100 times as large",
@@ -109,126 +92,109 @@ _UNITS = {
 #: The hint about normals.
 REVERSED = "normals that point the other way, out of the object"
 
-#: Returns contacts in {O}, points (k, 3) [m] and unit normals (k, 3) or None, of the same numbers
-#: read in a frame X_OF (4, 4) with lengths times a factor.
-Reading: TypeAlias = Callable[[Array, float], tuple[Array, Array | None]]
+#: What numbers may have been meant as: the frame in words, empty for the given one; the unit in
+#: words, likewise; and what they are so in {O}, points (k, 3) [m] and unit normals (k, 3) or None.
+Reading: TypeAlias = tuple[str, str, Array, Array | None]
 
 
-def known_frames(
-    X_TO: Array,
-    cameras: Mapping[str, Array] | None = None,
-    X_TC: Array | None = None,
-    X_OM: Array | None = None,
-) -> dict[str, Array]:
-    """Return the poses X_OF (4, 4) of the frames that numbers could be in, by what to call each.
-
-    Args:
-        X_TO: (4, 4), pose of the object.
-        cameras: (4, 4), poses in {T} of cameras, by what to call the frame of each.
-        X_TC: (4, 4), the camera's pose that the caller states, which may be another pose.
-        X_OM: (4, 4), pose of the mesh file's frame in {O}, if it is known.
-    """
-    X_OT = invert_pose(X_TO)
+def _frames(grasp: PlacedGrasp, thing: PlacedObject) -> dict[str, Array]:
+    """Return the poses X_OF (4, 4) of the frames that numbers could be in, the given one first."""
+    X_OT, given = invert_pose(thing.X_TO), grasp.attempt.X_TC
     frames = {
+        "": grasp.X_OA(thing),
         "the object's frame (object)": np.eye(4),
         "the table's frame (table)": X_OT,
         "the world's frame": multiply(X_OT, invert_pose(X_WT)),
     }
-    frames |= {} if X_OM is None else {"the mesh file's frame (mesh)": X_OM}
-    frames |= {name: multiply(X_OT, X) for name, X in (cameras or {}).items()}
-    if X_TC is not None:
-        X_CT = invert_pose(X_TC)
+    frames |= {} if thing.X_OM is None else {"the mesh file's frame (mesh)": thing.X_OM}
+    frames |= {name: multiply(X_OT, X_TC) for name, X_TC in grasp.cameras.items()}
+    if given is not None and not grasp.cameras:
+        # A caller who states the pose of a camera may mean another pose by it.
+        X_CT = invert_pose(given[0])
         frames |= {
             "the inverse of X_TC": multiply(X_OT, X_CT),
             "the inverse of X_TC, which is the object's pose in the camera's frame": X_CT,
-            "X_TC as the camera's pose in the object's frame": X_TC,
+            "X_TC as the camera's pose in the object's frame": given[0],
         }
     return frames
 
 
 def find_hints(
-    model: ObjectModel,
-    hand: Hand,
-    p_OQ: Array,
-    nhat_Q_O: Array,
-    *,
-    X_OA: Array,
-    frames: Mapping[str, Array],
-    fits: bool = False,
+    grasp: PlacedGrasp, p_OQ: Array, nhat_Q_O: Array, *, fits: bool = False
 ) -> tuple[str, ...]:
     """Return what would make contacts fit much better.
 
     Args:
-        model: The object.
-        hand: Of k fingers.
-        p_OQ: (k, 3), contact points in {O} [m].
+        grasp: On its object.
+        p_OQ: (k, 3), its contact points in {O} [m].
         nhat_Q_O: (k, 3), unit normals in {O}.
-        X_OA: (4, 4), pose of the frame in which the contacts were given.
-        frames: (4, 4), poses X_OF of other frames by their names, see `known_frames`.
         fits: Whether the hand makes the contacts: then only their place may be wrong.
     """
-    fit = fit_surface(model, p_OQ, nhat_Q_O)
-    X_AO = invert_pose(X_OA)
+    thing, hand = grasp.placed, load_hand(grasp.config.hand_source)
+    fit = fit_surface(thing.model, p_OQ, nhat_Q_O)
+    X_AO = invert_pose(grasp.X_OA(thing))
     p_AQ, nhat_Q_A = transform_points(X_AO, p_OQ), rotate_vectors(X_AO, nhat_Q_O)
 
-    def read(X_OF: Array, factor: float) -> tuple[Array, Array | None]:
-        return transform_points(X_OF, factor * p_AQ), rotate_vectors(X_OF, nhat_Q_A)
-
     # Where the points are elsewhere, neither normals nor fingers say anything.
-    if fit.distance.max() > FAR and (place := _better_place(model, fit, read, X_OA, frames)):
-        return (place,)
+    if fit.distance.max() > FAR:
+        readings: list[Reading] = [
+            (name, unit, transform_points(X_OF, factor * p_AQ), rotate_vectors(X_OF, nhat_Q_A))
+            for name, X_OF in _frames(grasp, thing).items()
+            for factor, unit in _UNITS.items()
+        ]
+        if place := _better_place(thing.model, fit, readings):
+            return (place,)
     if fits:
         return ()
-    return (*_turned(model, fit, p_OQ, nhat_Q_O), *_reordered(hand, p_OQ, nhat_Q_O))
+    return (*_turned(thing.model, fit, p_OQ, nhat_Q_O), *_reordered(hand, p_OQ, nhat_Q_O))
 
 
 def find_posture_hints(
-    model: ObjectModel,
-    hand: Hand,
-    posture: Posture,
-    *,
-    X_OA: Array,
-    frames: Mapping[str, Array],
-    link: bool = False,
-    poses: Mapping[str, Array] | None = None,
+    grasp: PlacedGrasp, thing: PlacedObject, posture: Posture
 ) -> tuple[tuple[str, ...], Array]:
     """Return what would bring the fingertips of a posture much closer to the object.
 
     Args:
-        model: The object.
-        hand: Of the posture.
-        posture: Wrist and joints, in {O}.
-        X_OA: (4, 4), pose of the frame in which the palm's pose was given.
-        frames: (4, 4), poses X_OF of other frames by their names, see `known_frames`.
-        link: Whether the pose that was given is that of the palm link.
-        poses: (4, 4), other poses X_AG that may have been meant, by what to call them.
+        grasp: Of the posture.
+        thing: The object as it lies.
+        posture: Wrist and joints, in {O} of it.
 
     Returns:
         The hints, and how far the fingertips that it closes are from the surface (m,) [m]; none if
         the hand's fingertips have no nominal contact points.
     """
+    hand = load_hand(grasp.config.hand_source)
     try:
         p_GQ = _fingertips(hand, posture)
     except HandError:
         return (), np.zeros(0)
-    X_AG = multiply(invert_pose(X_OA), posture.X_OG)
+
+    def fingertips(X_OG: Array) -> tuple[Array, None]:
+        return transform_points(X_OG, p_GQ), None
+
+    p_OQ, _ = fingertips(posture.X_OG)
+    fit = fit_surface(thing.model, p_OQ, np.zeros_like(p_OQ))
+    if fit.distance.mean() <= FAR:
+        return (), fit.distance
+
     # Where the given pose is: lengths in another unit move the palm with it.
-    p_AL = multiply(X_AG, invert_pose(hand.X_BG))[:3, 3] if link else X_AG[:3, 3]
-
-    def read(X_OF: Array, factor: float) -> tuple[Array, Array | None]:
-        X = X_AG.copy()
-        X[:3, 3] += (factor - 1.0) * p_AL
-        return transform_points(multiply(X_OF, X), p_GQ), None
-
-    fit, place = _fit(model, read(X_OA, 1.0)), ""
-    if fit.distance.mean() > FAR:
-        others = {
-            name: (transform_points(multiply(X_OA, X), p_GQ), None)
-            for name, X in (poses or {}).items()
-            if np.isfinite(X).all()
-        }
-        place = _better_place(model, fit, read, X_OA, frames, others)
-    place = place.replace("points", "positions of the palm")
+    X_AG, X_OA, attempt = grasp.attempt.X_FG[0], grasp.X_OA(thing), grasp.attempt
+    p_AL = (multiply(X_AG, invert_pose(hand.X_BG)) if attempt.link else X_AG)[:3, 3]
+    meant = dict[str, Array]()
+    if attempt.X_FG_xyzw is not None and np.isfinite(attempt.X_FG_xyzw).all():
+        meant["quaternions x, y, z, w instead of w, x, y, z"] = attempt.X_FG_xyzw[0]
+    if not attempt.link:
+        at_link = f"poses of the palm link instead of the palm (link: {hand.palm_link})"
+        meant[at_link] = multiply(X_AG, hand.X_BG)
+    readings: list[Reading] = [
+        (text, "", *fingertips(multiply(X_OA, X))) for text, X in meant.items()
+    ]
+    for name, X_OF in _frames(grasp, thing).items():
+        for factor, unit in _UNITS.items():
+            X = X_AG.copy()
+            X[:3, 3] += (factor - 1.0) * p_AL
+            readings.append((name, unit, *fingertips(multiply(X_OF, X))))
+    place = _better_place(thing.model, fit, readings).replace("points", "positions of the palm")
     return (place,) if place else (), fit.distance
 
 
@@ -237,43 +203,23 @@ def count_hints(hints: Iterable[tuple[str, ...]]) -> list[tuple[str, int]]:
     return Counter(hint for each in hints for hint in each).most_common()
 
 
-def _better_place(
-    model: ObjectModel,
-    fit: SurfaceFit,
-    read: Reading,
-    X_OA: Array,
-    frames: Mapping[str, Array],
-    others: Mapping[str, tuple[Array, None]] | None = None,
-) -> str:
+def _better_place(model: ObjectModel, fit: Table, readings: Iterable[Reading]) -> str:
     """Return the frame and unit in which far points are near the surface; empty if none is.
 
-    Of several, one that changes only frame or unit wins, then the one that is nearest. `others` are
-    contacts of other readings, by their names.
+    Of several, one that changes only frame or unit wins, then the one that is nearest.
     """
-    limit = min(MUCH_NEARER * fit.distance.mean(), FAR)
-    found = list[tuple[bool, float, str]]()
-    for text, other in (others or {}).items():
-        there = _fit(model, other)
-        if there.distance.mean() <= limit:
-            found.append((False, float(there.distance.max()), text))
-    for frame, X_OF in {"": X_OA, **frames}.items():
-        for factor, unit in {1.0: "", **_UNITS}.items():
-            contacts = read(X_OF, factor)
-            if not (frame or unit) or np.ptp(contacts[0], axis=0).max() < LEAST_SPREAD:
-                continue
-            there = _fit(model, contacts)
-            # Another unit turns no normals, so these say nothing of it.
-            agrees = contacts[1] is None or not frame or there.agreement.mean() > AGREEMENT
-            if there.distance.mean() <= limit and agrees:
-                both = bool(frame and unit)
-                text = ", with ".join(filter(None, (frame, unit)))
-                found.append((both, float(there.distance.max()), text))
+    limit, found = min(MUCH_NEARER * fit.distance.mean(), FAR), list[tuple[bool, float, str]]()
+    for frame, unit, points, normals in readings:
+        shrunk = normals is not None and np.ptp(points, axis=0).max() < LEAST_SPREAD
+        if shrunk or not (frame or unit):
+            continue
+        there = fit_surface(model, points, np.zeros_like(points) if normals is None else normals)
+        # Another unit turns no normals, so these say nothing of it.
+        agrees = normals is None or not frame or there.agreement.mean() > AGREEMENT
+        if there.distance.mean() <= limit and agrees:
+            text = ", with ".join(filter(None, (frame, unit)))
+            found.append((bool(frame and unit), float(there.distance.max()), text))
     return min(found, key=lambda each: each[:2])[2] if found else ""
-
-
-def _fit(model: ObjectModel, contacts: tuple[Array, Array | None]) -> SurfaceFit:
-    points, normals = contacts
-    return fit_surface(model, points, np.zeros_like(points) if normals is None else normals)
 
 
 def _fingertips(hand: Hand, posture: Posture) -> Array:
@@ -292,7 +238,7 @@ def _fingertips(hand: Hand, posture: Posture) -> Array:
     return np.asarray((points + X_GF[:, :3, 3])[~unused])
 
 
-def _turned(model: ObjectModel, fit: SurfaceFit, p_OQ: Array, nhat_Q_O: Array) -> Iterator[str]:
+def _turned(model: ObjectModel, fit: Table, p_OQ: Array, nhat_Q_O: Array) -> Iterator[str]:
     """Yield that the normals point inwards, if they do."""
     given, other = fit.agreement.mean(), fit_surface(model, p_OQ, -nhat_Q_O).agreement.mean()
     # Next to a thin wall both sides are near: there only points on the surface tell.

@@ -1,21 +1,20 @@
 """What a caller asks to be verified: each attempt in {O} of its object on the table.
 
-In: numbers in one of three frames or postures, with an object, with the objects of a dataset, or
-with rows of one. Out: a `PlacedGrasp` for each. Every mistake of the caller is found here, before
+In: contacts or postures, with an object, with the objects of a dataset, or with rows of one. Out: a
+`PlacedGrasp` for each. Every mistake of the caller is found here, before
 anything is simulated; a bad row is not a mistake of the caller.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
@@ -23,9 +22,9 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import GraspError, HandError
 from drakegrasp.frames import (
+    NO_MESH_FRAME,
     Array,
     as_numbers,
-    invert_pose,
     read_pose,
     rotate_vectors,
     transform_points,
@@ -50,9 +49,7 @@ from drakegrasp.simulation.placement import (
 )
 from drakegrasp.simulation.posture import Posture
 from drakegrasp.simulation.settle import find_resting_poses
-from drakegrasp.verification.hints import known_frames
-from drakegrasp.verification.prediction import frame_poses, read_grasps
-from drakegrasp.verification.verify import METHODS, PlacedGrasp
+from drakegrasp.verification.prediction import in_frame, read_grasps
 
 #: The row of a split for each of n grasps, or one for all; None: all rows, in order.
 RowChoice: TypeAlias = Sequence[int] | npt.NDArray[np.int64] | int | None
@@ -60,6 +57,60 @@ RowChoice: TypeAlias = Sequence[int] | npt.NDArray[np.int64] | int | None
 CAMERA, OTHER_CAMERA = "the camera's frame (camera)", "the frame of the dataset's other camera"
 #: Poses of an object at rest that differ by less are one: what is left of rounding in a file.
 SAME_POSE = 1e-6
+#: How contacts are verified.
+METHODS = ("hand", "forces")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacedGrasp:
+    """An attempt on an object on the table: all that its verification needs.
+
+    Attributes:
+        index: Its place among the caller's grasps.
+        attempt: Its row of a table: contacts or a posture, or the reason why it is no grasp.
+        stands: The object as it lies; of a posture that names no resting pose, in each of them.
+        method: "hand" or "forces" of contacts, "posture".
+        config: Hand, physics, lift and rules. What ends or avoids lifts (`lift.stop_when`,
+            `lift.least_chance`, `lift.least_depth_variance`) is without effect: the verdict is that
+            of a whole lift.
+        snap_points: Whether to move contact points to the surface.
+        cameras: (4, 4), poses X_TC of cameras in whose frames it could be, by these frames.
+    """
+
+    index: int
+    attempt: Attempts
+    stands: tuple[PlacedObject, ...]
+    method: str
+    config: Config
+    snap_points: bool = False
+    cameras: Mapping[str, Array] = field(default_factory=dict)
+
+    @property
+    def placed(self) -> PlacedObject:
+        """The object on the table, in the first of the resting poses."""
+        return self.stands[0]
+
+    @property
+    def invalid(self) -> str:
+        """Why it is no grasp; empty if it is one."""
+        return self.attempt.invalid[0]
+
+    def X_OA(self, thing: PlacedObject) -> Array:
+        """Return the pose (4, 4) of the frame of its numbers in {O} of the object as it lies."""
+        return self.attempt.frame_pose(0, thing.X_TO, thing.X_OM)
+
+    def posture(self, thing: PlacedObject) -> Posture:
+        """Return wrist and joints of a posture, in {O} of the object as it lies."""
+        return self.attempt.posture(0, thing.X_TO, thing.X_OM)
+
+    def contacts(self) -> tuple[Array, Array]:
+        """Return points p_OQ [m] and unit normals nhat_Q_O (k, 3) in {O}; NaN where it has none."""
+        points, normals = self.attempt.points, self.attempt.normals
+        if points is None or normals is None:
+            nothing = np.full((load_hand(self.config.hand_source).num_fingers, 3), np.nan)
+            return nothing, nothing
+        X_OA = self.X_OA(self.placed)
+        return transform_points(X_OA, points[0]), rotate_vectors(X_OA, normals[0])
 
 
 def place_on_object(
@@ -80,27 +131,14 @@ def place_on_object(
     Raises:
         GraspError: As `drakegrasp.verify_grasps`.
     """
-    table = _read(grasps, method, placed.config)
-    if table.grasps is not None:
-        given = None if X_TC is None else read_pose(X_TC, "X_TC")
-        return _placed(
-            placed,
-            np.arange(len(table)),
-            table,
-            frame=frame,
-            X_TC=given,
-            stated=given,
-            method=method,
-            snap_points=snap_points,
-            config=placed.config,
-        )
-
-    named = replace(table, objects=(placed.model.name,) * len(table))
-    things, config = [placed], placed.config
-    if config.objects.resting_poses > 1:
+    table, things, config = _read(grasps, method, placed.config), [placed], placed.config
+    if table.points is not None:
+        table = in_frame(table, frame, None if X_TC is None else read_pose(X_TC, "X_TC"))
+    elif config.objects.resting_poses > 1:
         others = find_resting_poses(placed.model, config)[1:]
         things += [replace(placed, X_TO=resting.X_TO) for resting in others]
-    return _placed_postures(named, range(len(named)), things, config, overrides)
+    table = replace(table, objects=(placed.model.name,) * len(table))
+    return _placed(table, range(len(table)), things, config, method, snap_points, overrides)
 
 
 def place_on_rows(
@@ -125,40 +163,26 @@ def place_on_rows(
     """
     # Read all grasps before any object: a wrong number is reported at once.
     used = dataset_config(dataset, config, hand, overrides)
-    read = _read(grasps, method, used)
-    chosen = choose_rows(dataset, read.of_row if rows is None else rows, len(read))
+    table = _read(grasps, method, used)
+    count = len(table)
+    chosen = choose_rows(dataset, table.of_row if rows is None else rows, count)
+    cameras = cameras_of_rows(dataset, chosen)
+    if table.points is not None:
+        table = in_frame(table, frame, cameras[CAMERA] if frame == "camera" else None)
 
-    # Each object in each resting pose once, with its grasps.
-    found, cameras = list[PlacedGrasp](), cameras_of_rows(dataset, chosen)
-    for placed, indices in objects_of_rows(dataset, chosen):
-        if read.grasps is None:
-            lying = _as_it_lies(read, placed.model.name)
-            found += _placed_postures(lying, indices.tolist(), [placed], used, cameras=cameras)
-            continue
-        own = {name: X_TC[indices] for name, X_TC in cameras.items()}
-        found += _placed(
-            placed,
-            indices,
-            read,
-            frame=frame,
-            X_TC=own[CAMERA] if frame == "camera" else None,
-            cameras=own,
-            method=method,
-            snap_points=snap_points,
-            config=used,
-        )
-    return found if config is not None else as_drawn(found, dataset, chosen, overrides)
-
-
-def _as_it_lies(table: Attempts, name: str) -> Attempts:
-    """Return postures of one object, without what they say of its pose and conditions."""
-    return replace(
+    # They lie as their rows, and have what was drawn for these.
+    table = replace(
         table,
-        objects=(name,) * len(table),
-        resting=np.zeros_like(table.resting),
-        X_TO=np.full_like(table.X_TO, np.nan),
-        conditions=np.full_like(table.conditions, np.nan),
+        objects=tuple(dataset.column("object_props/object_name")[chosen].tolist()),
+        resting=np.zeros(count, dtype=np.int64),
+        X_TO=np.full((count, 4, 4), np.nan),
+        conditions=_drawn(dataset, chosen) if config is None else np.full((count, 3), np.nan),
     )
+    found = list[PlacedGrasp]()
+    for placed, indices in objects_of_rows(dataset, chosen):
+        own = indices.tolist()
+        found += _placed(table, own, [placed], used, method, snap_points, overrides, cameras)
+    return found
 
 
 def cameras_of_rows(dataset: GraspDataset, rows: npt.NDArray[np.int64]) -> dict[str, Array]:
@@ -264,94 +288,17 @@ def _read(grasps: npt.ArrayLike | Attempts, method: str, config: Config) -> Atte
     return read_grasps(grasps, load_hand(config.hand_source).num_fingers)
 
 
-def _placed(
-    placed: PlacedObject,
-    indices: npt.NDArray[np.int64],
-    table: Attempts,
-    *,
-    frame: str,
-    X_TC: Array | None,
-    stated: Array | None = None,
-    cameras: Mapping[str, Array] | None = None,
-    method: str,
-    snap_points: bool,
-    config: Config,
-) -> list[PlacedGrasp]:
-    """Return the contacts of one object: those of the rows with the given indices.
-
-    Args:
-        placed: The object.
-        indices: (n,), into the rows of the table.
-        table: Of contacts.
-        frame: Of the numbers, see `frame_poses`.
-        X_TC: Of the camera, see `frame_poses`.
-        stated: X_TC if a caller states it, who may mean another pose by it.
-        cameras: (n, 4, 4), poses of the cameras that are known, by their frames.
-        method: Of each `PlacedGrasp`.
-        snap_points: Of each `PlacedGrasp`.
-        config: Of each `PlacedGrasp`.
-    """
-    assert table.points is not None and table.normals is not None
-    assert table.normalised is not None
-
-    # The frame of the numbers in {O}, and others that they could be in.
-    count = len(indices)
-    X_OM = placed.X_OM
-    X_OA = frame_poses(frame=frame, X_TC=X_TC, X_TO=placed.X_TO, count=count, X_OM=X_OM)
-    poses = None if stated is None else np.broadcast_to(stated, (count, 4, 4))
-
-    def others(i: int) -> dict[str, Array]:
-        own = {name: X[i] for name, X in (cameras or {}).items()}
-        return known_frames(placed.X_TO, own, None if poses is None else poses[i], X_OM)
-
-    return [
-        PlacedGrasp(
-            index=int(index),
-            placed=placed,
-            p_OQ=transform_points(X_OA[i], table.points[index]),
-            nhat_Q_O=rotate_vectors(X_OA[i], table.normals[index]),
-            method=method,
-            config=config,
-            invalid=table.invalid[index],
-            normalised=bool(table.normalised[index]),
-            snap_points=snap_points,
-            X_OA=X_OA[i],
-            frames=others(i),
-        )
-        for i, index in enumerate(indices)
-    ]
-
-
-def as_drawn(
-    grasps: Sequence[PlacedGrasp],
-    dataset: GraspDataset,
-    rows: npt.NDArray[np.int64],
-    overrides: Sequence[str],
-) -> list[PlacedGrasp]:
-    """Return grasps with the friction and mass that were drawn for their rows.
-
-    Args:
-        grasps: On the objects of a dataset.
-        dataset: The data file.
-        rows: (n,), the row of each grasp, by its index.
-        overrides: What the caller sets, e.g. "physics.friction_hand=0.5".
-    """
-    rules, told = (
-        read_manifest(dataset.path.parent).config.randomize,
-        np.full((len(rows), 3), np.nan),
-    )
-
-    # What the caller sets wins. Where one coefficient was drawn, both are taken from the row.
+def _drawn(dataset: GraspDataset, rows: npt.NDArray[np.int64]) -> Array:
+    """Return the `CONDITIONS` (n, 3) that were drawn for rows of a dataset; NaN where none was."""
+    rules = read_manifest(dataset.path.parent).config.randomize
+    told = np.full((len(rows), 3), np.nan)
+    # Where one coefficient was drawn, both are taken from the row.
     if rules.friction_hand is not None or rules.friction_table is not None:
         for k, name in enumerate(("friction_hand", "friction_table")):
             told[:, k] = dataset.column(f"conditions/{name}")[rows]
     if rules.mass is not None:
         told[:, 2] = dataset.column("object_props/work2mass")[rows, 0]
-    stands, overridden, tried = _Stands([]), overridden_keys(overrides), []
-    for grasp in grasps:
-        placed, config = stands.under(grasp.placed, grasp.config, told[grasp.index], overridden)
-        tried.append(replace(grasp, placed=placed, config=config))
-    return tried
+    return told
 
 
 def choose_rows(dataset: GraspDataset, rows: RowChoice, count: int) -> npt.NDArray[np.int64]:
@@ -460,15 +407,17 @@ def place_on_dataset(
             nobody = replace(prepared.model, name=name)
             things = [PlacedObject(model=nobody, X_TO=np.full((4, 4), np.nan), config=own)]
         rows = [i for i, each in enumerate(table.objects) if each == name]
-        placed += _placed_postures(table, rows, things, config or own, overrides)
+        placed += _placed(table, rows, things, config or own, overrides=overrides)
     return placed
 
 
-def _placed_postures(
+def _placed(
     table: Attempts,
-    rows: Sequence[int],
+    rows: Iterable[int],
     things: Sequence[PlacedObject],
     config: Config,
+    method: str = "hand",
+    snap_points: bool = False,
     overrides: Sequence[str] = (),
     cameras: Mapping[str, Array] | None = None,
 ) -> list[PlacedGrasp]:
@@ -476,57 +425,34 @@ def _placed_postures(
 
     `cameras` are poses X_TC (n, 4, 4) for the rows of the table, by their frames.
     """
-    # The cameras that are known, and what no posture has.
-    model, found = things[0].model, list[PlacedGrasp]()
-    known_cameras = dict(cameras or {})
-    if table.X_TC is not None:
-        known_cameras[CAMERA] = table.X_TC
+    model, known_cameras = things[0].model, dict(cameras or {})
+    if table.frame == "mesh" and things[0].X_OM is None:
+        raise GraspError(NO_MESH_FRAME)
+    if table.points is None:
+        method = "posture"
+        known_cameras |= {} if table.X_TC is None else {CAMERA: table.X_TC}
 
     # A row that tells how the object lies is tried so, whether or not it was dropped so.
     anywhere = replace(table, X_TO=np.full_like(table.X_TO, np.nan))
     poses = np.array([thing.X_TO for thing in things])
     table = table.refuse(misfits(anywhere, model.name, model.scale, poses))
-    hand, X_OM = load_hand(config.hand_source), things[0].X_OM
-    nothing = np.full((hand.num_fingers, 3), np.nan)
-    stands, known = _Stands(things), overridden_keys(overrides)
+    stands, overridden, found = _Stands(things), overridden_keys(overrides), list[PlacedGrasp]()
     for i in rows:
-        tried, used, reason = list[tuple[PlacedObject, Posture]](), config, table.invalid[i]
-        if not reason:
-            try:
-                for thing in stands.of(table, i):
-                    posture = table.posture(i, thing.X_TO, X_OM)
-                    told, used = stands.under(thing, config, table.conditions[i], known)
-                    tried.append((told, posture))
-            except GraspError as error:
-                if table.frame == "mesh" and X_OM is None:
-                    raise
-                tried, reason = [], str(error)
-        first = tried[0][1] if tried else None
-        stood = tried[0][0] if tried else things[0]
-        own = {name: X_TC[i] for name, X_TC in known_cameras.items()}
-        # What else the wrist's numbers may mean.
-        meant = dict[str, Array]()
-        if table.X_FG_xyzw is not None:
-            meant["quaternions x, y, z, w instead of w, x, y, z"] = table.X_FG_xyzw[i]
-        if not table.link:
-            at_link = f"poses of the palm link instead of the palm (link: {hand.palm_link})"
-            meant[at_link] = multiply(table.X_FG[i], hand.X_BG)
+        attempt, lying = table.at([i]), things[:1]
+        try:
+            lying = lying if table.invalid[i] else stands.of(table, i)
+        except GraspError as error:
+            attempt = attempt.refuse([str(error)])
+        tried = [stands.under(each, config, table.conditions[i], overridden) for each in lying]
         found.append(
             PlacedGrasp(
                 index=i,
-                placed=stood,
-                p_OQ=nothing,
-                nhat_Q_O=nothing,
-                method="posture",
-                config=used,
-                invalid=reason,
-                posture=first,
-                others=tuple(tried[1:]),
-                X_OA=None if first is None else first.X_OG @ invert_pose(table.X_FG[i]),
-                frames=known_frames(stood.X_TO, own, X_OM=X_OM),
-                pose_named=table.names_pose(i),
-                link=table.link,
-                poses=meant,
+                attempt=attempt,
+                stands=tuple(thing for thing, _ in tried),
+                method=method,
+                config=tried[0][1],
+                snap_points=snap_points,
+                cameras={name: X_TC[i] for name, X_TC in known_cameras.items()},
             )
         )
     return found
@@ -539,7 +465,7 @@ class _Stands:
         self._dropped, self._told = list(things), list[PlacedObject]()
         self._known: dict[tuple[int, bytes], tuple[PlacedObject, Config]] = {}
 
-    def of(self, table: Attempts, i: int) -> list[PlacedObject]:
+    def of(self, table: Attempts, i: int) -> Sequence[PlacedObject]:
         """Return the object as a row may be for it.
 
         Raises:

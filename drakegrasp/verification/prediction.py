@@ -1,12 +1,13 @@
 """Predicted contacts: grasp vectors become a table of attempts.
 
 In: grasp vectors in one of four frames, as a network put them out. Out: contact points and unit
-normals in that frame, and its poses in {O}; for a row that is no grasp the reason. An array that is
+normals in that frame; for a row that is no grasp the reason. An array that is
 none of grasps at all is an error that says in one line what is wrong.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from drakegrasp.config import LARGEST
 from drakegrasp.errors import GraspError
-from drakegrasp.frames import FARTHEST, NO_MESH_FRAME, Array, as_numbers, invert_pose, without_torch
+from drakegrasp.frames import FARTHEST, Array, as_numbers, without_torch
 from drakegrasp.simulation.attempts import CONDITIONS, UNTOLD, Attempts
 
 Frame = Literal["object", "camera", "table", "mesh"]
@@ -129,21 +130,17 @@ def _shape(row: Any) -> tuple[int, ...] | None:
         return None
 
 
-def frame_poses(
-    *, frame: str, X_TC: Array | None, X_TO: Array, count: int, X_OM: Array | None = None
-) -> Array:
-    """Return the poses X_OA (n, 4, 4) of the frame {A} of n grasps in {O} of the object.
+def in_frame(table: Attempts, frame: str, X_TC: Array | None) -> Attempts:
+    """Return contacts in the frame in which a caller says that they are.
 
     Args:
+        table: Of n grasps.
         frame: "object" {O}, "camera" {C}, "table" {T} or "mesh" {M}.
         X_TC: With the frame "camera": pose of the camera, (4, 4), or one per grasp (n, 4, 4).
-        X_TO: (4, 4), pose of the object.
-        count: Number of grasps, n.
-        X_OM: (4, 4), pose of the mesh file's frame; None if it is not known.
 
     Raises:
-        GraspError: If the frame or its pose is unknown, a camera's pose is missing, or one is given
-            for another frame, or not one per grasp.
+        GraspError: If the frame is unknown, a camera's pose is missing, or one is given for another
+            frame, or not one per grasp.
     """
     frame = "table" if frame == WORKSPACE else frame
     if frame not in FRAMES:
@@ -153,19 +150,11 @@ def frame_poses(
             "X_TC must be the camera's pose in the table-top frame (frame_work2cam in the files) "
             "if frame is camera, got None"
         )
-    if frame != "camera" and X_TC is not None:
+    if X_TC is None:
+        return replace(table, frame=frame)
+    if frame != "camera":
         raise GraspError(f"X_TC must be None if frame is {frame}, got a pose")
-    if frame == "object":
-        return np.tile(np.eye(4), (count, 1, 1))
-    if frame == "mesh":
-        if X_OM is None:
-            raise GraspError(NO_MESH_FRAME)
-        return np.tile(X_OM, (count, 1, 1))
-
-    X_OT = invert_pose(X_TO)
-    X_OA = X_OT if X_TC is None else X_OT @ X_TC
-    if X_OA.ndim == 2:
-        X_OA = np.broadcast_to(X_OA, (count, 4, 4))
-    if len(X_OA) != count:
-        raise GraspError(f"X_TC must be one pose, or one per grasp ({count}), got {len(X_OA)}")
-    return X_OA
+    each = np.broadcast_to(X_TC, (len(table), 4, 4)) if X_TC.ndim == 2 else X_TC
+    if len(each) != len(table):
+        raise GraspError(f"X_TC must be one pose, or one per grasp ({len(table)}), got {len(each)}")
+    return replace(table, frame=frame, X_TC=each)

@@ -10,15 +10,15 @@ prediction, a failed solver and a lost object are outcomes, not exceptions.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby, islice
 from typing import Any, TypeAlias, cast
 
 import numpy as np
 
 from drakegrasp.config import Config, with_whole_lifts
-from drakegrasp.frames import Array, invert_pose
+from drakegrasp.frames import Array
 from drakegrasp.generation.attempts import judge_sample
 from drakegrasp.grasp import for_all_fingers
 from drakegrasp.hand.description import load_hand
@@ -30,15 +30,14 @@ from drakegrasp.runtime.progress import Report
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.posture import Posture, run_trial, start_of
+from drakegrasp.simulation.posture import run_trial, start_of
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.forces import force_margin, hand_contacts, judge_forces
-from drakegrasp.verification.hints import find_hints, find_posture_hints, fit_surface, known_frames
+from drakegrasp.verification.hints import find_hints, find_posture_hints, fit_surface
+from drakegrasp.verification.placing import PlacedGrasp
 from drakegrasp.verification.result import PoseTrial, Verification
 from drakegrasp.verification.wrist_solver import WristFit, fit_wrist
-
-METHODS = ("hand", "forces")
 
 #: Decimals to which points [m] and unit normals are rounded: 0.1 mm and 0.06 degrees. This is
 #: finer than any contact is known and coarser than single precision, so the same grasp given in
@@ -49,98 +48,60 @@ POINT_DIGITS, NORMAL_DIGITS = 4, 3
 MARGINS = (1.0, 0.5)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PlacedGrasp:
-    """A grasp of k contacts on an object on the table: all that its verification needs.
-
-    Attributes:
-        index: Its place among the caller's grasps.
-        placed: The object on the table.
-        p_OQ, nhat_Q_O: (k, 3), contact points [m] and outward unit normals in {O}; NaN where the
-            row is invalid.
-        method: "hand", "forces" or "posture".
-        config: Hand, physics, lift and rules. What ends or avoids lifts (`lift.stop_when`,
-            `lift.least_chance`, `lift.least_depth_variance`) is without effect: the verdict is that
-            of a whole lift.
-        invalid: Why the row of numbers is no grasp; empty if it is one.
-        normalised: Whether a normal was not of unit length.
-        snap_points: Whether to move the points to the surface.
-        X_OA: (4, 4), pose of the frame in which the numbers were given.
-        frames: (4, 4), poses X_OF of other frames that they could be in, see `hints.known_frames`.
-        posture: With method "posture": wrist and joints, in place of contacts; None if invalid.
-        others: Of a posture that names no resting pose: the object in the others, and the same
-            posture in {O} there.
-        pose_named: Whether the caller named the resting pose in which a posture is tried.
-        link, poses: Of a posture, see `hints.find_posture_hints`.
-    """
-
-    index: int
-    placed: PlacedObject
-    p_OQ: Array
-    nhat_Q_O: Array
-    method: str
-    config: Config
-    invalid: str = ""
-    normalised: bool = False
-    snap_points: bool = False
-    X_OA: Array | None = None
-    frames: Mapping[str, Array] = field(default_factory=dict)
-    posture: Posture | None = None
-    others: tuple[tuple[PlacedObject, Posture], ...] = ()
-    pose_named: bool = True
-    link: bool = False
-    poses: Mapping[str, Array] = field(default_factory=dict)
-
-
 @one_thread
 def verify_placed(grasp: PlacedGrasp) -> Verification:
     """Return whether a grasp holds its object; the contacts are rounded to 0.1 mm."""
+    p_OQ, nhat_Q_O = grasp.contacts()
+    normalised = grasp.attempt.normalised
     base = Verification(
         method=grasp.method,
         outcome=Outcome.INVALID,
         reason=grasp.invalid,
         placed=grasp.placed,
         config=with_whole_lifts(grasp.config),
-        p_OQ=grasp.p_OQ,
-        nhat_Q_O=grasp.nhat_Q_O,
-        surface_distance=np.full(len(grasp.p_OQ), np.nan),
-        normalised=grasp.normalised,
+        p_OQ=p_OQ,
+        nhat_Q_O=nhat_Q_O,
+        surface_distance=np.full(len(p_OQ), np.nan),
+        normalised=normalised is not None and bool(normalised[0]),
     )
     if grasp.invalid:
         return base
-    if grasp.posture is not None:
-        return _best_stand(base, grasp, grasp.posture)
+    if grasp.method == "posture":
+        return _best_stand(base, grasp)
 
     # How the contacts lie on the surface, and what forces at them alone can do.
-    base = _on_surface(base, grasp)
+    model, (points, normals) = base.placed.model, _rounded(p_OQ, nhat_Q_O)
+    with timed(base.seconds, "surface"):
+        fit = fit_surface(model, points, normals)
+        if grasp.snap_points:
+            points, _ = _rounded(fit.nearest, normals)
     with timed(base.seconds, "margin"):
-        contacts = hand_contacts(base.placed.model, base.p_OQ, base.nhat_Q_O, base.config)
+        contacts = hand_contacts(model, points, normals, base.config)
         X_TO = base.placed.X_TO_simulated
-        margin = force_margin(base.placed.model, X_TO, contacts, base.config)
-    base = replace(base, epsilon=margin.epsilon, smallest_friction=margin.smallest_friction)
+        epsilon, smallest_friction = force_margin(model, X_TO, contacts, base.config)
+    base = replace(
+        base,
+        p_OQ=points,
+        nhat_Q_O=normals,
+        surface_distance=fit.distance,
+        snapped=grasp.snap_points,
+        epsilon=epsilon,
+        smallest_friction=smallest_friction,
+    )
 
     # The trial; where it fails, or the points are far away, what may be wrong with the numbers.
     result = _lift_by_hand(base) if grasp.method == "hand" else _lift_by_forces(base)
     if (result.success and not result.misplaced) or result.outcome.inconclusive:
         return result
     with timed(base.seconds, "hints"):
-        hints = find_hints(
-            base.placed.model,
-            load_hand(base.config.hand_source),
-            grasp.p_OQ,
-            base.nhat_Q_O,
-            X_OA=np.eye(4) if grasp.X_OA is None else grasp.X_OA,
-            frames=grasp.frames,
-            fits=result.success,
-        )
+        hints = find_hints(grasp, p_OQ, normals, fits=result.success)
     return replace(result, hints=hints)
 
 
 @one_thread
 def first_fit(grasp: PlacedGrasp) -> WristFit:
     """Return the wrist pose by which a grasp that is none of the invalid is judged."""
-    p_OQ, nhat_Q_O = _rounded(grasp)
-    return _fits(grasp.placed, p_OQ, nhat_Q_O, grasp.config)[0]
+    return _fits(grasp.placed, *_rounded(*grasp.contacts()), grasp.config)[0]
 
 
 def _fits(placed: PlacedObject, p_OQ: Array, nhat_Q_O: Array, config: Config) -> list[WristFit]:
@@ -150,27 +111,12 @@ def _fits(placed: PlacedObject, p_OQ: Array, nhat_Q_O: Array, config: Config) ->
     )
 
 
-def _rounded(grasp: PlacedGrasp) -> tuple[Array, Array]:
-    """Return the points and unit normals (k, 3) of a grasp, rounded."""
+def _rounded(p_OQ: Array, nhat_Q_O: Array) -> tuple[Array, Array]:
+    """Return points and unit normals (k, 3), rounded."""
     # Adding zero turns -0.0 into 0.0.
-    p_OQ = np.round(grasp.p_OQ, POINT_DIGITS) + 0.0
-    nhat_Q_O = np.round(grasp.nhat_Q_O, NORMAL_DIGITS) + 0.0
-    return p_OQ, nhat_Q_O / np.linalg.norm(nhat_Q_O, axis=1, keepdims=True)
-
-
-def _on_surface(base: Verification, grasp: PlacedGrasp) -> Verification:
-    """Return the verdict with rounded contacts, on the surface if that is asked for."""
-    p_OQ, nhat_Q_O = _rounded(grasp)
-    with timed(base.seconds, "surface"):
-        fit = fit_surface(base.placed.model, p_OQ, nhat_Q_O)
-    snapped = np.round(fit.nearest, POINT_DIGITS) + 0.0
-    return replace(
-        base,
-        p_OQ=snapped if grasp.snap_points else p_OQ,
-        nhat_Q_O=nhat_Q_O,
-        surface_distance=fit.distance,
-        snapped=grasp.snap_points,
-    )
+    normals = np.round(nhat_Q_O, NORMAL_DIGITS) + 0.0
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.round(p_OQ, POINT_DIGITS) + 0.0, normals / length
 
 
 def _lift_by_hand(base: Verification) -> Verification:
@@ -187,19 +133,14 @@ def _lift_by_hand(base: Verification) -> Verification:
     return _judged(base, tries)
 
 
-def _best_stand(base: Verification, grasp: PlacedGrasp, posture: Posture) -> Verification:
+def _best_stand(base: Verification, grasp: PlacedGrasp) -> Verification:
     """Try a posture in each resting pose that it may be for, and return the best verdict."""
-    found = [replace(_try_posture(base, grasp, posture), stand=0)]
-    for k, (placed, each) in enumerate(grasp.others, start=1):
-        # In another resting pose other frames lie elsewhere in {O}.
-        X_OA = None
-        if grasp.X_OA is not None:
-            X_OA = each.X_OG @ invert_pose(posture.X_OG) @ grasp.X_OA
-        frames = known_frames(placed.X_TO, X_OM=placed.X_OM)
-        there = replace(grasp, X_OA=X_OA, frames=frames)
-        found.append(replace(_try_posture(replace(base, placed=placed), there, each), stand=k))
+    found = [
+        _try_posture(replace(base, placed=placed, stand=k), grasp)
+        for k, placed in enumerate(grasp.stands)
+    ]
     best = max(found, key=lambda v: (v.held, v.stable, v.precision, v.outcome.stage, -v.stand))
-    if grasp.pose_named:
+    if grasp.attempt.names_pose(0):
         return best
     told = "in the one resting pose that is known, as none is named"
     if len(found) > 1:
@@ -207,8 +148,9 @@ def _best_stand(base: Verification, grasp: PlacedGrasp, posture: Posture) -> Ver
     return replace(best, reason=f"{best.reason} ({told})")
 
 
-def _try_posture(base: Verification, grasp: PlacedGrasp, posture: Posture) -> Verification:
+def _try_posture(base: Verification, grasp: PlacedGrasp) -> Verification:
     """Try a posture, which says wrist and joints itself."""
+    posture = grasp.posture(base.placed)
     with timed(base.seconds, "simulate"):
         trial = run_trial(base.placed, posture, base.config)
     start = start_of(posture, load_hand(base.config.hand_source))
@@ -227,15 +169,7 @@ def _try_posture(base: Verification, grasp: PlacedGrasp, posture: Posture) -> Ve
 
     # Where it fails, what may be wrong with the numbers.
     with timed(base.seconds, "hints"):
-        hints, distance = find_posture_hints(
-            base.placed.model,
-            load_hand(base.config.hand_source),
-            posture,
-            X_OA=np.eye(4) if grasp.X_OA is None else grasp.X_OA,
-            frames=grasp.frames,
-            link=grasp.link,
-            poses=grasp.poses,
-        )
+        hints, distance = find_posture_hints(grasp, base.placed, posture)
     return replace(result, hints=hints, fingertip_distance=distance)
 
 
@@ -373,7 +307,7 @@ def verify_batch(
         together: Most grasps of one object that are one task: they share its meshes on the way to
             a worker, and what a worker derives from them.
     """
-    objects = {g.index: (g.placed, *(placed for placed, _ in g.others)) for g in grasps}
+    objects = {g.index: g.stands for g in grasps}
     results: dict[int, Verification] = {}
     delivered = holding = 0
     report(0, len(grasps), holding=holding)

@@ -21,8 +21,8 @@ import numpy as np
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
-from drakegrasp.verification.placing import place_on_rows
-from drakegrasp.verification.verify import PlacedGrasp, verify_placed
+from drakegrasp.verification.placing import PlacedGrasp, place_on_rows
+from drakegrasp.verification.verify import verify_placed
 
 #: Most grasps of an object in the second measurement.
 SEVERAL = 6

@@ -33,7 +33,8 @@ from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import Posture, joint_order
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
-from drakegrasp.verification.verify import PlacedGrasp, first_fit
+from drakegrasp.verification.placing import place_on_object
+from drakegrasp.verification.verify import first_fit
 
 HAND = load_hand()
 
@@ -171,18 +172,13 @@ def test_workers_fit_and_cut_in_any_order(closed: tuple[Path, TrialRecord], tmp_
     assert record.closed is not None
     points, normals = record.closed.contacts.p_OQ, record.closed.contacts.nhat_Q_O
     models = [box_model(tmp_path, [CUBE] * 3, f"1_box_{letter}") for letter in "abc"]
-    placed = [
-        PlacedGrasp(
-            index=i,
-            placed=PlacedObject(model=model, X_TO=standing(model)),
-            p_OQ=np.add(points, [0.0, 0.0, 0.004 * i]),
-            nhat_Q_O=normals,
-            method="hand",
-            config=load_config(),
-            invalid="it is none" if i == 2 else "",
-        )
-        for i, model in enumerate(models)
-    ]
+    numbers = pack_grasp(points, normals)
+    placed = []
+    for i, model in enumerate(models):
+        asked = numbers + np.r_[np.tile([0.0, 0.0, 0.004 * i], 3), np.zeros(9)]
+        asked[0] = np.nan if i == 2 else asked[0]
+        (grasp,) = place_on_object(asked, PlacedObject(model=model, X_TO=standing(model)))
+        placed.append(grasp)
 
     sent: list[int] = []
 
@@ -197,7 +193,7 @@ def test_workers_fit_and_cut_in_any_order(closed: tuple[Path, TrialRecord], tmp_
     for (_, posture), grasp in zip(found[:2], placed, strict=False):
         assert isinstance(posture, Posture)
         np.testing.assert_array_equal(posture.X_OG, first_fit(grasp).X_OG)
-    assert found[2][1] == "it is none"
+    assert found[2][1] == "number 1 is nan, not finite"
     assert not np.array_equal(found[0][1].X_OG, found[1][1].X_OG)
 
     # The object of what is no grasp is not cut.

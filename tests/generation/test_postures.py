@@ -336,7 +336,7 @@ def test_postures_in_the_frame_of_the_mesh_file_are_moved_to_the_object(tmp_path
     own, again = (place_on_object(each, placed) for each in (table, moved))
     assert not any(grasp.invalid for grasp in (*own, *again))
     for one, other in zip(own, again, strict=True):
-        assert one.posture is not None and other.posture is not None
-        np.testing.assert_allclose(other.posture.X_OG, one.posture.X_OG, atol=1e-9)
+        poses = [each.posture(each.placed).X_OG for each in (one, other)]
+        np.testing.assert_allclose(*poses, atol=1e-9)
     with pytest.raises(GraspError, match=r"\(drakegrasp verify FILE --object MESH\)"):
         place_on_object(moved, replace(placed, X_OM=None))

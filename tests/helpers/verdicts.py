@@ -13,7 +13,8 @@ from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.trial import Closed, TrialRecord
-from drakegrasp.verification.forces import ContactForces, ForceVerdict, SurfaceContacts
+from drakegrasp.table import Table
+from drakegrasp.verification.forces import ContactForces, ForceVerdict
 from drakegrasp.verification.result import PoseTrial
 from drakegrasp.verification.wrist_solver import WristFit
 
@@ -75,12 +76,13 @@ def some_try(trial: TrialRecord, **values: Any) -> PoseTrial:
 
 def some_forces(*, points: float = 0.5, patches: float = 0.25) -> ForceVerdict:
     """Return what forces of three fingertips of 10 N do that take these shares of it."""
-    contacts = SurfaceContacts(
+    contacts = Table(
         p_OQ=np.full((3, 3), 0.01),
         nhat_Q_O=np.eye(3),
         distance=np.array([0.001, 0.002, 0.0]),
         inside=np.array([False, True, False]),
         angle=np.deg2rad([1.0, 2.0, 3.0]),
+        off_surface=np.zeros(3, dtype=bool),
     )
     forces = [
         ContactForces(

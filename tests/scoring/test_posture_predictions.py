@@ -85,8 +85,7 @@ def test_posture_in_the_frame_of_the_rows_camera_is_that_in_the_objects(
     table = rank_file(tmp_path / "p.npz", data)
     placed = sorted(place_on_rows(table, data, rows.tolist()), key=lambda g: g.index)
     for grasp, X_OG, row in zip(placed, X_OGs, rows.tolist(), strict=True):
-        assert grasp.posture is not None
-        np.testing.assert_allclose(grasp.posture.X_OG, X_OG, atol=1e-5)
+        np.testing.assert_allclose(grasp.posture(grasp.placed).X_OG, X_OG, atol=1e-5)
         assert grasp.placed.model.name == data.value("object_props/object_name", row)
 
 

@@ -46,7 +46,7 @@ def test_own_grasps_come_back_to_the_contacts_of_their_trials(path: Path) -> Non
     due = Trials(path.parent)[rows.column("trial_id")].columns(("closed_p_OQ", "X_TO"))
     placed = place_on_rows(rows.column("grasps"), rows)
     order = [grasp.index for grasp in placed]
-    found = np.array([grasp.p_OQ for grasp in placed])
+    found = np.array([grasp.contacts()[0] for grasp in placed])
     np.testing.assert_allclose(found, due["closed_p_OQ"][order], atol=1e-6)
     own = np.array(own_contacts(rows, range(len(rows)))).reshape(-1, 3, 3)
     np.testing.assert_allclose(own, due["closed_p_OQ"], atol=1e-6)

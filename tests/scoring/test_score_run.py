@@ -225,7 +225,7 @@ def test_own_contacts_are_those_that_are_tried(data: GraspDataset) -> None:
     placed = place_on_rows(data.column("grasps"), data)
     for each in placed:
         found = own_contacts(data, [each.index])[0]
-        np.testing.assert_allclose(found.reshape(3, 3), each.p_OQ, atol=1e-6)
+        np.testing.assert_allclose(found.reshape(3, 3), each.contacts()[0], atol=1e-6)
 
 
 def test_files_of_a_card_are_whole_and_come_again(data: GraspDataset, tmp_path: Path) -> None:

@@ -11,7 +11,8 @@ from helpers.objects import box_model, model_of
 
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.verification.hints import WALL, SurfaceFit, fit_surface
+from drakegrasp.table import Table
+from drakegrasp.verification.hints import WALL, fit_surface
 
 EXTENTS = np.array([0.06, 0.08, 0.1])
 #: Outer and inner half edge of the open box below [m]: walls of 2 mm.
@@ -33,7 +34,7 @@ def pot(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
     return model_of(mesh, tmp_path_factory.mktemp("pot"), "1_pot_a")
 
 
-def fit(model: ObjectModel, p: Array) -> SurfaceFit:
+def fit(model: ObjectModel, p: Array) -> Table:
     return fit_surface(model, p, np.tile([0.0, 0.0, 1.0], (len(p), 1)))
 
 

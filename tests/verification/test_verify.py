@@ -19,6 +19,7 @@ from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.attempts import make_attempts
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
@@ -26,7 +27,7 @@ from drakegrasp.simulation.samplers import R_OG0
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification import verify as verifying
 from drakegrasp.verification.placing import place_on_object
-from drakegrasp.verification.verify import PlacedGrasp, verify_placed
+from drakegrasp.verification.verify import verify_placed
 
 pytestmark = pytest.mark.sim
 
@@ -56,10 +57,10 @@ def verify(
     n: np.ndarray,
     method: str = "hand",
     config: Config = CONFIG,
+    **how: Any,
 ) -> dg.Verification:
-    return verify_placed(
-        PlacedGrasp(index=0, placed=placed, p_OQ=p, nhat_Q_O=n, method=method, config=config)
-    )
+    (grasp,) = place_on_object(dg.pack_grasp(p, n), placed, method=method, **how)
+    return verify_placed(replace(grasp, config=config))
 
 
 @pytest.fixture(scope="module")
@@ -143,9 +144,7 @@ def test_points_may_be_moved_to_the_surface(
     held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
 ) -> None:
     p, n = grasp
-    asked = PlacedGrasp(index=0, placed=cube, p_OQ=p + 0.03 * n, nhat_Q_O=n, method="hand",
-                        config=CONFIG, snap_points=True)  # fmt: skip
-    found = verify_placed(asked)
+    found = verify(cube, p + 0.03 * n, n, snap_points=True)
     assert found.success and found.snapped and not held.snapped
     np.testing.assert_allclose(found.p_OQ, held.p_OQ, atol=1.5e-4)
     np.testing.assert_array_equal(found.nhat_Q_O, held.nhat_Q_O)
@@ -231,26 +230,24 @@ def test_one_point_in_the_air_is_told(
     ("X_FO", "factor", "frames", "hint"),
     [
         (np.eye(4), 1e3, {}, "positions of the palm in millimetres instead of metres"),
-        (X_TC, 1.0, {"the camera's frame (camera)": invert_pose(X_TC)}, None),
+        (None, 1.0, {"the camera's frame (camera)": X_TC}, None),
         (np.eye(4), 1.0, {}, ""),
     ],
 )
 def test_posture_in_another_frame_or_unit_is_told(
     held: dg.Verification,
     cube: PlacedObject,
-    X_FO: np.ndarray,
+    X_FO: np.ndarray | None,
     factor: float,
     frames: dict[str, np.ndarray],
     hint: str | None,
 ) -> None:
     assert held.trial is not None and held.trial.closed is not None
-    X_OG = X_FO @ held.trial.X_OG
+    X_OG = (invert_pose(X_TC) @ cube.X_TO if X_FO is None else X_FO) @ held.trial.X_OG
     X_OG[:3, 3] *= factor
-    nothing = np.full((3, 3), np.nan)
-    asked = PlacedGrasp(index=0, placed=cube, p_OQ=nothing, nhat_Q_O=nothing, method="posture",
-                        config=CONFIG, posture=dg.Posture(X_OG, held.trial.closed.q),
-                        frames=frames)  # fmt: skip
-    found = verify_placed(asked)
+    table = make_attempts(HAND, [""], [X_OG], [held.trial.closed.q], resting=[0])
+    (asked,) = place_on_object(table, cube)
+    found = verify_placed(replace(asked, cameras=frames))
     if hint == "":
         assert found.held and not found.misplaced and found.hints == ()
         return
@@ -311,11 +308,7 @@ def test_contacts_in_the_frame_of_the_mesh_are_known_on_a_mesh(
 
 @pytest.mark.parametrize("method", ["hand", "forces"])
 def test_invalid_row_is_a_verdict_without_a_trial(cube: PlacedObject, method: str) -> None:
-    nothing = np.full((3, 3), np.nan)
-    found = verify_placed(
-        PlacedGrasp(index=0, placed=cube, p_OQ=nothing, nhat_Q_O=nothing, method=method,
-                    config=CONFIG, invalid="number 1 is nan, not finite")
-    )  # fmt: skip
+    found = verify(cube, np.full((3, 3), np.nan), np.eye(3), method)
     assert found.outcome is Outcome.INVALID and not found.outcome.inconclusive
     assert not (found.success or found.held or found.held_any or found.sample)
     assert found.tries == () and found.fit is None and np.isnan(found.surface_distance).all()
@@ -482,11 +475,9 @@ def test_a_wrist_pose_alone_is_fitted_by_one_thread(
         return fit_wrist(*given, **named)
 
     monkeypatch.setattr(verifying, "fit_wrist", fit)
-    p, n = grasp
+    (asked,) = place_on_object(dg.pack_grasp(*grasp), cube)
     with threadpool_limits(2):
-        verifying.first_fit(
-            PlacedGrasp(index=0, placed=cube, p_OQ=p, nhat_Q_O=n, method="hand", config=CONFIG)
-        )
+        verifying.first_fit(asked)
     assert threads == {1}
 
 

@@ -74,7 +74,7 @@ def test_more_friction_than_the_smallest_holds_and_less_does_not(
     box: ObjectModel, config: Config
 ) -> None:
     contacts = hand_contacts(box, P, N, config)
-    smallest = force_margin(box, standing(box), contacts, config).smallest_friction
+    _, smallest = force_margin(box, standing(box), contacts, config)
     assert judged(box, slippery(1.001 * smallest)).held
     found = judged(box, slippery(0.999 * smallest))
     assert not found.held and found.on_surface
