@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import sys
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -164,10 +162,10 @@ def _verify_by_lift(
     from drakegrasp.cli.tables import make_console, verdict_table
     from drakegrasp.verification.hints import count_hints
     from drakegrasp.verification.result_files import (
-        json_lines,
+        json_line,
         part_path,
         result_paths,
-        write_json_line,
+        text_lines,
         write_results,
     )
 
@@ -175,17 +173,12 @@ def _verify_by_lift(
     out = request.out
     grasps, config, rows = place_requested(request)
 
-    def print_line(index: int, result: Verification) -> None:
-        write_json_line(index, result, sys.stdout)
-
     def deliver(index: int, result: Verification) -> None:
-        write(index, result)
-        if as_json and out is not None:
-            print_line(index, result)
+        write(json_line(index, result))
 
     # Lines are written as verdicts arrive, so an interrupted run leaves those that are done.
     try:
-        with nullcontext(print_line) if out is None else json_lines(out) as write:
+        with text_lines(out, echo=as_json) as write:
             results = run_verification(grasps, **workers, on_result=deliver, show=not quiet)
             if out is not None:
                 write_results(results, result_paths(out)[1], config, rows)
@@ -222,10 +215,6 @@ def _verify_by_protocol(
     from drakegrasp.protocols.postures import json_line, prepare_trials, verify_postures
     from drakegrasp.verification.result_files import refuse_unwritable, result_paths, text_lines
 
-    def print_line(line: str) -> None:
-        sys.stdout.write(line + "\n")
-        sys.stdout.flush()
-
     if out is not None:
         refuse_unwritable(out)
     held, show, read = 0, not (quiet or as_json), request.grasps
@@ -239,15 +228,12 @@ def _verify_by_protocol(
 
         # A line per verdict as it comes.
         with (
-            nullcontext(print_line) if out is None else text_lines(out) as write,
+            text_lines(out, echo=as_json) as write,
             progress_bar("verify", "grasps", show=show) as report,
         ):
             for index, result in enumerate(verify_postures(files, trials, execute)):
                 name = read if folder == Path(scratch) else files[index]
-                line = json_line(index, name, result, trials)
-                write(line)
-                if as_json and out is not None:
-                    print_line(line)
+                write(json_line(index, name, result, trials))
                 held += result[0].success
                 report(index + 1, len(files), holding=held)
     if out is not None and not as_json:

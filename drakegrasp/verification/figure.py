@@ -7,10 +7,10 @@ trial. The pictures come from `pictures.still_scene`, so they need OpenGL and a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -89,7 +89,6 @@ class Marks:
         p_OQ: (n, 3), points in {O} [m].
         nhat_Q_O: (n, 3), outward unit normals in {O}.
         tail_O, tip_O: (n, 3), ends of the arrows in {O} [m].
-        names: Text at the tip of each arrow.
     """
 
     kind: str
@@ -99,91 +98,50 @@ class Marks:
     nhat_Q_O: Array
     tail_O: Array
     tip_O: Array
-    names: Sequence[str]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class View:
-    """A picture, and the contacts to draw over it.
-
-    Attributes:
-        title: Text above the picture.
-        picture: The picture.
-        X_WO: (4, 4), pose of the object.
-        marks: The contacts.
-    """
-
-    title: str
-    picture: Picture
-    X_WO: Array
-    marks: Sequence[Marks]
+#: A picture with its title, the pose X_WO (4, 4) of the object in it, and the contacts to draw.
+View: TypeAlias = tuple[str, Picture, Array, Sequence[Marks]]
 
 
-def render_views(verified: Verification) -> list[View]:
-    """Return the views of a verified grasp.
-
-    Args:
-        verified: The verdict.
-
-    Raises:
-        MachineError: If a picture is blank, which means that OpenGL failed.
-    """
-    # The contacts: predicted ones, those after closing, and where these are after the lift.
-    model = verified.placed.model
+def _views(verified: Verification) -> Iterator[View]:
+    """Yield the object from two sides, then the last state that was reached with the hand."""
+    # The predicted contacts, those after closing with their forces, and where these are after the
+    # lift on the object as it lay: an arrow is how far a fingertip slid over its surface.
+    model, closed, lifted = verified.placed.model, verified.closed, verified.lifted
     scene = StillScene(load_hand(verified.config.hand_source), model)
     X_WO = X_WT @ verified.placed.X_TO_simulated
-    marks = [
-        _predicted(verified),
-        *_reached(verified.closed, _force_scale(verified)),
-        *_moved(verified.closed, verified.lifted),
-    ]
+    scale = LARGEST_FORCE / largest_force(verified)
+    marks = [_predicted(verified)]
+    if closed is not None:
+        marks.append(_arriving(closed, closed.p_OQ - scale * closed.f_Q_O, "reached", REACHED))
+    if closed is not None and lifted is not None:
+        marks.append(_arriving(lifted, closed.p_OQ, "lifted", LIFTED, size=4.0))
 
-    # The object from two sides, then the last state that was reached.
-    first, second = _two_sides(model, X_WO, marks)
-    return [
-        _object_view(scene, "contacts", X_WO, marks, _camera(model, X_WO, marks, first)),
-        _object_view(scene, "from another side", X_WO, marks, _camera(model, X_WO, marks, second)),
-        *_last_view(scene, verified, marks),
-    ]
+    # The object alone.
+    azimuths = _two_sides(model, X_WO, marks)
+    for title, azimuth in zip(("contacts", "from another side"), azimuths, strict=True):
+        scene.pose(Poses(X_WG=AWAY, q=scene.positions(0.0), X_WO=X_WO))
+        X_WC = _camera(model, X_WO, marks, azimuth)
+        yield title, scene.picture(X_WC, (PIXELS, PIXELS), LIGHTING), X_WO, marks
 
-
-def _last_view(scene: StillScene, verified: Verification, marks: Sequence[Marks]) -> list[View]:
-    """Return the view of the last state that was reached; no view if no hand was tried."""
-    X_WO = X_WT @ verified.placed.X_TO_simulated
+    # The hand after the lift or closed, or its palm pose that comes closest.
     trial, fit = verified.trial, verified.fit
-
-    # After the lift.
     if trial is not None and trial.lift is not None:
-        X_WO = X_WT @ trial.lift.X_TO
-        reached = _reached(verified.lifted, _force_scale(verified), kind="lifted", colour=LIFTED)
-        title, X_OG, q = "end of the lift, with forces", trial.lift.X_OG, trial.lift.q
-        return [_hand_view(scene, title, X_WO, X_OG, q, reached)]
-
-    # Before it: the closed hand, or the palm pose that comes closest.
-    if trial is not None and trial.closed is not None:
-        return [_hand_view(scene, "after closing", X_WO, trial.X_OG, trial.closed.q, marks)]
-    if fit is not None:
+        X_WO, X_OG, q = X_WT @ trial.lift.X_TO, trial.lift.X_OG, trial.lift.q
+        end = trial.lift.contacts
+        marks = [_arriving(end, end.p_OQ - scale * end.f_Q_O, "lifted", LIFTED)]
+        title = "end of the lift, with forces"
+    elif trial is not None and trial.closed is not None:
+        title, X_OG, q = "after closing", trial.X_OG, trial.closed.q
+    elif fit is not None:
         q, title = scene.positions(fit.spread, fit.closing), "the hand where it comes closest"
-        return [_hand_view(scene, title, X_WO, fit.X_OG, q, marks)]
-    return []
-
-
-def _object_view(
-    scene: StillScene, title: str, X_WO: Array, marks: Sequence[Marks], X_WC: Array
-) -> View:
-    """Return a view of the object alone."""
-    scene.pose(Poses(X_WG=AWAY, q=scene.positions(0.0), X_WO=X_WO))
-    picture = scene.picture(X_WC, (PIXELS, PIXELS), LIGHTING)
-    return View(title=title, picture=picture, X_WO=X_WO, marks=marks)
-
-
-def _hand_view(
-    scene: StillScene, title: str, X_WO: Array, X_OG: Array, q: Array, marks: Sequence[Marks]
-) -> View:
-    """Return a view of hand and object, from where most of both is visible."""
+        X_OG = fit.X_OG
+    else:
+        return
     around = scene.outline(Poses(X_WG=X_WO @ X_OG, q=q, X_WO=X_WO))
     picture = scene.picture(scene.choose_view(around), (PIXELS, PIXELS), LIGHTING)
-    return View(title=title, picture=picture, X_WO=X_WO, marks=marks)
+    yield title, picture, X_WO, marks
 
 
 def _predicted(verified: Verification) -> Marks:
@@ -191,68 +149,18 @@ def _predicted(verified: Verification) -> Marks:
     # A row that is no grasp has none.
     there = np.isfinite(verified.p_OQ).all(axis=1)
     p, n = verified.p_OQ[there], verified.nhat_Q_O[there]
-    return Marks(
-        kind="predicted",
-        colour=PREDICTED,
-        size=9.0,
-        p_OQ=p,
-        nhat_Q_O=n,
-        tail_O=p,
-        tip_O=p + ARROW * n,
-        names=[str(i + 1) for i in range(len(p))],
-    )
-
-
-def _reached(
-    contacts: Contacts | None, scale: float, *, kind: str = "reached", colour: str = REACHED
-) -> list[Marks]:
-    """Return the contacts of touching fingertips, if any, with their forces as arrows.
-
-    The arrow of a force ends at its contact; its length per force is `scale` [m/N].
-    """
-    if contacts is None:
-        return []
-    return _arriving(
-        contacts, contacts.touching, contacts.p_OQ - scale * contacts.f_Q_O, kind, colour, size=5.0
-    )
-
-
-def _moved(closed: Contacts | None, lifted: Contacts | None) -> list[Marks]:
-    """Return the contacts after the lift, with arrows from where they were after closing.
-
-    They are on the object as it lay: an arrow is how far a fingertip slid over its surface.
-    """
-    if closed is None or lifted is None:
-        return []
-    both = closed.touching & lifted.touching
-    return _arriving(lifted, both, closed.p_OQ, "lifted", LIFTED, size=4.0)
+    return Marks(kind="predicted", colour=PREDICTED, size=9.0, p_OQ=p, nhat_Q_O=n, tail_O=p,
+                 tip_O=p + ARROW * n)  # fmt: skip
 
 
 def _arriving(
-    contacts: Contacts,
-    chosen: npt.NDArray[np.bool_],
-    tail_O: Array,
-    kind: str,
-    colour: str,
-    *,
-    size: float,
-) -> list[Marks]:
-    """Return chosen contacts (k,), if there is one, at the tips of arrows from tail_O (k, 3)."""
-    if not chosen.any():
-        return []
-    p = contacts.p_OQ[chosen]
-    return [
-        Marks(
-            kind=kind,
-            colour=colour,
-            size=size,
-            p_OQ=p,
-            nhat_Q_O=contacts.nhat_Q_O[chosen],
-            tail_O=tail_O[chosen],
-            tip_O=p,
-            names=[""] * len(p),
-        )
-    ]
+    contacts: Contacts, tail_O: Array, kind: str, colour: str, *, size: float = 5.0
+) -> Marks:
+    """Return the contacts that touch, at the tips of arrows from tail_O (k, 3), NaN for none."""
+    there = contacts.touching & np.isfinite(tail_O).all(axis=1)
+    p, n = contacts.p_OQ[there], contacts.nhat_Q_O[there]
+    return Marks(kind=kind, colour=colour, size=size, p_OQ=p, nhat_Q_O=n, tail_O=tail_O[there],
+                 tip_O=p)  # fmt: skip
 
 
 def largest_force(verified: Verification) -> float:
@@ -260,11 +168,6 @@ def largest_force(verified: Verification) -> float:
     ends = (verified.closed, verified.lifted)
     forces = [float(np.linalg.norm(c.f_Q_O, axis=1).max()) for c in ends if c is not None]
     return max(forces, default=0.0) or np.inf
-
-
-def _force_scale(verified: Verification) -> float:
-    """Return the length of an arrow per force [m/N]."""
-    return LARGEST_FORCE / largest_force(verified)
 
 
 def _two_sides(model: ObjectModel, X_WO: Array, marks: Sequence[Marks]) -> tuple[float, float]:
@@ -324,7 +227,7 @@ STABLE, HELD, FAILS = "#1B7F3B", "#8A5A00", "#B3261E"
 
 
 def verification_figure(verified: Verification) -> Figure:
-    """Return the figure of a verified grasp.
+    """Return the figure of a verified grasp: views side by side, the verdict, and a legend.
 
     Args:
         verified: The verdict.
@@ -332,23 +235,20 @@ def verification_figure(verified: Verification) -> Figure:
     Raises:
         MachineError: If a picture is blank, which means that OpenGL failed.
     """
-    return _draw_figure(verified, verified.placed.model, render_views(verified))
+    model, views = verified.placed.model, list(_views(verified))
 
-
-def _draw_figure(verified: Verification, model: ObjectModel, views: Sequence[View]) -> Figure:
-    """Draw the views side by side, with the verdict above and the legend below."""
     # The page [inch].
     gap, margin, head, foot = 0.08, 0.12, 1.25, 0.4
     width = len(views) * (EDGE + gap) - gap + 2.0 * margin
     figure = Figure(figsize=(width, EDGE + head + foot), facecolor="white")
 
     # The views, with their contacts.
-    for k, view in enumerate(views):
+    for k, (title, picture, X_WO, marks) in enumerate(views):
         axes = add_axes(figure, margin + k * (EDGE + gap), head, EDGE, EDGE)
-        show_image(axes, view.picture.image)
-        axes.set_title(view.title, fontsize=9.5, color=INK, loc="left", pad=4)
-        for marks in view.marks:
-            _draw_marks(axes, view, model, marks)
+        show_image(axes, picture.image)
+        axes.set_title(title, fontsize=9.5, color=INK, loc="left", pad=4)
+        for each in marks:
+            _draw_marks(axes, picture, X_WO, model, each)
 
     # The verdict, its reason, and what happened in the hand.
     left, height = margin / width, EDGE + head + foot
@@ -390,19 +290,19 @@ def _lift_line(verified: Verification) -> str:
     )
 
 
-def _draw_marks(axes: Axes, view: View, model: ObjectModel, marks: Marks) -> None:
+def _draw_marks(
+    axes: Axes, picture: Picture, X_WO: Array, model: ObjectModel, marks: Marks
+) -> None:
     """Draw contacts of one kind; the dots of those that the object hides are hollow."""
     # Project them into the picture, and ask which are visible.
     halo = [withStroke(linewidth=3.0, foreground="white")]
-    pixels = [
-        view.picture.pixels(transform_points(view.X_WO, p))
-        for p in (marks.p_OQ, marks.tail_O, marks.tip_O)
-    ]
-    seen = is_seen(model, view.X_WO, marks, view.picture.X_WC[:3, 3])
+    ends = (marks.p_OQ, marks.tail_O, marks.tip_O)
+    pixels = [picture.pixels(transform_points(X_WO, p)) for p in ends]
+    seen = is_seen(model, X_WO, marks, picture.X_WC[:3, 3])
 
-    # An arrow, the dot, and the name beyond the arrow's tip.
-    rows = zip(*pixels, marks.names, seen, strict=True)
-    for i, (dot, tail, tip, name, visible) in enumerate(rows):
+    # An arrow, the dot, and for a prediction its number beyond the arrow's tip.
+    for i, (dot, tail, tip, visible) in enumerate(zip(*pixels, seen, strict=True)):
+        name = str(i + 1) if marks.kind == "predicted" else ""
         arrow = {"arrowstyle": "-|>", "color": marks.colour, "linewidth": 0.36 * marks.size,
                  "shrinkA": 0.0, "shrinkB": 0.0, "mutation_scale": 4.0 + marks.size,
                  "path_effects": halo}  # fmt: skip

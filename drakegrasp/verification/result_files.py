@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -86,40 +87,35 @@ def _is_writable(folder: Path) -> bool:
 
 
 @contextmanager
-def json_lines(out: Path) -> Iterator[Callable[[int, Verification], None]]:
-    """Yield a function that writes the next verdict as a JSON line, see `text_lines`."""
-    with text_lines(out) as write:
-        yield lambda index, result: write(json_line(index, result))
-
-
-@contextmanager
-def text_lines(out: Path) -> Iterator[Callable[[str], None]]:
-    """Yield a function that writes the next line of NAME.jsonl.
+def text_lines(out: Path | None, *, echo: bool = False) -> Iterator[Callable[[str], None]]:
+    """Yield a function that writes the next line of NAME.jsonl, and flushes it.
 
     Until the block ends, the lines are in NAME.part.jsonl; they stay there if the block raises. No
     file is made before the first line.
 
     Args:
-        out: The common name of the files, see `result_paths`.
+        out: The common name of the files, see `result_paths`; None: standard output.
+        echo: Whether lines of a file go to standard output, too.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written.
     """
-    lines, _ = result_paths(out)
-    part, stream = part_path(out), None
+    streams = [sys.stdout] if echo or out is None else []
     with ExitStack() as stack:
+        opened = list[TextIO]()
 
         def write(line: str) -> None:
-            nonlocal stream
-            if stream is None:
-                part.parent.mkdir(parents=True, exist_ok=True)
-                stream = stack.enter_context(part.open("w", encoding="utf-8"))
-            _write_line(line, stream)
+            if out is not None and not opened:
+                part_path(out).parent.mkdir(parents=True, exist_ok=True)
+                opened.append(stack.enter_context(part_path(out).open("w", encoding="utf-8")))
+            for stream in (*opened, *streams):
+                stream.write(line + "\n")
+                stream.flush()
 
         yield write
-    if stream is not None:
+    if out is not None and opened:
         # Not `atomic_path`: the lines of a run that is stopped must stay.
-        sync_and_rename(part, lines)
+        sync_and_rename(part_path(out), result_paths(out)[0])
 
 
 def part_path(out: Path) -> Path:
@@ -128,29 +124,10 @@ def part_path(out: Path) -> Path:
     return lines.with_suffix(f".part{JSON_SUFFIX}")
 
 
-def write_json_line(index: int, result: Verification, stream: TextIO) -> None:
-    """Write a result as a line of strict JSON, and flush it; NaN and infinity become null.
-
-    Args:
-        index: Of the grasp.
-        result: Its verdict.
-        stream: Where to write.
-    """
-    _write_line(json_line(index, result), stream)
-
-
 def json_line(index: int, result: Verification) -> str:
-    """Return a result as a line of strict JSON, see `write_json_line`."""
-    return json.dumps(_plain(as_dict(index, result)), ensure_ascii=False, allow_nan=False)
+    """Return a verdict as a line of strict JSON; NaN and infinity become null.
 
-
-def _write_line(line: str, stream: TextIO) -> None:
-    stream.write(line + "\n")
-    stream.flush()
-
-
-def as_dict(index: int, result: Verification) -> dict[str, Any]:
-    """Return the JSON object of a result; keys that are HDF5 fields have the same meaning.
+    Keys that are HDF5 fields have the same meaning.
 
     Args:
         index: Of the grasp.
@@ -162,8 +139,11 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
     def fields(*names: str) -> dict[str, Any]:
         return {name: values[name] for name in names}
 
+    def degrees(name: str) -> Any:
+        return None if values[name] is None else np.rad2deg(values[name])
+
     # In the order in which a person reads them: verdict, contacts, hand, lift, margin.
-    return {
+    line = {
         "index": index,
         **fields("object", "method", "success", "held", "precision", "stable", "sample"),
         "removal": None if result.removal is None else result.removal.label,
@@ -176,14 +156,14 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         "outcomes": [each.trial.outcome.label for each in result.tries],
         **fields("X_TO", "p_OQ", "nhat_Q_O", "normalised", "snapped", "surface_distance"),
         **fields("X_OG", "spread", "closing", "fit_residual"),
-        "fit_normal_error_deg": _degrees(values["fit_normal_error"]),
+        "fit_normal_error_deg": degrees("fit_normal_error"),
         **fields("contact_error"),
-        "normal_error_deg": _degrees(values["normal_error"]),
+        "normal_error_deg": degrees("normal_error"),
         "solver": None if fit is None else _attributes(fit, "status", "message", "iterations"),
         "closed": None if trial is None else _end_as_dict(trial.closed),
         "lifted": None if trial is None else _end_as_dict(trial.lift),
         "slip": values["slip"],
-        "turn_deg": _degrees(values["turn"]),
+        "turn_deg": degrees("turn"),
         **fields("epsilon", "smallest_friction"),
         # A null above is either infinity or not computed; this tells which.
         "friction_can_hold": None
@@ -199,10 +179,7 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         },
         "seconds": result.seconds,
     }
-
-
-def _degrees(angles: AnyArray | float | None) -> Any:
-    return None if angles is None else np.rad2deg(angles)
+    return json.dumps(_plain(line), ensure_ascii=False, allow_nan=False)
 
 
 def _attributes(source: object, *names: str) -> dict[str, Any]:

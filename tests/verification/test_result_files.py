@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from dataclasses import replace
@@ -26,11 +25,11 @@ from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.result_files import (
-    json_lines,
+    json_line,
     part_path,
     refuse_unwritable,
     result_paths,
-    write_json_line,
+    text_lines,
     write_results,
 )
 
@@ -103,14 +102,13 @@ def found() -> list[Verification]:
 
 
 def lines_of(found: list[Verification]) -> list[dict[str, Any]]:
-    stream = io.StringIO()
-    for index, result in enumerate(found):
-        write_json_line(index, result, stream)
-
     def refuse(constant: str) -> None:
         raise AssertionError(f"{constant} is not strict JSON")
 
-    return [json.loads(line, parse_constant=refuse) for line in stream.getvalue().splitlines()]
+    return [
+        json.loads(json_line(index, result), parse_constant=refuse)
+        for index, result in enumerate(found)
+    ]
 
 
 def test_a_line_says_all_of_a_grasp_in_strict_json(found: list[Verification]) -> None:
@@ -216,18 +214,18 @@ def test_lines_are_whole_in_the_end_and_not_lost_before(
     found: list[Verification], tmp_path: Path
 ) -> None:
     out = tmp_path / "new folder" / "run.1"
-    with pytest.raises(KeyboardInterrupt), json_lines(out) as write:
-        write(0, found[0])
+    with pytest.raises(KeyboardInterrupt), text_lines(out) as write:
+        write(json_line(0, found[0]))
         assert len(part_path(out).read_text(encoding="utf-8").splitlines()) == 1
         raise KeyboardInterrupt
     assert [p.name for p in out.parent.iterdir()] == ["run.1.part.jsonl"]
-    with json_lines(out) as write:
+    with text_lines(out) as write:
         for index, result in enumerate(found):
-            write(index, result)
+            write(json_line(index, result))
     (whole,) = out.parent.iterdir()
     assert whole.name == "run.1.jsonl"
     assert len(whole.read_text(encoding="utf-8").splitlines()) == 4
-    with pytest.raises(ValueError, match="nothing"), json_lines(tmp_path / "deep" / "run"):
+    with pytest.raises(ValueError, match="nothing"), text_lines(tmp_path / "deep" / "run"):
         raise ValueError("nothing was verified")
     assert [p.name for p in tmp_path.iterdir()] == ["new folder"]
 
