@@ -705,7 +705,7 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
         *_LIFTED,
         Field("X_TO_lifted", "12", "float64", "m, -", "T",
               "pose of the object after the lift, which began at X_TO_simulated",
-              of="X_TO_lifted"),
+              of="trial.lift.X_TO"),
         *_SLIP,
     ),
     *_measured(

@@ -253,11 +253,6 @@ class Verification:
         return None if end is None else end.contacts
 
     @property
-    def X_TO_lifted(self) -> Array | None:
-        """Pose (4, 4) of the object after the lift."""
-        return self.trial.lift.X_TO if self.trial is not None and self.trial.lift else None
-
-    @property
     def solver_status(self) -> int:
         """Exit mode of SLSQP, 0 for success; -1 where it was not asked."""
         return -1 if self.fit is None else self.fit.status
@@ -290,7 +285,7 @@ class Verification:
 
     def explain(self) -> str:
         """Return the verdict, and why, in a few sentences."""
-        return explain(self)
+        return " ".join(_sentences(self))
 
     def __repr__(self) -> str:
         return f"Verification({self.method}, {self.words}: {self.reason})"
@@ -300,11 +295,6 @@ def _largest(values: Array | None) -> float:
     """Return the largest number, NaN if there is none."""
     there = np.zeros(0) if values is None else values[np.isfinite(values)]
     return float(there.max()) if there.size else np.nan
-
-
-def explain(verified: Verification) -> str:
-    """Return the verdict, and why, in a few sentences."""
-    return " ".join(_sentences(verified))
 
 
 def _sentences(verified: Verification) -> Iterator[str]:
