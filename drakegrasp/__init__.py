@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from drakegrasp.hand.description import Hand, load_hand
     from drakegrasp.hand.settings import load_config
     from drakegrasp.outcomes import Outcome
+    from drakegrasp.scoring.proposals import propose
+    from drakegrasp.scoring.ranking import Ranking, rank
     from drakegrasp.scoring.run import Score
     from drakegrasp.simulation.posture import Posture, make_posture, run_trial
     from drakegrasp.verification.result import PoseTrial, Verification
@@ -68,6 +70,7 @@ _HOMES = {
     "PlacedObject": "api.verifying",
     "PoseTrial": "verification.result",
     "Posture": "simulation.posture",
+    "Ranking": "scoring.ranking",
     "Replay": "generation.replay",
     "Sample": "dataset.reader",
     "SceneDataset": "dataset.scenes",
@@ -84,6 +87,8 @@ _HOMES = {
     "make_posture": "simulation.posture",
     "pack_grasp": "grasp",
     "place_object": "api.verifying",
+    "propose": "scoring.proposals",
+    "rank": "scoring.ranking",
     "replay_trial": "generation.replay",
     "run_trial": "simulation.posture",
     "score": "api.scoring",
@@ -112,6 +117,7 @@ __all__ = [
     "PlacedObject",
     "PoseTrial",
     "Posture",
+    "Ranking",
     "Replay",
     "Sample",
     "SceneDataset",
@@ -128,6 +134,8 @@ __all__ = [
     "make_posture",
     "pack_grasp",
     "place_object",
+    "propose",
+    "rank",
     "replay_trial",
     "run_trial",
     "score",

@@ -420,14 +420,14 @@ def _meeting(lookup: PointLookup, path: FingerPath) -> Array:
     for _ in range(STEPS):
         if not len(active):
             break
-        least = lookup.distances(active, _points(path, place[active]), FAR).min(axis=1)
+        least = lookup.distances(active, points_at(path, place[active]), FAR).min(axis=1)
         place[active] += least / rate
         going = (np.abs(least) > TOUCH) & (place[active] >= 0.0) & (place[active] <= end)
         active = active[going]
     return np.where(place > end, np.inf, place)
 
 
-def _points(path: FingerPath, place: Array) -> npt.NDArray[np.float32]:
+def points_at(path: FingerPath, place: Array) -> npt.NDArray[np.float32]:
     """Return the points (n, p, 3) in {G} at places on a path, between its steps in proportion."""
     before = np.clip(np.floor(place).astype(np.int64), 0, len(path.points) - 2)
     share = (place - before).astype(np.float32)[:, None, None]

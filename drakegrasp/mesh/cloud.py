@@ -1,0 +1,163 @@
+"""Solids of what a camera saw: the visible points of an object on the table, filled.
+
+In: points (n, 3) in {T}, whose table is z = 0. Out: distance fields in {T}. Of the object's back
+and of its underside nothing is seen, so a solid is a guess; two of them bracket it. The convex hull
+of the points and of what is below them fills every hollow; the columns from the points down to the
+table keep handles and waists that are seen from above.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import binary_closing, distance_transform_edt
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from drakegrasp.arithmetic import Array, norm
+from drakegrasp.errors import GraspError
+from drakegrasp.frames import as_numbers
+from drakegrasp.mesh.distance_field import DistanceField
+
+#: Fewest points of a cloud, most that are used, and its largest size [m]: that of an object.
+FEWEST, MOST, LARGEST = 10, 4096, 1.0
+#: Points rise at least so far above the table [m]: thinner objects no solid shows.
+LEAST_HEIGHT = 0.004
+#: Approximate number of cells of a grid, no finer than this [m], and empty cells around it.
+CELLS, FINEST, PADDING = 150_000, 0.002, 6
+#: Normals are slopes between points this many cells apart from where they are asked for: columns
+#: have steps of a cell.
+SLOPE = 2.0
+#: Gaps between columns are filled up to this many times the distance between neighbouring points,
+#: and at least and at most up to so many cells.
+CLOSED, LEAST_CLOSED, MOST_CLOSED = 2.0, 3, 2 * PADDING - 1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solid:
+    """A filled cloud: its distance field in {T}, and the middle (3,) of its volume [m]."""
+
+    field: DistanceField
+    middle: Array
+
+    def normals(self, p_TQ: Array) -> Array:
+        """Return unit normals (n, 3), outward, of the solid nearest to points (n, 3) [m]."""
+        slope = np.zeros_like(p_TQ)
+        for axis, step in enumerate(SLOPE * self.field.spacing * np.eye(3)):
+            ahead, behind = (
+                self.field.interpolate(*(p_TQ + sign * step).astype(np.float32).T)
+                for sign in (1.0, -1.0)
+            )
+            slope[:, axis] = ahead - behind
+        return slope / np.maximum(norm(slope), np.finfo(float).tiny)[:, None]
+
+
+def read_cloud(cloud: npt.ArrayLike) -> Array:
+    """Return the points (n, 3) of a cloud [m], none below the table, `MOST` of them at most.
+
+    Raises:
+        GraspError: If they are no points of one object that stands on the table.
+    """
+    must = "cloud must be points (n, 3) of one object, in {T} and in metres"
+    points = as_numbers(cloud, must)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise GraspError(f"{must}, got an array of shape {points.shape}")
+    if not np.isfinite(points).all():
+        raise GraspError(f"{must}, got numbers that are not finite")
+    if len(points) < FEWEST:
+        raise GraspError(f"{must}, {FEWEST} or more, got {len(points)}")
+    if (size := float(np.ptp(points, axis=0).max())) > LARGEST:
+        raise GraspError(f"{must}, got points {size:.3g} m apart")
+    if (top := float(points[:, 2].max())) < LEAST_HEIGHT:
+        raise GraspError(f"{must}, got none higher than {1e3 * top:.3g} mm above the table")
+    points = points[:: -(-len(points) // MOST)].copy()
+    points[:, 2] = np.maximum(points[:, 2], 0.0)
+    return points
+
+
+def hull_solid(points: Array) -> Solid:
+    """Return the convex hull of points (n, 3) and of what is below them on the table.
+
+    Raises:
+        GraspError: If the points lie in a vertical plane.
+    """
+    planes = _hull(np.concatenate([points, points * [1.0, 1.0, 0.0]])).equations
+    origin, spacing, shape = _grid(points)
+    x, y, z = (o + spacing * np.arange(n) for o, n in zip(origin, shape, strict=True))
+
+    # Distances from the nearest face: outside of edges and corners they are too small.
+    values = np.full(shape, -np.inf)
+    for a, b, c, d in np.unique(planes.round(6), axis=0):
+        np.maximum(values, a * x[:, None, None] + b * y[:, None] + (c * z + d), out=values)
+    return _solid(values, points, origin, spacing)
+
+
+def column_solid(points: Array) -> Solid:
+    """Return the columns from points (n, 3) down to the table, small gaps between them filled."""
+    origin, spacing, shape = _grid(points)
+    i, j, k = np.rint((points - origin) / spacing).astype(np.int64).T
+    top = np.full(shape[:2], -1)
+    np.maximum.at(top, (i, j), k)
+    layers = np.arange(shape[2])
+    filled = (layers <= top[:, :, None]) & (layers >= PADDING)
+
+    # Few points leave wide gaps.
+    apart = np.quantile(cKDTree(points).query(points, k=2)[0][:, 1], 0.9)
+    width = int(np.clip(np.ceil(CLOSED * apart / spacing) + 1, LEAST_CLOSED, MOST_CLOSED))
+    filled |= binary_closing(filled, np.ones((width, width, 1)))
+
+    # Half a cell: the surface is between a filled point and one that is not.
+    inside, outside = distance_transform_edt(filled), distance_transform_edt(~filled)
+    steps = np.where(filled, 0.5 - inside, outside - 0.5)
+    return _solid(spacing * steps, points, origin, spacing)
+
+
+def smallest_rectangle(points: Array) -> tuple[Array, Array, Array]:
+    """Return the smallest rectangle about points (n, 3) seen from above.
+
+    Returns:
+        Unit axes (2, 2) as rows, the long side first; the middle (2,) and half sides (2,) [m].
+
+    Raises:
+        GraspError: If the points lie in a vertical plane.
+    """
+    corners = points[_hull(points[:, :2]).vertices, :2]
+    edges = np.roll(corners, -1, axis=0) - corners
+    u = edges / norm(edges)[:, None]
+    axes = np.stack([u, np.column_stack([-u[:, 1], u[:, 0]])], axis=1)
+    along = axes @ corners.T
+    low, high = along.min(axis=2), along.max(axis=2)
+    best = int(np.argmin(np.prod(high - low, axis=1)))
+    middle = axes[best].T @ (low[best] + high[best]) / 2.0
+    half = (high[best] - low[best]) / 2.0
+    order = np.argsort(-half)
+    return axes[best][order], middle, half[order]
+
+
+def _hull(points: Array) -> ConvexHull:
+    try:
+        return ConvexHull(points)
+    except QhullError:
+        raise GraspError("cloud must show an object from above or aslant, got a flat one") from None
+
+
+def _grid(points: Array) -> tuple[Array, float, tuple[int, ...]]:
+    """Return the first point (3,) [m], the spacing [m] and the shape of a grid about a cloud."""
+    low, high = points.min(axis=0) * [1.0, 1.0, 0.0], points.max(axis=0)
+    room = high - low + 2 * PADDING * FINEST
+    spacing = max(FINEST, float(np.cbrt(np.prod(room) / CELLS)))
+    shape = np.ceil((high - low) / spacing).astype(int) + 2 * PADDING + 1
+    return low - PADDING * spacing, spacing, tuple(shape.tolist())
+
+
+def _solid(values: Array, points: Array, origin: Array, spacing: float) -> Solid:
+    """Return the solid of signed distances (nx, ny, nz) [m] on a grid."""
+    field = DistanceField(
+        origin=origin,
+        spacing=spacing,
+        values=values.astype(np.float32),
+        lower=points.min(axis=0) * [1.0, 1.0, 0.0],
+        upper=points.max(axis=0),
+    )
+    return Solid(field=field, middle=np.argwhere(values < 0.0).mean(axis=0) * spacing + origin)

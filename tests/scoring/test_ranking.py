@@ -1,0 +1,174 @@
+"""Grasps are proposed and ranked by closing the hand on the points that a camera saw."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+import drakegrasp as dg
+from drakegrasp.arithmetic import Array
+from drakegrasp.frames import invert_pose, make_pose, rotation_about
+from drakegrasp.mesh.cloud import column_solid, hull_solid, read_cloud
+from drakegrasp.scoring.proposals import SAME
+from drakegrasp.simulation.attempts import make_attempts
+
+#: Half extents of a box on the table, whose long side, along Tx, no hand spans [m].
+HALF = np.array([0.18, 0.03, 0.04])
+#: A palm that looks down on it closes across Ty.
+DOWN = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 2 * HALF[2] + 0.06])
+
+
+def seen(half: Array = HALF, turn: float = 0.0) -> Array:
+    """Return points on the top and on the sides +x and +y of a box on the table, turned [rad]."""
+    x, y, z = (np.linspace(-each, each, int(each / 0.0015)) for each in half)
+    faces = [(x, y, half[2:]), (half[:1], y, z), (x, half[1:2], z)]
+    grids = [np.stack(np.meshgrid(*face), axis=-1).reshape(-1, 3) for face in faces]
+    points = np.concatenate(grids)
+    points[:, 2] += half[2]
+    return points @ rotation_about([0.0, 0.0, 1.0], turn).T
+
+
+def turned(X_TG: Array, degrees: float) -> Array:
+    """Return a palm pose turned about its own Gz."""
+    return X_TG @ make_pose(rotation_about([0.0, 0.0, 1.0], np.deg2rad(degrees)), np.zeros(3))
+
+
+def moved(*p_GQ: float) -> Array:
+    return DOWN @ make_pose(np.eye(3), p_GQ)
+
+
+def test_a_grasp_across_the_narrow_side_beats_one_along_it() -> None:
+    ranked = dg.rank([turned(DOWN, 90.0), DOWN], seen())
+    assert ranked.order.tolist() == [1, 0]
+    assert ranked.features["touch"][1].tolist() == [1.0, 1.0, 1.0]
+    assert ranked.features["opposition"][1] > 0.9
+    assert ranked.features["opposition"][0] < 0.5
+    assert ranked.features["robust"][1] == 1.0
+
+
+def test_a_hand_within_the_object_or_the_table_is_last() -> None:
+    through = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.01])
+    beside = through.copy()
+    beside[0, 3], beside[2, 3] = 0.4, -0.1
+    ranked = dg.rank([through, beside, DOWN], seen())
+    assert ranked.order[0] == 2
+    assert ranked.score[:2].tolist() == [0.0, 0.0]
+    assert ranked.features["clearance"][0] < 0.0
+    assert ranked.features["table"][1] < 0.0
+
+
+@pytest.mark.parametrize(
+    ("other", "feature", "sign"),
+    [
+        (moved(0.05, 0.0, 0.0), "arm", 1),
+        (moved(0.0, 0.03, 0.0), "push", -1),
+        (moved(0.0, 0.0, -0.08), "gap", 1),
+    ],
+    ids=["held at its end", "off the middle", "too high"],
+)
+def test_a_worse_palm_is_told_by_its_feature(other: Array, feature: str, sign: int) -> None:
+    ranked = dg.rank(np.stack([other, DOWN]), seen())
+    assert ranked.order.tolist() == [1, 0]
+    worse, better = ranked.features[feature]
+    assert sign * (worse - better) > 0.0
+
+
+def test_a_ranking_turns_and_moves_with_the_object() -> None:
+    X = make_pose(rotation_about([0.0, 0.0, 1.0], 0.7), [0.1, -0.2, 0.0])
+    palms = np.stack([DOWN, moved(0.1, 0.0, 0.0), turned(DOWN, 40.0)])
+    there = dg.rank(X @ palms, seen(turn=0.7) + X[:3, 3])
+    assert there.order.tolist() == dg.rank(palms, seen()).order.tolist()
+
+
+def test_proposals_begin_across_the_narrow_side_and_are_distinct() -> None:
+    found = dg.propose(seen(turn=0.4), name="box")
+    assert not found.refused
+    assert found.frame == "table"
+    assert set(found.objects) == {"box"}
+    # Gy closes across the long side, which is turned by 0.4 rad.
+    first = found.X_FG[0]
+    assert abs(first[:3, 1] @ [np.cos(0.4), np.sin(0.4), 0.0]) < 1e-6
+    np.testing.assert_allclose(first[:2, 3], 0.0, atol=1e-9)
+    assert first[:3, 2] @ [0.0, 0.0, -1.0] == pytest.approx(1.0)
+    for i, X in enumerate(found.X_FG):
+        for Y in found.X_FG[:i]:
+            angle = np.arccos(np.clip((np.trace(X[:3, :3].T @ Y[:3, :3]) - 1) / 2, -1, 1))
+            assert np.linalg.norm(X[:3, 3] - Y[:3, 3]) >= SAME[0] or angle >= SAME[1] - 1e-9
+
+
+@pytest.mark.parametrize("hand", ["barrett", "franka", "allegro_four"])
+def test_any_hand_proposes_and_ranks(hand: str) -> None:
+    cloud = seen(np.array([0.05, 0.02, 0.03]))
+    found = dg.propose(cloud, hand)
+    ranked = dg.rank(found, cloud, hand)
+    assert not found.refused
+    assert sorted(ranked.order.tolist()) == list(range(len(found)))
+    assert ranked.features["robust"].max() > 0.5
+    # The grasp has closed, from the open hand.
+    first = ranked.order[0]
+    assert np.abs(found.q_grasp[first] - found.q_pregrasp[first]).max() > 0.0
+
+
+def test_postures_of_the_object_are_ranked_with_its_pose() -> None:
+    X_TO = make_pose(rotation_about([0.0, 0.0, 1.0], 0.3), [0.1, 0.0, 0.04])
+    cloud = seen(turn=0.3)
+    cloud[:, 0] += 0.1
+    table = dg.propose(cloud)
+    own = {"q_grasp": table.q_grasp, "q_pregrasp": table.q_pregrasp}
+    X_OG = invert_pose(X_TO) @ table.X_FG
+    names, count = table.objects, len(table)
+    given = make_attempts(dg.load_hand(), names, X_OG, X_TO=[X_TO] * count, **own)
+    np.testing.assert_allclose(dg.rank(given, cloud).score, dg.rank(table, cloud).score, atol=1e-3)
+    with pytest.raises(dg.GraspError, match="must be in the frame table, or say X_TO, got object"):
+        dg.rank(make_attempts(dg.load_hand(), names, X_OG, **own), cloud)
+
+
+def test_a_row_that_is_no_posture_is_last() -> None:
+    found = dg.propose(seen())
+    spoilt = found.refuse(["bad", *[""] * (len(found) - 1)])
+    ranked = dg.rank(spoilt, seen())
+    assert ranked.order[-1] == 0
+    assert ranked.score[0] == -1.0
+    assert np.isnan(ranked.features["arm"][0])
+
+
+def test_solids_fill_what_is_not_seen() -> None:
+    points = read_cloud(seen())
+    for solid in (hull_solid(points), column_solid(points)):
+        inside, beside = np.float32([[0.0, 0.0, 0.03], [0.0, 0.04, 0.03]])
+        assert solid.field.interpolate(*inside) < -0.02
+        assert solid.field.interpolate(*beside) == pytest.approx(0.01, abs=2e-3)
+        np.testing.assert_allclose(solid.middle, [0.0, 0.0, HALF[2]], atol=2e-3)
+        normals = solid.normals(np.array([[0.0, HALF[1], 0.04], [HALF[0], 0.0, 0.04]]))
+        np.testing.assert_allclose(normals, [[0, 1, 0], [1, 0, 0]], atol=0.1)
+
+
+def test_the_columns_keep_what_the_hull_fills() -> None:
+    """A ring that is seen from above: a hand may reach into it."""
+    ring = trimesh.creation.annulus(r_min=0.03, r_max=0.04, height=0.03)
+    points = np.array(trimesh.sample.sample_surface(ring, 4000, seed=0)[0])
+    points[:, 2] += 0.015
+    points = read_cloud(points[points[:, 2] > 0.02])
+    middle = np.float32([0.0, 0.0, 0.015])
+    assert hull_solid(points).field.interpolate(*middle) < 0.0
+    assert column_solid(points).field.interpolate(*middle) > 0.02
+
+
+@pytest.mark.parametrize(
+    ("cloud", "words"),
+    [
+        (seen()[:, :2], "points .* shape"),
+        (seen()[:5], "10 or more, got 5"),
+        (1e3 * seen(), "in metres, got points 360 m apart"),
+        (seen() * [1.0, 1.0, 0.0], "got none higher than 0 mm"),
+        (np.where(np.arange(3) == 0, np.nan, seen()), "not finite"),
+        (seen() * [1.0, 0.0, 1.0], "got a flat one"),
+    ],
+    ids=["two numbers", "few", "millimetres", "the table", "nan", "a wall"],
+)
+def test_a_cloud_that_is_none_is_refused(cloud: Array, words: str) -> None:
+    with pytest.raises(dg.GraspError, match=words):
+        dg.rank([DOWN], cloud)
+    with pytest.raises(dg.GraspError, match=words):
+        dg.propose(cloud)
