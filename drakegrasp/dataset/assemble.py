@@ -135,7 +135,7 @@ def assemble_locked(
         if rejected is not None:
             known = keys_of(manifest, shards.successes)
             manifest = replace(manifest, rejected=find_keys(rejected, known, out))
-        decisions = decide(manifest, shards.successes)
+        decisions = decide(manifest, shards)
         certified = manifest.config.certified
 
         # Write what is small, and room for all rows.
@@ -154,7 +154,7 @@ def assemble_locked(
             _write_table(files[""], "successes", SUCCESS_FIELDS, decisions.columns())
 
             # Rows are packed in any order, and put into the files in theirs.
-            tasks = list(pack_tasks(out, shards, decisions, certified=certified))
+            tasks = list(pack_tasks(out, decisions, certified=certified))
             texts = sample_texts(manifest)
             surveyed = len({piece.object for piece in shards.slices})
             for done, task in enumerate(_packed(execute, tasks), start=1):

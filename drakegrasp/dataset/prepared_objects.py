@@ -11,6 +11,7 @@ import json
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -34,6 +35,13 @@ from drakegrasp.objects.model import ObjectModel, load_object, save_object
 from drakegrasp.runtime.files import atomic_hdf5
 from drakegrasp.simulation.candidates import Candidates
 from drakegrasp.table import Table
+
+#: What an object's entry in the manifest has of its model, and of its palm poses.
+_OF_MODEL = (
+    *("name", "class_name", "mesh_sha256", "scale", "up", "mass", "density", "friction"),
+    *("collision_error", "notes"),
+)
+_COUNTS = ("combinations", "valid", "distinct")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,21 +80,10 @@ class PreparedObject:
 
         # What is known of the object, its poses at rest, and how many palm poses there are.
         return ObjectEntry(
-            name=self.model.name,
-            class_name=self.model.class_name,
-            mesh_sha256=self.model.mesh_sha256,
-            scale=self.model.scale,
-            up=self.model.up,
-            mass=self.model.mass,
-            density=self.model.density,
-            friction=self.model.friction,
-            collision_error=self.model.collision_error,
+            **{name: getattr(self.model, name) for name in _OF_MODEL},
             resting=resting,
             candidates=len(self.candidates),
-            combinations=self.candidates.combinations,
-            valid=self.candidates.valid,
-            distinct=self.candidates.distinct,
-            notes=self.model.notes,
+            **{name: getattr(self.candidates, name) for name in _COUNTS},
         )
 
 
@@ -105,7 +102,7 @@ def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
         file.attrs["config_hash"] = config.simulation_hash()
         file.attrs["mesh_sha256"] = model.mesh_sha256
         file.attrs["max"] = config.candidates.max
-        for name in ("combinations", "valid", "distinct"):
+        for name in _COUNTS:
             file.attrs[name] = getattr(candidates, name)
         arrays = {**vars(candidates), **vars(prepared), "X_TO": prepared.resting_poses}
         for field in chain(*PLAN_TABLES):
@@ -139,35 +136,23 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
     refuse_changed_model(out, name, recorded_model(out, name))
     with opened(path, "the plan of an object") as file:
         attributes = dict(file.attrs)
-        arrays = {field.name: file[field.name][:] for field in chain(*PLAN_TABLES)}
+        resting, palms = ({f.name: file[f.name][:] for f in fields} for fields in PLAN_TABLES)
         names = [field.name for field in (*POSTURE_FIELDS, *POSTURE_TEXTS)]
         given = {name: file[name][:] for name in names if name in file}
-    if attributes["config_hash"] != config.simulation_hash():
-        raise DataError(
-            f"{path}: must be of configuration {config.simulation_hash()}, "
-            f"got {attributes['config_hash']}"
-        )
-
-    if attributes["max"] != config.candidates.max:
-        raise DataError(
-            f"{path}: must be of candidates.max {config.candidates.max}, got {attributes['max']}"
-        )
-
-    model = load_object(model_path(out, name))
-    if model.mesh_sha256 != attributes["mesh_sha256"]:
-        raise DataError(f"{path}: must be of the same mesh as {name}.npz, got another")
-
+    for key, of, due in (
+        ("config_hash", "configuration", config.simulation_hash()),
+        ("max", "candidates.max", config.candidates.max),
+    ):
+        if attributes[key] != due:
+            raise DataError(f"{path}: must be of {of} {due}, got {attributes[key]}")
+    counts: dict[str, Any] = {name: int(attributes[name]) for name in _COUNTS}
     return PreparedObject(
-        model=model,
-        resting_poses=arrays["X_TO"],
-        **{key: arrays[key] for key in ("probability", "table_force", "stopped")},
+        model=load_object(model_path(out, name)),
+        resting_poses=resting.pop("X_TO"),
+        **resting,
         candidates=Candidates(
-            **{
-                key: arrays[key] for key in ("X_OG", "distance", "resting", "source", "log_density")
-            },
-            combinations=int(attributes["combinations"]),
-            valid=int(attributes["valid"]),
-            distinct=int(attributes["distinct"]),
+            **palms,
+            **counts,
             postures=_given_postures(given, path),
         ),
     )

@@ -354,18 +354,14 @@ def _lines_of(sample: Sample) -> Iterator[tuple[str, str]]:
 
     # Of groups, single numbers and texts by their values, arrays by their shapes.
     for name in ("grasp_props", "props", "conditions"):
-        values = getattr(sample, name)
-        texts, arrays = [], []
-        for key, value in values.items():
-            if np.ndim(value):
-                arrays.append(f"{key} {np.shape(value)}")
-            else:
-                texts.append(
-                    f"{key} {value:.3g}"
-                    if np.issubdtype(type(value), np.floating)
-                    else f"{key} {value}"
-                )
-        yield name, ", ".join([*texts, *arrays])
+        values = sorted(getattr(sample, name).items(), key=lambda item: np.ndim(item[1]) > 0)
+        yield name, ", ".join(_said(key, value) for key, value in values)
+
+
+def _said(key: str, value: Any) -> str:
+    if np.ndim(value):
+        return f"{key} {np.shape(value)}"
+    return f"{key} {value:.3g}" if isinstance(value, np.floating) else f"{key} {value}"
 
 
 def _group(values: dict[str, Any], prefix: str) -> dict[str, Any]:
@@ -405,13 +401,8 @@ class PredictedRows:
             DataError: If the file is missing, damaged, or differs from the schema.
         """
         with open_samples(path) as file:
-            return cls(
-                split=split,
-                camera=str(file.attrs["camera"]),
-                shards=str(file.attrs["shards"]),
-                row=rows,
-                trial_id=file[split]["trial_id"][:][rows],
-            )
+            said = {name: str(file.attrs[name]) for name in ("camera", "shards")}
+            return cls(split=split, **said, row=rows, trial_id=file[split]["trial_id"][:][rows])
 
     def write(self, file: h5py.File) -> None:
         """Write the rows into a file of results."""
@@ -423,14 +414,10 @@ class PredictedRows:
 
 def read_predicted_rows(file: h5py.File) -> PredictedRows | None:
     """Return the rows that a file of results is about; None if it does not say so."""
-    group = file.get(ROWS_GROUP)
+    group, said = file.get(ROWS_GROUP), dict[str, Any]()
     try:
-        return PredictedRows(
-            split=str(group.attrs["split"]),
-            camera=str(group.attrs["camera"]),
-            shards=str(group.attrs["shards"]),
-            row=group["row"][:].astype(np.int64),
-            trial_id=group["trial_id"][:].astype(np.int64),
-        )
+        said |= {name: str(group.attrs[name]) for name in ("split", "camera", "shards")}
+        said |= {f.name: group[f.name][:].astype(f.dtype) for f in PREDICTED_ROW_FIELDS}
     except (AttributeError, KeyError, TypeError, ValueError):
         return None
+    return PredictedRows(**said)

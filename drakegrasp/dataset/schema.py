@@ -29,6 +29,9 @@ SPLITS = ("train", "valid", "test")
 #: Units in which people read numbers, and factors to them from SI.
 SHOWN_UNITS = {"": 1.0, "s": 1.0, "N": 1.0, "kg": 1.0, "mm": 1e3, "°": float(np.rad2deg(1.0))}
 CAMERAS = ("oto", "otm")
+#: Limits of fields: what is positive, not negative, an angle, a share.
+POSITIVE = 5e-324
+ABOVE_0, FROM_0, ANGLE, SHARE = (POSITIVE, np.inf), (0.0, np.inf), (0.0, np.pi), (0.0, 1.0)
 
 #: The conventions in words, stored as attributes in every file.
 CONVENTIONS = {
@@ -112,6 +115,7 @@ class Field:
         sample: Whether it is an image, stored in one chunk per row.
         some: Whether rows that reached the stage may lack a value.
         optional: Whether files may lack it: then it reads as without a value, or is derived.
+        limits: Least and largest value, POSITIVE for what is above 0; None for any. NaN has none.
         derive: Of a field of `/trials` that follows from others: given a table of rows with the
             columns of `needs`, its values (n, ...). No shard stores it.
         needs: Names of these columns.
@@ -132,6 +136,7 @@ class Field:
     sample: bool = False
     some: bool = False
     optional: bool = False
+    limits: tuple[float, float] | None = None
     derive: Callable[[Mapping[str, npt.NDArray[Any]]], npt.NDArray[Any]] | None = None
     needs: tuple[str, ...] = ()
     of: str = ""
@@ -286,7 +291,7 @@ _CONTACTS: tuple[Field, ...] = (
     Field("f_Q_O", "k 3", "float64", "N", "O", "forces of the fingertips on the object"),
     Field("area", "k", "float64", "m^2", "-", "areas of the contact patches"),
     Field("penetration", "k", "float64", "m", "-",
-          "largest depths of the object's surface in the fingertips"),
+          "largest depths of the object's surface in the fingertips", limits=FROM_0),
     Field("other_links", "", "uint8", "-", "-",
           "number of other links of the hand that touch the object"),
     Field("hand_on_table", "", "bool", "-", "-", "whether the hand touches the table"),
@@ -355,9 +360,11 @@ _CLEARANCE = {
 _SLIP = _measured(
     "trial.lift",
     Field("slip", "", "float64", "m", "G",
-          "distance that the object moved in the hand during the lift", shown=Shown("slip", "mm")),
+          "distance that the object moved in the hand during the lift", limits=FROM_0,
+          shown=Shown("slip", "mm")),
     Field("turn", "", "float64", "rad", "G",
-          "angle that the object turned in the hand during the lift", shown=Shown("turn", "°")),
+          "angle that the object turned in the hand during the lift", limits=ANGLE,
+          shown=Shown("turn", "°")),
 )
 _SLIP_USE = Field("slip_use", "k", "float64", "-", "-",
                   "share of the friction cone in use after the lift, 1 at its border",
@@ -367,10 +374,10 @@ _SLIP_USE = Field("slip_use", "k", "float64", "-", "-",
 _RELEASED = _measured(
     "trial.lift",
     Field("slip_released", "", "float64", "m", "G",
-          "distance that the object moved in the hand before the wrist moved",
+          "distance that the object moved in the hand before the wrist moved", limits=FROM_0,
           shown=Shown("slip before the wrist moves", "mm")),
     Field("turn_released", "", "float64", "rad", "G",
-          "angle that the object turned in the hand before the wrist moved",
+          "angle that the object turned in the hand before the wrist moved", limits=ANGLE,
           shown=Shown("turn before the wrist moves", "°")),
 )
 _WORDS = (
@@ -427,7 +434,7 @@ HOLD_FIELDS: tuple[Field, ...] = tuple(
               "that was not tried or has no verdict"),
         Field("p_hold_probability", "", "float64", "-", "-",
               "probability with which an attempt of its kind was drawn for repeats; NaN if it was "
-              "not drawn"),
+              "not drawn", limits=(POSITIVE, 1.0)),
     )
 )
 
@@ -436,7 +443,7 @@ DATA_FIELDS: tuple[Field, ...] = (
     Field("images", "4 S S", "float32", "-, -, -, m", "C",
           "R, G, B in 0..1 and depth; object and table only, never the hand", sample=True),
     Field("masks", "S S", "uint8", "-", "C",
-          "1 where the object is seen, 0 everywhere else", sample=True),
+          "1 where the object is seen, 0 everywhere else", sample=True, limits=(0, 1)),
     Field("grasps", "6k", "float32", "m, -", "C",
           "contact points, then outward unit normals, after closing, in this file's camera"),
     Field("grasps_held", "6k", "float32", "m, -", "C",
@@ -477,7 +484,7 @@ DATA_FIELDS: tuple[Field, ...] = (
     Field("object_props/work2inertia", "9", "float32", "kg m^2", "T",
           "rotational inertia of the resting object about Ocm, 3x3 row-major"),
     Field("object_props/work2mass", "1", "float32", "kg", "-",
-          "mass of the object, as in the trial", of="mass"),
+          "mass of the object, as in the trial", of="mass", limits=ABOVE_0),
     Field("object_props/frame_cam2img_otm", "12", "float32", "m, -", "C (otm)",
           "X_CI, image frame estimated from the otm mask"),
     *(Field(f"object_props/frame_cam2work_{camera}", "12", "float32", "m, -", f"C ({camera})",
@@ -558,10 +565,11 @@ TRIAL_FIELDS: tuple[Field, ...] = (
 #: How robust a success is; see `drakegrasp.simulation.robustness`.
 CERTIFICATE_FIELDS: tuple[Field, ...] = (
     Field("certified_share", "", "float64", "-", "-",
-          "share of `certify.repeats` repeats with noise that hold; NaN if not certified"),
+          "share of `certify.repeats` repeats with noise that hold; NaN if not certified",
+          limits=SHARE),
     Field("certified_friction", "", "float64", "-", "-",
           "least friction of hand and object at which it holds, inf if not even at the configured "
-          "one; NaN if not certified"),
+          "one; NaN if not certified", limits=FROM_0),
 )
 
 
@@ -589,7 +597,7 @@ LOOK_FIELDS: tuple[Field, ...] = (
 SUCCESS_FIELDS: tuple[Field, ...] = (
     Field("trial_id", "", "int64", "-", "-", "row of /trials"),
     Field("removal", "", "uint8", "-", "-",
-          f"why it is no sample: {_labels(list(Removal))}"),
+          f"why it is no sample: {_labels(list(Removal))}", limits=(0, max(Removal))),
     *CERTIFICATE_FIELDS,
 )
 
@@ -745,7 +753,7 @@ DEPTH_UNIT = 1e-4
 SCENE_FIELDS: tuple[Field, ...] = (
     Field("split", "", "uint8", "-", "-",
           f"{', '.join(f'{i} {name}' for i, name in enumerate(SPLITS))}: by object, whatever "
-          "`split.by` is"),
+          "`split.by` is", limits=(0, len(SPLITS) - 1)),
     Field("object", "o", "int32", "-", "-", "rows of /objects"),
     Field("resting", "o", "uint8", "-", "-", "indices of the objects' resting poses"),
     Field("probability", "o", "float64", "-", "-", "shares of the drops that ended in them"),

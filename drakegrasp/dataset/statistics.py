@@ -219,51 +219,49 @@ def count_funnel(out: Path) -> Funnel:
 
 def funnel_of(trials: Trials) -> Funnel:
     """Return the funnel of attempts, as `count_funnel`."""
-    names = trials.objects["name"]
-    count = len(names)
-    outcomes = np.zeros((count, 1 + max(Outcome)), dtype=np.int64)
-    removals = np.zeros((count, 1 + max(Removal)), dtype=np.int64)
-    candidates, precision, stable = np.zeros((3, count), dtype=np.int64)
-    refined, audited = np.zeros((count, 3), np.int64), np.zeros((count, 4), np.int64)
-    preshapes = np.zeros((1 + NO_PRESHAPE, 5), np.int64)
+    objects, count = trials.objects, len(trials.objects["name"])
+
+    def zeros(*shape: int) -> npt.NDArray[np.int64]:
+        return np.zeros(shape, dtype=np.int64)
+
+    funnel = Funnel(
+        names=tuple(objects["name"].tolist()),
+        classes=tuple(objects["class_name"].tolist()),
+        candidates=zeros(count),
+        distinct=objects["distinct"],
+        valid=objects["valid"],
+        outcomes=zeros(count, 1 + max(Outcome)),
+        precision=zeros(count),
+        stable=zeros(count),
+        removals=zeros(count, 1 + max(Removal)),
+        refined=zeros(count, 3),
+        audited=zeros(count, 4),
+        preshapes=zeros(1 + NO_PRESHAPE, 5),
+    )
     for block in trials.blocks(_COUNTED):
         number, outcome, removal = (block[name] for name in ("object", "outcome", "removal"))
         held, sample = outcome == Outcome.SUCCESS, removal == Removal.KEPT
+        first, stable = block["generation"] == 0, block["stable"]
 
         # Palm poses, outcomes, how well they hold and removals of the first round.
-        first = block["generation"] == 0
-        _count(candidates, number[first & (block["standoff_index"] == 0)])
-        _count(outcomes, (number[first], outcome[first]))
-        _count(precision, number[first & block["precision"]])
-        _count(stable, number[first & block["stable"]])
+        _count(funnel.candidates, number[first & (block["standoff_index"] == 0)])
+        _count(funnel.outcomes, (number[first], outcome[first]))
+        _count(funnel.precision, number[first & block["precision"]])
+        _count(funnel.stable, number[first & stable])
         decided = first & (removal != NONE)
-        _count(removals, (number[decided], removal[decided]))
+        _count(funnel.removals, (number[decided], removal[decided]))
 
-        held_by = (first, first & held, first & held & block["stable"], first & sample)
-        for column, chosen in zip(preshapes.T, (*held_by, ~first & sample), strict=True):
-            _count(column, block["preshape"][chosen])
-
-        # What was refined from it, and what became of those that were lifted in any case.
-        for column, chosen in zip(refined.T, (True, held, sample), strict=True):
-            _count(column, number[~first & chosen])
+        # What was refined, and what became of those that were lifted in any case.
         fair, lifted = first & block["audited"], np.isfinite(block["slip"])
-        for column, chosen in zip(audited.T, (lifted, held, block["stable"], sample), strict=True):
-            _count(column, number[fair & chosen])
-
-    return Funnel(
-        names=tuple(names.tolist()),
-        classes=tuple(trials.objects["class_name"].tolist()),
-        candidates=candidates,
-        distinct=trials.objects["distinct"],
-        valid=trials.objects["valid"],
-        outcomes=outcomes,
-        precision=precision,
-        stable=stable,
-        removals=removals,
-        refined=refined,
-        audited=audited,
-        preshapes=preshapes,
-    )
+        for counts, of, among, chosen in (
+            (funnel.preshapes, block["preshape"], first, (True, held, held & stable, sample)),
+            (funnel.preshapes[:, 4:], block["preshape"], ~first, (sample,)),
+            (funnel.refined, number, ~first, (True, held, sample)),
+            (funnel.audited, number, fair, (lifted, held, stable, sample)),
+        ):
+            for column, own in zip(counts.T, chosen, strict=False):
+                _count(column, of[among & own])
+    return funnel
 
 
 def preshapes_of(funnel: Funnel, config: Config) -> list[PreshapeCount]:

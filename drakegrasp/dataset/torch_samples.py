@@ -12,12 +12,15 @@ each image would be written three times, always into new pages, which costs as m
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.schema import DATA_FIELDS
+
+if TYPE_CHECKING:
+    from drakegrasp.dataset.reader import GraspDataset
 
 try:
     import torch
@@ -31,24 +34,6 @@ except ModuleNotFoundError:
 _FIELDS = {field.name: field for field in DATA_FIELDS}
 #: Fields that are read when a sample is asked for; the others fit into memory.
 _IMAGES = frozenset(name for name, field in _FIELDS.items() if field.sample)
-
-
-class Split(Protocol):
-    """What is asked of a `GraspDataset`, whose methods say more."""
-
-    image_size: int
-
-    def __len__(self) -> int: ...
-
-    def row_of(self, index: int) -> int: ...  # noqa: D102
-
-    def value(self, name: str, row: int) -> Any: ...  # noqa: D102
-
-    def column(self, name: str) -> npt.NDArray[Any]: ...  # noqa: D102
-
-    def read_images(  # noqa: D102
-        self, name: str, rows: Sequence[int], images: npt.NDArray[Any]
-    ) -> None: ...
 
 
 class TorchSamples(Dataset):
@@ -65,7 +50,7 @@ class TorchSamples(Dataset):
         data, fields: As given.
     """
 
-    def __init__(self, data: Split, fields: Sequence[str]) -> None:
+    def __init__(self, data: GraspDataset, fields: Sequence[str]) -> None:
         self.data, self.fields = data, tuple(fields)
         self._columns: dict[str, npt.NDArray[Any]] = {}
 

@@ -81,16 +81,16 @@ class Shards:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Decisions:
-    """What becomes of n successes.
+    """What becomes of the n successes of a dataset.
 
     Attributes:
-        successes: The successes.
+        shards: What its shards hold.
         removal: (n,) uint8, the `Removal` of each.
         splits: Indices of the samples of each split among the successes, in rising order.
         weights: (n,), weight of each sample; NaN for a success that is not one.
     """
 
-    successes: Table
+    shards: Shards
     removal: AnyArray
     splits: Mapping[str, npt.NDArray[np.int64]]
     weights: Array
@@ -98,11 +98,14 @@ class Decisions:
     @cached_property
     def ids(self) -> dict[str, npt.NDArray[np.int64]]:
         """Ids of the trials that are samples, in rising order, by split."""
-        return {split: self.successes["trial_id"][rows] for split, rows in self.splits.items()}
+        return {
+            split: self.shards.successes["trial_id"][rows] for split, rows in self.splits.items()
+        }
 
     def columns(self) -> dict[str, AnyArray]:
         """Return the columns of /successes: why each success is, or is not, a sample."""
-        return {"removal": self.removal, **self.successes.only(*(f.name for f in SUCCESS_FIELDS))}
+        own = self.shards.successes.only(*(f.name for f in SUCCESS_FIELDS))
+        return {"removal": self.removal, **own}
 
 
 def number_rows(surveys: Sequence[Survey], manifest: Manifest) -> Shards:
@@ -132,18 +135,17 @@ def keys_of(manifest: Manifest, successes: Table) -> dict[AttemptKey, int]:
 
 
 def decide(
-    manifest: Manifest,
-    successes: Table,
-    removed_by_own: npt.NDArray[np.bool_] | None = None,
+    manifest: Manifest, shards: Shards, removed_by_own: npt.NDArray[np.bool_] | None = None
 ) -> Decisions:
     """Decide which successes are samples, in which split, and what each weighs.
 
     Args:
         manifest: Of the dataset: its filters and its split; what it rejects becomes no sample.
-        successes: All successes of the dataset.
+        shards: What its shards hold.
         removed_by_own: As for `judge_successes`.
     """
     # The filters.
+    successes = shards.successes
     known = keys_of(manifest, successes)
     rejected = [known[key] for key in manifest.rejected if key in known]
     removal = judge_successes(successes, manifest.config.filters, rejected, removed_by_own)
@@ -157,13 +159,11 @@ def decide(
     # The weights, among all samples.
     kept = np.flatnonzero(removal == Removal.KEPT)
     weights = np.full(len(removal), np.nan)
-    numbers, rows = (
-        manifest.pose_numbers(),
-        zip(successes["object"], successes["resting"], strict=True),
-    )
-    poses = np.array([numbers[i][k] for i, k in rows], dtype=np.int64)[kept]
+    numbers = manifest.pose_numbers()
+    rows = zip(successes["object"][kept], successes["resting"][kept], strict=True)
+    poses = np.array([numbers[i][k] for i, k in rows], dtype=np.int64)
     weights[kept] = weigh_samples(poses, successes["X_OG"][kept])
-    return Decisions(successes=successes, removal=removal, splits=splits, weights=weights)
+    return Decisions(shards=shards, removal=removal, splits=splits, weights=weights)
 
 
 def _split_successes(

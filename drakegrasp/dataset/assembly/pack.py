@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.assembly.decisions import Decisions, Shards, ShardSlice
+from drakegrasp.dataset.assembly.decisions import Decisions, ShardSlice
 from drakegrasp.dataset.hdf5 import (
     COLUMN_CHUNK,
     AnyArray,
@@ -95,12 +95,10 @@ class PackTask:
     certified: bool
 
 
-def pack_tasks(
-    out: Path, shards: Shards, decisions: Decisions, *, certified: bool
-) -> Iterator[PackTask]:
+def pack_tasks(out: Path, decisions: Decisions, *, certified: bool) -> Iterator[PackTask]:
     """Yield the tasks that pack the rows, from the first to the last."""
-    slices, ids = shards.slices, decisions.ids
-    firsts = [piece.first for piece in slices]
+    shards, ids = decisions.shards, decisions.ids
+    slices, firsts = shards.slices, [piece.first for piece in shards.slices]
     weights = {split: decisions.weights[rows] for split, rows in decisions.splits.items()}
     for start in range(0, shards.count, TASK_ROWS):
         stop = min(start + TASK_ROWS, shards.count)

@@ -14,7 +14,6 @@ from contextlib import suppress
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
-from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -22,7 +21,6 @@ import numpy as np
 from drakegrasp.config import CarriedHand
 from drakegrasp.dataset.assembly.decisions import (
     Decisions,
-    Shards,
     decide,
     file_attributes,
     number_rows,
@@ -40,12 +38,13 @@ from drakegrasp.dataset.checks.rows import (
     AnyArray,
     Batch,
     CheckedFile,
+    Dataset,
     Findings,
     Task,
     Violation,
     of_file,
 )
-from drakegrasp.dataset.checks.trials import Dataset, trial_rules
+from drakegrasp.dataset.checks.trials import trial_rules
 from drakegrasp.dataset.hdf5 import unpacked_chunk
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry
 from drakegrasp.dataset.paths import (
@@ -162,16 +161,9 @@ def _broken_shards(task: SurveyTask) -> Iterator[Violation]:
 # What is decided again
 
 
-class Again(NamedTuple):
-    """A dataset assembled again, but for its rows: what its shards hold, and what becomes of it."""
-
-    shards: Shards
-    decisions: Decisions
-
-
 def assemble_again(
     manifest: Manifest, surveys: Sequence[Survey], trials: CheckedFile | None
-) -> Again:
+) -> Decisions:
     """Decide again which successes are samples, given the surveys of all objects.
 
     Code of a dataset is never imported: what the user's own filters removed is read from
@@ -184,11 +176,11 @@ def assemble_again(
             ids, reasons = (file["successes"][name][:] for name in ("trial_id", "removal"))
         removed = ids[reasons == Removal.OWN]
     own = np.isin(shards.successes["trial_id"], removed)
-    return Again(shards, decide(manifest, shards.successes, own))
+    return decide(manifest, shards, own)
 
 
 def of_another_state(
-    file: CheckedFile, manifest: Manifest, again: Again | None, camera: str
+    file: CheckedFile, manifest: Manifest, again: Decisions | None
 ) -> Iterator[Violation]:
     """A file is of the manifest's configuration and of the shards that are there, with their rows.
 
@@ -196,9 +188,8 @@ def of_another_state(
         file: The file.
         manifest: Of the dataset.
         again: The dataset assembled again; None if its shards are not all known.
-        camera: `oto` or `otm`; empty for the trials.
     """
-    due = file_attributes(manifest, "" if again is None else again.shards.seals, camera)
+    due = file_attributes(manifest, "" if again is None else again.shards.seals, file.camera)
     for key in ORIGIN:
         if key not in due or key not in file.attributes or (key == "shards" and again is None):
             continue
@@ -212,9 +203,9 @@ def of_another_state(
     # The number of rows of each group.
     if again is None:
         return
-    counts = {split: len(ids) for split, ids in again.decisions.ids.items()}
-    if not camera:
-        counts = {"trials": again.shards.count, "successes": len(again.decisions.removal)}
+    counts = {split: len(ids) for split, ids in again.ids.items()}
+    if not file.camera:
+        counts = {"trials": again.shards.count, "successes": len(again.removal)}
         counts["objects"] = len(manifest.objects)
     for group, number in counts.items():
         count = file.counts.get(group, number)
@@ -223,12 +214,12 @@ def of_another_state(
 
 
 def objects_and_successes(
-    trials: CheckedFile, manifest: Manifest, again: Again | None, findings: Findings
+    trials: CheckedFile, manifest: Manifest, again: Decisions | None, findings: Findings
 ) -> None:
     """Compare /objects with the manifest, and /successes with what is decided again."""
     tables = {"objects": (object_columns(manifest), FILE_NAME)}
     if again is not None:
-        tables["successes"] = again.decisions.columns(), "the shards, the filters and the split"
+        tables["successes"] = again.columns(), "the shards, the filters and the split"
     with trials.opened() as file:
         for group, (columns, of) in tables.items():
             count = len(next(iter(columns.values())))
@@ -243,7 +234,7 @@ def objects_and_successes(
 def trials_tasks(
     files: Mapping[str, CheckedFile],
     dataset: Dataset | None = None,
-    again: Again | None = None,
+    again: Decisions | None = None,
     compared: frozenset[str] = frozenset(),
 ) -> Iterator[Task]:
     """Yield the tasks that judge all attempts, and compare what follows from the shards.
@@ -264,7 +255,7 @@ def trials_tasks(
     packs: Iterator[PackTask] = iter(())
     if dataset is not None and again is not None and compared:
         certified = dataset.manifest.config.certified
-        packs = pack_tasks(dataset.out, *again, certified=certified)
+        packs = pack_tasks(dataset.out, again, certified=certified)
     data = {camera: files[camera] for camera in CAMERAS if camera in compared}
     for start, pack in zip_longest(range(0, count, TASK_ROWS), packs):
         first = pack.start if start is None else start
@@ -293,16 +284,14 @@ def _judge(
     findings = Findings()
     columns, records, images = ({}, {}, {}) if pack is None else read_rows(pack)
     if trials is not None and len(rows):
-        groups = trial_rules(trials, dataset)
+        stages = trial_rules(trials, dataset)
         with trials.opened() as file:
             for batch in trials.batches(file, "trials", rows, TRIAL_ROWS, findings):
                 if compared and pack is not None:
                     own = {name: v[batch.rows - rows[0]] for name, v in columns.items()}
-                    batch = batch.judge(
-                        findings, partial(Batch.follow, columns=own, what="its shard")
-                    )
-                for rules in groups:
-                    batch = batch.judge(findings, *rules)
+                    follow = partial(Batch.follow, columns=own, what="its shard")
+                    batch = batch.judge(findings, [follow])
+                batch.judge(findings, *stages)
 
     if dataset is not None and pack is not None:
         texts = sample_texts(dataset.manifest)
@@ -340,13 +329,13 @@ def _compare_samples(
             names = ["trial_id"], [name for name in due if name != "trial_id"]
             for own, of in zip(names, ("shards and manifest", "its trial"), strict=True):
                 columns = {name: due[name][batch.rows - first] for name in own}
-                batch = batch.judge(findings, partial(Batch.follow, columns=columns, what=of))
+                batch = batch.judge(findings, [partial(Batch.follow, columns=columns, what=of)])
             for name, stored in images.items():
                 differs = partial(_differs, file[split][name])
                 bad = [differs(row, *stored[row - first]) for row in batch.rows.tolist()]
                 what = f"{name} must be what the shard holds"
                 other = np.array(bad, dtype=bool)
-                findings.add(batch.broken(what, other, lambda i: "another image"))
+                findings.add(batch.broken(what, other, "another image"))
                 batch = batch.where(~other)
 
 

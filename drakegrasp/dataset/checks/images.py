@@ -77,10 +77,11 @@ def border_of(mask: AnyArray) -> AnyArray:
 # Samples
 
 
-def object_in_camera(batch: Batch, camera: str) -> Array:
-    """Return X_CO (n, 4, 4) of the object in a camera's frame."""
+def object_in_camera(batch: Batch) -> Array:
+    """Return X_CO (n, 4, 4) of the object in the frame of the file's camera."""
     X_CT, X_WO = (
-        batch.pose(f"object_props/frame_{name}") for name in (f"cam2work_{camera}", "world2obj")
+        batch.pose(f"object_props/frame_{name}")
+        for name in (f"cam2work_{batch.of.camera}", "world2obj")
     )
     return X_CT @ invert_pose(X_WT) @ X_WO
 
@@ -98,9 +99,9 @@ def has_depth(depth: AnyArray, config: Config) -> AnyArray:
     return np.asarray(~lost) if loses else np.ones_like(lost)
 
 
-def image_values(batch: Batch, config: Config) -> Iterator[Violation]:
+def image_values(batch: Batch) -> Iterator[Violation]:
     """Colours are within 0..1 and depths within near..far; a mask has an object pixel."""
-    near, far = np.float32(config.camera.near), np.float32(config.camera.far)
+    near, far = np.float32(batch.config.camera.near), np.float32(batch.config.camera.far)
     for what, channels, low, high in (
         ("colours must be within 0..1", slice(3), 0.0, 1.0),
         (f"depths must be within {near:g}..{far:g} m", slice(3, 4), near, far),
@@ -110,13 +111,13 @@ def image_values(batch: Batch, config: Config) -> Iterator[Violation]:
         got = [f"{a:.6g}..{b:.6g}" for a, b in zip(least, most, strict=True)]
         yield from batch.broken(what, (least < low) | (most > high), got.__getitem__)
     empty = np.logical_not(batch["masks"].any(axis=(1, 2)))
-    yield from batch.broken("mask must have an object pixel", empty, lambda i: "an empty mask")
+    yield from batch.broken("mask must have an object pixel", empty, "an empty mask")
 
 
-def image_frames(batch: Batch, camera: str, config: Config) -> Iterator[Violation]:
+def image_frames(batch: Batch) -> Iterator[Violation]:
     """The image frame is before the camera, faces away from it, and in otm is at the centroid."""
     name = "frame_cam2img_otm"
-    X_CI, K = batch.pose(f"object_props/{name}"), intrinsics(config.camera)
+    X_CI, K = batch.pose(f"object_props/{name}"), intrinsics(batch.config.camera)
     ahead = X_CI[:, 2, 3]
     yield from batch.broken(f"{name} must start before the camera [m]", ahead <= 0.0, ahead)
     turned = np.abs(X_CI[:, :3, 0] - [0.0, 0.0, 1.0]).max(axis=1)
@@ -125,7 +126,7 @@ def image_frames(batch: Batch, camera: str, config: Config) -> Iterator[Violatio
     yield from batch.broken(what, turned > UNIT_TOLERANCE, got.__getitem__)
 
     # The frame was estimated from the otm mask, so only that file can confirm its origin.
-    if camera == "otm":
+    if batch.of.camera == "otm":
         off = np.zeros(len(batch))
         for i in np.flatnonzero(ahead > 0.0):
             centroid = np.argwhere(batch["masks"][i]).mean(axis=0)[::-1]
@@ -134,32 +135,31 @@ def image_frames(batch: Batch, camera: str, config: Config) -> Iterator[Violatio
         yield from batch.broken(what, off > CENTROID_TOLERANCE, off)
 
 
-def without_noise(batch: Batch, camera: str, config: Config) -> Batch:
+def without_noise(batch: Batch) -> Batch:
     """Return the samples with depth images from which the noise is taken that was drawn."""
     noise, seeds = batch["conditions/depth_noise"], batch["conditions/depth_seed"]
     if not noise.any():
         return batch
-    images = batch["images"].copy()
+    images, number = batch["images"].copy(), CAMERAS.index(batch.of.camera)
     for i in range(len(batch)):
         sensor = DepthSensor(noise=float(noise[i]), seed=int(seeds[i]))
-        number = CAMERAS.index(camera)
-        images[i, 3] = clean_depth(images[i, 3], sensor, number, config.camera)
+        images[i, 3] = clean_depth(images[i, 3], sensor, number, batch.config.camera)
     return replace(batch, columns={**batch.columns, "images": images})
 
 
-def contacts_in_image(batch: Batch, config: Config) -> Iterator[Violation]:
+def contacts_in_image(batch: Batch) -> Iterator[Violation]:
     """Contacts project onto the mask, and lie on the visible surface or behind it."""
-    p_CQ, _ = contacts_of(batch)
+    (p_CQ, _), K = contacts_of(batch), intrinsics(batch.config.camera)
     for finger in range(p_CQ.shape[1]):
         # How far each contact is beside the mask [px], and before the surface there [m].
         z = p_CQ[:, finger, 2]
         beside, before = np.zeros((2, len(batch)))
         for i in np.flatnonzero(z > 0.0):
-            (pixel,) = project(intrinsics(config.camera), p_CQ[i, finger, None])
+            (pixel,) = project(K, p_CQ[i, finger, None])
             v, u = np.nonzero(batch["masks"][i])
             beside[i] = np.hypot(u - pixel[0], v - pixel[1]).min()
             if beside[i] <= MASK_TOLERANCE:
-                nearest = nearest_depth(batch["images"][i, 3], config, pixel)
+                nearest = nearest_depth(batch["images"][i, 3], batch.config, pixel)
                 before[i] = nearest - z[i] if np.isfinite(nearest) else 0.0
 
         mesh = f"not lie more than {BEFORE_SURFACE:g} m before the surface in the depth image"
@@ -182,25 +182,24 @@ def nearest_depth(depth: AnyArray, config: Config, pixel: Array) -> float:
     return float(around.min(initial=np.inf, where=has_depth(around, config)))
 
 
-def table_pixels(batch: Batch, camera: str, config: Config) -> Iterator[Violation]:
+def table_pixels(batch: Batch) -> Iterator[Violation]:
     """Pixels beside the mask, nearer than far, show the table."""
-    X_TC = invert_pose(batch.pose(f"object_props/frame_cam2work_{camera}"))
-    K, off = intrinsics(config.camera), np.zeros(len(batch))
+    X_TC = invert_pose(batch.pose(f"object_props/frame_cam2work_{batch.of.camera}"))
+    camera, off = batch.config.camera, np.zeros(len(batch))
+    K = intrinsics(camera)
     for i, depth in enumerate(batch["images"][:, 3]):
-        beside = (batch["masks"][i] == 0) & (depth < np.float32(config.camera.far))
+        beside = (batch["masks"][i] == 0) & (depth < np.float32(camera.far))
         off[i] = off_table(points_of(depth, beside, K, X_TC[i]))
     what = f"points beside the mask must be on the table within {DEPTH_TOLERANCE:g} m"
     yield from batch.broken(what, off > DEPTH_TOLERANCE, off)
 
 
-def object_pixels(
-    batch: Batch, camera: str, config: Config, model: ObjectModel
-) -> Iterator[Violation]:
+def object_pixels(batch: Batch, model: ObjectModel) -> Iterator[Violation]:
     """Pixels in the mask show the object: all are in its box, and some are on its mesh."""
-    X_OC, K = invert_pose(object_in_camera(batch, camera)), intrinsics(config.camera)
+    X_OC, K = invert_pose(object_in_camera(batch)), intrinsics(batch.config.camera)
     beyond, chosen = np.zeros(len(batch)), []
     for i, depth in enumerate(batch["images"][:, 3]):
-        seen = (batch["masks"][i] == 1) & has_depth(depth, config)
+        seen = (batch["masks"][i] == 1) & has_depth(depth, batch.config)
         # A corner of the mesh stands for an image whose depths are all lost.
         if not seen.any():
             chosen.append(some_of(model.visual_vertices[:1]))
@@ -213,13 +212,12 @@ def object_pixels(
         # The mesh is measured inside the border, if there is any inside.
         chosen.append(some_of(p_OQ[~border[seen]] if (seen & ~border).any() else p_OQ))
     off, outside = off_mesh(chosen, model), beyond > DEPTH_TOLERANCE
-    what = f"within {DEPTH_TOLERANCE:g} m"
-    box, mesh = (f"points in the mask must be {where} {what}" for where in _WHERE)
-    yield from batch.broken(box, outside, beyond)
-    yield from batch.broken(mesh, (off > DEPTH_TOLERANCE) & ~outside, off)
-
-
-_WHERE = ("in the object's box", "on the object's mesh")
+    for where, bad, got in (
+        ("in the object's box", outside, beyond),
+        ("on the object's mesh", (off > DEPTH_TOLERANCE) & ~outside, off),
+    ):
+        what = f"points in the mask must be {where} within {DEPTH_TOLERANCE:g} m"
+        yield from batch.broken(what, bad, got)
 
 
 def beyond_box(p_OQ: Array, p_OC: Array, half_extents: Array, slack: Array) -> float:

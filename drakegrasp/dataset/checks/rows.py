@@ -8,11 +8,11 @@ what each value must be by the schema, whatever its name.
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ import numpy.typing as npt
 from drakegrasp.config import Config, parse_stored
 from drakegrasp.dataset.assembly.decisions import lens_attributes
 from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.opening import (
     DATA_TABLES,
     OF_CAMERA,
@@ -30,21 +31,25 @@ from drakegrasp.dataset.opening import (
     ORIGIN,
     SCENE_TABLES,
     TRIAL_TABLES,
+    Difference,
     attribute_mistakes,
     differences,
 )
+from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.schema import (
     CAMERAS,
     CONVENTIONS,
     OTHER_SCHEMA,
+    POSITIVE,
     SCHEMA_VERSION,
-    SPLITS,
     Field,
+    is_readable,
 )
+from drakegrasp.dataset.trials import stamp
 from drakegrasp.errors import DataError, first_line
-from drakegrasp.filters import Removal
 from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import Array, unpack_pose
+from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.outcomes import Stage
 from drakegrasp.runtime.executor import Executor, in_order
 from drakegrasp.runtime.progress import Report
@@ -55,6 +60,8 @@ Rows = npt.NDArray[np.int64]
 MAX_LISTED = 20
 #: float32 rounds points within a metre or two by 1e-7 m; this leaves room for products.
 POSITION_TOLERANCE = 1e-5  # [m]
+#: float32 rounds unit vectors and rotations by 2e-7; this leaves room for products.
+UNIT_TOLERANCE = 1e-5
 #: How far a number may be from the same derived again, in units in the last place of its row's
 #: largest value: a last bit may differ between machines.
 LAST_PLACES = 2
@@ -62,6 +69,9 @@ LAST_PLACES = 2
 CAMERA_TOLERANCE = 1e-9
 #: Key of scenes.hdf5 among the files that are checked; "" is that of the trials.
 SCENES = "scenes"
+#: Objects whose meshes, with their search trees, stay in memory during a task; samples are ordered
+#: by object.
+KEPT_OBJECTS = 4
 
 
 # Violations
@@ -150,9 +160,204 @@ class Findings:
         for (file, group, what), listed in self._listed.items():
             result += listed
             if more := self._more[file, group, what]:
-                got = f"{more} more rows that break it"
-                result.append(Violation(file=file, group=group, what=what, got=got))
+                result.append(of_file(file, what, f"{more} more rows that break it", group))
         return result
+
+
+# Files
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CheckedFile:
+    """What is known of a file that is checked: plain data, which a task takes along.
+
+    Attributes:
+        path: Of the file.
+        stamp: What tells it from another file at the same path.
+        name: Its name in violations.
+        camera: `oto` or `otm`; SCENES, or empty for the trials.
+        attributes: Its attributes that break no rule of their own.
+        config: Its configuration, if it is sound.
+        fields: Fields of each group.
+        counts: Number of rows of each group whose layout is sound.
+    """
+
+    path: str
+    stamp: tuple[int, ...] | None
+    name: str
+    camera: str
+    attributes: Mapping[str, Any]
+    config: Config | None
+    fields: Mapping[str, tuple[Field, ...]]
+    counts: Mapping[str, int]
+
+    @contextmanager
+    def opened(self) -> Iterator[h5py.File]:
+        """Open the file while the block runs.
+
+        Raises:
+            DataError: If it is another file by now.
+            OSError: If it cannot be opened.
+        """
+        with open_hdf5(Path(self.path), again=True) as file:
+            if stamp(Path(self.path)) != self.stamp:
+                raise DataError(f"{self.path}: must stay while it is checked, got another file")
+            yield file
+
+    def read(
+        self, file: h5py.File, group: str, rows: Rows, names: Sequence[str] | None = None
+    ) -> Batch:
+        """Return some rows of a group.
+
+        Args:
+            file: The file, opened.
+            group: Name of the group.
+            rows: (n,), numbers of the rows, rising.
+            names: Fields to read; all if None.
+
+        Raises:
+            OSError, UnicodeDecodeError: If the file is damaged there.
+        """
+        # HDF5 reads a slice far faster than the same rows as a list.
+        dense = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
+        choice = slice(int(rows[0]), int(rows[-1]) + 1) if dense else rows
+        own, columns = file[group], {}
+        for f in self.fields[group]:
+            if names is not None and f.name not in names:
+                continue
+            if f.name in own or not f.optional:
+                columns[f.name] = (own[f.name].asstr() if f.dtype == "str" else own[f.name])[choice]
+            elif not f.shape:
+                columns[f.name] = f.empty(len(rows), {})
+        # In files made before it a derived number of a trial is derived here.
+        for f in self.fields[group]:
+            if f.derive is not None and f.name not in own and {*f.needs} <= {*columns}:
+                columns[f.name] = f.derive(columns)
+        return Batch(of=self, group=group, rows=rows, columns=columns)
+
+    def batches(
+        self,
+        file: h5py.File,
+        group: str,
+        rows: Rows,
+        size: int,
+        findings: Findings,
+        names: Sequence[str] | None = None,
+    ) -> Iterator[Batch]:
+        """Yield rows of a group that are not bad, of `size` rows each; others become findings."""
+        place = f"/{group}"
+        for first in range(0, len(rows), size):
+            own = rows[first : first + size]
+            good = own[~np.isin(own, findings.bad(self.name, place))]
+            try:
+                if len(good):
+                    yield self.read(file, group, good, names)
+            except (OSError, UnicodeDecodeError) as error:
+                what = f"rows {own[0]} to {own[-1]} must be readable"
+                findings.add([of_file(self.name, what, first_line(error), place)])
+                findings.mark(self.name, place, own.tolist())
+
+
+def look_at(name: str, file: h5py.File, camera: str, findings: Findings) -> CheckedFile:
+    """Check the attributes and the layout of a file; no row is read.
+
+    Args:
+        name: Name of the file, for the violations.
+        file: The file.
+        camera: `oto` or `otm`; SCENES, or empty for the trials.
+        findings: Where violations go.
+    """
+    kinds = {"": (ORIGIN, TRIAL_TABLES), SCENES: (OF_SCENES, SCENE_TABLES)}
+    rules, fields = kinds.get(camera, (OF_CAMERA, DATA_TABLES))
+    config, attributes, counts = None, dict[str, Any](), dict[str, int]()
+
+    # Another version has another layout: its version is all that is told.
+    if not is_readable(version := file.attrs.get("schema_version", "none")):
+        what = f"attribute schema_version must be {SCHEMA_VERSION}"
+        findings.add([of_file(name, what, f"{version}; {OTHER_SCHEMA}")])
+    else:
+        # Its attributes: those that break no rule of their own are compared.
+        mistakes = attribute_mistakes(file, rules)
+        attributes = {key: value for key, value in file.attrs.items() if key not in mistakes}
+        try:
+            config = parse_stored(parse_json(str(file.attrs["config"])))
+            mistakes.pop("config", None)
+        except (KeyError, ValueError) as error:  # none, no JSON, or no configuration
+            got = "none" if isinstance(error, KeyError) else f"another ({first_line(error)})"
+            must = "attribute config must be a configuration of drakegrasp"
+            mistakes["config"] = Difference(what=must, got=got)
+        findings.add(of_file(name, each.what, each.got) for each in mistakes.values())
+        findings.add(_attributes(name, attributes, config, camera))
+
+        # Its layout: a group with a broken dataset is not read.
+        image, broken = None if config is None else config.camera.size, set()
+        for found in differences(file, fields, image=image, thorough=True):
+            findings.add([of_file(name, found.what, found.got, found.path)])
+            if not found.text_only:
+                broken.add(found.path[1:].split("/")[0])
+        sound = [group for group in fields if group in file and group not in broken]
+        counts = {group: len(file[group][fields[group][0].name]) for group in sound}
+    return CheckedFile(
+        path=file.filename,
+        stamp=stamp(Path(file.filename)),
+        name=name,
+        camera=camera,
+        attributes=attributes,
+        config=config,
+        fields=fields,
+        counts=counts,
+    )
+
+
+def _attributes(
+    name: str, attributes: Mapping[str, Any], config: Config | None, camera: str
+) -> Iterator[Violation]:
+    """The attributes agree with the configuration; conventions are there."""
+    for key in CONVENTIONS:
+        if not str(attributes.get(f"convention_{key}", "")).strip():
+            yield of_file(name, f"attribute convention_{key} must be there", "none")
+
+    due: dict[str, Any] = {"camera": camera} if camera in CAMERAS else {}
+    if config is not None:
+        due |= {"config_hash": config.simulation_hash(), "seed": config.seed}
+        lens = lens_attributes(config.camera)
+        due |= {k: getattr(config.scenes, k) for k in ("near", "far")} if camera == SCENES else lens
+    for key in due.keys() & attributes.keys():
+        value, expected = attributes[key], due[key]
+        same = value == expected
+        if not isinstance(expected, str | int):
+            same = np.allclose(value, expected, rtol=CAMERA_TOLERANCE, atol=CAMERA_TOLERANCE)
+        if not same:
+            expected = expected.tolist() if isinstance(expected, np.ndarray) else expected
+            yield of_file(name, f"attribute {key} must be {expected}", value)
+
+
+#: Returns an object by its name, or None if its file is broken, which is a finding.
+LoadModel = Callable[[str], ObjectModel | None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dataset:
+    """The dataset around a file that is checked.
+
+    Attributes:
+        out: Its directory.
+        manifest: Its manifest.
+        readable: Names of the objects whose meshes can be read.
+    """
+
+    out: Path
+    manifest: Manifest
+    readable: frozenset[str]
+
+    def loader(self) -> LoadModel:
+        """Return what loads the objects, and keeps some, while a task has it."""
+        out, readable = self.out, self.readable
+
+        def load(name: str) -> ObjectModel | None:
+            return load_object(model_path(out, name)) if name in readable else None
+
+        return lru_cache(KEPT_OBJECTS)(load)
 
 
 # Rows and rules
@@ -163,13 +368,13 @@ class Batch:
     """Some rows of one group.
 
     Attributes:
-        file: Path within the dataset's directory.
-        group: Group of the file, e.g. `/train`.
+        of: The file.
+        group: Name of the group, e.g. `train`.
         rows: (n,), numbers of the rows in the group.
         columns: Values by field, (n, ...) each.
     """
 
-    file: str
+    of: CheckedFile
     group: str
     rows: Rows
     columns: Mapping[str, AnyArray]
@@ -180,6 +385,17 @@ class Batch:
     def __getitem__(self, name: str) -> AnyArray:
         return self.columns[name]
 
+    @property
+    def config(self) -> Config:
+        """Configuration of the file, which is sound."""
+        assert self.of.config is not None
+        return self.of.config
+
+    @property
+    def fields(self) -> Iterator[Field]:
+        """The fields of the group that were read."""
+        return (f for f in self.of.fields[self.group] if f.name in self.columns)
+
     def pose(self, name: str) -> Array:
         """Return the poses (n, ..., 4, 4) in a field."""
         return unpack_pose(self.columns[name])
@@ -189,29 +405,34 @@ class Batch:
         if keep.all():
             return self
         columns = {name: values[keep] for name, values in self.columns.items()}
-        return Batch(file=self.file, group=self.group, rows=self.rows[keep], columns=columns)
+        return replace(self, rows=self.rows[keep], columns=columns)
 
-    def judge(self, findings: Findings, *rules: Rule) -> Batch:
-        """Apply rules that do not build on each other; return the rows that break none."""
-        if not len(self):
-            return self
-        bad = set[int]().union(*(findings.add(rule(self)) for rule in rules))
-        return self.where(~np.isin(self.rows, sorted(bad))) if bad else self
+    def judge(self, findings: Findings, *stages: Sequence[Rule]) -> Batch:
+        """Apply rules, in each stage to the rows that broke none before; return those left."""
+        batch = self
+        for rules in stages:
+            if len(batch):
+                bad = set[int]().union(*(findings.add(rule(batch)) for rule in rules))
+                batch = batch.where(~np.isin(batch.rows, sorted(bad))) if bad else batch
+        return batch
 
     def broken(
-        self, what: str, bad: AnyArray, got: Callable[[int], str] | AnyArray
+        self, what: str, bad: AnyArray, got: Callable[[int], str] | AnyArray | str
     ) -> Iterator[Violation]:
         """Yield a violation for each row where `bad` (n,) is true.
 
         Args:
             what: The invariant in words.
             bad: (n,) bool.
-            got: The values (n,) that break it, or their text by index into the batch.
+            got: The values (n,) that break it, their text by index into the batch, or one text.
         """
         for i in np.flatnonzero(bad).tolist():
-            figure = got(i) if callable(got) else f"{got[i].item():.6g}"
-            row = int(self.rows[i])
-            yield Violation(file=self.file, group=self.group, row=row, what=what, got=figure)
+            if isinstance(got, str):
+                said = got
+            else:
+                said = got(i) if callable(got) else f"{got[i].item():.6g}"
+            row, place = int(self.rows[i]), f"/{self.group}"
+            yield Violation(file=self.of.name, group=place, row=row, what=what, got=said)
 
     def follows(
         self, name: str, due: AnyArray, what: str, tolerance: float | None = None
@@ -256,183 +477,102 @@ def all_per_row(values: AnyArray) -> AnyArray:
     return np.asarray(values.all(axis=tuple(range(1, values.ndim))))
 
 
-# Files
+# Rules of the schema, for any group
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CheckedFile:
-    """What is known of a file that is checked: plain data, which a task takes along.
-
-    Attributes:
-        path: Of the file.
-        identity: What tells it from another file at the same path.
-        name: Its name in violations.
-        attributes: Its attributes that break no rule of their own.
-        config: Its configuration, if it is sound.
-        fields: Fields of each group.
-        counts: Number of rows of each group whose layout is sound.
-    """
-
-    path: str
-    identity: tuple[int, int]
-    name: str
-    attributes: Mapping[str, Any]
-    config: Config | None
-    fields: Mapping[str, tuple[Field, ...]]
-    counts: Mapping[str, int]
-
-    @contextmanager
-    def opened(self) -> Iterator[h5py.File]:
-        """Open the file while the block runs.
-
-        Raises:
-            DataError: If it is another file by now.
-            OSError: If it cannot be opened.
-        """
-        with open_hdf5(Path(self.path), again=True) as file:
-            if _identity(file) != self.identity:
-                raise DataError(f"{self.path}: must stay while it is checked, got another file")
-            yield file
-
-    def read(
-        self, file: h5py.File, group: str, rows: Rows, names: Sequence[str] | None = None
-    ) -> Batch:
-        """Return some rows of a group.
-
-        Args:
-            file: The file, opened.
-            group: Name of the group.
-            rows: (n,), numbers of the rows, rising.
-            names: Fields to read; all if None.
-
-        Raises:
-            OSError, UnicodeDecodeError: If the file is damaged there.
-        """
-        # HDF5 reads a slice far faster than the same rows as a list.
-        dense = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
-        choice = slice(int(rows[0]), int(rows[-1]) + 1) if dense else rows
-        own, columns = file[group], {}
-        for f in self.fields[group]:
-            if names is not None and f.name not in names:
-                continue
-            if f.name in own or not f.optional:
-                columns[f.name] = (own[f.name].asstr() if f.dtype == "str" else own[f.name])[choice]
-            elif not f.shape:
-                columns[f.name] = f.empty(len(rows), {})
-        # In files made before it a derived number of a trial is derived here.
-        for f in self.fields[group]:
-            if f.derive is not None and f.name not in own and {*f.needs} <= {*columns}:
-                columns[f.name] = f.derive(columns)
-        return Batch(file=self.name, group=f"/{group}", rows=rows, columns=columns)
-
-    def batches(
-        self,
-        file: h5py.File,
-        group: str,
-        rows: Rows,
-        size: int,
-        findings: Findings,
-        names: Sequence[str] | None = None,
-    ) -> Iterator[Batch]:
-        """Yield rows of a group that are not bad, of `size` rows each; others become findings."""
-        for first in range(0, len(rows), size):
-            own = rows[first : first + size]
-            good = own[~np.isin(own, findings.bad(self.name, f"/{group}"))]
-            try:
-                if len(good):
-                    yield self.read(file, group, good, names)
-            except (OSError, UnicodeDecodeError) as error:
-                what = f"rows {own[0]} to {own[-1]} must be readable"
-                findings.add([of_file(self.name, what, first_line(error), f"/{group}")])
-                findings.mark(self.name, f"/{group}", own.tolist())
-
-
-def _identity(file: h5py.File) -> tuple[int, int]:
-    """Return what tells an open file from others, also from one of the same name."""
-    found = os.fstat(file.id.get_vfd_handle())
-    return found.st_dev, found.st_ino
-
-
-def look_at(name: str, file: h5py.File, camera: str, findings: Findings) -> CheckedFile:
-    """Check the attributes and the layout of a file; no row is read.
+def complete(
+    batch: Batch, stage: AnyArray | Stage = Stage.LIFTED, **contacts: AnyArray
+) -> Iterator[Violation]:
+    """Fields of numbers have values from their stage on, and none before.
 
     Args:
-        name: Name of the file, for the violations.
-        file: The file.
-        camera: `oto` or `otm`; SCENES, or empty for the trials.
-        findings: Where violations go.
+        batch: Rows of a group.
+        stage: (n,), the stage that each row reached.
+        contacts: (n, k), the fingers that have a contact, by instant: `closed`, `lifted`.
     """
-    kinds = {"": (ORIGIN, TRIAL_TABLES), SCENES: (OF_SCENES, SCENE_TABLES)}
-    rules, fields = kinds.get(camera, (OF_CAMERA, DATA_TABLES))
-    config, attributes, counts = None, dict[str, Any](), dict[str, int]()
+    stage = np.broadcast_to(np.asarray(stage), len(batch))
+    for f in batch.fields:
+        if f.derive is not None:
+            continue  # see `derived`
+        values, reached, late = batch[f.name], stage >= f.stage, f.stage is not Stage.PLACED
+        of_grasp, since = f.axes == ("6k",), f.stage.name.lower()
 
-    # Another version has another layout: its version is all that is told.
-    version = file.attrs.get("schema_version", "none")
-    if not isinstance(version, int | np.integer) or version != SCHEMA_VERSION:
-        what = f"attribute schema_version must be {SCHEMA_VERSION}"
-        findings.add([of_file(name, what, f"{version}; {OTHER_SCHEMA}")])
-    else:
-        # Its attributes: those that break no rule of their own are compared.
-        mistakes = attribute_mistakes(file, rules)
-        attributes = {key: value for key, value in file.attrs.items() if key not in mistakes}
-        for key, mistake in mistakes.items():
-            if key != "config":  # `_read_config` says it
-                findings.add([of_file(name, mistake.what, mistake.got)])
-        config = _read_config(name, file, findings)
-        findings.add(_attributes(name, attributes, config, camera))
+        # What a value must be depends on its kind.
+        if not f.dtype.startswith("float"):
+            if not late:
+                continue
+            bad = ~reached & ~all_per_row(values == 0)
+            what = f"{f.name} must be 0 before the stage {since}"
+        elif f.some:
+            bad = ~reached & ~np.isnan(values)
+            what = f"{f.name} must be NaN before the stage {since}"
+        elif f.per_finger or of_grasp:
+            there = contacts["lifted" if "lifted" in f.name or "held" in f.name else "closed"]
+            there = reached[:, None] & there
+            there = np.tile(np.repeat(there, 3, axis=1), 2) if of_grasp else there
+            bad = _is_not_as_due(values, there)
+            what = f"{f.name} must be finite where the finger touches and NaN elsewhere"
+        else:
+            bad = _is_not_as_due(values, reached)
+            what = f"{f.name} must be finite"
+            what += f" from the stage {since} on and NaN before" if late else ""
+        yield from batch.broken(what, bad, "the contrary")
 
-        # Its layout: a group with a broken dataset is not read.
-        image, broken = None if config is None else config.camera.size, set()
-        for found in differences(file, fields, image=image, thorough=True):
-            findings.add([of_file(name, found.what, found.got, found.path)])
-            if not found.text_only:
-                broken.add(found.path[1:].split("/")[0])
-        sound = [group for group in fields if group in file and group not in broken]
-        counts = {group: len(file[group][fields[group][0].name]) for group in sound}
-    return CheckedFile(
-        path=file.filename,
-        identity=_identity(file),
-        name=name,
-        attributes=attributes,
-        config=config,
-        fields=fields,
-        counts=counts,
+
+def _is_not_as_due(values: AnyArray, due: AnyArray) -> AnyArray:
+    """Return where (n,) values (n, ...) are not finite that are due, or not NaN that are not."""
+    if due.all():
+        return ~all_per_row(np.isfinite(values))
+    due = due.reshape(*due.shape, *(1,) * (values.ndim - due.ndim))
+    return ~all_per_row(np.where(due, np.isfinite(values), np.isnan(values)))
+
+
+def ranges(batch: Batch) -> Iterator[Violation]:
+    """Fields are within their limits by the schema; NaN has none."""
+    for f in batch.fields if len(batch) else ():
+        if f.limits is not None:
+            # In single precision the largest turn is beyond itself.
+            values = batch[f.name].reshape(len(batch), -1)
+            low, high = (values.dtype.type(limit) for limit in f.limits)
+            positive = f.limits[0] == POSITIVE
+            what = f"above 0..{high:.4g}" if positive else f"{low:g}..{high:.4g}"
+            bad = (values < low) | (values > high) | (positive & (values <= 0))
+            worst = values[range(len(values)), bad.argmax(axis=1)]
+            yield from batch.broken(f"{f.name} must be {what}", bad.any(axis=1), worst)
+
+
+def derived(batch: Batch) -> Iterator[Violation]:
+    """Fields that follow from others by the schema have the values that it derives."""
+    for f in batch.fields:
+        if f.derive is not None:
+            yield from batch.follows(f.name, f.derive(batch.columns), ", ".join(f.needs))
+
+
+def rigid(batch: Batch) -> Iterator[Violation]:
+    """Poses are rigid motions, and normals have length one; NaN means there is none."""
+    for f in batch.fields:
+        if f.axes[-1:] == (12,):
+            yield from _rotation(batch, f.name)
+        elif f.axes == ("6k",) or (f.axes == ("k", 3) and "nhat" in f.name):
+            # Of a grasp the normals come after the points.
+            n = batch[f.name].astype(float).reshape(len(batch), -1, 3)
+            n = n[:, n.shape[1] // 2 :] if f.axes == ("6k",) else n
+            for k, own in enumerate(np.linalg.norm(n, axis=2).T):
+                what = f"{f.name} of finger {k + 1} must have length 1 within {UNIT_TOLERANCE:g}"
+                yield from batch.broken(what, np.abs(own - 1.0) > UNIT_TOLERANCE, own)
+
+
+def _rotation(batch: Batch, name: str) -> Iterator[Violation]:
+    """The poses of a field have orthonormal rotations with determinant +1."""
+    R = batch.pose(name).reshape(len(batch), -1, 4, 4)[..., :3, :3]
+    R = np.where(np.isfinite(R).all(axis=(2, 3), keepdims=True), R, np.eye(3))
+    skew = np.abs(np.swapaxes(R, 2, 3) @ R - np.eye(3)).max(axis=(1, 2, 3))
+    determinant = np.linalg.det(R).min(axis=1)
+    yield from batch.broken(
+        f"{name} must have an orthonormal rotation with determinant +1",
+        (skew > UNIT_TOLERANCE) | (determinant < 0.0),
+        lambda i: f"one that is off by {skew[i]:.3g}, with determinant {determinant[i]:.4g}",
     )
-
-
-def _read_config(name: str, file: h5py.File, findings: Findings) -> Config | None:
-    """Return the configuration in a file, if it is sound."""
-    try:
-        return parse_stored(parse_json(str(file.attrs["config"])))
-    except KeyError:
-        got = "none"
-    except ValueError as error:  # no JSON, or no configuration
-        got = f"another ({first_line(error)})"
-    findings.add([of_file(name, "attribute config must be a configuration of drakegrasp", got)])
-    return None
-
-
-def _attributes(
-    name: str, attributes: Mapping[str, Any], config: Config | None, camera: str
-) -> Iterator[Violation]:
-    """The attributes agree with the configuration; conventions are there."""
-    for key in CONVENTIONS:
-        if not str(attributes.get(f"convention_{key}", "")).strip():
-            yield of_file(name, f"attribute convention_{key} must be there", "none")
-
-    due: dict[str, Any] = {"camera": camera} if camera in CAMERAS else {}
-    if config is not None:
-        due |= {"config_hash": config.simulation_hash(), "seed": config.seed}
-        lens = lens_attributes(config.camera)
-        due |= {k: getattr(config.scenes, k) for k in ("near", "far")} if camera == SCENES else lens
-    for key in due.keys() & attributes.keys():
-        value, expected = attributes[key], due[key]
-        same = value == expected
-        if not isinstance(expected, str | int):
-            same = np.allclose(value, expected, rtol=CAMERA_TOLERANCE, atol=CAMERA_TOLERANCE)
-        if not same:
-            expected = expected.tolist() if isinstance(expected, np.ndarray) else expected
-            yield of_file(name, f"attribute {key} must be {expected}", value)
 
 
 # Tasks
@@ -484,125 +624,3 @@ def _judge(task: Task) -> tuple[int, Findings]:
     """Do a task; return its number of rows and what it found."""
     size, judge = task
     return size, judge()
-
-
-#: float32 rounds unit vectors and rotations by 2e-7; this leaves room for products.
-UNIT_TOLERANCE = 1e-5
-#: What is positive, for a least value.
-POSITIVE = 5e-324
-#: Least and largest value of fields; NaN has no limits.
-RANGES = {
-    **dict.fromkeys(("slip", "slip_released", "certified_friction"), (0.0, np.inf)),
-    **dict.fromkeys(("turn", "turn_released"), (0.0, np.pi)),
-    **dict.fromkeys(("closed_penetration", "lifted_penetration"), (0.0, np.inf)),
-    "certified_share": (0.0, 1.0),
-    "p_hold_probability": (POSITIVE, 1.0),
-    "object_props/work2mass": (POSITIVE, np.inf),
-    "masks": (0, 1),
-    "removal": (0, max(Removal)),
-    "split": (0, len(SPLITS) - 1),
-}
-
-
-def complete(
-    batch: Batch, fields: Sequence[Field], stage: AnyArray, contacts: dict[str, AnyArray]
-) -> Iterator[Violation]:
-    """Fields of numbers have values from their stage on, and none before.
-
-    Args:
-        batch: Rows of a group.
-        fields: Its fields.
-        stage: (n,), the stage that each row reached.
-        contacts: (n, k), the fingers that have a contact, by instant: `closed`, `lifted`.
-    """
-    for f in fields:
-        if f.derive is not None or f.name not in batch.columns:
-            continue  # see `derived`; it is in no older file
-        values, reached, late = batch[f.name], stage >= f.stage, f.stage is not Stage.PLACED
-        by_finger = f.per_finger or f.axes == ("6k",)
-
-        # What a value must be depends on its kind.
-        if not f.dtype.startswith("float"):
-            if not late:
-                continue
-            bad = ~reached & ~all_per_row(values == 0)
-            what = f"{f.name} must be 0 before the stage {f.stage.name.lower()}"
-        elif f.some:
-            bad = ~reached & ~np.isnan(values)
-            what = f"{f.name} must be NaN before the stage {f.stage.name.lower()}"
-        elif by_finger:
-            there = contacts["lifted" if "lifted" in f.name or "held" in f.name else "closed"]
-            there = reached[:, None] & there
-            if f.axes == ("6k",):
-                there = np.tile(np.repeat(there, 3, axis=1), 2)
-            bad = _is_not_as_due(values, there)
-            what = f"{f.name} must be finite where the finger touches and NaN elsewhere"
-        else:
-            bad = _is_not_as_due(values, reached)
-            what = f"{f.name} must be finite"
-            what += f" from the stage {f.stage.name.lower()} on and NaN before" if late else ""
-        yield from batch.broken(what, bad, lambda i: "the contrary")
-
-
-def _is_not_as_due(values: AnyArray, due: AnyArray) -> AnyArray:
-    """Return where (n,) values (n, ...) are not finite that are due, or not NaN that are not."""
-    if due.all():
-        return ~all_per_row(np.isfinite(values))
-    due = due.reshape(*due.shape, *(1,) * (values.ndim - due.ndim))
-    return ~all_per_row(np.where(due, np.isfinite(values), np.isnan(values)))
-
-
-def ranges(batch: Batch, fields: Sequence[Field]) -> Iterator[Violation]:
-    """Fields are within RANGES."""
-    for f in fields:
-        if f.name in RANGES and f.name in batch.columns and len(batch):
-            values = batch[f.name].reshape(len(batch), -1)
-            # In single precision the largest turn is beyond itself.
-            low, high = (values.dtype.type(limit) for limit in RANGES[f.name])
-            positive = RANGES[f.name][0] == POSITIVE
-            what = f"above 0..{high:.4g}" if positive else f"{low:g}..{high:.4g}"
-            bad = (values < low) | (values > high) | (positive & (values <= 0))
-            worst = np.where(bad.any(axis=1), values[range(len(values)), bad.argmax(axis=1)], 0)
-            yield from batch.broken(f"{f.name} must be {what}", bad.any(axis=1), worst)
-
-
-def derived(batch: Batch, fields: Sequence[Field]) -> Iterator[Violation]:
-    """Fields that follow from others by the schema have the values that it derives."""
-    for f in fields:
-        if f.derive is not None:
-            yield from batch.follows(f.name, f.derive(batch.columns), ", ".join(f.needs))
-
-
-def rigid(batch: Batch, fields: Sequence[Field]) -> Iterator[Violation]:
-    """Poses are rigid motions, and normals have length one; NaN means there is none."""
-    for f in fields:
-        if f.name not in batch.columns:
-            continue
-        if f.axes[-1:] == (12,):
-            yield from _rotation(batch, f.name)
-        elif f.axes == ("6k",):
-            vectors = batch[f.name].astype(float).reshape(len(batch), 2, -1, 3)
-            yield from _unit_length(batch, f.name, vectors[:, 1])
-        elif f.axes == ("k", 3) and "nhat" in f.name:
-            yield from _unit_length(batch, f.name, batch[f.name].astype(float))
-
-
-def _rotation(batch: Batch, name: str) -> Iterator[Violation]:
-    """The poses of a field have orthonormal rotations with determinant +1."""
-    R = batch.pose(name).reshape(len(batch), -1, 4, 4)[..., :3, :3]
-    R = np.where(np.isfinite(R).all(axis=(2, 3), keepdims=True), R, np.eye(3))
-    skew = np.abs(np.swapaxes(R, 2, 3) @ R - np.eye(3)).max(axis=(1, 2, 3))
-    determinant = np.linalg.det(R).min(axis=1)
-    yield from batch.broken(
-        f"{name} must have an orthonormal rotation with determinant +1",
-        (skew > UNIT_TOLERANCE) | (determinant < 0.0),
-        lambda i: f"one that is off by {skew[i]:.3g}, with determinant {determinant[i]:.4g}",
-    )
-
-
-def _unit_length(batch: Batch, name: str, normals: Array) -> Iterator[Violation]:
-    """Normals (n, k, 3) by finger have length one."""
-    lengths = np.linalg.norm(normals, axis=2)
-    for k, own in enumerate(lengths.T):
-        what = f"{name} of finger {k + 1} must have length 1 within {UNIT_TOLERANCE:g}"
-        yield from batch.broken(what, np.abs(own - 1.0) > UNIT_TOLERANCE, own)

@@ -14,10 +14,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from drakegrasp.dataset.assembly.decisions import Decisions
 from drakegrasp.dataset.card import card_content
 from drakegrasp.dataset.checks import scenes
 from drakegrasp.dataset.checks.assembled import (
-    Again,
     assemble_again,
     carried_hand_as_built,
     check_object,
@@ -30,13 +30,14 @@ from drakegrasp.dataset.checks.rows import (
     SCENES,
     Check,
     CheckedFile,
+    Dataset,
     Findings,
     Violation,
     look_at,
     of_file,
 )
 from drakegrasp.dataset.checks.samples import samples_tasks, splits
-from drakegrasp.dataset.checks.trials import Dataset, successes
+from drakegrasp.dataset.checks.trials import successes
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, SCENES_FILE, TRIALS_FILE
@@ -128,7 +129,7 @@ def _check_directory(out: Path, check: Check) -> None:
     # Files of another state are not compared row by row.
     current = set()
     for camera, file in files.items():
-        other = [*of_another_state(file, manifest, again, camera)]
+        other = [*of_another_state(file, manifest, again)]
         check.findings.add(other)
         if file.config is not None and not other:
             current.add(camera)
@@ -150,7 +151,7 @@ def _check_rows(
     files: Mapping[str, CheckedFile],
     check: Check,
     dataset: Dataset | None = None,
-    again: Again | None = None,
+    again: Decisions | None = None,
     current: frozenset[str] = frozenset(),
 ) -> None:
     """Judge all rows of some files, by camera: first the attempts, then what the samples show.
@@ -170,7 +171,7 @@ def _check_rows(
         if camera:
             both = {"", camera} <= current - compared and "trials" in files[""].counts
             trials = files[""] if both else None
-            check.judge(samples_tasks(file, camera, dataset, trials, check.findings))
+            check.judge(samples_tasks(file, dataset, trials, check.findings))
         # What is compared follows from the shards; other files are judged by themselves.
         if camera not in compared:
             with check.readable(file):

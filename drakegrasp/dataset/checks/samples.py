@@ -9,20 +9,29 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from drakegrasp.config import Config, FilterConfig
 from drakegrasp.dataset.assembly.split import split_samples
-from drakegrasp.dataset.checks import images
+from drakegrasp.dataset.checks.images import (
+    contacts_in_image,
+    contacts_of,
+    image_frames,
+    image_values,
+    object_in_camera,
+    object_pixels,
+    table_pixels,
+    without_noise,
+)
 from drakegrasp.dataset.checks.rows import (
     POSITION_TOLERANCE,
     UNIT_TOLERANCE,
     AnyArray,
     Batch,
     CheckedFile,
+    Dataset,
     Findings,
+    LoadModel,
     Rows,
     Rule,
     Task,
@@ -32,14 +41,13 @@ from drakegrasp.dataset.checks.rows import (
     ranges,
     rigid,
 )
-from drakegrasp.dataset.checks.trials import Dataset
 from drakegrasp.dataset.manifest import ObjectEntry
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SPLITS
 from drakegrasp.filters import rules_of_hold
 from drakegrasp.frames import P_WT, X_WT, invert_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.objects.model import ObjectModel, fit_contacts
-from drakegrasp.outcomes import Outcome, Stage
+from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.verdict import is_precision, is_stable
 from drakegrasp.table import Table
 from drakegrasp.vision.camera import LOOKS_VERTICALLY
@@ -55,35 +63,29 @@ MOTION_TOLERANCE = 1e-6
 
 
 def samples_tasks(
-    data: CheckedFile,
-    camera: str,
-    dataset: Dataset | None,
-    trials: CheckedFile | None,
-    findings: Findings,
+    data: CheckedFile, dataset: Dataset | None, trials: CheckedFile | None, findings: Findings
 ) -> Iterator[Task]:
     """Yield the tasks that judge all samples of a file; none if its lens is not known.
 
     Args:
         data: The file.
-        camera: `oto` or `otm`.
         dataset: The dataset around the file, if there is one.
         trials: trials.hdf5, where the samples are to be compared with it; their shards tell more.
         findings: Has the bad rows of both files.
     """
+    copied = list[Rule]()
+    if trials is not None:
+        bad = findings.bad(trials.name, "/trials")
+        copied.append(partial(_copies_trial, trials=trials, bad=bad))
     for split, count in data.counts.items() if data.config is not None else ():
         for start in range(0, count, TASK_ROWS):
             rows = np.arange(start, min(start + TASK_ROWS, count))
             known = findings.of_rows(data.name, f"/{split}", start, start + len(rows))
-            copied = list[Rule]()
-            if trials is not None:
-                bad = findings.bad(trials.name, "/trials")
-                copied.append(partial(_copies_trial, trials=trials, bad=bad))
-            yield len(rows), partial(_judge, data, camera, split, rows, dataset, copied, known)
+            yield len(rows), partial(_judge, data, split, rows, dataset, copied, known)
 
 
 def _judge(
     data: CheckedFile,
-    camera: str,
     split: str,
     rows: Rows,
     dataset: Dataset | None,
@@ -94,43 +96,20 @@ def _judge(
 
     Args:
         data: The file.
-        camera: `oto` or `otm`.
         split: Name of the split.
         rows: Of the split, (n,).
         dataset: See `samples_tasks`.
         copied: The rule that they repeat their trials, if it is to be applied.
         findings: Has the rows that are bad already.
     """
-    assert data.config is not None
-    config = data.config
-    load = (lambda name: None) if dataset is None else dataset.loader()
-    of_camera: dict[str, Any] = {"camera": camera, "config": config}
+    meshes = [] if dataset is None else [partial(on_meshes, load=dataset.loader())]
+    values = [rigid, ranges, image_values, mass_properties, fixed_frames, hold]
     with data.opened() as file:
         for batch in data.batches(file, split, rows, SAMPLE_ROWS, findings):
-            own = batch.judge(findings, finite).judge(
-                findings,
-                partial(rigid, fields=DATA_FIELDS),
-                partial(ranges, fields=DATA_FIELDS),
-                partial(images.image_values, config=config),
-                mass_properties,
-                fixed_frames,
-                partial(hold, filters=config.filters),
-            )
-            frames = partial(images.image_frames, **of_camera)
-            own = own.judge(findings, camera_pair, frames).judge(findings, *copied)
-
+            sound = batch.judge(findings, [finite], values, [camera_pair, image_frames], copied)
             # What the images show, which needs right frames.
-            own = images.without_noise(own, **of_camera).judge(
-                findings,
-                partial(images.contacts_in_image, config=config),
-                partial(images.table_pixels, **of_camera),
-            )
-            names = own["object_props/object_name"]
-            for name in dict.fromkeys(names.tolist()):
-                if (model := load(name)) is not None:
-                    shown = partial(images.object_pixels, **of_camera, model=model)
-                    touched = partial(contacts_on_mesh, **of_camera, model=model)
-                    own.where(names == name).judge(findings, shown, touched)
+            shown = without_noise(sound)
+            shown.judge(findings, [contacts_in_image, table_pixels], meshes)
     return findings
 
 
@@ -158,8 +137,7 @@ def _copies_trial(batch: Batch, trials: CheckedFile, bad: AnyArray) -> Iterator[
 def finite(batch: Batch) -> Iterator[Violation]:
     """No number of a sample is NaN or infinite but the contacts of fingers that it leaves out."""
     used = ~unused_fingers(batch["grasp_props/unused"], batch["grasps"].shape[1] // 6)
-    stage = np.full(len(batch), Stage.LIFTED)
-    yield from complete(batch, DATA_FIELDS, stage, {"closed": used, "lifted": used})
+    yield from complete(batch, closed=used, lifted=used)
 
 
 def mass_properties(batch: Batch) -> Iterator[Violation]:
@@ -180,8 +158,9 @@ def mass_properties(batch: Batch) -> Iterator[Violation]:
     )
 
 
-def hold(batch: Batch, filters: FilterConfig) -> Iterator[Violation]:
+def hold(batch: Batch) -> Iterator[Violation]:
     """A sample keeps the limits of the hold in `filters`, and is called as it holds."""
+    filters = batch.config.filters
     links, slip, turn, precision, stable = (
         batch[f"grasp_props/{name}"]
         for name in ("other_links_held", "slip", "turn", "precision", "stable")
@@ -191,8 +170,7 @@ def hold(batch: Batch, filters: FilterConfig) -> Iterator[Violation]:
     for rule in rules_of_hold():
         if rule.is_on(filters) and least.has(*rule.needs):
             what = f"a sample must pass the filter {rule.removal.label}"
-            bad = rule.refuses(least, filters)
-            yield from batch.broken(what, bad, lambda i: "one that does not")
+            yield from batch.broken(what, rule.refuses(least, filters), "one that does not")
 
     # On the limit rounding decides.
     success = np.full(len(batch), Outcome.SUCCESS.value)
@@ -236,28 +214,30 @@ def camera_pair(batch: Batch) -> Iterator[Violation]:
     )
 
 
-def contacts_on_mesh(
-    batch: Batch, camera: str, config: Config, model: ObjectModel
-) -> Iterator[Violation]:
-    """Contacts are on the mesh, and their normals point out of it.
+def on_meshes(batch: Batch, load: LoadModel) -> Iterator[Violation]:
+    """The images show the meshes of the objects, and the contacts are on them."""
+    names = batch["object_props/object_name"]
+    for name in dict.fromkeys(names.tolist()):
+        if (model := load(name)) is not None:
+            own = batch.where(names == name)
+            yield from object_pixels(own, model)
+            yield from contacts_on_mesh(own, model)
+
+
+def contacts_on_mesh(batch: Batch, model: ObjectModel) -> Iterator[Violation]:
+    """Contacts of samples of one object are on its mesh, and their normals point out of it.
 
     A normal counts as outward if it agrees with either face of `ContactFit.normal_angle`.
-
-    Args:
-        batch: Samples of one object.
-        camera: `oto` or `otm`, the camera of their grasps.
-        config: Says how far a contact may be from the mesh.
-        model: The object.
     """
     # Contacts in {O}, and how they lie there.
-    X_OC = invert_pose(images.object_in_camera(batch, camera))
-    p_CQ, n_C = images.contacts_of(batch)
+    X_OC = invert_pose(object_in_camera(batch))
+    p_CQ, n_C = contacts_of(batch)
     n_O = np.einsum("nij,nkj->nki", X_OC[:, :3, :3], n_C)
     p_OQ = np.einsum("nij,nkj->nki", X_OC[:, :3, :3], p_CQ) + X_OC[:, None, :3, 3]
     fit = fit_contacts(model, p_OQ.reshape(-1, 3), n_O.reshape(-1, 3))
     off, angle = fit.distance.reshape(len(batch), -1), fit.normal_angle.reshape(len(batch), -1)
 
-    distance = config.filters.max_surface_distance
+    distance = batch.config.filters.max_surface_distance
     beyond = off > distance + POSITION_TOLERANCE
     inward = (np.degrees(angle) > 90.0) & (off <= distance + POSITION_TOLERANCE)
     for k in range(off.shape[1]):

@@ -29,8 +29,8 @@ from drakegrasp.dataset.checks.rows import (
     Batch,
     Check,
     CheckedFile,
+    Dataset,
     Findings,
-    Task,
     Violation,
     complete,
     of_file,
@@ -38,22 +38,15 @@ from drakegrasp.dataset.checks.rows import (
     rigid,
 )
 from drakegrasp.dataset.checks.samples import group_of
-from drakegrasp.dataset.checks.trials import Dataset
 from drakegrasp.dataset.manifest import ObjectEntry
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.scenes import GRASPS_FOLLOW_FROM, LIFTED, grasps_of_trials
-from drakegrasp.dataset.schema import (
-    DEPTH_UNIT,
-    SCENE_FIELDS,
-    SCENE_GRASP_FIELDS,
-    VIEW_FIELDS,
-    Field,
-)
+from drakegrasp.dataset.schema import DEPTH_UNIT
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.filters import Removal
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points, unpack_pose
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.outcomes import Outcome, Stage
+from drakegrasp.outcomes import Outcome
 from drakegrasp.vision.camera import visible_contacts
 
 #: Half a step of the stored depths comes on top.
@@ -74,58 +67,37 @@ def judge(data: CheckedFile, check: Check, dataset: Dataset | None) -> None:
     with check.readable(data):
         check.findings.add(_tables(data, {entry.name: entry for entry in entries}))
     if len(check.findings.violations()) == before and data.config is not None:
-        check.judge(_tasks(data, dataset))
-
-
-def _tasks(data: CheckedFile, dataset: Dataset | None) -> Iterator[Task]:
-    """Yield the tasks that judge all scenes."""
-    for scene in range(data.counts["scenes"]):
-        yield 1, partial(_judge, data, scene, dataset)
+        scenes = range(data.counts["scenes"])
+        check.judge((1, partial(_judge, data, scene, dataset)) for scene in scenes)
 
 
 def _judge(data: CheckedFile, scene: int, dataset: Dataset | None) -> Findings:
     """Apply the rules of a scene: of its place, its grasps, then of each of its views."""
-    assert data.config is not None
-    findings, lens = Findings(), data.config.scenes
+    findings = Findings()
     with data.opened() as file:
         rows = {g: np.flatnonzero(file[g]["scene"][:] == scene) for g in ("views", "grasps")}
         place = data.read(file, "scenes", np.array([scene]))
         grasps = data.read(file, "grasps", rows["grasps"])
-        of_views, model = [table_pixels], None
-        of_place, of_grasps = [partial(ranges, fields=SCENE_FIELDS)], [labels]
+        of_place, of_grasps, of_views = [ranges, rigid, complete], [labels, rigid], [table_pixels]
         if dataset is not None:
             name = file["objects/name"].asstr()[int(place["object"][0, 0])]
-            model, trials = dataset.loader()(name), Trials(dataset.out)
             of_place.append(partial(resting_scene, dataset=dataset, name=name))
-            of_grasps.append(partial(follow_trials, place=place, trials=trials))
-        if model is not None:
-            of_views.append(
-                partial(object_pixels, X_TO=unpack_pose(place["X_TO"][0, 0]), model=model)
-            )
-        for batch, own, fields in (
-            (place, of_place, SCENE_FIELDS),
-            (grasps, of_grasps, SCENE_GRASP_FIELDS),
-        ):
-            batch.judge(findings, *own, partial(rigid, fields=fields))
-        place.judge(findings, partial(_finite, fields=SCENE_FIELDS))
+            of_grasps.append(partial(follow_trials, place=place, trials=Trials(dataset.out)))
+            if (model := dataset.loader()(name)) is not None:
+                of_views.append(partial(object_pixels, X_TO=place.pose("X_TO")[0, 0], model=model))
+        place.judge(findings, of_place)
+        grasps.judge(findings, of_grasps)
 
-        values = partial(
-            image_values, near=lens.near, far=lens.far, objects=place["object"].shape[1]
-        )
         views, seen = rows["views"], file["visible/view"][:]
+        values = partial(image_values, objects=place["object"].shape[1])
         for batch in data.batches(file, "views", views, len(views) or 1, findings):
             visible = {
                 view: file["visible/visible"][np.flatnonzero(seen == view)]
                 for view in batch.rows.tolist()
             }
-            poses = partial(rigid, fields=VIEW_FIELDS)
-            sound = batch.judge(findings, poses, values, partial(_finite, fields=VIEW_FIELDS))
-            sound.judge(findings, *of_views, partial(seen_contacts, of=visible, grasps=grasps))
+            seen_by = partial(seen_contacts, of=visible, grasps=grasps)
+            batch.judge(findings, [rigid, values, complete], [*of_views, seen_by])
     return findings
-
-
-def _finite(batch: Batch, fields: tuple[Field, ...]) -> Iterator[Violation]:
-    yield from complete(batch, fields, np.full(len(batch), Stage.LIFTED), {})
 
 
 def _other_state(data: CheckedFile, out: Path) -> Iterator[Violation]:
@@ -216,7 +188,7 @@ def follow_trials(grasps: Batch, place: Batch, trials: Trials) -> Iterator[Viola
     if not len(grasps):
         return
     own = trials[grasps["trial_id"]].columns([*GRASPS_FOLLOW_FROM, "removal"])
-    X_TO = np.tile(unpack_pose(place["X_TO"][0, 0]), (len(grasps), 1, 1))
+    X_TO = np.tile(place.pose("X_TO")[0, 0], (len(grasps), 1, 1))
     # Of a sample its weight is known from the data files alone.
     weights = np.where(own["removal"] == Removal.KEPT, grasps["weight"], np.nan)
     due = grasps_of_trials(own, X_TO, weights)
@@ -226,8 +198,9 @@ def follow_trials(grasps: Batch, place: Batch, trials: Trials) -> Iterator[Viola
 # Views
 
 
-def image_values(views: Batch, near: float, far: float, objects: int) -> Iterator[Violation]:
+def image_values(views: Batch, objects: int) -> Iterator[Violation]:
     """Depths are 0 or within near..far; masks name objects of the scene, and these have depths."""
+    near, far = views.config.scenes.near, views.config.scenes.far
     depth = views["depth"].reshape(len(views), -1) * DEPTH_UNIT
     mask = views["mask"].reshape(len(views), -1)
     low, high = np.where(depth > 0.0, depth, far).min(axis=1), depth.max(axis=1)
@@ -237,7 +210,7 @@ def image_values(views: Batch, near: float, far: float, objects: int) -> Iterato
     most = mask.max(axis=1)
     yield from views.broken("mask must be 0 to the number of objects", most > objects, most)
     blind = ((mask > 0) & (depth == 0.0)).any(axis=1)
-    yield from views.broken("pixels of an object must have a depth", blind, lambda i: "0")
+    yield from views.broken("pixels of an object must have a depth", blind, "0")
 
 
 def _points(views: Batch, i: int, chosen: AnyArray) -> Array:

@@ -9,20 +9,19 @@ dataset conditions, resting pose and chance, by those that a build draws and com
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import lru_cache, partial
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
-from drakegrasp.config import CloseConfig, LiftConfig, RandomizeConfig
+from drakegrasp.config import RandomizeConfig
 from drakegrasp.dataset.checks.rows import (
     POSITION_TOLERANCE,
     AnyArray,
     Batch,
     CheckedFile,
+    Dataset,
+    LoadModel,
     Rule,
     Violation,
     complete,
@@ -32,14 +31,14 @@ from drakegrasp.dataset.checks.rows import (
     rigid,
 )
 from drakegrasp.dataset.manifest import Manifest
-from drakegrasp.dataset.paths import FILE_NAME, model_path
-from drakegrasp.dataset.schema import CONDITION_FIELDS, NO_PRESHAPE, SUCCESS_FIELDS, TRIAL_FIELDS
+from drakegrasp.dataset.paths import FILE_NAME
+from drakegrasp.dataset.schema import CONDITION_FIELDS, NO_PRESHAPE
 from drakegrasp.errors import HandError
 from drakegrasp.frames import invert_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.folder import is_hand
 from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp, read_lift_chance
-from drakegrasp.objects.model import ObjectModel, load_object
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.simulation.candidates import Source
 from drakegrasp.simulation.conditions import draw_conditions
@@ -61,76 +60,40 @@ MOTION_TOLERANCE = 1e-4
 PULL = 0.05
 #: With more friction a force may leave the object's side of a mean normal: a cone of 45 degrees.
 MAX_FRICTION = 1.0
-#: Objects whose meshes, with their search trees, stay in memory during a task; samples are ordered
-#: by object.
-KEPT_OBJECTS = 4
 #: Chances are rounded to about a millionth.
 CHANCE_TOLERANCE = 1e-5
 #: Attempts whose successes are looked for at once.
 BLOCK = 16_384
 
-#: Returns an object by its name, or None if its file is broken, which is a finding.
-LoadModel = Callable[[str], ObjectModel | None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Dataset:
-    """The dataset around a file that is checked.
-
-    Attributes:
-        out: Its directory.
-        manifest: Its manifest.
-        readable: Names of the objects whose meshes can be read.
-    """
-
-    out: Path
-    manifest: Manifest
-    readable: frozenset[str]
-
-    def loader(self) -> LoadModel:
-        """Return what loads the objects, and keeps some, while a task has it."""
-        out, readable = self.out, self.readable
-
-        def load(name: str) -> ObjectModel | None:
-            return load_object(model_path(out, name)) if name in readable else None
-
-        return lru_cache(KEPT_OBJECTS)(load)
-
 
 def trial_rules(trials: CheckedFile, dataset: Dataset | None) -> list[list[Rule]]:
-    """Return the rules for a file and the dataset around it, if there is one.
+    """Return the rules for a file and the dataset around it, if there is one, in stages.
 
-    Each group relies on those before it: the first is for any values, stages need a legal outcome,
-    the third is for finite values of known objects, the last for sound poses and contacts.
+    The first is for any values, stages of attempts need a legal outcome, the third is for finite
+    values of known objects, the last for sound poses and contacts.
     """
-    config = trials.config
-    close, lift = (config.close, config.lift) if config else (None, None)
-    fingers = json.loads(trials.attributes.get("fingers", "{}"))
-    required = list(fingers.values()) or [True]
-    finite: list[Rule] = [
-        partial(verdicts, required=required, lift=lift, close=close),
-        partial(rigid, fields=TRIAL_FIELDS),
-        contacts,
-    ]
-    sound: list[Rule] = [motion, partial(derived, fields=TRIAL_FIELDS)]
-
+    finite: list[Rule] = [verdicts, rigid, contacts]
+    sound: list[Rule] = [motion, derived]
+    most: AnyArray | None = None
     # What follows from the dataset needs all of its objects.
     if dataset is not None and trials.counts["objects"] == len(dataset.manifest.objects):
-        known: dict[str, Any] = {"manifest": dataset.manifest, "model": dataset.loader()}
-        finite += [partial(resting_poses, manifest=dataset.manifest), partial(conditions, **known)]
-        sound.append(partial(chances, required=required, **known))
-    stages: list[Rule] = [
-        partial(complete_stages, close=close),
-        partial(ranges, fields=TRIAL_FIELDS),
-        partial(repeats, most=None if config is None else config.certify.repeats),
-    ]
-    manifest = None if dataset is None else dataset.manifest
-    return [[partial(numbers, trials=trials, manifest=manifest)], stages, finite, sound]
+        manifest, model = dataset.manifest, dataset.loader()
+        most = np.array([entry.candidates for entry in manifest.objects])
+        finite.append(partial(resting_poses, manifest=manifest))
+        finite.append(partial(conditions, manifest=manifest, model=model))
+        if trials.config is not None:
+            sound.append(partial(chances, manifest=manifest, model=model))
+    return [[partial(numbers, candidates=most)], [complete_stages, ranges, repeats], finite, sound]
 
 
-def numbers(batch: Batch, trials: CheckedFile, manifest: Manifest | None) -> Iterator[Violation]:
-    """The numbers of a trial are legal, and a refined palm pose has a parent."""
-    config, objects = trials.config, trials.counts["objects"]
+def numbers(batch: Batch, candidates: AnyArray | None) -> Iterator[Violation]:
+    """The numbers of a trial are legal, and a refined palm pose has a parent.
+
+    Args:
+        batch: Rows of `/trials`.
+        candidates: Number of candidates of each object, if known.
+    """
+    config, objects = batch.of.config, batch.of.counts["objects"]
     yield from batch.follows("trial_id", batch.rows, "the row's number")
     outcome, known = batch["outcome"], [o.value for o in Outcome if not o.verification_only]
     what = f"outcome must be one of {', '.join(map(str, known))}"
@@ -138,9 +101,9 @@ def numbers(batch: Batch, trials: CheckedFile, manifest: Manifest | None) -> Ite
 
     # Of an unknown object, which is a finding, no number is too large.
     most, index = np.full(len(batch), np.inf), batch["object"]
-    if manifest is not None and len(manifest.objects) == objects:
+    if candidates is not None:
         there = (index >= 0) & (index < objects)
-        most[there] = np.array([entry.candidates for entry in manifest.objects])[index[there]]
+        most[there] = candidates[index[there]]
     for name, of, limit in (
         ("object", "rows of /objects", objects),
         ("candidate", "candidates of its object", most),
@@ -152,25 +115,17 @@ def numbers(batch: Batch, trials: CheckedFile, manifest: Manifest | None) -> Ite
 
     # The first of a family has no parent. Only of a posture from outside may the density be
     # unknown, or the preshape be none.
-    child, source, unused = batch["child"], batch["source"], batch["unused"] > 0
+    child, source, preshape = batch["child"], batch["source"], batch["preshape"]
     refined, given = child > 0, source == Source.POSTURES
-    for name, must, bad in (
-        (
-            "generation",
-            "0 for the first of a family and positive for others",
-            (batch["generation"] > 0) != refined,
-        ),
-        (
-            "source",
-            "2 (refine) for a refined palm pose, and 0, 1, 3 or 4 for another",
-            ((source == Source.REFINE) != refined) | (source > max(Source)),
-        ),
-        ("log_density", "finite but for postures", ~np.isfinite(batch["log_density"]) & ~given),
-        (
-            "preshape",
-            "255 of postures only, which use all fingers",
-            (~given | unused) & (batch["preshape"] == NO_PRESHAPE),
-        ),
+    first = (batch["generation"] > 0) != refined
+    drawn = ((source == Source.REFINE) != refined) | (source > max(Source))
+    dense = ~np.isfinite(batch["log_density"]) & ~given
+    shape = (preshape == NO_PRESHAPE) & (~given | (batch["unused"] > 0))
+    for name, bad, must in (
+        ("generation", first, "0 for the first of a family and positive for others"),
+        ("source", drawn, "2 (refine) for a refined palm pose, and 0, 1, 3 or 4 for another"),
+        ("log_density", dense, "finite but for postures"),
+        ("preshape", shape, "255 of postures only, which use all fingers"),
     ):
         yield from batch.broken(f"{name} must be {must}", bad, batch[name])
     if config is not None:
@@ -178,14 +133,14 @@ def numbers(batch: Batch, trials: CheckedFile, manifest: Manifest | None) -> Ite
         yield from batch.follows("parent", parent, "child")
 
 
-def complete_stages(batch: Batch, close: CloseConfig | None) -> Iterator[Violation]:
+def complete_stages(batch: Batch) -> Iterator[Violation]:
     """The fields of a stage have values if the attempt reached it, and none otherwise."""
-    stage = _stages(batch, close)
+    stage = _stages(batch)
     touching = {when: batch[f"{when}_touching"] for when in ("closed", "lifted")}
-    yield from complete(batch, TRIAL_FIELDS, stage, touching)
-    if close is None:
+    yield from complete(batch, stage, **touching)
+    if batch.of.config is None:
         return
-    measured = close.scrape_depth is not None
+    measured = batch.config.close.scrape_depth is not None
     state, given = ("finite", "given") if measured else ("NaN", "null")
     for name, reached in (("clearance_close", Stage.CLOSED), ("clearance_lift", Stage.LIFTED)):
         bad = (stage >= reached) & (np.isfinite(batch[name]) != measured)
@@ -193,15 +148,11 @@ def complete_stages(batch: Batch, close: CloseConfig | None) -> Iterator[Violati
         yield from batch.broken(what, bad, batch[name])
 
 
-def repeats(batch: Batch, most: int | None) -> Iterator[Violation]:
-    """Of the repeats of an attempt some hold, and of these some are samples.
-
-    Args:
-        batch: Rows of `/trials`.
-        most: Number of repeats of an attempt that is drawn, if known.
-    """
+def repeats(batch: Batch) -> Iterator[Violation]:
+    """Of the repeats of an attempt some hold, and of these some are samples."""
     drawn, half = ~np.isnan(batch["p_hold_probability"]), batch["p_hold_half_step"]
-    limit, of = np.where(drawn, np.inf if most is None else most, 0), "those drawn for"
+    most = batch.of.config.certify.repeats if batch.of.config else np.inf
+    limit, of = np.where(drawn, most, 0), "those drawn for"
     for name in ("p_hold_repeats", "p_hold_held", "p_hold_samples"):
         values = batch[name]
         yield from batch.broken(f"{name} must be at most {of}", values > limit, values)
@@ -210,24 +161,15 @@ def repeats(batch: Batch, most: int | None) -> Iterator[Violation]:
     yield from batch.broken("p_hold_half_step must be 0, 1 or NaN, of those drawn", bad, half)
 
 
-def verdicts(
-    batch: Batch, required: Sequence[bool], lift: LiftConfig | None, close: CloseConfig | None
-) -> Iterator[Violation]:
-    """The outcome is what follows from contacts, motion and chance (`simulation.verdict`).
-
-    Args:
-        batch: Rows of `/trials`.
-        required: Whether a grasp needs each fingertip on the object.
-        lift: When lifts end, if known.
-        close: How hands close, if known.
-    """
-    outcome, closed = batch["outcome"], judged_closed(batch, required, close)
+def verdicts(batch: Batch) -> Iterator[Violation]:
+    """The outcome is what follows from contacts, motion and chance (`simulation.verdict`)."""
+    outcome, closed = batch["outcome"], judged_closed(batch)
     due = judge_lifted(
         batch["lifted_touching"],
         batch["lifted_other_links"],
         batch["lifted_object_on_table"],
-        required=required_of(batch, required),
-        scraped=_scraped(batch, "lift", close),
+        required=required_of(batch),
+        scraped=_scraped(batch, "lift"),
     )
     # Older versions called slipped what is partly held.
     older = (outcome == Outcome.SLIPPED) & (due == Outcome.PARTLY_HELD)
@@ -236,7 +178,8 @@ def verdicts(
     # A lift that was ended has no verdict, but a reason; so has a closed hand that was not lifted.
     ended, left = outcome == Outcome.MOVED, outcome == Outcome.NOT_LIFTED
     must_stay = np.zeros(len(batch), dtype=np.bool_)
-    if lift is not None:
+    if batch.of.config is not None:
+        lift = batch.config.lift
         ended &= is_lost_sample(batch["slip"], batch["turn"], lift)
         must_stay = (batch["chance"] < lift.least_chance) & ~batch["audited"]
         # Of a flat image the trial knows nothing; it has none.
@@ -248,7 +191,7 @@ def verdicts(
     due = np.where(closed != Outcome.SUCCESS, closed, due)
     yield from batch.broken(
         "outcome must follow from the contacts, the clearance, the motion and the chance",
-        (_stages(batch, close) >= Stage.CLOSED) & (due != outcome),
+        (_stages(batch) >= Stage.CLOSED) & (due != outcome),
         lambda i: (
             f"{Outcome(int(outcome[i])).label} where these say {Outcome(int(due[i])).label}: slip "
             f"{batch['slip'][i]:.4g} m, turn {batch['turn'][i]:.4g} rad, chance "
@@ -257,19 +200,20 @@ def verdicts(
     )
 
 
-def judged_closed(batch: Batch, required: Sequence[bool], close: CloseConfig | None) -> AnyArray:
+def judged_closed(batch: Batch) -> AnyArray:
     """Return the outcomes (n,) of closed hands, SUCCESS where the hand may lift."""
     return judge_closed(
         batch["closed_touching"],
         batch["closed_other_links"],
         batch["closed_hand_on_table"],
-        required=required_of(batch, required),
-        scraped=_scraped(batch, "close", close),
+        required=required_of(batch),
+        scraped=_scraped(batch, "close"),
     )
 
 
-def required_of(batch: Batch, required: Sequence[bool]) -> AnyArray:
+def required_of(batch: Batch) -> AnyArray:
     """Return whether the grasp of each row needs each fingertip, (n, k): those of its preshape."""
+    required = [*json.loads(batch.of.attributes.get("fingers", "{}")).values()] or [True]
     return np.asarray(required) & ~unused_fingers(batch["unused"], len(required))
 
 
@@ -309,19 +253,19 @@ def motion(batch: Batch) -> Iterator[Violation]:
     yield from batch.follow(words, "outcome, lifted_other_links, slip and turn")
 
 
-def _scraped(batch: Batch, when: str, close: CloseConfig | None) -> AnyArray:
+def _scraped(batch: Batch, when: str) -> AnyArray:
     """Return (n,) whether the hand came too far below the table's top; not where unknown."""
-    if close is None:
+    if batch.of.config is None:
         return np.zeros(len(batch), dtype=np.bool_)
-    return scrapes(batch[f"clearance_{when}"], close)
+    return scrapes(batch[f"clearance_{when}"], batch.config.close)
 
 
-def _stages(batch: Batch, close: CloseConfig | None) -> AnyArray:
+def _stages(batch: Batch) -> AnyArray:
     """Return the stage (n,) that each attempt reached."""
     table = np.zeros(max(Outcome) + 1, dtype=int)
     table[[o.value for o in Outcome]] = [o.stage.value for o in Outcome]
     # The table can be touched by the hand as it closes, or in the lift.
-    by_hand = batch["closed_hand_on_table"] | _scraped(batch, "close", close)
+    by_hand = batch["closed_hand_on_table"] | _scraped(batch, "close")
     lifted = (batch["outcome"] == Outcome.TABLE_CONTACT) & ~by_hand
     return np.where(lifted, Stage.LIFTED.value, table[batch["outcome"]])
 
@@ -359,17 +303,8 @@ def conditions(batch: Batch, manifest: Manifest, model: LoadModel) -> Iterator[V
         yield from batch.follows(key, values, "what the seed gives the attempt", 0.0)
 
 
-def chances(
-    batch: Batch, required: Sequence[bool], manifest: Manifest, model: LoadModel
-) -> Iterator[Violation]:
-    """A closed hand that may lift has the chance of a sample that its contacts give.
-
-    Args:
-        batch: Rows of `/trials`, with sound contacts.
-        required: Whether a grasp needs each fingertip on the object.
-        manifest: Of the dataset.
-        model: Loads its objects.
-    """
+def chances(batch: Batch, manifest: Manifest, model: LoadModel) -> Iterator[Violation]:
+    """A closed hand that may lift has the chance of a sample that its sound contacts give."""
     # Other files of the hand may have other weights.
     try:
         if not is_hand(manifest.config.hand_source, manifest.versions.get("hand")):
@@ -379,7 +314,7 @@ def chances(
         return
 
     # A hand that was never closed has no `time_close`.
-    lifts = judged_closed(batch, required, manifest.config.close) == Outcome.SUCCESS
+    lifts = judged_closed(batch) == Outcome.SUCCESS
     lifts &= np.isfinite(batch["time_close"])
     due = np.where(lifts & (chance is not None), batch["chance"], np.nan)
     for _, known, rows in _by_object(batch, manifest, model):
@@ -424,4 +359,4 @@ def successes(trials: CheckedFile) -> Iterator[Violation]:
         different = sorted(set(batch["trial_id"].tolist()) ^ set(due.tolist()))
         got = f"differences at trials {different[:5]}" if different else "another order"
         yield of_file(trials.name, "trial_id must list the successes of /trials", got, "/successes")
-    yield from ranges(batch, SUCCESS_FIELDS)
+    yield from ranges(batch)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -26,13 +26,12 @@ from helpers.datasets import (
 )
 from scipy import ndimage
 
-from drakegrasp.config import parse_config
 from drakegrasp.dataset.checks import images as image_rules
-from drakegrasp.dataset.checks.rows import Batch
+from drakegrasp.dataset.checks.rows import Findings, look_at
 from drakegrasp.dataset.paths import model_path
-from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
+from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.frames import invert_pose, pack_pose, unpack_pose
-from drakegrasp.hand.settings import load_config
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import load_object
 
 
@@ -179,23 +178,18 @@ def test_mesh_is_measured_inside_the_border_of_the_mask(out: Path, inside: bool)
 def test_image_without_a_depth_hides_no_other(sound: Path) -> None:
     """A sensor may lose all depths of an object; the object of the next image is still found."""
     with h5py.File(sound / OTO) as file:
-        config = parse_config(json.loads(file.attrs["config"]))
-        group = file["test"]
-        columns = {f.name: np.array(group[f.name]) for f in DATA_FIELDS if f.dtype != "str"}
-        name = group["object_props/object_name"].asstr()[0]
-        rows = np.flatnonzero(group["object_props/object_name"].asstr()[:] == name)
-    batch = Batch(
-        file=OTO, group="/test", rows=rows, columns={k: v[rows] for k, v in columns.items()}
-    )
-    loses = config.randomize.model_copy(update={"depth_baseline": 0.02})
-    config = config.model_copy(update={"randomize": loses})
-    model = load_object(model_path(sound, name))
-    assert len(rows) > 1
+        data = look_at(OTO, file, "oto", Findings())
+        names = file["test/object_props/object_name"].asstr()[:]
+        batch = data.read(file, "test", np.flatnonzero(names == names[0]))
+    config = override_config(batch.config, ["randomize.depth_baseline=0.02"])
+    batch = replace(batch, of=replace(data, config=config))
+    model = load_object(model_path(sound, names[0]))
+    assert len(batch) > 1
     batch["images"][0, 3] = config.camera.far
-    assert list(image_rules.object_pixels(batch, "oto", config, model)) == []
+    assert list(image_rules.object_pixels(batch, model)) == []
     batch["images"][1, 3][batch["masks"][1] == 1] -= 0.02
-    (violation,) = image_rules.object_pixels(batch, "oto", config, model)
-    assert violation.row == rows[1]
+    (violation,) = image_rules.object_pixels(batch, model)
+    assert violation.row == batch.rows[1]
 
 
 def test_nearest_depth_is_the_least_within_two_pixels() -> None:

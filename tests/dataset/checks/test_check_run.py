@@ -28,7 +28,7 @@ from helpers.datasets import (
 )
 
 from drakegrasp.dataset.assembly import pack
-from drakegrasp.dataset.checks import assembled, samples, trials
+from drakegrasp.dataset.checks import assembled, rows, samples
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.paths import model_path, plan_path
@@ -118,7 +118,7 @@ def test_meshes_and_files_are_let_go_with_each_task(
         alive.append(weakref.ref(model))
         return model
 
-    monkeypatch.setattr(trials, "load_object", load)
+    monkeypatch.setattr(rows, "load_object", load)
     gc.collect()
     gc.disable()
     try:
