@@ -668,6 +668,11 @@ class Config(_Section):
         return self.certify.certified
 
     @property
+    def has_target(self) -> bool:
+        """Whether it says after how many samples to stop."""
+        return self.samples is not None or self.samples_per_object is not None
+
+    @property
     def code(self) -> Mapping[str, str]:
         """Text of the files of the user's own classes, by their names."""
         return {**self.candidates.code, **self.filters.code}

@@ -19,6 +19,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, TypeVar, get_args, get_origin
@@ -70,6 +71,14 @@ class PathType(click.Path):
         return super().convert(value, param, ctx)
 
 
+class FrameType(click.Choice[str]):
+    """The frames of grasps; `workspace` is an earlier name of `table`."""
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Return the frame of a word."""
+        return super().convert("table" if value == "workspace" else value, param, ctx)
+
+
 class Named(click.Choice[str]):
     """A name of the registry; it is asked when the option is used, or its help is printed."""
 
@@ -87,6 +96,28 @@ PATH = PathType(path_type=Path)
 NEW_FILE = PathType(path_type=Path, dir_okay=False)
 FILE = PathType(path_type=Path, exists=True, dir_okay=False)
 EXISTING = PathType(path_type=Path, exists=True)
+#: The splits of a dataset.
+SPLITS = click.Choice(["train", "valid", "test"])
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifyRequest:
+    """What is verified, see the help of the command; None for options that were not given."""
+
+    grasps: Path
+    mesh: Path | None = None
+    dataset: Path | None = None
+    split: Annotated[str | None, SPLITS] = None
+    frame: Annotated[str | None, FrameType(["object", "camera", "table", "mesh"])] = None
+    camera: Path | None = None
+    units: str | None = None
+    method: Annotated[str, click.Choice(["hand", "forces"])] = "hand"
+    snap_points: bool = False
+    hand: str | None = None
+    config: str | None = None
+    overrides: tuple[str, ...] = ()
+    out: Path | None = None
+    rows: str | None = None
 
 
 def described(function: F, request: type | None = None) -> F:

@@ -7,12 +7,12 @@ Whatever is wrong with the files or the options is a `GraspError`, `MeshError`, 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.cli.console import say
+from drakegrasp.cli.options import VerifyRequest
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset, PredictedRows
@@ -33,9 +33,6 @@ from drakegrasp.verification.placing import (
     place_on_rows,
 )
 from drakegrasp.verification.result_files import refuse_unwritable
-
-if TYPE_CHECKING:
-    from drakegrasp.cli.predictions import VerifyRequest
 
 #: No split has so many rows.
 MOST_ROWS = 10_000_000

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,7 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import click
 
 from drakegrasp.cli.console import Command, progress_bar, say
-from drakegrasp.cli.options import CONNECTION, EXISTING, PATH, chosen_workers, described
+from drakegrasp.cli.options import (
+    CONNECTION,
+    EXISTING,
+    PATH,
+    SPLITS,
+    VerifyRequest,
+    chosen_workers,
+    described,
+)
 from drakegrasp.runtime.executor import processes
 
 if TYPE_CHECKING:
@@ -21,7 +28,6 @@ if TYPE_CHECKING:
     from drakegrasp.runtime.progress import Report
     from drakegrasp.verification.result import Verification
 
-SPLITS = click.Choice(["train", "valid", "test"])
 #: Options that say what the grasps are and where; a protocol of MuJoCo answers all others.
 PLACES = ("grasps", "mesh", "units", "dataset", "split", "frame", "camera", "hand")
 #: What those others are if they are not given, and how the command line calls them.
@@ -29,34 +35,6 @@ _USUAL = {"method": "hand", "overrides": (), "snap_points": False, "tls": True}
 _CALLED = {"mesh": "object", "overrides": "set", "tls": "no-tls", "tls_files": "tls-ca-file"}
 #: Options of `score` that change no verdict.
 _IDLE = {"out", "as_json", "quiet", "tls", *(n[2:].replace("-", "_") for n in CONNECTION)}
-
-
-class _Frame(click.Choice[str]):
-    """The frames of grasps; `workspace` is an earlier name of `table`."""
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        """Return the frame of a word."""
-        return super().convert("table" if value == "workspace" else value, param, ctx)
-
-
-@dataclass(frozen=True, kw_only=True)
-class VerifyRequest:
-    """What is verified, see the help of the command; None for options that were not given."""
-
-    grasps: Path
-    mesh: Path | None = None
-    dataset: Path | None = None
-    split: Annotated[str | None, SPLITS] = None
-    frame: Annotated[str | None, _Frame(["object", "camera", "table", "mesh"])] = None
-    camera: Path | None = None
-    units: str | None = None
-    method: Annotated[str, click.Choice(["hand", "forces"])] = "hand"
-    snap_points: bool = False
-    hand: str | None = None
-    config: str | None = None
-    overrides: tuple[str, ...] = ()
-    out: Path | None = None
-    rows: str | None = None
 
 
 @click.command(cls=Command)

@@ -10,19 +10,16 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import takewhile
 from math import ceil
-from typing import TYPE_CHECKING
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.assembly.survey import headers_by_object
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import ConfigError, listed
+from drakegrasp.generation.work_unit import UnitSummary
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import WorkerPool
 from drakegrasp.runtime.progress import Report
-
-if TYPE_CHECKING:
-    from drakegrasp.generation.work_unit import UnitSummary
 
 #: Outcomes of attempts that the machine, or an error of the simulator, ended.
 ENDED = (Outcome.CRASHED, Outcome.TIMEOUT)
@@ -57,7 +54,7 @@ class Counts:
         self.damaged: list[str] = []
         self.errors: Counter[str] = Counter()
         self.target: Target | None = None
-        if has_target(manifest.config):
+        if manifest.config.has_target:
             units = {of[0].object_name: of for of in headers_by_object(manifest) if of}
             self.target = Target(manifest.config, units)
 
@@ -278,16 +275,11 @@ class Target:
         return level
 
 
-def has_target(config: Config) -> bool:
-    """Return whether a configuration says after how many samples to stop."""
-    return config.samples is not None or config.samples_per_object is not None
-
-
 def refuse_two_ends(config: Config) -> None:
     """Refuse a number of grasps together with a number of samples after which to stop.
 
     Raises:
         ConfigError: If both are stated.
     """
-    if config.max_grasps is not None and has_target(config):
+    if config.max_grasps is not None and config.has_target:
         raise ConfigError("max_grasps must be null with samples or samples_per_object, got both")

@@ -41,7 +41,6 @@ from drakegrasp.generation.attempts import (
     trial_setup,
     try_attempt,
 )
-from drakegrasp.generation.counts import has_target
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread, timed, trim_memory
 from drakegrasp.runtime.files import disk_full_named
@@ -404,7 +403,7 @@ def _find_unit(out: Path, header: ShardHeader) -> UnitSummary | None:
 
 def _with_samples(out: Path, summary: UnitSummary, config: Config) -> UnitSummary:
     """Return a summary with its number of samples, if there is a target of them."""
-    if not has_target(config):
+    if not config.has_target:
         return summary
     return replace(summary, samples=count_samples(out, summary.header, config))
 

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from drakegrasp import __version__
 from drakegrasp.errors import ConfigError, DataError, MeshError
 from drakegrasp.protocols.files import inner_path, one_motion, read_grasp_file, read_object_folder
 from drakegrasp.protocols.protocol import MujocoProtocol, PostureVerdict, Protocol, find_protocol
@@ -164,7 +163,7 @@ def json_line(index: int, file: Path | str, result: PostureResult, trials: Postu
 
 def versions() -> dict[str, str]:
     """Return the versions of what makes a verdict."""
-    return {"drakegrasp": __version__, "mujoco": metadata.version("mujoco")}
+    return {name: metadata.version(name) for name in ("drakegrasp", "mujoco")}
 
 
 def _plain(value: Any) -> Any:

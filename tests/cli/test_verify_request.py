@@ -12,8 +12,8 @@ from helpers.commands import run
 from helpers.datasets import OTO, make_dataset
 from helpers.hands import write_with_optional_fingers
 
+from drakegrasp.cli.options import VerifyRequest
 from drakegrasp.cli.placing import place_requested
-from drakegrasp.cli.predictions import VerifyRequest
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError, HandError

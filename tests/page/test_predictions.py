@@ -16,8 +16,8 @@ from helpers.pages import Tags
 from helpers.predictions import write_predictions
 from starlette.testclient import TestClient
 
+from drakegrasp.cli.options import VerifyRequest
 from drakegrasp.cli.placing import place_requested
-from drakegrasp.cli.predictions import VerifyRequest
 from drakegrasp.dataset.reader import GraspDataset, read_predicted_rows
 from drakegrasp.errors import DataError
 from drakegrasp.page.app import Inspection, make_app
