@@ -44,7 +44,6 @@ CONFIG_PAGE = ROOT / "docs" / "reference" / "configuration.md"
 DOCS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 #: Columns of the README's lines.
 README_COLUMNS = 120
-SUBMIT = "pipelines/submit_build.py"
 
 
 def page_id(page: Path) -> str:
@@ -193,7 +192,7 @@ def _bases(page: Path, name: str) -> list[Path]:
 
 def commands() -> dict[str, click.Command]:
     """Return the commands that have a section on their page."""
-    return {**main.commands, SUBMIT: load_script("submit_build").main}
+    return dict(main.commands)
 
 
 def command_lines(page: Path) -> Iterator[tuple[click.Command, list[str]]]:
@@ -238,8 +237,8 @@ def test_the_command_page_has_every_command_and_its_options() -> None:
         named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", sections[name]))
         options = options_of(command) - {"--help", "-h"}
         assert named <= options | shared, name
-        # The script takes the options of a build, which its section refers to.
-        assert options <= named | (shared if name == SUBMIT else set()), name
+        # `submit` takes the options of a build, which its section refers to.
+        assert options <= named | (shared if name == "submit" else set()), name
 
 
 def test_the_configuration_page_has_every_setting() -> None:

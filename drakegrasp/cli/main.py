@@ -29,6 +29,7 @@ from drakegrasp.cli.datasets import (
 from drakegrasp.cli.models import audit, hand, objects
 from drakegrasp.cli.options import PATH
 from drakegrasp.cli.predictions import score, verify
+from drakegrasp.cli.submit import submit
 from drakegrasp.cli.views import export, figures, inspect_
 from drakegrasp.runtime.allocator import restart_with_jemalloc
 
@@ -61,7 +62,7 @@ def doctor(directory: Path) -> None:
 
 # The help lists them in this order.
 for _command in (
-    *(doctor, objects, audit, hand, build, assemble, merge, scenes, check, stats, inspect_),
+    *(doctor, objects, audit, hand, build, submit, assemble, merge, scenes, check, stats, inspect_),
     *(figures, replay, verify, score, bench_set, export, bench),
 ):
     main.add_command(_command)

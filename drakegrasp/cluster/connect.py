@@ -14,7 +14,7 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -102,6 +102,14 @@ def dask_settings() -> dict[str, Any]:
         "distributed.worker.memory.spill": False,
         # A paused worker has no task whose end would free memory: it would wait for ever.
         "distributed.worker.memory.pause": False,
+    }
+
+
+def dask_variables(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Return settings of Dask as environment variables of a process that inherits nothing."""
+    return {
+        "DASK_" + key.upper().replace(".", "__").replace("-", "_"): repr(value)
+        for key, value in settings.items()
     }
 
 

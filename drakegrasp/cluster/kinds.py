@@ -1,4 +1,4 @@
-"""Kinds of clusters by name, as `pipelines/submit_build.py --cluster` takes them.
+"""Kinds of clusters by name, as `drakegrasp submit --cluster` takes them.
 
 In: the options of a kind. Out: lines for the user, and a Dask client while a block runs. A kind is
 a class in a module of its own and a line in pyproject.toml; those of this machine and of a running
@@ -9,9 +9,10 @@ scheduler are here. Workers on other machines inherit nothing, so each kind send
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -27,7 +28,13 @@ from drakegrasp.cluster.certificates import (
     private_directory,
     security_of,
 )
-from drakegrasp.cluster.connect import LOOPBACK, closing_cluster, connect, dask_settings
+from drakegrasp.cluster.connect import (
+    LOOPBACK,
+    closing_cluster,
+    connect,
+    dashboard_line,
+    dask_settings,
+)
 from drakegrasp.errors import ConfigError, MachineError
 
 #: Options of a cluster on other machines.
@@ -38,9 +45,10 @@ MOST_MEMORY = 10**15
 
 @dataclass(kw_only=True)
 class Local:
-    """Workers on this machine, as on the command line of the script; the base of all kinds.
+    """Workers on this machine, as on the command line; the base of all kinds.
 
     Attributes:
+        starts: Whether `connected` starts or finds workers; else there is only a `script`.
         follow: Least and largest number of words that follow the kind, and what they are.
         options: The options that it has.
         kind: Its name in the registry.
@@ -48,7 +56,7 @@ class Local:
         workers: Number of processes in all.
         cores: Number of cores of each host or job, with a worker on each.
         memory: Memory of each worker, e.g. "2GB".
-        walltime: Time limit of each SLURM job, as SLURM writes it: [D-]HH:MM:SS.
+        walltime: Time limit of each job, as SLURM writes it: [D-]HH:MM:SS.
         host: Address on which the scheduler listens.
         interface: Name of the network interface on which scheduler and workers listen.
         tls: Whether connections need a certificate.
@@ -56,6 +64,7 @@ class Local:
             private key. Without them, workers that are started get some that are made for this run.
     """
 
+    starts: ClassVar[bool] = True
     follow: ClassVar[tuple[int, float, str]] = (0, 0, "nothing")
     options: ClassVar[tuple[str, ...]] = ("workers", "memory")
     kind: str
@@ -101,6 +110,22 @@ class Local:
     def is_open(self) -> bool:
         """Return whether other machines reach the scheduler that is started."""
         return False
+
+    def script(self, out: Path) -> str:
+        """Return what another program is given to start the workers; empty if there is none.
+
+        Args:
+            out: Directory of the dataset.
+        """
+        return ""
+
+    def submission(self) -> str:
+        """Return the command that takes the script."""
+        return ""
+
+    def client_options(self) -> list[str]:
+        """Return the options by which a client finds workers that the script starts."""
+        return []
 
     def connected(self, out: Path) -> AbstractContextManager[Client]:
         """Return what starts the workers when it is entered.
@@ -204,15 +229,30 @@ class Remote(Local):
             yield chosen_security(self.tls, self.tls_files, elsewhere=True)
 
 
-def cluster_of(kind: str, **options: Any) -> Local:
+def cluster_of(kind: str, own: Sequence[str] = (), **options: Any) -> Local:
     """Return the cluster that is asked for, see the attributes of `Local`; nothing is started.
+
+    Args:
+        kind: Its name in the registry.
+        own: `KEY=VALUE` of settings that only this kind has.
+        options: Of all kinds.
 
     Raises:
         ConfigError: If the options contradict each other, or lack something.
         MachineError: If a package is missing.
     """
-    found: Local = registry.find("clusters", kind)(kind=kind, **options)
-    return found
+    found = registry.find("clusters", kind)
+    if not (isinstance(found, type) and issubclass(found, Local)):
+        raise ConfigError(f"clusters: {kind} must be a subclass of Local, got {found!r}")
+    known = [f.name for f in fields(found) if f.name not in Local.__dataclass_fields__]
+    for text in own:
+        key, equals, value = text.partition("=")
+        if key not in known or not (equals and value):
+            settings = f"KEY=VALUE with KEY one of {', '.join(known)}" if known else "left out"
+            raise ConfigError(f"--with must be {settings} for --cluster {kind}, got {text!r}")
+        options[key] = value
+    cluster: Local = found(kind=kind, **options)
+    return cluster
 
 
 def describe(cluster: Local) -> list[str]:
@@ -225,6 +265,18 @@ def describe(cluster: Local) -> list[str]:
             "--no-tls"
         )
     return lines
+
+
+@contextmanager
+def present(cluster: AbstractContextManager[Client], show: bool) -> Iterator[Client]:
+    """Enter a cluster, say where its dashboard is, and wait for its first worker."""
+    with cluster as client:
+        if show and client.dashboard_link:  # workers on this machine have none
+            sys.stderr.write(f"{dashboard_line(client)}\n")
+        if not client.nthreads():
+            sys.stderr.write("waiting for the first worker\n")
+            client.wait_for_workers(1)
+        yield client
 
 
 def is_loopback(host: str) -> bool:

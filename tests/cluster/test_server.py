@@ -20,7 +20,7 @@ from server.processes import wait_until
 from server.slurm import PARTITION, queued_jobs, running_slurm
 from server.ssh import running_sshd
 
-from drakegrasp.cluster import slurm as jobs
+from drakegrasp.cluster import jobqueue as jobs
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT
 from drakegrasp.cluster.kinds import cluster_of
 from drakegrasp.generation.pipeline import build

@@ -30,8 +30,8 @@ from drakegrasp.cluster import connect as connecting
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.certificates import make_certificates, private_directory
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect, dask_settings
+from drakegrasp.cluster.jobqueue import _exports, walltime_seconds
 from drakegrasp.cluster.kinds import cluster_of
-from drakegrasp.cluster.slurm import _exports, walltime_seconds
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.settings import load_config
@@ -133,7 +133,11 @@ def test_workers_elsewhere_need_a_certificate_unless_told_otherwise(
             ["--cluster", "ssh", "a", "b", "--cores", "4", "--workers", "9"],
             "--workers must be --cores times the number of hosts, 8, or not be given, got 9",
         ),
-        (["--cluster", "pbs"], "error: Invalid value for '--cluster': 'pbs' is not one of"),
+        (["--cluster", "moab"], "error: Invalid value for '--cluster': 'moab' is not one of"),
+        (["--address", "tls://a:1", "--cluster", "ssh", "a"], "--address must be used without"),
+        (["--with", "image=x"], "--with must be left out for --cluster local, got 'image=x'"),
+        (["--cluster", "kubernetes", "--with", "size=1"], "KEY one of image, claim, name, namesp"),
+        (["--cluster", "kubernetes", "--workers", "2"], "--with image=NAME must be given"),
         (["--cluster", "ssh", "a", "--cores", "2"], "--interface NAME or --host ADDRESS must be"),
         (["--cluster", "ssh", "me@a", "--cores", "2", "--host", "x"], "go into ~/.ssh/config"),
         (["--cluster", "scheduler"], "must be followed by its address"),

@@ -1,0 +1,147 @@
+"""The command `submit`: a build whose workers the command starts as well."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import click
+
+from drakegrasp.cli.console import OneCommand, say
+from drakegrasp.cli.datasets import print_plan, print_report
+from drakegrasp.cli.options import NEW_FILE, Named, chosen_tls, described, parse_request
+
+if TYPE_CHECKING:
+    from drakegrasp.cluster.kinds import Local
+
+#: Options that say where the workers are, with a value each, and without.
+_WHERE = (
+    *("cluster", "workers", "cores", "memory", "walltime", "interface", "host", "with"),
+    "script",
+)
+_ALONE = ("--dry-run", "--tls")
+
+
+@click.command(cls=OneCommand, context_settings={"help_option_names": ["-h", "--help"]})
+@described
+@click.argument("where", nargs=-1, metavar="[HOST...|ADDRESS|PATH]")
+def submit(
+    where: tuple[str, ...],
+    times: Path | None,
+    kind: Annotated[str, Named("clusters")] = "local",
+    address: str | None = None,
+    workers: int | None = None,
+    cores: int | None = None,
+    memory: str | None = None,
+    walltime: str | None = None,
+    interface: str | None = None,
+    host: str | None = None,
+    own: tuple[str, ...] = (),
+    dry_run: bool = False,
+    script: Annotated[Path | None, NEW_FILE] = None,
+    **options: Any,
+) -> None:
+    """Build a dataset on a cluster, whose workers the command starts.
+
+    \b
+        drakegrasp submit --cluster local ...
+        drakegrasp submit --cluster ssh node1 node2 --cores 16 --interface eth0 ...
+        drakegrasp submit --cluster slurm --workers 200 --walltime 04:00:00 ...
+        drakegrasp submit --address tls://10.0.0.1:8786 ...
+
+    The command first prints what will run and how long it is expected to take; --dry-run stops
+    there. The same command continues an interrupted build, on any cluster. See
+    docs/how-to/clusters.md for the details and pipelines/recipes/ for an example of each.
+
+    Options:
+        --cluster (kind): Where the work runs. Hosts follow ssh, an address follows scheduler, and a
+            path follows scheduler-file.
+        --address ADDRESS: Use the running Dask scheduler at this address, instead.
+        BUILD
+        --workers N: Processes in all. [default with local: one per core]
+        --cores N: Cores of each SSH host or job, a worker on each.
+        --memory SIZE: Memory of each worker, e.g. 2GB.
+        --walltime TIME: Time limit of each job, [D-]HH:MM:SS.
+        --interface NAME: Network interface on which scheduler and workers listen.
+        --host ADDRESS: Address on which the scheduler listens, instead.
+        --with KEY=VALUE (own): A setting that only this kind of cluster has, e.g. image of
+            kubernetes; may be given several times.
+        TLS, --times
+        --dry-run: Only print what would run, with the script of a job.
+        --script FILE: Only write the script of a job, or the manifest of kubernetes.
+    """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
+    from drakegrasp.api.building import build_on, find_sources
+    from drakegrasp.cluster.kinds import cluster_of, describe, present
+    from drakegrasp.exchange.attempts import read_attempts
+    from drakegrasp.hand.description import load_hand
+
+    if address is not None:
+        if kind != "local" or where:
+            raise click.UsageError("--address must be used without --cluster")
+        kind, where = "scheduler", (address,)
+    given = dict(workers=workers, cores=cores, memory=memory, walltime=walltime)
+    given |= dict(interface=interface, host=host)
+    tls = chosen_tls(options)
+    request = parse_request(options)
+    cluster = cluster_of(kind, own, where=where, **given, **tls)
+
+    # Say what will run before anything starts.
+    say("\n".join(describe(cluster)))
+    if request.postures is None:
+        print_plan(request, cluster.count(), times)
+    if dry_run or script is not None:
+        _give_script(cluster, request.out, script)
+        return
+    if not cluster.starts:
+        raise click.UsageError(
+            f"--script FILE or --dry-run must be given with --cluster {kind}: "
+            f"{cluster.submission().split()[0]} starts the workers"
+        )
+
+    sources = find_sources(request.objects, request.units, request.manifest)
+    running = present(cluster.connected(request.out), request.show)
+    postures = None
+    if request.postures is not None:
+        postures = read_attempts(request.postures, load_hand(request.config.hand_source))
+    report = build_on(
+        running,
+        sources,
+        request.out,
+        request.config,
+        only=request.only,
+        postures=postures,
+        show=request.show,
+    )
+    print_report(report)
+
+
+def _give_script(cluster: Local, out: Path, file: Path | None) -> None:
+    """Print what another program is given to start the workers, or write it, and what follows."""
+    script = cluster.script(out)
+    if not script:
+        if file is not None:
+            raise click.UsageError(f"--script must not be given with --cluster {cluster.kind}")
+        return
+    if file is None:
+        say(f"\nscript for {cluster.submission()}:\n\n{script.rstrip()}\n")
+    else:
+        file.write_text(script, encoding="utf-8")
+        say(f"{cluster.submission()} {shlex.quote(str(file))}")
+    say(f"client: {_client_command(cluster, sys.argv[1:])}")
+
+
+def _client_command(cluster: Local, words: Sequence[str]) -> str:
+    """Return the command of the process that hands out the work, which has these words now."""
+    without = [f"--{name}" for name in (("script",) if cluster.starts else _WHERE)]
+    flags = _ALONE[:1] if cluster.starts else _ALONE
+    kept, left = list[str](), iter(words)
+    for word in left:
+        if word in without:
+            next(left, None)
+        elif word not in flags and word.partition("=")[0] not in without:
+            kept.append(word)
+    kept = kept[1:] if kept[:1] == ["submit"] else kept
+    return shlex.join(["drakegrasp", "submit", *cluster.client_options(), *kept])

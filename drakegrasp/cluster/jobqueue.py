@@ -1,0 +1,416 @@
+"""Workers in jobs of a batch scheduler, with the user's jobqueue.yaml; needs extra `[jobqueue]`.
+
+A kind is a few lines: the class of dask-jobqueue, and in what its scheduler differs. A job's script
+means what it says, whatever is in the names of folders: dask-jobqueue (0.9) writes paths into it
+without quotes, a blank splits them, and the shell runs what is in `$(...)`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import types
+from collections.abc import Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import dask
+import dask_jobqueue
+from distributed import SpecCluster, Status
+from distributed.security import Security
+from tornado.ioloop import PeriodicCallback
+
+from drakegrasp.cluster.certificates import security_of
+from drakegrasp.cluster.connect import LOOPBACK, NANNY_PRELOAD, dask_settings, dask_variables
+from drakegrasp.cluster.kinds import REMOTE, Remote, memory_bytes
+from drakegrasp.errors import ConfigError, MachineError
+
+#: Memory of a worker, if neither the user nor jobqueue.yaml gives it.
+WORKER_MEMORY = "2GB"
+#: Time between two looks for lost jobs [s]; a job that is missing twice in a row is lost.
+REFILL_SECONDS = 20.0
+#: A worker ends by itself this long before its job's walltime, give or take the second [s]; less
+#: for short jobs. Then its unit is not cut off, and jobs do not all end together.
+LIFETIME_MARGIN, LIFETIME_STAGGER = 300.0, 120.0
+#: A number of days, hours, minutes or seconds.
+_NUMBER = re.compile("[0-9]{1,6}")
+
+
+class Jobs(Remote):
+    """Jobs of some cores each, with a worker on each core.
+
+    Attributes:
+        of: Class of dask-jobqueue.
+        title: Name of the scheduler.
+        test: Command that asks the scheduler whether it would run a script; empty if it has none.
+        alone: What a walltime in jobqueue.yaml that is one number is of [s].
+        pair: What the numbers of one with a single colon are of [s].
+    """
+
+    options = (*REMOTE, "walltime")
+    of: ClassVar[type[Any]]
+    title: ClassVar[str]
+    test: ClassVar[tuple[str, ...]] = ()
+    alone: ClassVar[float] = 1.0
+    pair: ClassVar[tuple[float, float]] = (60.0, 1.0)
+
+    def __post_init__(self) -> None:
+        """Refuse a malformed walltime, and jobs without a number of workers."""
+        super().__post_init__()
+        if self.walltime is not None:
+            walltime_seconds(self.walltime)
+        if self.workers is None:
+            raise ConfigError(f"--workers must be given with --cluster {self.kind}")
+        self.listening()
+        self.per_job = int(self.cores or self.setting("cores") or 1)
+        self.jobs = math.ceil(self.workers / self.per_job)
+        # None: jobqueue.yaml says that of a job; the queue has a limit.
+        self.memory = self.memory or (None if self.setting("memory") else WORKER_MEMORY)
+
+    def setting(self, key: str) -> Any:
+        """Return a value of the user's jobqueue.yaml, or dask-jobqueue's default."""
+        return dask.config.get(f"jobqueue.{self.of.job_cls.config_name}.{key}", None)
+
+    def listens(self) -> bool:
+        """Return whether jobqueue.yaml says where the scheduler listens."""
+        options = self.setting("scheduler-options") or {}
+        return bool(self.setting("interface") or {"host", "interface"} & set(options))
+
+    def count(self) -> int:
+        """Return how many workers there will be."""
+        return self.per_job * self.jobs
+
+    def line(self) -> str:
+        """Return what each job asks for, in words."""
+        memory = "memory as in jobqueue.yaml" if self.memory is None else f"{self.memory} each"
+        walltime = f"walltime {self._walltime() or 'as the queue has it'}"
+        return (
+            f"{self.count()} workers in {self.title} jobs of {self.per_job}, {memory}, {walltime}"
+        )
+
+    def _walltime(self) -> str | None:
+        """Return the time limit of a job; None if nobody says it."""
+        return self.walltime or self.setting("walltime")
+
+    def seconds(self) -> float | None:
+        """Return the time limit of a job [s]."""
+        if self.walltime is not None:
+            return walltime_seconds(self.walltime)
+        told = self.setting("walltime")
+        return None if told is None else walltime_seconds(str(told), self.alone, self.pair)
+
+    def job_memory(self) -> int:
+        """Return the memory of a job [bytes]."""
+        if self.memory is None:
+            return memory_bytes(str(self.setting("memory")))
+        return self.per_job * memory_bytes(self.memory)
+
+    def asks(self) -> dict[str, Any]:
+        """Return what this scheduler's jobs ask for, as options of its class."""
+        return {"walltime": self.told_walltime()}
+
+    def told_walltime(self) -> str | None:
+        """Return the user's time limit as H:MM:SS; None: as the user's jobqueue.yaml says."""
+        return None if self.walltime is None else clock(walltime_seconds(self.walltime))
+
+    def job(self, security: Security | None) -> dict[str, Any]:
+        """Return all options of a job."""
+        # Whatever is None or not named here is as the user's jobqueue.yaml says.
+        memory = None if self.memory is None else f"{self.job_memory()}B"
+        return {
+            "cores": self.per_job,
+            "processes": self.per_job,
+            "memory": memory,
+            "interface": self.interface,
+            "security": security,
+            "worker_extra_args": [
+                *(self.setting("worker-extra-args") or ()),
+                *_lifetime(self.seconds()),
+                f"--dashboard-address={LOOPBACK}:0",
+                # The settings' preload is not read by the command that starts a worker.
+                f"--preload-nanny={NANNY_PRELOAD}",
+                *([f"--host={LOOPBACK}"] if "host" in self.workers_listening() else []),
+            ],
+            "job_script_prologue": [*(self.setting("job-script-prologue") or ()), *_exports()],
+            **self.asks(),
+        }
+
+    def script(self, out: Path) -> str:
+        """Return the script of a job, but for the address of the scheduler and certificates."""
+        keys = out / ".tls-RUN"
+        files = self.tls_files or (keys / "ca.pem", keys / "cert.pem", keys / "key.pem")
+        options = self.job(security_of(files) if self.tls else None)
+        protocol = "tls://" if self.tls else None
+        job = quoted(self.of.job_cls)(
+            f"{protocol or 'tcp://'}SCHEDULER:PORT", name="WORKER", protocol=protocol, **options
+        )
+        return str(job.job_script())
+
+    def submission(self) -> str:
+        """Return the command that gives the scheduler a script."""
+        return str(self.of.job_cls.submit_command)
+
+    def start(self, security: Security | None) -> SpecCluster:
+        """Submit the jobs, if the scheduler would run them, and others in place of those lost."""
+        cluster = self.of(
+            job_cls=quoted(self.of.job_cls),
+            **self.job(security),
+            scheduler_options={
+                "dashboard_address": f"{LOOPBACK}:0",
+                **(self.setting("scheduler-options") or {}),
+                **self.listening(),
+            },
+        )
+        try:
+            self.refuse_bad_job(cluster.job_script())
+        except MachineError:
+            cluster.close()
+            raise
+        cluster.scale(jobs=self.jobs)
+
+        async def refill() -> None:
+            PeriodicCallback(_Refill(cluster, self.jobs), 1000.0 * REFILL_SECONDS).start()
+
+        cluster.sync(refill)
+        return cluster
+
+    def refuse_bad_job(self, script: str) -> None:
+        """Ask the scheduler whether it would run a job: later nobody sees it fail.
+
+        Raises:
+            MachineError: If the scheduler is not here, or would not run the job.
+        """
+        command = shlex.split(self.submission())[0]
+        if shutil.which(command) is None:
+            raise MachineError(
+                f"there is no {command} on the PATH: start this on a machine that submits jobs"
+            )
+        if not self.test:
+            return
+        test = subprocess.run(self.test, input=script, capture_output=True, text=True)
+        if test.returncode:
+            raise MachineError(f"{self.title} does not accept the job: {test.stderr.strip()}")
+
+
+class Slurm(Jobs):
+    """SLURM: memory of a job by --mem."""
+
+    of, title, test = dask_jobqueue.SLURMCluster, "SLURM", ("sbatch", "--test-only")
+    alone = 60.0
+
+    def told_walltime(self) -> str | None:
+        """Return the user's time limit, which has the form of SLURM."""
+        return self.walltime
+
+
+class Pbs(Jobs):
+    """PBS: cores and memory of a job by one -l select."""
+
+    of, title = dask_jobqueue.PBSCluster, "PBS"
+
+
+class Lsf(Jobs):
+    """LSF: memory of a job by -M, in the unit of lsf.conf, and minutes."""
+
+    of, title = dask_jobqueue.LSFCluster, "LSF"
+    alone, pair = 60.0, (3600.0, 60.0)
+
+    def told_walltime(self) -> str | None:
+        """Return the user's time limit as H:MM, rounded up."""
+        if self.walltime is None:
+            return None
+        minutes = math.ceil(walltime_seconds(self.walltime) / 60.0)
+        return f"{minutes // 60}:{minutes % 60:02d}"
+
+
+class Sge(Jobs):
+    """Grid Engine: memory of each slot by mem_free, unless jobqueue.yaml has a resource-spec."""
+
+    of, title = dask_jobqueue.SGECluster, "Grid Engine"
+
+    def __post_init__(self) -> None:
+        """Refuse jobs of several cores without the site's parallel environment."""
+        super().__post_init__()
+        directives = self.setting("job-extra-directives") or ()
+        if self.per_job > 1 and not any("-pe " in directive for directive in directives):
+            raise ConfigError(
+                f"--cores must be 1 with --cluster {self.kind}, got {self.per_job}: for more, "
+                f"job-extra-directives in jobqueue.yaml must have -pe NAME {self.per_job}"
+            )
+
+    def asks(self) -> dict[str, Any]:
+        """Return the time limit and the memory of a job."""
+        if self.setting("resource-spec"):
+            return super().asks()
+        slot = math.ceil(self.job_memory() / self.per_job / 2**20)
+        return {**super().asks(), "resource_spec": f"mem_free={slot}M"}
+
+
+class Htcondor(Jobs):
+    """HTCondor: memory and disk of a job in its ClassAd, and no time limit but ours."""
+
+    of, title = dask_jobqueue.HTCondorCluster, "HTCondor"
+
+    def asks(self) -> dict[str, Any]:
+        """Return the disk and the time limit of a job."""
+        disk = None if self.setting("disk") else f"{self.per_job}GB"
+        extra = dict(self.setting("job-extra-directives") or {})
+        if (seconds := self.seconds()) is not None:
+            extra.setdefault("allowed_job_duration", math.ceil(seconds))
+        return {"disk": disk, "job_extra_directives": extra}
+
+
+class Oar(Jobs):
+    """OAR: cores of one node; memory if jobqueue.yaml names the property that has it."""
+
+    of, title = dask_jobqueue.OARCluster, "OAR"
+    alone, pair = 3600.0, (3600.0, 60.0)
+
+    def asks(self) -> dict[str, Any]:
+        """Return the time limit and the property of memory."""
+        name = self.setting("memory-per-core-property-name") or "not_applicable"
+        return {**super().asks(), "memory_per_core_property_name": name}
+
+
+def clock(seconds: float) -> str:
+    """Return a time as HH:MM:SS."""
+    whole = math.ceil(seconds)
+    return f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+
+
+def walltime_seconds(
+    text: str, alone: float = 60.0, pair: tuple[float, float] = (60.0, 1.0)
+) -> float:
+    """Return a time limit in seconds, by default of SLURM.
+
+    SLURM's forms: M, M:S, H:M:S, D-H, D-H:M, D-H:M:S.
+
+    Args:
+        text: The time.
+        alone: What a lone number is of [s].
+        pair: What two numbers without days are of [s].
+
+    Raises:
+        ConfigError: If the text is none of them.
+    """
+    days, dash, rest = text.partition("-") if "-" in text else ("0", "", text)
+    parts = rest.split(":")
+    if len(parts) > 3 or not all(_NUMBER.fullmatch(part) for part in (days, *parts)):
+        raise ConfigError(f"walltime must be a time of SLURM such as 02:00:00, got {text[:40]!r}")
+    numbers = [int(p) for p in parts]
+    if dash or len(numbers) == 3:
+        hours, minutes, seconds = [*numbers, 0, 0][:3]
+        total = 86400.0 * int(days) + 3600.0 * hours + 60.0 * minutes + seconds
+    elif len(numbers) == 2:
+        total = pair[0] * numbers[0] + pair[1] * numbers[1]
+    else:
+        total = alone * numbers[0]
+    if total <= 0.0:
+        raise ConfigError(f"walltime must be longer than 0 s, got {text!r}")
+    return total
+
+
+class _Quoted:
+    """A job of dask-jobqueue with every path of ours in quotes.
+
+    What the user's jobqueue.yaml says of options and of lines of the script is shell already.
+    """
+
+    config_name: str
+
+    def __init__(
+        self,
+        *arguments: Any,
+        security: Security | None = None,
+        worker_extra_args: Sequence[str] = (),
+        python: str | None = None,
+        local_directory: str | None = None,
+        **options: Any,
+    ) -> None:
+        """Take the arguments of the job."""
+        told = partial(dask.config.get, default=None)
+        folder = local_directory or told(f"jobqueue.{self.config_name}.local-directory")
+        python = python or told(f"jobqueue.{self.config_name}.python") or sys.executable
+        super().__init__(  # type: ignore[call-arg]
+            *arguments,
+            # Given as `security`, the files of the certificates would not be quoted.
+            worker_extra_args=[*worker_extra_args, *_tls_words(security)],
+            python=shlex.quote(python),
+            local_directory=None if folder is None else shlex.quote(str(folder)),
+            **options,
+        )
+
+
+@cache
+def quoted(job: type[Any]) -> type[Any]:
+    """Return a class of jobs with every path of ours in quotes."""
+    return types.new_class(f"Quoted{job.__name__}", (_Quoted, job))
+
+
+def _tls_words(security: Security | None) -> list[str]:
+    """Return the options of a worker that name its certificates, as words of a shell."""
+    files = {} if security is None else security.get_tls_config_for_role("worker")
+    words = (
+        (f"--tls-{key.replace('_', '-')}", shlex.quote(str(value)))
+        for key, value in files.items()
+        if key != "ciphers"  # Dask has no option for them
+    )
+    return [word for pair in words for word in pair]
+
+
+def _exports() -> list[str]:
+    """Return Dask's settings as lines of a job script, which inherits nothing."""
+    told = dask_variables(dask_settings())
+    return [f"export {name}={shlex.quote(value)}" for name, value in told.items()]
+
+
+def _lifetime(seconds: float | None) -> list[str]:
+    """Return the options by which a worker ends before its job's walltime [s]."""
+    if seconds is None:
+        return []
+    margin = min(LIFETIME_MARGIN, seconds / 4.0)
+    stagger = min(LIFETIME_STAGGER, margin / 2.0)
+    return ["--lifetime", f"{seconds - margin:.0f}s", "--lifetime-stagger", f"{stagger:.0f}s"]
+
+
+class _Refill:
+    """Submits a new job in place of each that ended: at its walltime, or with its machine.
+
+    `adapt(minimum_jobs=n, maximum_jobs=n)` of dask-jobqueue does not: it compares n with the jobs
+    that were asked for, and a job of several workers stays among these when it has ended (0.9,
+    distributed 2026.8).
+    """
+
+    def __init__(self, cluster: SpecCluster, jobs: int) -> None:
+        self._cluster, self._jobs = cluster, jobs
+        self._seen: set[str] = set()
+        self._missing: set[str] = set()
+
+    async def __call__(self) -> None:
+        """Replace jobs that had workers and have none, twice in a row."""
+        cluster = self._cluster
+        if cluster.status is not Status.running:
+            return
+
+        # A job is there if it has a worker; one that still queues never was.
+        names = {str(w["name"]) for w in cluster.scheduler_info["workers"].values()}
+        present = {job for job in cluster.worker_spec if _has_worker(str(job), names)}
+        missing = self._seen - present
+
+        # Forget the lost jobs: to reach the number of jobs again, Dask submits new ones.
+        for job in missing & self._missing:
+            if job in cluster.workers:
+                await cluster.workers.pop(job).close()
+            self._seen.discard(job)
+        self._missing = missing
+        self._seen |= present
+        cluster.scale(jobs=self._jobs)
+
+
+def _has_worker(job: str, names: set[str]) -> bool:
+    return job in names or any(name.startswith(f"{job}-") for name in names)

@@ -1,0 +1,146 @@
+"""The script of a job, for each scheduler, whatever is in the names of folders."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import dask
+import pytest
+
+from drakegrasp.cluster.certificates import security_of
+from drakegrasp.cluster.connect import dask_settings
+from drakegrasp.cluster.kinds import cluster_of
+from drakegrasp.errors import ConfigError, MachineError
+
+pytest.importorskip("dask_jobqueue")
+
+from dask_jobqueue.slurm import SLURMJob
+
+from drakegrasp.cluster.jobqueue import Jobs, Slurm, quoted
+
+
+def test_paths_in_a_job_script_are_words_and_nothing_of_them_runs(tmp_path: Path) -> None:
+    folder = tmp_path / "a b $(touch ran) 'c' \"d\" `touch ran`"
+    folder.mkdir()
+    python = folder / "python"
+    python.write_text(
+        f"#!{sys.executable}\nimport json, sys\n"
+        f"json.dump(sys.argv[1:], open({str(tmp_path / 'words')!r}, 'w'))\n"
+    )
+    python.chmod(0o755)
+    files = folder / "ca.pem", folder / "cert.pem", folder / "key.pem"
+    script = quoted(SLURMJob)(
+        scheduler="tls://10.0.0.1:8786",
+        name="worker",
+        cores=1,
+        memory="1GB",
+        python=str(python),
+        local_directory=str(folder / "local"),
+        worker_extra_args=["--lifetime", "60s"],
+        security=security_of(files),
+    ).job_script()
+    subprocess.run(["bash", "-c", script], cwd=tmp_path, check=True, timeout=120)
+    words = json.loads((tmp_path / "words").read_text())
+    said = dict(pairwise(words))
+    assert said["--local-directory"] == str(folder / "local")
+    assert [said[f"--tls-{key}"] for key in ("ca-file", "cert", "key")] == list(map(str, files))
+    assert said["--lifetime"] == "60s"
+    assert not list(tmp_path.rglob("ran"))
+
+
+def test_job_has_the_memory_of_all_its_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """SLURM reads it: three workers of 2 GB in a job of three cores."""
+    scripts: list[str] = []
+
+    def refuse(_: Jobs, script: str) -> None:
+        scripts.append(script)
+        raise MachineError("no SLURM here")
+
+    monkeypatch.setattr(Jobs, "refuse_bad_job", refuse)
+    cluster = Slurm(kind="slurm", workers=6, cores=3, memory="2GB", host="127.0.0.1")
+    with pytest.raises(MachineError, match="no SLURM here"):
+        cluster.start(None)
+    (script,) = scripts
+    lines = [line.removeprefix("#SBATCH ").split("=") for line in script.splitlines()]
+    said = {line[0]: line[1] for line in lines if len(line) == 2}
+    assert (said["--cpus-per-task"], said["--mem"]) == ("3", "6G")
+
+
+def test_workers_run_the_kernel_of_blas_that_the_caller_chose(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A job inherits nothing, and the last bits of a lift depend on the kernel."""
+    key = "distributed.nanny.pre-spawn-environ"
+    monkeypatch.setenv("OPENBLAS_CORETYPE", "Prescott")
+    assert dask_settings()[key]["OPENBLAS_CORETYPE"] == "Prescott"
+    monkeypatch.delenv("OPENBLAS_CORETYPE")
+    assert "OPENBLAS_CORETYPE" not in dask_settings()[key]
+
+
+#: Of jobs of three workers with 2 GB each for 90 minutes: the lines that ask for it.
+ASKED = {
+    "slurm": ("sbatch", ["#SBATCH --cpus-per-task=3", "#SBATCH --mem=6G", "#SBATCH -t 01:30:00"]),
+    "pbs": ("qsub", ["#PBS -l select=1:ncpus=3:mem=5723MB", "#PBS -l walltime=01:30:00"]),
+    # Without lsf.conf LSF's unit is KB.
+    "lsf": ("bsub", ["#BSUB -n 3", "#BSUB -M 6000000", "#BSUB -W 1:30"]),
+    "sge": ("qsub", ["#$ -l mem_free=1908M", "#$ -l h_rt=01:30:00", "#$ -pe smp 3"]),
+    "htcondor": (
+        "condor_submit",
+        [
+            "MY.DaskWorkerCores = 3",
+            "MY.DaskWorkerMemory = 6000000000",
+            "MY.DaskWorkerDisk = 3000000000",
+            "allowed_job_duration = 5400",
+        ],
+    ),
+    "oar": (
+        "oarsub",
+        ["#OAR -l /nodes=1/core=3,walltime=01:30:00", "#OAR -p mem>=1908"],
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", ASKED)
+def test_each_scheduler_is_asked_in_its_own_words(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("LSF_ENVDIR", raising=False)
+    site = {
+        "jobqueue.sge.job-extra-directives": ["-pe smp 3"],
+        "jobqueue.oar.memory-per-core-property-name": "mem",
+    }
+    submission, lines = ASKED[kind]
+    given = {"cores": 3, "memory": "2GB", "walltime": "01:30:00", "host": "10.0.0.1"}
+    with dask.config.set(site):
+        cluster = cluster_of(kind, workers=6, **given)
+        script = cluster.script(tmp_path)
+        assert cluster.submission() == submission
+    assert set(lines) <= set(script.splitlines())
+    assert "--nworkers 3 --nanny" in script
+    # A quarter of an hour is more than the five minutes of long jobs.
+    assert "--lifetime 5100s" in script
+    assert f"--tls-key {tmp_path}/.tls-RUN/key.pem --protocol tls://" in script
+    assert not list(tmp_path.iterdir())
+    assert f"6 workers in {type(cluster).title} jobs of 3, 2GB each" in cluster.line()
+
+
+def test_times_of_the_users_file_are_read_as_its_scheduler_does() -> None:
+    told = {"slurm": 90.0, "pbs": 90.0, "lsf": 5400.0, "sge": 90.0, "oar": 5400.0}
+    for kind, seconds in told.items():
+        with dask.config.set({f"jobqueue.{kind}.walltime": "1:30"}):
+            assert cluster_of(kind, workers=1, host="10.0.0.1").seconds() == seconds
+
+
+def test_several_cores_of_grid_engine_need_the_environment_of_the_site() -> None:
+    with pytest.raises(ConfigError, match="must have -pe NAME 3"):
+        cluster_of("sge", workers=3, cores=3, host="10.0.0.1")
+
+
+def test_machine_that_submits_no_jobs_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(MachineError, match="there is no condor_submit on the PATH"):
+        cluster_of("htcondor", workers=1, host="10.0.0.1").refuse_bad_job("")
