@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -53,17 +54,9 @@ NEAREST = 96
 DIFFERENT = np.deg2rad(14.0)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Start:
-    """A start for the wrist problem.
-
-    Attributes:
-        X_OG: (4, 4), palm pose.
-        coordinates: (1 + m,), see `HandConstants.limits` [rad or m].
-    """
-
-    X_OG: Array
-    coordinates: Array
+#: A start for the wrist problem: the palm pose X_OG (4, 4), and coordinates (1 + m,), see
+#: `HandConstants.limits` [rad or m].
+Start: TypeAlias = tuple[Array, Array]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -126,9 +119,8 @@ def find_starts(postures: Postures, p_OQ: Array, nhat_Q_O: Array, count: int) ->
     starts: list[Start] = []
     for i in np.argsort(misfit, kind="stable"):
         c = postures.coordinates[rows[i]]
-        distance = [np.abs((start.coordinates - c) / postures.units).max() for start in starts]
-        if all(d > DIFFERENT for d in distance):
-            starts.append(Start(X_OG=X_OG[i], coordinates=c))
+        if all(np.abs((other - c) / postures.units).max() > DIFFERENT for _, other in starts):
+            starts.append((X_OG[i], c))
         if len(starts) == count:
             break
     return starts
@@ -173,7 +165,7 @@ def turned_starts(starts: Sequence[Start], p_OQ: Array, count: int) -> list[Star
     for angle in 2.0 * np.pi * np.arange(count) / count:
         R = rotation_about(axis, angle)
         X_OO = make_pose(R, centre - R @ centre)
-        turned += [replace(start, X_OG=X_OO @ start.X_OG) for start in starts]
+        turned += [(X_OO @ X_OG, c) for X_OG, c in starts]
     return turned
 
 
@@ -304,15 +296,15 @@ def fit_wrist(
     starts = find_starts(make_postures(hand), p_OQ, nhat_Q_O, STARTS)
     if hand.num_fingers == 2:
         starts = turned_starts(starts[:1], p_OQ, TURNS)
-    for start in starts:
+    for X_OS, posture in starts:
         problem = WristProblem(
             constants=constants,
             p_OQ=p_OQ,
             nhat_Q_O=nhat_Q_O,
             up_O=up_O,
             height=height,
-            X_OS=start.X_OG,
-            posture=start.coordinates,
+            X_OS=X_OS,
+            posture=posture,
         )
         fits.append(solve(problem))
     return sorted(fits, key=lambda fit: fit.objective)
