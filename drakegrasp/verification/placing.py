@@ -7,10 +7,10 @@ anything is simulated; a bad row is not a mistake of the caller.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -138,7 +138,8 @@ def place_on_object(
         others = find_resting_poses(placed.model, config)[1:]
         things += [replace(placed, X_TO=resting.X_TO) for resting in others]
     table = replace(table, objects=(placed.model.name,) * len(table))
-    return _placed(table, range(len(table)), things, config, method, snap_points, overrides)
+    how: dict[str, Any] = {"method": method, "snap_points": snap_points, "overrides": overrides}
+    return _placed(table, range(len(table)), things, config, **how)
 
 
 def place_on_rows(
@@ -174,15 +175,12 @@ def place_on_rows(
     table = replace(
         table,
         objects=tuple(dataset.column("object_props/object_name")[chosen].tolist()),
-        resting=np.zeros(count, dtype=np.int64),
+        resting=dataset.column("grasp_props/resting")[chosen].astype(np.int64),
         X_TO=np.full((count, 4, 4), np.nan),
         conditions=_drawn(dataset, chosen) if config is None else np.full((count, 3), np.nan),
     )
-    found = list[PlacedGrasp]()
-    for placed, indices in objects_of_rows(dataset, chosen):
-        own = indices.tolist()
-        found += _placed(table, own, [placed], used, method, snap_points, overrides, cameras)
-    return found
+    how: dict[str, Any] = {"method": method, "snap_points": snap_points, "overrides": overrides}
+    return place_on_dataset(table, dataset.path.parent, used, cameras=cameras, **how)
 
 
 def cameras_of_rows(dataset: GraspDataset, rows: npt.NDArray[np.int64]) -> dict[str, Array]:
@@ -200,25 +198,6 @@ def cameras_of_rows(dataset: GraspDataset, rows: npt.NDArray[np.int64]) -> dict[
         )
         for camera, name in names.items()
     }
-
-
-def objects_of_rows(
-    dataset: GraspDataset, rows: npt.NDArray[np.int64]
-) -> Iterator[tuple[PlacedObject, npt.NDArray[np.int64]]]:
-    """Yield each object of some rows (n,) in each resting pose, and the indices of its rows.
-
-    Raises:
-        DataError: If the dataset's objects cannot be read.
-    """
-    out = dataset.path.parent
-    manifest = read_manifest(out)
-    names = dataset.column("object_props/object_name")[rows]
-    resting = dataset.column("grasp_props/resting")[rows]
-    for name, k in dict.fromkeys(zip(names.tolist(), resting.tolist(), strict=True)):
-        config = manifest.config_of(name)
-        prepared = load_prepared(out, name, config)
-        placed = PlacedObject(model=prepared.model, X_TO=prepared.resting_poses[k], config=config)
-        yield placed, np.flatnonzero((names == name) & (resting == k))
 
 
 def overridden_keys(overrides: Sequence[str]) -> set[str]:
@@ -250,33 +229,20 @@ def dataset_config(
     """
     if config is not None:
         refuse_no_config(config)
-    known = read_manifest(dataset.path.parent).config
+    manifest = read_manifest(dataset.path.parent)
+    known, digest = manifest.config, manifest.versions.get("hand")
     if config is not None and config.hand == known.hand:
         config = config.with_hand(known.hand, known.hand_source)
     used = override_config(config or known, overrides) if overrides else config or known
-    used = _with_hand(used, hand)
+    used = used if hand is None else override_config(used, [], hand=str(hand))
     refuse_other_objects(used, known, "as in the dataset, whose objects are prepared")
-    if hand is None and used.hand == known.hand:
-        _refuse_other_hand(dataset, used)
-    return used
-
-
-def _with_hand(config: Config, hand: str | Path | None) -> Config:
-    return config if hand is None else override_config(config, [], hand=str(hand))
-
-
-def _refuse_other_hand(dataset: GraspDataset, config: Config) -> None:
-    """Refuse the hand of a dataset if its files have changed since.
-
-    Raises:
-        HandError: If so, or if they are gone.
-    """
-    known = read_manifest(dataset.path.parent).versions.get("hand")
-    if known is not None and not is_hand(config.hand_source, known):
+    own = hand is None and used.hand == known.hand and digest is not None
+    if own and not is_hand(used.hand_source, digest):
         raise HandError(
-            f"{config.hand}: files of the hand must be those of the dataset ({known}), got others "
-            f"({hand_digest(config.hand_source)}); name the hand to verify with it as it is now"
+            f"{used.hand}: files of the hand must be those of the dataset ({digest}), got others "
+            f"({hand_digest(used.hand_source)}); name the hand to verify with it as it is now"
         )
+    return used
 
 
 def _read(grasps: npt.ArrayLike | Attempts, method: str, config: Config) -> Attempts:
@@ -373,19 +339,17 @@ def read_several(
 
 
 def place_on_dataset(
-    table: Attempts,
-    out: Path,
-    config: Config | None = None,
-    *,
-    overrides: Sequence[str] = (),
+    table: Attempts, out: Path, config: Config | None = None, **how: Any
 ) -> list[PlacedGrasp]:
-    """Return the postures of a table on the objects of a dataset that they name.
+    """Return the rows of a table on the objects of a dataset that they name.
+
+    Those of an object in a resting pose stand together, so that its scene is built once.
 
     Args:
-        table: The postures.
+        table: The attempts.
         out: Directory of the dataset.
         config: By which they are tried; that of each object if None.
-        overrides: What the caller sets, which is stronger than the conditions of a posture.
+        how: See `_placed`.
 
     Raises:
         GraspError: If they are in the frames of mesh files.
@@ -407,7 +371,8 @@ def place_on_dataset(
             nobody = replace(prepared.model, name=name)
             things = [PlacedObject(model=nobody, X_TO=np.full((4, 4), np.nan), config=own)]
         rows = [i for i, each in enumerate(table.objects) if each == name]
-        placed += _placed(table, rows, things, config or own, overrides=overrides)
+        rows.sort(key=lambda i: table.resting[i])
+        placed += _placed(table, rows, things, config or own, **how)
     return placed
 
 
@@ -416,6 +381,7 @@ def _placed(
     rows: Iterable[int],
     things: Sequence[PlacedObject],
     config: Config,
+    *,
     method: str = "hand",
     snap_points: bool = False,
     overrides: Sequence[str] = (),
@@ -423,7 +389,15 @@ def _placed(
 ) -> list[PlacedGrasp]:
     """Return some rows of a table on one object, which is there in each of its resting poses.
 
-    `cameras` are poses X_TC (n, 4, 4) for the rows of the table, by their frames.
+    Args:
+        table: The attempts.
+        rows: Which of them.
+        things: The object.
+        config: By which they are tried.
+        method: Of contacts.
+        snap_points: Of each `PlacedGrasp`.
+        overrides: What the caller sets, which is stronger than the conditions of a row.
+        cameras: Poses X_TC (n, 4, 4) for all rows of the table, by their frames.
     """
     model, known_cameras = things[0].model, dict(cameras or {})
     if table.frame == "mesh" and things[0].X_OM is None:

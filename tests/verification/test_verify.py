@@ -33,6 +33,7 @@ pytestmark = pytest.mark.sim
 
 CONFIG = load_config()
 HAND = load_hand()
+X_TC = make_pose(Rotation.from_euler("xyz", [2.0, 0.4, -1.0]).as_matrix(), [0.1, 0.3, 0.4])
 
 
 @pytest.fixture(scope="module")
@@ -101,30 +102,20 @@ def test_the_same_grasp_gives_the_same_bits(
     np.testing.assert_array_equal(again.trial.lift.X_TO, held.trial.lift.X_TO)
 
 
-@pytest.mark.parametrize("yaw", [0.7, -2.9])
+@pytest.mark.parametrize("where", ["workspace", "camera"])
 def test_moving_object_and_grasp_together_changes_nothing(
-    held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray], yaw: float
+    held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray], where: str
 ) -> None:
-    Z = make_pose(Rotation.from_euler("z", yaw).as_matrix(), [0.2, -0.1, 0.0])
-    X_TO = Z @ cube.X_TO
-    moved = dg.transform_grasp(X_TO, dg.pack_grasp(*grasp))
-    (found,) = dg.place_object(cube, X_TO=X_TO).verify(moved, frame="workspace")
+    Z = make_pose(Rotation.from_euler("z", -2.9).as_matrix(), [0.2, -0.1, 0.0])
+    X_TO, seen = Z @ cube.X_TO, where == "camera"
+    moved = dg.transform_grasp(invert_pose(X_TC) @ X_TO if seen else X_TO, dg.pack_grasp(*grasp))
+    how = {"X_TC": X_TC} if seen else {}
+    (found,) = dg.place_object(cube, X_TO=X_TO).verify(moved, frame=where, **how)
     assert found.outcome is held.outcome and found.num_tries == held.num_tries
     assert found.closed is not None and held.closed is not None
     assert found.fit is not None and held.fit is not None
     np.testing.assert_allclose(found.fit.X_OG, held.fit.X_OG, atol=1e-9)
     np.testing.assert_allclose(found.closed.p_OQ, held.closed.p_OQ, atol=1e-9)
-
-
-def test_the_camera_frame_is_the_one_of_its_pose(
-    held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
-) -> None:
-    X_TC = make_pose(Rotation.from_euler("xyz", [2.0, 0.4, -1.0]).as_matrix(), [0.1, 0.3, 0.4])
-    X_CO = invert_pose(X_TC) @ cube.X_TO
-    seen = dg.transform_grasp(X_CO, dg.pack_grasp(*grasp))
-    (found,) = dg.place_object(cube).verify(seen, frame="camera", X_TC=X_TC)
-    assert found.outcome is held.outcome
-    np.testing.assert_allclose(found.p_OQ, held.p_OQ, atol=1e-12)
 
 
 def test_contacts_in_the_air_are_tried_and_told(
@@ -160,9 +151,6 @@ def test_normals_that_point_inwards_are_tried_and_get_a_hint(
     assert not found.success and found.trial is not None
     assert found.hints == ("normals that point the other way, out of the object",)
     assert found.explain().startswith("The normals point into the object; a grasp has normals that")
-
-
-X_TC = make_pose(Rotation.from_euler("xyz", [2.0, 0.4, -1.0]).as_matrix(), [0.1, 0.3, 0.4])
 
 
 @pytest.mark.parametrize(
@@ -334,28 +322,6 @@ def test_contacts_that_no_hand_spans_are_tried_and_fail(tmp_path: Path) -> None:
     assert found.fit is not None and found.fit.residual.max() > 0.05
 
 
-@pytest.mark.parametrize(("factor", "success"), [(1.01, True), (0.99, False)])
-def test_success_is_held_within_a_distance(
-    held: dg.Verification, factor: float, success: bool
-) -> None:
-    limited = f"verify.max_contact_error={factor * held.farthest_contact}"
-    found = replace(held, config=override_config(CONFIG, [limited]))
-    assert found.held and found.success is success
-    assert ("is no success" in found.explain()) is not success
-
-
-def test_fingertips_that_touch_count_where_another_need_not(held: dg.Verification) -> None:
-    (first,) = held.tries
-    error = first.contact_error.copy()
-    error[2] = np.nan
-    near = replace(held, tries=(replace(first, contact_error=error),))
-    assert near.success
-    error[0] += 0.03
-    far = replace(held, tries=(replace(first, contact_error=error),))
-    assert far.held and not far.success
-    assert "fingertip 1 is more than 20.0 mm from its point" in far.explain()
-
-
 def test_at_little_friction_neither_method_holds(
     cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
 ) -> None:
@@ -406,6 +372,7 @@ LOST, HITS, HELD = Outcome.SLIPPED, Outcome.START_COLLISION, Outcome.SUCCESS
         ([LOST, LOST, HELD], 2, 2, None),
         ([LOST, HELD], 1, 1, None),
         ([LOST, LOST], 5, 2, None),
+        ([Outcome.TIMEOUT, LOST], 5, 2, None),
     ],
 )
 def test_first_wrist_pose_decides_and_the_others_are_an_oracle(
@@ -422,14 +389,6 @@ def test_first_wrist_pose_decides_and_the_others_are_an_oracle(
     assert [each.trial.outcome for each in found.tries] == ends[:tries]
     if by:
         assert f"number {by + 1} of {tries} does" in found.explain()
-
-
-def test_without_a_verdict_on_the_first_try_there_is_none(
-    held: dg.Verification, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = tried(held, monkeypatch, [Outcome.TIMEOUT, LOST])
-    assert found.outcome is Outcome.TIMEOUT and not found.success
-    assert "says nothing about the grasp" in found.explain()
 
 
 def test_two_contacts_leave_poses_that_collide_out(

@@ -138,13 +138,6 @@ def test_one_programme_serves_all_wrenches_in_any_order():
     assert np.array_equal(light.f_Q_O, alone.f_Q_O)
 
 
-def test_no_load_needs_no_force():
-    forces = smallest_forces(*PINCH, ORIGIN, np.zeros(6), MU)
-    assert forces.feasible
-    assert forces.largest_normal == 0.0
-    assert not forces.f_Q_O.any()
-
-
 @pytest.mark.parametrize(
     ("p", "n"),
     [
@@ -166,9 +159,10 @@ def test_grasp_that_cannot_carry_the_object_says_so(p, n):
     assert smallest_friction(GraspContacts(p, n, ORIGIN, 20.0), [CARRY]) == np.inf
 
 
-def test_wrench_that_is_not_finite_cannot_be_given():
-    program = ForceProgram(GraspContacts(*PINCH, ORIGIN), MU)
-    assert not program.smallest(CARRY * np.nan).feasible
+def test_no_load_needs_no_force_and_a_wrench_that_is_not_finite_cannot_be_given():
+    forces = smallest_forces(*PINCH, ORIGIN, np.zeros(6), MU)
+    assert forces.feasible and forces.largest_normal == 0.0 and not forces.f_Q_O.any()
+    assert not smallest_forces(*PINCH, ORIGIN, CARRY * np.nan, MU).feasible
 
 
 @pytest.mark.parametrize("limit", [5.0, 20.0])
@@ -195,18 +189,6 @@ def test_smallest_friction_is_infinite_where_the_limit_is_too_low():
     p, n = ring(3)
     limit = 0.99 * WEIGHT / (3.0 * MAX_FRICTION)
     assert smallest_friction(GraspContacts(p, n, ORIGIN, limit), [CARRY]) == np.inf
-
-
-def test_weak_finger_is_spared():
-    """It could carry 0.1 of its limit by friction alone; unequal forces must balance as well."""
-    p, n = ring(3)
-    limits = np.array([10.0, 20.0, 30.0])
-    up = 0.1 * MU * limits[:, None] * [0.0, 0.0, 1.0]
-    wrench = np.append(np.cross(p, up).sum(axis=0), up.sum(axis=0))
-    forces = smallest_forces(p, n, ORIGIN, wrench, MU, force_limit=limits)
-    assert 0.1 <= forces.share < 0.13
-    assert np.allclose(forces.shares, forces.normal / limits)
-    assert smallest_forces(p, n, ORIGIN, wrench, MU).normal[0] > 1.1 * forces.normal[0]
 
 
 def test_no_forces_take_a_smaller_share_of_unequal_limits():

@@ -88,13 +88,6 @@ def test_friction_of_the_object_wins_over_the_configured_one(
     assert found.planned_force == pytest.approx(heaviest(config) / 0.1, rel=1e-6)
 
 
-def test_turned_cube_is_held_as_well(box: ObjectModel, config: Config) -> None:
-    X_TO = standing(box)
-    X_TO[:3, :3] = Rotation.from_rotvec([0.0, 0.0, 0.7]).as_matrix()
-    turned = judged(box, config, X_TO=X_TO)
-    assert turned.planned_force == pytest.approx(judged(box, config).planned_force, rel=1e-6)
-
-
 def test_finger_below_the_object_as_it_lies_carries_it_almost_without_friction(
     box: ObjectModel,
 ) -> None:

@@ -146,16 +146,6 @@ def test_epsilon_is_the_same_in_any_frame(seed):
     ) == pytest.approx(here, rel=1e-9)
 
 
-def test_epsilon_grows_with_friction():
-    p, n, p_OOcm = some_grasp(2)
-    values = [
-        ferrari_canny(GraspContacts(p, n, p_OOcm), friction=mu, length=0.05)
-        for mu in (0.3, 0.6, 0.9)
-    ]
-    assert values == sorted(values)
-    assert values[0] < values[-1]
-
-
 @pytest.mark.parametrize(
     ("p", "n"),
     [

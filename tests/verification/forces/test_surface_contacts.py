@@ -77,11 +77,6 @@ def test_a_normal_cannot_name_the_other_side_of_a_wall(tmp_path: Path) -> None:
     assert found.off_surface.tolist() == [True, False]
 
 
-def test_numbers_that_are_not_finite_are_off_the_surface(box: ObjectModel) -> None:
-    found = surface_contacts(box, [[np.nan, 0.0, 0.0]], [RIGHT])
-    assert found.off_surface.all()
-
-
 def test_patch_on_a_plane_is_a_ring_with_the_planes_normal(box: ObjectModel) -> None:
     contacts = surface_contacts(box, [[HALF, 0.01, -0.005]], [RIGHT])
     points, normals = patch_points(box, contacts)

@@ -111,27 +111,6 @@ def test_palm_and_fingertips_are_where_kinematics_puts_them(name: str, seed: int
     np.testing.assert_allclose(at.pad_normals_O, normals, atol=1e-9)
 
 
-def test_at_zero_the_palm_is_at_the_start(name: str) -> None:
-    problem, x = random_problem(name, 0)
-    x[:POSE] = 0.0
-    np.testing.assert_array_equal(evaluate(problem, x).X_OG, problem.X_OS)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_slope_of_the_objective_is_that_of_finite_differences(name: str, seed: int) -> None:
-    problem, x = random_problem(name, seed)
-
-    def objective(x: Array) -> Array:
-        residuals = evaluate(problem, x).residuals
-        return np.asarray(residuals @ residuals)
-
-    at = evaluate(problem, x)
-    slope = differences(objective, x)
-    np.testing.assert_allclose(
-        2.0 * at.residuals @ at.jacobian, slope, atol=1e-6 * np.abs(slope).max(), rtol=1e-5
-    )
-
-
 TERMS = ("distance", "normal", "closing", "pad", "posture", "region")
 
 
