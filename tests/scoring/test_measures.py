@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,48 +20,56 @@ from drakegrasp.scoring.measures import (
     estimates,
     resample,
 )
+from drakegrasp.scoring.verdict import Verdict
 
 DRAWS = resample([f"object {i}" for i in range(3)])
 
 
+def estimated(one: Judged, *objects: int) -> dict[str, dict[str, float]]:
+    """Return the measures of a set whose rows are of these objects."""
+    return estimates(one, grouping(*objects), DRAWS, oracle=False)
+
+
+def of_verdicts(*verdicts: Verdict, **stated: Any) -> Judged:
+    """Return a set with a prediction for each row that has this verdict."""
+    count = len(verdicts)
+    ranked = ranked_array("net", np.zeros((count, 18)), length=count, **stated)
+    return Judged(name="net", ranked=(ranked,), verdicts=(verdicts,))
+
+
 def test_an_object_with_many_rows_counts_no_more_than_another() -> None:
     rows = [["sample"], ["fails"], ["fails"], ["fails"], ["sample"], ["sample"]]
-    one = judged("net", rows)
-    found = estimates(one, grouping(0, 0, 0, 0, 1, 2), DRAWS, oracle=False)
+    found = estimated(judged("net", rows), 0, 0, 0, 0, 1, 2)
     assert found["headline"]["value"] == pytest.approx((0.25 + 1 + 1) / 3, abs=1e-6)
     assert found["objects"]["value"] == 1.0
     assert "held_any" not in found
 
 
-def test_the_headline_asks_for_a_sample_with_contacts_where_they_were_asked_for() -> None:
-    ranked = ranked_array("net", np.zeros((3, 18)), length=3)
-    verdicts = (verdict("sample"), verdict("sample", error=0.03), verdict("held"))
-    one = Judged(name="net", ranked=(ranked,), verdicts=(verdicts,))
-    assert grouping(0, 1, 2).best_of_rows(one, one.table.headline).tolist() == [[1, 0, 0]]
-    assert grouping(0, 1, 2).best_of_rows(one, one.table.sample).tolist() == [[1, 1, 0]]
-    assert grouping(0, 1, 2).best_of_rows(one, one.table.success).tolist() == [[1, 0, 1]]
+@pytest.mark.parametrize(
+    ("measure", "rows"),
+    [("headline", [1, 0, 0]), ("sample", [1, 1, 0]), ("success", [1, 0, 1]), ("held", [1, 1, 1])],
+)
+def test_the_headline_asks_for_a_sample_with_contacts_where_they_were_asked_for(
+    measure: str, rows: list[int]
+) -> None:
+    one = of_verdicts(verdict("sample"), verdict("sample", error=0.03), verdict("held"))
+    # A row without prediction fails.
+    assert grouping(0, 1, 2, 3).best_of_rows(one, one.table[measure]).tolist() == [[*rows, 0]]
 
 
 def test_the_k_best_of_a_row_count_in_success_at_k_only() -> None:
     rows = [["fails", "sample", "fails"], ["fails", "fails", "sample"], ["sample"] * 3]
-    one = judged("net", rows)
-    found = estimates(one, grouping(0, 1, 2), DRAWS, oracle=False)
+    found = estimated(judged("net", rows), 0, 1, 2)
     assert found["headline"]["value"] == pytest.approx(1 / 3, abs=1e-6)
     assert found["success@2"]["value"] == pytest.approx(2 / 3, abs=1e-6)
     assert "success@5" not in found
 
 
-def test_a_row_without_prediction_fails() -> None:
-    one = judged("net", [["sample"]])
-    assert grouping(0, 1).best_of_rows(one, one.table.held).tolist() == [[1, 0]]
-
-
 def test_intervals_are_of_objects_and_come_again() -> None:
     one = judged("net", [["sample"], ["fails"], ["fails"]])
-    found = estimates(one, grouping(0, 1, 2), DRAWS, oracle=False)["headline"]
+    found = estimated(one, 0, 1, 2)["headline"]
     assert (found["low"], found["high"]) == (0.0, 1.0)
-    again = estimates(one, grouping(0, 1, 2), resample(["a", "b", "c"]), oracle=False)
-    assert again["headline"] == found
+    assert estimated(one, 0, 1, 2)["headline"] == found
     # As one object there is nothing to draw.
     alone = estimates(one, grouping(0, 0, 0), resample(["a"]), oracle=False)["headline"]
     assert alone["low"] == alone["value"] == alone["high"]
@@ -86,7 +95,7 @@ def test_a_difference_is_paired_by_object() -> None:
 
 def test_training_seeds_widen_the_interval() -> None:
     good, bad = [["sample"]] * 3, [["fails"]] * 3
-    one = estimates(judged("net", good, bad), grouping(0, 1, 2), DRAWS, oracle=False)["headline"]
+    one = estimated(judged("net", good, bad), 0, 1, 2)["headline"]
     assert (one["value"], one["low"], one["high"]) == (0.5, 0.0, 1.0)
 
 
@@ -102,38 +111,30 @@ def test_training_seeds_of_both_sets_widen_a_difference() -> None:
 
 
 def test_the_curve_rises_with_the_distance() -> None:
-    ranked = ranked_array("net", np.zeros((2, 18)), length=2)
-    verdicts = (verdict("held", error=0.012), verdict("held", error=0.05))
-    values = curve(Judged(name="n", ranked=(ranked,), verdicts=(verdicts,)), grouping(0, 1))
-    assert values == [0.0] * 3 + [0.5] * 7 + [1.0] * 3
+    one = of_verdicts(verdict("held", error=0.012), verdict("held", error=0.05))
+    assert curve(one, grouping(0, 1)) == [0.0] * 3 + [0.5] * 7 + [1.0] * 3
 
 
 def test_calibration_groups_by_confidence() -> None:
-    ranked = ranked_array("net", np.zeros((10, 18)), length=10, confidence=np.arange(10) / 10)
-    verdicts = tuple(verdict("fails" if i < 5 else "sample") for i in range(10))
-    one = Judged(name="n", ranked=(ranked,), verdicts=(verdicts,))
-    groups = calibration(one)
+    words = ["fails"] * 5 + ["sample"] * 5
+    groups = calibration(of_verdicts(*map(verdict, words), confidence=np.arange(10) / 10))
     assert [group["share"] for group in groups] == [0, 0, 0.5, 1, 1]
     assert calibration(judged("net", [["sample"]])) == []
 
 
 def test_diversity_is_one_along_a_line_and_falls_with_directions() -> None:
-    ranked = ranked_array("net", np.zeros((4, 18)), length=4)
-
     def variance(postures: np.ndarray) -> list[float] | None:
-        held = tuple(replace(verdict("sample"), posture=tuple(p)) for p in postures)
-        return diversity(Judged(name="n", ranked=(ranked,), verdicts=(held,)))
+        return diversity(
+            of_verdicts(*(replace(verdict("sample"), posture=(*p,)) for p in postures))
+        )
 
     assert variance(np.outer([0.0, 1.0, 2.0, 3.0], [1.0, 1.0, 0.0]))[0] == 1.0
     assert variance(np.eye(4))[0] == pytest.approx(1 / 3, abs=1e-6)
 
 
 def test_coverage_is_of_own_grasps_with_a_good_one_near() -> None:
-    ranked = ranked_array("net", np.zeros((3, 18)), length=3)
     near = replace(verdict("sample"), contacts=(0.01,) * 9)
-    one = Judged(
-        name="n", ranked=(ranked,), verdicts=((near, verdict("fails"), verdict("sample")),)
-    )
+    one = of_verdicts(near, verdict("fails"), verdict("sample"))
     own = {0: np.zeros(9), 1: np.full(9, 0.015), 2: np.full(9, 0.5)}
     assert coverage(one, own, grouping(0, 0, 1)) == 0.5
 
