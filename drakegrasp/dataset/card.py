@@ -112,6 +112,17 @@ def card_content(out: Path) -> dict[str, Any]:
     return content
 
 
+def card_counts(out: Path) -> dict[str, Any]:
+    """Return the counts of a dataset's card.
+
+    Raises:
+        DataError: If one of the files is missing or damaged.
+    """
+    funnel = funnel_of(Trials(out, any_name=True))
+    with open_samples(out / DATA_FILES["oto"]) as file:
+        return _counts(file, funnel)
+
+
 def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
     """Return what the card says of a manifest and of files that may not have their names yet.
 

@@ -7,6 +7,7 @@ as fast; it is used where the package `deflate` is installed, with the same resu
 from __future__ import annotations
 
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +154,35 @@ def read_column(group: h5py.Group, name: str) -> AnyArray:
     except RuntimeError as error:
         raise OSError(str(error)) from None  # what HDF5 says of a damaged file
     return values
+
+
+def read_rows(
+    group: h5py.Group,
+    field: Field,
+    rows: slice = slice(None),
+    sizes: Mapping[str, int] | None = None,
+) -> AnyArray:
+    """Return rows (n, ...) of a field; one that an older file lacks is derived, or has no value.
+
+    Args:
+        group: The group of the field.
+        field: The field.
+        rows: The rows.
+        sizes: Lengths of the letters in the shape of a field that may have no value.
+
+    Raises:
+        DataError: If the field must be there, and is not.
+    """
+    if field.name in group:
+        dataset = group[field.name]
+        return np.asarray((dataset.asstr() if field.dtype == "str" else dataset)[rows])
+    if not field.optional:
+        path = f"{group.name}/{field.name}"
+        raise DataError(f"{group.file.filename}: {path} must be there, got none")
+    if field.derive is not None and all(name in group for name in field.needs):
+        return field.derive({name: group[name][rows] for name in field.needs})
+    (count, *_) = next(each.shape for each in group.values() if isinstance(each, h5py.Dataset))
+    return field.empty(len(range(count)[rows]), sizes or {})
 
 
 def create_field(

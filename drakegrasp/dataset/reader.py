@@ -22,7 +22,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import ImageRows, open_hdf5, says_damage, write_field
+from drakegrasp.dataset.hdf5 import ImageRows, open_hdf5, read_rows, says_damage, write_field
 from drakegrasp.dataset.opening import open_samples
 from drakegrasp.dataset.schema import DATA_FIELDS, PREDICTED_ROW_FIELDS, SPLITS
 from drakegrasp.errors import DataError, MachineError, first_line
@@ -237,13 +237,9 @@ class GraspDataset:
             DataError: If there is no such field.
         """
         _refuse_other_fields([name])
-        dataset = self._open()[self.split].get(name)
-        if dataset is None:
-            return self._missing(name)[start:stop]
+        group = self._open()[self.split]
         try:
-            if FIELDS[name].dtype == "str":
-                return np.asarray(dataset.asstr()[start:stop])
-            return np.asarray(dataset[start:stop])
+            return read_rows(group, FIELDS[name], slice(start, stop), _sizes(group))
         except Exception as error:
             raise self._as_damage(error) from None
 
@@ -272,18 +268,13 @@ class GraspDataset:
 
     def _field(self, name: str) -> h5py.Dataset | ImageRows | npt.NDArray[Any]:
         """Return a field in the file of this process, which is kept open with it."""
-        file = self._open()
+        group = self._open()[self.split]
         if name not in self._fields:
-            field = file[self.split].get(name)
+            field = group.get(name)
             if field is None:
-                field = self._missing(name)
+                field = read_rows(group, FIELDS[name], sizes=_sizes(group))
             self._fields[name] = ImageRows(field) if FIELDS[name].sample else field
         return self._fields[name]
-
-    def _missing(self, name: str) -> npt.NDArray[Any]:
-        """Return the rows of a field that a file made before it lacks: they have no value."""
-        grasps = self._open()[self.split]["grasps"]
-        return FIELDS[name].empty(self._length, {"k": grasps.shape[1] // 6})
 
     def _open(self) -> h5py.File:
         """Return the file, as this process opened it."""
@@ -331,6 +322,10 @@ def _content(file: h5py.File, split: str) -> str:
     digest = hashlib.sha256(str(file.attrs.get("signature")).encode())
     digest.update(file[split]["trial_id"][:].tobytes())
     return digest.hexdigest()
+
+
+def _sizes(group: h5py.Group) -> dict[str, int]:
+    return {"k": group["grasps"].shape[1] // 6}
 
 
 def _refuse_other_fields(names: Sequence[str]) -> None:

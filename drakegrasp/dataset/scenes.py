@@ -21,11 +21,11 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply
-from drakegrasp.dataset.hdf5 import AnyArray, ImageRows, read_texts
+from drakegrasp.dataset.hdf5 import AnyArray, ImageRows, read_rows, read_texts
 from drakegrasp.dataset.opening import SCENE_TABLES, open_scenes, opened, refuse_other_codes
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.schema import DEPTH_UNIT, SCENE_GRASP_FIELDS, SPLITS, Field
-from drakegrasp.dataset.trials import Trials, stamp
+from drakegrasp.dataset.schema import DEPTH_UNIT, SCENE_GRASP_FIELDS, SPLITS
+from drakegrasp.dataset.trials import Trials, reopened, stamp
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import X_WT, invert_pose, pack_pose, unpack_pose
@@ -164,7 +164,7 @@ class SceneDataset:
                 read_texts(file["objects"][key]) for key in ("name", "class_name")
             )
             self.tables: Mapping[str, Mapping[str, AnyArray]] = {
-                group: {f.name: _column(file[group], f) for f in fields if not f.sample}
+                group: {f.name: read_rows(file[group], f) for f in fields if not f.sample}
                 for group, fields in SCENE_TABLES.items()
                 if group not in ("objects", "visible")
             }
@@ -442,16 +442,7 @@ class SceneDataset:
 
     def _opened(self) -> Any:
         """Open the file, which must be the one that the tables were read from."""
-        if stamp(self.path) != self._stamp:
-            raise DataError(f"{self.path}: must stay while it is read, got another; open it again")
-        return opened(self.path, "the scenes of a dataset", again=True)
-
-
-def _column(group: h5py.Group, field: Field) -> AnyArray:
-    """Return a column; an optional one that is missing has no value."""
-    if field.optional and field.name not in group:
-        return field.empty(len(group["scene"]), {})
-    return np.asarray(group[field.name][:])
+        return reopened(self.path, self._stamp, "the scenes of a dataset")
 
 
 def count_scenes(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, int]]:

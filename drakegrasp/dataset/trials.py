@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.hdf5 import AnyArray, read_names, read_texts
+from drakegrasp.dataset.hdf5 import AnyArray, read_names, read_rows, read_texts
 from drakegrasp.dataset.opening import (
     open_samples,
     open_trials,
@@ -393,9 +393,7 @@ class Trials:
             with open_shard(part.path, part.header, verify_seal=False, again=True) as (file, _):
                 yield file
             return
-        with opened(part.path, "the trials of a dataset", again=True) as file:
-            if stamp(part.path) != self._stamp:
-                raise DataError(f"{part.path}: must stay while it is read, got another; read again")
+        with reopened(part.path, self._stamp, "the trials of a dataset") as file:
             yield file
 
     def _read(
@@ -476,18 +474,12 @@ def _stored(
         rows: In rising order.
         codes: What its numbers may stand for, see `refuse_other_codes`; None for measured values.
     """
-    field, near = FIELDS[name], slice(int(rows[0]), int(rows[-1]) + 1)
-    path = Path(trials.file.filename)
-    if name not in trials:
-        if not field.optional:
-            raise DataError(f"{path}: /trials/{name} must be there, got none")
-        if field.derive is not None:
-            return field.derive({name: _stored(name, trials, rows) for name in field.needs})
-        return field.empty(len(rows), {})
-    values = trials[name][near]
+    near = slice(int(rows[0]), int(rows[-1]) + 1)
+    values = read_rows(trials, FIELDS[name], near)
     if codes is not None:
+        path = Path(trials.file.filename)
         refuse_other_codes(path, f"/trials/{name}", values, codes, near.start)
-    return np.asarray(values[rows - near.start])
+    return values[rows - near.start]
 
 
 def shard_part(
@@ -536,3 +528,16 @@ def stamp(path: Path) -> Stamp:
     except OSError:
         return None
     return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+@contextmanager
+def reopened(path: Path, known: Stamp, what: str) -> Iterator[h5py.File]:
+    """Open a file that was read before while the block runs, see `opened`; `known` is its stamp.
+
+    Raises:
+        DataError: If it is another file by now.
+    """
+    with opened(path, what, again=True) as file:
+        if stamp(path) != known:
+            raise DataError(f"{path}: must stay while it is read, got another; open it again")
+        yield file

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from drakegrasp.dataset.assembly.decisions import Decisions
-from drakegrasp.dataset.card import card_content
+from drakegrasp.dataset.card import card_counts
 from drakegrasp.dataset.checks import scenes
 from drakegrasp.dataset.checks.assembled import (
     assemble_again,
@@ -199,7 +199,7 @@ def _check_card(out: Path, findings: Findings) -> None:
     """The data card counts what the files hold; older datasets have no card."""
     path = out / CARD_FILES[0]
     try:
-        counts = card_content(out)["counts"]
+        counts = card_counts(out)
     except (DataError, ValueError, IndexError):
         return  # a file is damaged, and found above
     try:
