@@ -118,7 +118,7 @@ def assemble(
     """
     from drakegrasp.cli import tables
     from drakegrasp.dataset.assemble import assemble as assemble_files
-    from drakegrasp.dataset.checks.assembled import carried_hand_as_built
+    from drakegrasp.dataset.checks.run import carried_hand_as_built
     from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.dataset.rejections import read_rejected, unused_rejections
 

@@ -4,51 +4,88 @@ In: a dataset's directory, or grasping_oto.hdf5, grasping_otm.hdf5, trials.hdf5 
 alone. Out: a list of violations, empty for a sound dataset. Rows are read in batches, so the memory
 is bounded, and judged in tasks, by an `Executor`. Imports no Drake.
 
-Of a whole dataset the files are compared first with what assembling gives again of its shards
-(`assembled`). All other rules do not ask how a value was made: verdicts, poses, images, meshes.
+Of a whole dataset the files are compared first with what assembling gives again of its shards:
+samples are derived by the functions that write them, stored images are compared byte for byte. All
+other rules do not ask how a value was made: verdicts, poses, images, meshes.
 `trials`, `samples` and `scenes` apply them in an order, see `rows`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 
-from drakegrasp.dataset.assembly.decisions import Decisions
+import h5py
+import numpy as np
+
+from drakegrasp.config import CarriedHand
+from drakegrasp.dataset.assembly.decisions import (
+    Decisions,
+    decide,
+    file_attributes,
+    number_rows,
+    object_columns,
+)
+from drakegrasp.dataset.assembly.pack import (
+    TASK_ROWS,
+    PackTask,
+    pack_tasks,
+    read_rows,
+    sample_texts,
+)
+from drakegrasp.dataset.assembly.survey import Survey, SurveyTask, survey_object, survey_tasks
 from drakegrasp.dataset.card import card_counts
 from drakegrasp.dataset.checks import scenes
-from drakegrasp.dataset.checks.assembled import (
-    assemble_again,
-    carried_hand_as_built,
-    check_object,
-    object_tasks,
-    objects_and_successes,
-    of_another_state,
-    trials_tasks,
-)
 from drakegrasp.dataset.checks.rows import (
     SCENES,
+    AnyArray,
+    Batch,
     Check,
     CheckedFile,
     Dataset,
     Findings,
+    Task,
     Violation,
     look_at,
     of_file,
 )
 from drakegrasp.dataset.checks.samples import samples_tasks, splits
-from drakegrasp.dataset.checks.trials import successes
-from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, SCENES_FILE, TRIALS_FILE
+from drakegrasp.dataset.checks.trials import successes, trial_rules
+from drakegrasp.dataset.hdf5 import open_hdf5, unpacked_chunk
+from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
+from drakegrasp.dataset.paths import (
+    CARD_FILES,
+    DATA_FILES,
+    FILE_NAME,
+    SCENES_FILE,
+    TRIALS_FILE,
+    model_path,
+    plan_path,
+    recorded_model,
+    refuse_changed_model,
+)
 from drakegrasp.dataset.schema import CAMERAS, refuse_other_schema
-from drakegrasp.errors import DataError, first_line
+from drakegrasp.dataset.shards import read_trials
+from drakegrasp.errors import DataError, HandError, MeshError, first_line
+from drakegrasp.filters import Removal
 from drakegrasp.foreign_files import read_json
+from drakegrasp.hand.folder import HAND_FOLDER, hand_digest
+from drakegrasp.objects.model import load_object
+from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.files import refuse_half_replaced
 from drakegrasp.runtime.progress import Report, silent
 
 __all__ = ["Violation", "check_dataset"]
+
+#: Attributes that say of what a file was assembled, the cause of others first.
+ORIGIN = ("config", "split_by", "versions", "fingers", "joints", "shards", "signature")
+#: Trials in a batch: some 10 MB.
+TRIAL_ROWS = 8192
 
 
 def check_dataset(
@@ -114,7 +151,9 @@ def _check_directory(out: Path, check: Check) -> None:
 
     # The files that all others follow from.
     objects, surveys = set[str](), []
-    results = in_order(check.execute)(check_object, object_tasks(out, manifest))
+    shards = {task.object: task for task in survey_tasks(out, manifest)}
+    tasks = ((out, entry, shards.get(i)) for i, entry in enumerate(manifest.objects))
+    results = in_order(check.execute)(_check_object, tasks)
     for entry, (found, readable, survey) in zip(manifest.objects, results, strict=True):
         check.findings.merge(found)
         check.advance(entry.candidates)
@@ -124,19 +163,19 @@ def _check_directory(out: Path, check: Check) -> None:
     dataset = Dataset(out=out, manifest=manifest, readable=frozenset(objects))
     sound = len(surveys) == sum(entry.candidates > 0 for entry in manifest.objects)
     sound &= len(surveys) > 0 and len(objects) == len(manifest.objects)
-    again = assemble_again(manifest, surveys, files.get("")) if sound else None
+    again = _assemble_again(manifest, surveys, files.get("")) if sound else None
 
     # Files of another state are not compared row by row.
     current = set()
     for camera, file in files.items():
-        other = [*of_another_state(file, manifest, again)]
+        other = [*_of_another_state(file, manifest, again)]
         check.findings.add(other)
         if file.config is not None and not other:
             current.add(camera)
     if (trials := files.get("")) is not None:
         decided = again if "" in current else None
         with check.readable(trials):
-            objects_and_successes(trials, manifest, decided, check.findings)
+            _objects_and_successes(trials, manifest, decided, check.findings)
     _check_rows(files, check, dataset, again, frozenset(current))
     if (out / SCENES_FILE).exists() and (
         shown := _look_at(out, SCENES, SCENES_FILE, check.findings)
@@ -165,7 +204,7 @@ def _check_rows(
             trials. They are compared with what is assembled again, or else with each other.
     """
     compared = frozenset() if again is None else current
-    check.judge(trials_tasks(files, dataset, again, compared))
+    check.judge(_trials_tasks(files, dataset, again, compared))
     entries = dataset.manifest.objects if dataset else ()
     for camera, file in files.items():
         if camera:
@@ -217,3 +256,298 @@ def _rows(files: Mapping[str, CheckedFile]) -> int:
     """Return the number of samples and trials of some files."""
     counts = (item for file in files.values() for item in file.counts.items())
     return sum(count for group, count in counts if group not in ("objects", "successes"))
+
+
+# Files of objects
+
+
+def _check_object(
+    task: tuple[Path, ObjectEntry, SurveyTask | None],
+) -> tuple[Findings, bool, Survey | None]:
+    """Verify the files of an object in a dataset's directory.
+
+    Args:
+        task: The directory, the object and its shards; None if it has no palm pose.
+
+    Returns:
+        The violations, whether its meshes can be read, and the survey of its shards; None where
+        one is missing or broken, or there is none.
+    """
+    out, entry, shards = task
+    findings, survey = Findings(), None
+    findings.add(_meshes(out, entry))
+    readable = not findings
+    findings.add(_as_written(out, entry.name))
+    if shards is not None:
+        try:
+            survey = survey_object(shards)
+        except DataError:
+            findings.add(_broken_shards(shards))
+    return findings, readable, survey
+
+
+def carried_hand_as_built(manifest: Manifest) -> Iterator[Violation]:
+    """The hand that the dataset carries is the one that built it."""
+    source, what = manifest.config.hand_source, f"the hand must be that of {FILE_NAME}"
+    if not isinstance(source, CarriedHand):
+        return  # an older dataset carries none
+    try:
+        found = hand_digest(source)
+    except HandError as error:
+        yield of_file(HAND_FOLDER, what, first_line(error).rpartition(", got ")[2])
+        return
+    if found != source.digest:
+        yield of_file(HAND_FOLDER, f"{what}, {source.digest}", found)
+
+
+def _meshes(out: Path, entry: ObjectEntry) -> Iterator[Violation]:
+    """The meshes can be read, and are those of the manifest."""
+    path = model_path(out, entry.name)
+    name = str(path.relative_to(out))
+    try:
+        found = load_object(path).mesh_sha256
+    except MeshError as error:
+        yield of_file(name, "the object must be readable", error)
+        return
+    if found != entry.mesh_sha256:
+        yield of_file(name, f"mesh_sha256 must be that of {FILE_NAME}", found)
+
+
+def _as_written(out: Path, name: str) -> Iterator[Violation]:
+    """The meshes and the plan are as they were written: the plan vouches for both."""
+    path = plan_path(out, name)
+    try:
+        expected = recorded_model(out, name)
+        path = model_path(out, name)
+        refuse_changed_model(out, name, expected)
+    except (DataError, OSError) as error:
+        what = "an object's file must be as it was written"
+        got = first_line(error).removeprefix(f"{path}: ")
+        yield of_file(str(path.relative_to(out)), what, got)
+
+
+def _broken_shards(task: SurveyTask) -> Iterator[Violation]:
+    """The shards are there and whole, up to the last wanted grasp."""
+    out, left = Path(task.out), np.inf if task.wanted is None else task.wanted
+    for header in task.headers:
+        if left <= 0:
+            return
+        path = header.path(out)
+        try:
+            outcome = read_trials(path, header, ("outcome",), complete=True)["outcome"]
+        except DataError as error:
+            what = "the shard must be there, whole and of its work unit"
+            got = str(error).rpartition(", got ")[2] if path.exists() else "none"
+            yield of_file(str(path.relative_to(out)), what, got)
+            continue
+        left -= int((outcome == Outcome.SUCCESS).sum())
+
+
+# What is decided again
+
+
+def _assemble_again(
+    manifest: Manifest, surveys: Sequence[Survey], trials: CheckedFile | None
+) -> Decisions:
+    """Decide again which successes are samples, given the surveys of all objects.
+
+    Code of a dataset is never imported: what the user's own filters removed is read from
+    `trials`, if these can be read.
+    """
+    shards, removed = number_rows(surveys, manifest), np.zeros(0, dtype=np.int64)
+    if manifest.config.filters.own and trials is not None and "successes" in trials.counts:
+        # Columns that cannot be read are a finding later.
+        with suppress(OSError), trials.opened() as file:
+            ids, reasons = (file["successes"][name][:] for name in ("trial_id", "removal"))
+        removed = ids[reasons == Removal.OWN]
+    own = np.isin(shards.successes["trial_id"], removed)
+    return decide(manifest, shards, own)
+
+
+def _of_another_state(
+    file: CheckedFile, manifest: Manifest, again: Decisions | None
+) -> Iterator[Violation]:
+    """A file is of the manifest's configuration and of the shards that are there, with their rows.
+
+    Args:
+        file: The file.
+        manifest: Of the dataset.
+        again: The dataset assembled again; None if its shards are not all known.
+    """
+    due = file_attributes(manifest, "" if again is None else again.shards.seals, file.camera)
+    for key in ORIGIN:
+        if key not in due or key not in file.attributes or (key == "shards" and again is None):
+            continue
+        if _rows_depend_on(key, str(file.attributes[key])) != _rows_depend_on(key, due[key]):
+            of = "the shards that are there" if key == "shards" else FILE_NAME
+            got = "another" if key in ("config", "signature") else file.attributes[key]
+            got = f"{got}; run `drakegrasp assemble` again"
+            yield of_file(file.name, f"attribute {key} must be that of {of}", got)
+            return  # others follow from it
+
+    # The number of rows of each group.
+    if again is None:
+        return
+    counts = {split: len(ids) for split, ids in again.ids.items()}
+    if not file.camera:
+        counts = {"trials": again.shards.count, "successes": len(again.removal)}
+        counts["objects"] = len(manifest.objects)
+    for group, number in counts.items():
+        count = file.counts.get(group, number)
+        if count != number:
+            yield of_file(file.name, f"number of rows must be {number}", count, f"/{group}")
+
+
+def _objects_and_successes(
+    trials: CheckedFile, manifest: Manifest, again: Decisions | None, findings: Findings
+) -> None:
+    """Compare /objects with the manifest, and /successes with what is decided again."""
+    tables = {"objects": (object_columns(manifest), FILE_NAME)}
+    if again is not None:
+        tables["successes"] = again.columns(), "the shards, the filters and the split"
+    with trials.opened() as file:
+        for group, (columns, of) in tables.items():
+            count = len(next(iter(columns.values())))
+            if trials.counts.get(group) == count:  # else a finding already, or no group
+                for batch in trials.batches(file, group, np.arange(count), count or 1, findings):
+                    findings.add(batch.follow(columns, of))
+
+
+# Rows
+
+
+def _trials_tasks(
+    files: Mapping[str, CheckedFile],
+    dataset: Dataset | None = None,
+    again: Decisions | None = None,
+    compared: frozenset[str] = frozenset(),
+) -> Iterator[Task]:
+    """Yield the tasks that judge all attempts, and compare what follows from the shards.
+
+    Args:
+        files: The files, by camera; the trials under "", if they can be read.
+        dataset: The dataset around them, if there is one.
+        again: The dataset assembled again, if its shards are sound.
+        compared: Cameras of the files that are compared; "" for the trials.
+    """
+    # Trials need their objects: a broken layout is a finding already.
+    trials = files.get("")
+    sound = trials is not None and {"objects", "trials"} <= set(trials.counts)
+    trials = trials if sound else None
+    count = 0 if trials is None else trials.counts["trials"]
+
+    # What follows from the shards comes along, range by range.
+    packs: Iterator[PackTask] = iter(())
+    if dataset is not None and again is not None and compared:
+        certified = dataset.manifest.config.certified
+        packs = pack_tasks(dataset.out, again, certified=certified)
+    data = {camera: files[camera] for camera in CAMERAS if camera in compared}
+    for start, pack in zip_longest(range(0, count, TASK_ROWS), packs):
+        first = pack.start if start is None else start
+        rows = np.arange(first, max(first, min(first + TASK_ROWS, count)))
+        yield len(rows), partial(_judge, trials, rows, dataset, pack, "" in compared, data)
+
+
+def _judge(
+    trials: CheckedFile | None,
+    rows: AnyArray,
+    dataset: Dataset | None,
+    pack: PackTask | None,
+    compared: bool,
+    data: Mapping[str, CheckedFile],
+) -> Findings:
+    """Apply every rule to a range of attempts, and compare the samples among them.
+
+    Args:
+        trials: trials.hdf5; None if it cannot be read.
+        rows: Of /trials, (n,).
+        dataset: The dataset around the files, if there is one.
+        pack: Derives the rows again; None where they cannot be compared.
+        compared: Whether the attempts are compared, too.
+        data: The data files that are compared, by camera.
+    """
+    findings = Findings()
+    columns, records, images = ({}, {}, {}) if pack is None else read_rows(pack)
+    if trials is not None and len(rows):
+        stages = trial_rules(trials, dataset)
+        with trials.opened() as file:
+            for batch in trials.batches(file, "trials", rows, TRIAL_ROWS, findings):
+                if compared and pack is not None:
+                    own = {name: v[batch.rows - rows[0]] for name, v in columns.items()}
+                    follow = partial(Batch.follow, columns=own, what="its shard")
+                    batch = batch.judge(findings, [follow])
+                batch.judge(findings, *stages)
+
+    if dataset is not None and pack is not None:
+        texts = sample_texts(dataset.manifest)
+        for (split, camera), due in records.items():
+            if camera in data and split in data[camera].counts:
+                columns = {name: due[name] for name in due.dtype.names or () if name != "object"}
+                columns |= {n: np.array(t, dtype=object)[due["object"]] for n, t in texts.items()}
+                first, stored = pack.firsts[split], images[split, camera]
+                _compare_samples(data[camera], split, first, columns, stored, findings)
+    return findings
+
+
+def _compare_samples(
+    data: CheckedFile,
+    split: str,
+    first: int,
+    due: Mapping[str, AnyArray],
+    images: Mapping[str, Sequence[tuple[bytes, int]]],
+    findings: Findings,
+) -> None:
+    """Compare some samples of a data file with those that are derived again.
+
+    Args:
+        data: The file.
+        split: Name of the split.
+        first: Row of the first sample.
+        due: Their columns but for images.
+        images: See `assembly.pack.Images`.
+        findings: Takes the violations.
+    """
+    rows = np.arange(first, first + len(due["trial_id"]))
+    with data.opened() as file:
+        for batch in data.batches(file, split, rows, max(len(rows), 1), findings, list(due)):
+            # A sample of another trial differs in all else.
+            names = ["trial_id"], [name for name in due if name != "trial_id"]
+            for own, of in zip(names, ("shards and manifest", "its trial"), strict=True):
+                columns = {name: due[name][batch.rows - first] for name in own}
+                batch = batch.judge(findings, [partial(Batch.follow, columns=columns, what=of)])
+            for name, stored in images.items():
+                differs = partial(_differs, file[split][name])
+                bad = [differs(row, *stored[row - first]) for row in batch.rows.tolist()]
+                what = f"{name} must be what the shard holds"
+                other = np.array(bad, dtype=bool)
+                findings.add(batch.broken(what, other, "another image"))
+                batch = batch.where(~other)
+
+
+def _differs(dataset: h5py.Dataset, row: int, chunk: bytes, skipped: int) -> bool:
+    """Return whether an image is another than a chunk of a shard; mostly the bytes are the same."""
+    try:
+        stored = dataset.id.read_direct_chunk((row, *(0,) * (dataset.ndim - 1)))
+    except RuntimeError:  # packed otherwise, or not there
+        stored = None
+    if stored == (skipped, chunk):
+        return False
+    try:
+        return not np.array_equal(dataset[row : row + 1], unpacked_chunk(chunk, skipped, dataset))
+    except OSError:
+        return False  # it cannot be read, as the rules of samples find
+
+
+def _rows_depend_on(key: str, text: str) -> str:
+    """Return an attribute without what no row depends on: the section `verify` of a configuration.
+
+    It acts on predicted grasps, and may be another one now.
+    """
+    if key != "config":
+        return text
+    try:
+        config = json.loads(text)
+        config.pop("verify", None)
+    except (AttributeError, ValueError):
+        return text
+    return json.dumps(config, sort_keys=True)

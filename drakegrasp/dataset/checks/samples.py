@@ -2,7 +2,7 @@
 
 In: a data file and, if there is one, the dataset around it. Out: tasks that judge its samples, each
 by itself and against its trial and the mesh; the rules of its splits. That a sample is what its
-shard gives is for `assembled`.
+shard gives is for `run`.
 """
 
 from __future__ import annotations

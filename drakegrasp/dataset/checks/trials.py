@@ -1,7 +1,7 @@
 """What is checked of trials.hdf5: each attempt by itself, and what is derived of it again.
 
 In: the file, with the dataset around it if there is one. Out: tasks; each judges a range of the
-attempts. What the shards give is compared first (`assembled`). All else a file alone shows: verdict
+attempts. What the shards give is compared first (`run`). All else a file alone shows: verdict
 and motion follow from contacts and poses, by the functions that a trial decides by; and with the
 dataset conditions, resting pose and chance, by those that a build draws and computes by.
 """

@@ -28,7 +28,7 @@ from helpers.datasets import (
 )
 
 from drakegrasp.dataset.assembly import pack
-from drakegrasp.dataset.checks import assembled, rows, samples
+from drakegrasp.dataset.checks import rows, run, samples
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.paths import model_path, plan_path
@@ -81,7 +81,7 @@ def test_two_processes_find_what_one_does(out: Path, monkeypatch: pytest.MonkeyP
     assert kinds.count((TRIALS, "/trials")) == 22  # 20 candidates, the number of more, an object
     assert {(OTO, "/test"), (OTM, "/test"), ("objects/1_box_a.npz", "")} <= set(kinds)
 
-    for module in (assembled, pack):
+    for module in (run, pack):
         monkeypatch.setattr(module, "TASK_ROWS", 7)
     monkeypatch.setattr(samples, "TASK_ROWS", 1)
     small = check_dataset(out)
@@ -178,7 +178,7 @@ def test_object_file_that_cannot_be_read_is_found(
     def fail(out: Path, name: str, expected: str) -> None:
         raise OSError(5, "Input/output error")
 
-    monkeypatch.setattr(assembled, "refuse_changed_model", fail)
+    monkeypatch.setattr(run, "refuse_changed_model", fail)
     what = "an object's file must be as it was written"
     names = [entry.name for entry in read_manifest(out).objects]
     must_find(out, *((f"objects/{name}.npz", "", None, what) for name in names))
