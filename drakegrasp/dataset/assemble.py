@@ -17,13 +17,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from drakegrasp.dataset.assembly.decisions import (
-    decide,
-    file_attributes,
-    keys_of,
-    number_rows,
-    object_columns,
-)
 from drakegrasp.dataset.assembly.pack import (
     PackTask,
     pack_rows,
@@ -31,7 +24,16 @@ from drakegrasp.dataset.assembly.pack import (
     sample_texts,
     unpack_rows,
 )
-from drakegrasp.dataset.assembly.survey import Survey, survey_object, survey_tasks
+from drakegrasp.dataset.assembly.survey import (
+    Survey,
+    decide,
+    file_attributes,
+    keys_of,
+    number_rows,
+    object_columns,
+    survey_object,
+    survey_tasks,
+)
 from drakegrasp.dataset.card import card_files, content_of
 from drakegrasp.dataset.hdf5 import AnyArray, create_field, write_field
 from drakegrasp.dataset.lock import build_lock

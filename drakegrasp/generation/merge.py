@@ -17,8 +17,7 @@ from typing import TypeAlias
 
 from drakegrasp.config import CarriedHand, Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked
-from drakegrasp.dataset.assembly.decisions import own_filters
-from drakegrasp.dataset.assembly.survey import headers_by_object
+from drakegrasp.dataset.assembly.survey import headers_by_object, own_filters
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,

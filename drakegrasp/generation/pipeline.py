@@ -17,8 +17,8 @@ from pathlib import Path
 
 from drakegrasp.config import Config, continued
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
-from drakegrasp.dataset.assembly.decisions import own_filters
 from drakegrasp.dataset.assembly.split import rank_in_split
+from drakegrasp.dataset.assembly.survey import own_filters
 from drakegrasp.dataset.card import write_card
 from drakegrasp.dataset.lock import BuildLog, Holder, build_lock
 from drakegrasp.dataset.manifest import (

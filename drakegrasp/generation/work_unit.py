@@ -21,8 +21,13 @@ from pathlib import Path
 import numpy as np
 
 from drakegrasp.config import Config, FilterConfig
-from drakegrasp.dataset.assembly.decisions import count_samples, judge_successes
-from drakegrasp.dataset.assembly.survey import SurveyTask, successes_of, survey_tasks
+from drakegrasp.dataset.assembly.survey import (
+    SurveyTask,
+    count_samples,
+    judge_successes,
+    successes_of,
+    survey_tasks,
+)
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import shards_folder
 from drakegrasp.dataset.schema import HOLD_FIELDS, LOOK_FIELDS

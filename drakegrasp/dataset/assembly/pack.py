@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.assembly.decisions import Decisions, ShardSlice
+from drakegrasp.dataset.assembly.survey import Decisions, ShardSlice
 from drakegrasp.dataset.hdf5 import (
     COLUMN_CHUNK,
     AnyArray,

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config, parse_stored
-from drakegrasp.dataset.assembly.decisions import lens_attributes
+from drakegrasp.dataset.assembly.survey import lens_attributes
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.opening import (

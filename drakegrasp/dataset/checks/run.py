@@ -23,13 +23,6 @@ import h5py
 import numpy as np
 
 from drakegrasp.config import CarriedHand
-from drakegrasp.dataset.assembly.decisions import (
-    Decisions,
-    decide,
-    file_attributes,
-    number_rows,
-    object_columns,
-)
 from drakegrasp.dataset.assembly.pack import (
     TASK_ROWS,
     PackTask,
@@ -37,7 +30,17 @@ from drakegrasp.dataset.assembly.pack import (
     read_rows,
     sample_texts,
 )
-from drakegrasp.dataset.assembly.survey import Survey, SurveyTask, survey_object, survey_tasks
+from drakegrasp.dataset.assembly.survey import (
+    Decisions,
+    Survey,
+    SurveyTask,
+    decide,
+    file_attributes,
+    number_rows,
+    object_columns,
+    survey_object,
+    survey_tasks,
+)
 from drakegrasp.dataset.card import card_counts
 from drakegrasp.dataset.checks import scenes
 from drakegrasp.dataset.checks.rows import (
