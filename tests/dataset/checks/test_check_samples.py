@@ -111,6 +111,7 @@ SAMPLE_CASES: Mapping[str, tuple[str, str, Edit, str]] = {
         set_at(3, 0, 0, to=0.2),
         "points beside the mask must be on the table",
     ),
+    "slip back": (OTM, GRASP + "slip_released", lambda s: -s, GRASP + "slip_released must be 0.."),
 }
 
 
