@@ -79,7 +79,7 @@ def score(
             because the headline is of the first wrist pose.
         protocol: The rule of a verdict, by name or `FILE.py:NAME`. All but "lift" try the first
             wrist pose of a prediction in MuJoCo, on this machine.
-        out: Folder that keeps verdicts, so that the same call goes on, and gets the card.
+        out: Folder that keeps verdicts, so that the same call continues, and gets the card.
         again: What the card says about how to make it again.
         client: A Dask client whose workers do the work, e.g. of `connect`.
         show: Whether to show progress on standard error.

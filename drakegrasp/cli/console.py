@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 _UTF8, _STREAMS = "PYTHONUTF8", "PYTHONIOENCODING"
 #: A signal that comes while a module is imported is sent again after this time [s].
 AGAIN_SECONDS = 0.05
-#: An option that is not known is told like another if its name is [ratio of `difflib`].
+#: How much a known option must be like an unknown one to be proposed [ratio of `difflib`].
 ALIKE = 0.75
 #: Commands that go on where they were stopped.
 RESUMABLE = ("build", "score")
@@ -134,7 +134,7 @@ def one_line_errors(resumable: Callable[[], bool] = lambda: False) -> Iterator[N
         raise
     except click.UsageError as error:
         if isinstance(error, click.NoSuchOption):
-            # Click compares the dashes, too: any two short names are alike then.
+            # Click compares the dashes as well: any two short names are alike then.
             names = {each.lstrip("-"): each for each in error.possibilities or ()}
             near = get_close_matches(error.option_name.lstrip("-"), names, cutoff=ALIKE)
             error = click.NoSuchOption(error.option_name, possibilities=[names[n] for n in near])
@@ -151,7 +151,7 @@ def one_line_errors(resumable: Callable[[], bool] = lambda: False) -> Iterator[N
     except MemoryError as error:
         _end(f"error: not enough memory on this machine ({first_line(error)})", 1)
     except KeyboardInterrupt as stop:
-        line = "stopped" + "; the same command goes on from here" * resumable()
+        line = "stopped" + "; the same command continues from here" * resumable()
         _end(line, 143 if isinstance(stop, _Terminated) else 130)
     finally:
         for number, handler in before.items():

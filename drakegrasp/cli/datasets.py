@@ -141,7 +141,7 @@ def assemble(
 @described
 @dataset_argument()
 def scenes(out: Path, workers: int | None, quiet: bool, overrides: tuple[str, ...] = ()) -> None:
-    """Render scenes whose cameras know no grasp, to train on.
+    """Render scenes to train on, whose cameras do not depend on a grasp.
 
     The command writes OUT/scenes.hdf5: each object of OUT in each resting pose, seen by sixteen
     cameras (five fixed ones to test), with all hands that closed on it.
@@ -186,8 +186,8 @@ def merge(
 ) -> None:
     """Make one dataset of several that were built apart.
 
-    Their objects or their seeds may differ, and nothing else but what --set says for all. INTO
-    must be new or empty, and appears when it is complete; OUTS stay as they are.
+    Only their objects, their seeds, and what --set sets for all of them may differ. INTO must be
+    new or empty, and appears when it is complete; OUTS do not change.
 
     Options:
         ASSEMBLED, --workers
@@ -223,8 +223,8 @@ def stats(out: Path, as_json: bool) -> None:
 def check(path: Path, workers: int | None, as_json: bool) -> None:
     """Check every invariant of a dataset.
 
-    OUT is a dataset's directory; FILE is one of its three main files. Exit code 1 if an
-    invariant is broken.
+    OUT is a dataset's directory; FILE is one of its HDF5 files. Exit code 1 if an invariant is
+    broken.
     """
     from drakegrasp.dataset.checks.run import check_dataset
 

@@ -37,8 +37,8 @@ def audit(
 
     Options:
         --units, --manifest
-        --hand HAND: Hand with whose opening and stand-offs sizes are compared (default: barrett).
-        --json FILE (json_file): Write all findings as JSON too.
+        --hand HAND: Hand with whose opening and stand-offs sizes are compared. [default: barrett]
+        --json FILE (json_file): Write all findings as JSON.
         --sheet FILE: Write a picture of every object with its status (.png).
     """
     from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console, memory_line
@@ -118,9 +118,9 @@ def morph(
 ) -> None:
     """Make objects of other proportions from meshes.
 
-    Each mesh of MESH_DIR is widened, bent in and stretched along an axis at random. The morphs
-    (.obj, metres, +z up) stand on the table as the mesh does, and an objects.yaml beside them
-    keeps their class. The same seed gives the same files.
+    Each mesh of MESH_DIR is widened, narrowed and stretched along a random axis. The morphs (.obj,
+    metres, +z up) stand on the table as the mesh does, and an objects.yaml in DIR keeps their
+    classes. The same seed gives the same files.
 
     Options:
         --per-mesh N: Morphs of each mesh.

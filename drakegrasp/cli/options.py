@@ -5,7 +5,7 @@ In: what click parsed. Out: a `BuildRequest`, with the configuration resolved.
 A command says its options in the section `Options` of its docstring, in the order of its help:
 
     --port N: Port on this machine; 0 takes any that is free.
-    --json FILE (json_file): Write all findings as JSON, too.
+    --json FILE (json_file): Write all findings as JSON as well.
     --units, --manifest
 
 The first has a parameter `port`, whose annotation and default say the rest; the second one of
@@ -125,7 +125,7 @@ def described(function: F, request: type | None = None) -> F:
 
     Args:
         function: The command.
-        request: Dataclass whose fields are parameters, too, of those that it does not have.
+        request: Dataclass whose fields are added to its parameters.
     """
     text, _, section = inspect.cleandoc(function.__doc__ or "").partition(_SECTION)
     function.__doc__ = text
@@ -226,8 +226,8 @@ def _shared(
         --per-class N: Built-in objects of each class. [default: 2]
         --objects-seed S: Seed of the sizes of the built-in objects. [default: 0]
         --units m|cm|mm: Unit of length of the meshes.
-        --manifest FILE: YAML file with units and classes by mesh. [default: objects.yaml beside the
-            meshes]
+        --manifest FILE: YAML file with units and classes by mesh. [default: objects.yaml in the
+            directory of the meshes]
         --postures FILE|DIR: Try these postures (wrist and joints) instead of drawn palm poses, on
             the objects that they name: .npz, .hdf5, .csv, .parquet, DexGraspBench .npy or
             isaac_grasp .yaml.
@@ -239,8 +239,8 @@ def _shared(
             times.
         --candidates N: Palm poses per object. [default: 10000]
         --max-grasps N: Stop an object after N successes. [default: no limit]
-        --samples N: Stop when there are N samples, which the objects share in turns; a larger N
-            goes on from there. [default: no limit]
+        --samples N: Stop when all objects together have N samples; a larger N continues from
+            there. [default: no limit]
         --samples-per-object N: Stop an object when it has N samples. [default: no limit]
         --certify K: Repeat each sample K times, disturbed, and store how many hold. [default: 0]
         --seed S: Seed of all random draws. [default: 0]
@@ -256,7 +256,7 @@ def _shared(
         --times FILE: Estimate from these times, which measure_stages.py of pipelines/measurements
             printed. [default: OUT/log.jsonl, else times measured on other meshes]
         --quiet: Show no progress.
-        --json (as_json): Print one document of JSON, and nothing else.
+        --json (as_json): Print one document of JSON instead of text.
     """
 
 

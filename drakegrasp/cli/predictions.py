@@ -53,23 +53,23 @@ def verify(
     The command says whether each grasp holds its object, and if not, why.
 
     GRASPS is a .npy array with a row per grasp, a .csv file with a line per grasp, or an HDF5
-    file with an array `grasps` at its root or in a group. An array `rows` beside it names the
-    rows of the dataset. A grasp has 6 numbers per finger (18 for the Barrett Hand): the contact
+    file with an array `grasps` at its root or in a group. An array `rows` in the same place names
+    the rows of the dataset. A grasp has 6 numbers per finger (18 for the Barrett Hand): the contact
     points in metres, then the unit normals out of the object, in the order of the hand's
     fingers.
 
-    GRASPS may also be a file or a folder of postures as `build --postures` reads it, on --object
-    or on the objects of --dataset that it names, or that its `row` says.
+    GRASPS may also be a file or a folder of postures, as for `build --postures`. They are tried on
+    --object, or on the objects of --dataset that the file names or gives by `row`.
 
-    With another protocol than lift, the first wrist pose that fits contacts is tried. There GRASPS
-    may be a .npy file of DexGraspBench or a folder of such files, and --hand an MJCF, whose world
-    is the hand's root.
+    With a protocol other than lift, only the first wrist pose that fits the contacts is tried.
+    GRASPS may then be a .npy file of DexGraspBench or a folder of such files, and --hand an MJCF
+    whose world is the hand's root.
 
     If GRASPS is a data file of a dataset, and neither --object nor --dataset is given, the
     command tries the grasps of that dataset.
 
     One line of JSON per grasp goes to standard output or NAME.jsonl, a table of the outcomes to
-    standard error. A row that is no grasp has the outcome `invalid`. Exit code: 0 if every grasp
+    standard error. A row that is not a grasp has the outcome `invalid`. Exit code: 0 if every grasp
     has a verdict, whatever it is; 2 for input that cannot be used.
 
     Options:
@@ -85,11 +85,11 @@ def verify(
         --camera FILE: With --object and --frame camera: .npy file with the camera's pose in the
             table-top frame X_TC, as (4, 4), or per grasp as (n, 4, 4) or (n, 12).
         --method: hand: close a simulated hand on the contacts and lift. forces: ask whether forces
-            at the contacts that they select on the surface can lift the object.
+            at the points of the surface that the contacts select can lift the object.
         --snap-points: Move the points, not the normals, to the surface of the object first.
         --protocol NAME|FILE.py:NAME: The rule of the verdict: {protocols}, or a class of your own.
             All but lift run in MuJoCo.
-        --simulator: Where the protocol must run. [default: where it is at home]
+        --simulator: Refuse a protocol that runs in the other simulator. [default: either]
         --assets DIR: With files of DexGraspBench: the folder in which they name their objects.
             [default: .]
         --hand NAME|YAML|XML: The hand. [default: that of the configuration]
@@ -99,7 +99,7 @@ def verify(
         --out NAME: Write NAME.jsonl and NAME.h5 instead of printing lines of JSON.
         CONNECTION
         --quiet: Show neither progress nor the table.
-        --json (as_json): Print the lines of JSON also with --out, and nothing else.
+        --json (as_json): Print the lines of JSON also with --out, and no progress or table.
     """
     from drakegrasp.protocols.protocol import find_protocol
 
@@ -294,22 +294,23 @@ def score(
     quiet: bool = False,
     **options: Any,
 ) -> None:
-    """Score predicted grasps beside reference rows, and write a card.
+    """Score predicted grasps against reference rows, and write a card.
 
-    Each of PREDICTIONS is a .npy, HDF5 or Parquet file: (n, 6k) numbers, one grasp per row of the
-    split, or (n, m, 6k), m per row, in the camera's frame; or a file of postures with the `row`
-    that each is for; or a file or a folder of samples that were exported. Several files are of one
-    method that was trained several times. Without any, the reference rows are scored alone.
+    Each of PREDICTIONS is a .npy, HDF5 or Parquet file of (n, 6k) numbers, one grasp per row of the
+    split, or (n, m, 6k), m per row, in the camera's frame. It may also be a file of postures with
+    the `row` that each is for, or a file or folder of exported samples. Several files are taken as
+    one method that was trained several times. Without PREDICTIONS the reference rows are scored
+    alone.
 
-    DIR gets card.json, card.md, card.png, and the verdicts, so that an interrupted score goes on.
+    DIR gets card.json, card.md, card.png, and the verdicts, so that an interrupted score continues.
 
     Options:
         --dataset FILE: The data file OUT/grasping_oto.hdf5 or _otm, or OUT/scenes.hdf5, whose rows
             or views the predictions are for.
         --split: Rows of the dataset.
-        --against FILE: Predictions of another method for the same rows: the card says by how much
-            the headline is above its. May be given several times, for a method that was trained
-            several times.
+        --against FILE: Predictions of another method for the same rows: the card has the difference
+            of the headlines. May be given several times, for a method that was trained several
+            times.
         --train FILE: Data file whose training rows give the reference rows. [default: --dataset]
         --reference NAME (references): Score these reference rows only; may be given several times:
             own, nearest image, constant, random, top-down, palm normals, surface. [default: all]
@@ -317,7 +318,7 @@ def score(
         --set
         --protocol NAME|FILE.py:NAME: The rule of a verdict, see `drakegrasp verify`. All but lift
             try the first wrist pose of a prediction in MuJoCo.
-        --out DIR: Folder of the card and of the verdicts; the same command goes on from there.
+        --out DIR: Folder of the card and of the verdicts; the same command continues from there.
         --json (as_json): Print the card as JSON.
         CONNECTION
         --quiet: Show neither progress nor the table.

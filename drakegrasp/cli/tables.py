@@ -244,7 +244,7 @@ def unfinished_line(unfinished: Unfinished) -> str:
     )
 
 
-#: Columns of the audit: head, cell, and whether a narrow terminal has it, too.
+#: Columns of the audit: head, cell, and whether a narrow terminal has it as well.
 _AUDIT: tuple[tuple[str, Callable[[AuditRow], str], bool], ...] = (
     ("faces", lambda row: _number(row.faces, ","), True),
     ("size [mm]", lambda row: "x".join(f"{1e3 * e:.0f}" for e in row.extents or ()) or "-", True),

@@ -31,11 +31,11 @@ def inspect_(
 
     The page shows every attempt in OUT with images, contacts, forces and a 3D view, the most
     suspicious first. Rejections are written to OUT/reject.json at once; assemble --reject reads
-    that file. The page can be reached from this machine only, and while a build runs, too. Ctrl-C
-    ends it.
+    that file. It also works while a build runs. The page can be reached from this machine
+    only. Ctrl-C ends it.
 
     Options:
-        --predictions RESULTS (results): Show predictions beside the rows that they are for: the
+        --predictions RESULTS (results): Show predictions with the rows that they are for: the
             results that verify --dataset FILE --out NAME wrote.
         --port N: Port on this machine; 0 takes any that is free.
         --static DIR (folder): Write the pages to DIR as files that open without a server, and end.

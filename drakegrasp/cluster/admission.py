@@ -49,7 +49,7 @@ class Admission(WorkerPlugin):  # type: ignore[misc]
             fault = _image_fault()
         if fault is not None:
             worker.log_event(_TOPIC, f"not used: worker {worker.address}: {fault}")
-            # Its nanny is closed, too: a new process would not be fitter.
+            # Its nanny is closed as well: a new process would not be fitter.
             worker.loop.add_callback(worker.close, nanny=True, reason="drakegrasp-unfit")
 
 

@@ -68,7 +68,7 @@ def security_of(files: tuple[Path, Path, Path]) -> Security:
 def private_directory(out: Path) -> Iterator[Path]:
     """Yield a directory in `out` that only this user can enter, and remove it again.
 
-    Directories of clients that were killed are removed, too: the caller holds the lock of `out`.
+    Directories of clients that were killed are removed as well: the caller holds the lock of `out`.
 
     Raises:
         MachineError: If it cannot be made.

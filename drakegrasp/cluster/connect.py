@@ -41,7 +41,7 @@ CONNECT_SECONDS, WRITE_SECONDS = 10, 2
 #: Module that a nanny loads before it starts its worker: it chooses the worker's allocator.
 NANNY_PRELOAD = "drakegrasp.runtime.allocator"
 #: Tasks that the scheduler gives to a worker, per thread: a task that waits behind another would
-#: be blamed, too, when that one kills the worker.
+#: be blamed as well, when that one kills the worker.
 SATURATION = 1.0
 #: Time without a sign of life after which the scheduler gives a worker up [s]: longer than the
 #: limits of every step (see `runtime.journal`). A step that holds the interpreter gives none, and
@@ -156,7 +156,7 @@ def connect(
         MachineError: If there is no scheduler at the address.
     """
     # Python imports a script into each process that it starts: a call that is not under
-    # `if __name__ == "__main__"` would begin there, too.
+    # `if __name__ == "__main__"` would begin there as well.
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         sys.exit(1)
     elsewhere = bool(scheduler or scheduler_file)

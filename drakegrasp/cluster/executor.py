@@ -53,7 +53,7 @@ SAY_SECONDS = 60.0
 RESUBMISSIONS = 100
 #: How often a task may render a blank image.
 BLANKS = 3
-_GOES_ON = "the same command goes on from here"
+_CONTINUES = "the same command continues from here"
 
 
 @dataclass(eq=False)
@@ -254,14 +254,14 @@ class DaskExecutor:
             self._empty_since, self._said = now, False
         seconds = now - self._empty_since
         if seconds > LOST_SECONDS and not _may_come(self._client.cluster):
-            raise MachineError(f"there has been no worker for {LOST_SECONDS:g} s; {_GOES_ON}")
+            raise MachineError(f"there has been no worker for {LOST_SECONDS:g} s; {_CONTINUES}")
         if seconds > SAY_SECONDS and not self._said:
             self._said = True
             self.pool.on_none()
 
 
 def _scheduler_lost(reason: str) -> MachineError:
-    return MachineError(f"the scheduler was lost: {reason}; {_GOES_ON}")
+    return MachineError(f"the scheduler was lost: {reason}; {_CONTINUES}")
 
 
 def _may_come(cluster: Cluster | None) -> bool:

@@ -128,7 +128,7 @@ class Counts:
         self._report(self._done, self._expected(), found=self._reused_attempts, **figures)
 
     def _expected(self) -> int:
-        """Return how many attempts the build will make, if it goes on to find as much as it did.
+        """Return how many attempts the build will make, if it continues to find as much as it did.
 
         It makes all of them, or ends when it has found what is wanted.
         """

@@ -130,7 +130,7 @@ def build(
             can be simulated.
         GraspError: If no row of the postures is one of these objects.
         HandError: If the hand cannot be used.
-        DiskFullError: If there is no room; the same call goes on when there is.
+        DiskFullError: If there is no room; the same call continues when there is.
         MachineError: If the workers cannot do the work.
     """
     refuse_unusable(config)

@@ -92,7 +92,7 @@ def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
             if journal.in_crash_loop:
                 raise MachineError(
                     f"{name}: the worker died {GIVE_UP_DEATHS} times in a row while preparing it; "
-                    "is there enough memory? The same command goes on from here"
+                    "is there enough memory? The same command continues from here"
                 )
             with journal.step(PREPARE, PREPARE_SECONDS):
                 inject_fault(name)

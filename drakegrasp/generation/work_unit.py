@@ -178,7 +178,7 @@ class _Experiment:
             raise MachineError(
                 f"{header.object_name}, palm poses {header.start} to {header.stop - 1}: the worker "
                 f"died {GIVE_UP_DEATHS} times in a row in this work unit; is there enough memory? "
-                "The same command goes on from here"
+                "The same command continues from here"
             )
         with self._stage("build"):
             self._setup = self._build_setup()
@@ -427,7 +427,7 @@ def find_tasks(out: Path, manifest: Manifest) -> Iterator[SurveyTask]:
 def find_units(config: Config, task: SurveyTask) -> tuple[list[UnitSummary], list[tuple[str, str]]]:
     """Look at the shards of an object of a dataset, up to its last wanted grasp.
 
-    The folder is listed once and the seals of its shards are verified, so a build that goes on
+    The folder is listed once and the seals of its shards are verified, so a build that continues
     looks at them with all its workers.
 
     Returns:

@@ -72,8 +72,8 @@ def load_config(
 def override_config(config: Config, overrides: Sequence[str], **values: Any) -> Config:
     """Return a configuration with overrides applied, see `load_config`.
 
-    Another hand brings its own stand-offs and spreads, unless they are overridden, too. That of a
-    dataset stays what the dataset carries, unless it is named.
+    Another hand brings its own stand-offs and spreads, unless they are overridden. The hand of a
+    dataset is the one that the dataset carries, unless another is named.
 
     Raises:
         ConfigError, HandError: See `load_config`.
@@ -155,7 +155,7 @@ def _completed(
         return parse_config(tree)  # which refuses it
     missing = [key for key in HAND_KEYS if candidates.get(key) is None]
     if missing:
-        # A hand that is no text is refused by `parse_config`, too.
+        # A hand that is no text is refused by `parse_config` as well.
         source = source or (hand if isinstance(hand, str) else DEFAULT_HAND)
         described = read_hand_file(hand_file(source))
         filled = {key: getattr(described, key) for key in missing}

@@ -203,7 +203,7 @@ def _shape(
 ) -> tuple[mujoco.mjtGeom, list[float], str]:
     """Return MuJoCo's kind, size and mesh of a shape of the hand; meshes are added to the model.
 
-    MuJoCo has these primitives, too; the corners of `hand.shapes` only approximate them.
+    MuJoCo has these primitives as well; the corners of `hand.shapes` only approximate them.
     """
     shape, kinds = inspector.GetShape(geometry), mujoco.mjtGeom
     if isinstance(shape, Box):

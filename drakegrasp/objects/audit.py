@@ -144,7 +144,7 @@ def audit(
         manifest: Their YAML file, if it is not beside them.
         opening: Largest distance of the hand's fingertips [m], see `hand.kinematics.opening`;
             objects that are wider everywhere get a warning.
-        flat: See `hand.kinematics.flat_limits` [m]; objects that stand lower get one, too.
+        flat: See `hand.kinematics.flat_limits` [m]; objects that stand lower get one as well.
         progress: Is told of each mesh.
 
     Raises:

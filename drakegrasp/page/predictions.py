@@ -56,7 +56,7 @@ NEEDED = ("object", "outcome", "p_OQ", "nhat_Q_O")
 _MAY_LACK = tuple(replace(field, optional=field.name not in NEEDED) for field in FIELDS.values())
 #: Numbers of a verdict as people read them; of several contacts the largest.
 NUMBERS = {field.name: field.shown for field in FIELDS.values() if field.shown is not None}
-#: Those that the dataset's own trial has, too.
+#: Those that the dataset's own trial has as well.
 _BOTH = {field.name for field in TRIAL_FIELDS if field.shown == NUMBERS.get(field.name, 0)}
 #: Numbers of a prediction that can be filtered and sorted by.
 QUANTITIES = {

@@ -156,7 +156,7 @@ class Scenes(Gallery):
             )
             visible, near = grasps["visible"][row], self.data.near
             dots = dots_of(K, p_CQ, nhat, near, lambda finger, u, v: not visible[finger])
-            # A dot with a line, too, in the place of a contact.
+            # A dot with a line as well, in the place of a contact.
             along = PALM / ARROW * X_CG[None, :3, 2]
             palm = dots_of(K, X_CG[None, :3, 3], along, near, lambda finger, u, v: False)
         return {

@@ -335,8 +335,8 @@ def draw_object(axes: Axes, triangles: Array) -> None:
     front = np.flatnonzero(normals[:, 2] > 0.0)
     front = front[np.argsort(triangles[front, :, 2].mean(axis=1), kind="stable")]
 
-    # Thousands of triangles are pixels in an SVG, too: else no program could open it. Edges close
-    # the seams.
+    # Thousands of triangles are drawn as pixels also in an SVG: else no program could open it.
+    # Edges close the seams.
     shade = 0.55 + 0.45 * np.clip(normals[front] @ LIGHT, 0.0, 1.0)
     colours = np.outer(shade, OBJECT_COLOUR)
     axes.add_collection(

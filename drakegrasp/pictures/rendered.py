@@ -380,7 +380,7 @@ def phases_figure(out: Path, trial_id: int) -> Figure:
         FIELD: frustum(X_WC, intrinsics(camera), camera.size, FIELD_DEPTH),
     }
 
-    # What each picture says; that of the lift shows the table's middle, too.
+    # What each picture says; that of the lift shows the table's middle as well.
     force, slip = float(norm(trial.row["closed_f_Q_O"]).max()), 1e3 * float(trial.row["slip"])
     turn, table = np.rad2deg(float(trial.row["turn"])), X_WT[None, :3, 3]
     start = f"start\npalm {1e3 * standoff:.0f} mm from the surface"

@@ -239,7 +239,7 @@ def _settings(config: Config) -> dict[str, Any]:
 def _common_objects(datasets: dict[str, Path], funnels: dict[str, Funnel]) -> list[str]:
     """Return the names of the objects that all datasets have, of the same mesh, in order.
 
-    A manifest has more objects than the files while a build goes on that adds some.
+    A manifest has more objects than the files while a build continues that adds some.
 
     Raises:
         DataError: If there is none.

@@ -79,7 +79,7 @@ def in_order(execute: Executor) -> Executor:
                     yield early.pop(due)
                     due += 1
         finally:
-            # Who closes this iterator ends the work, too.
+            # Who closes this iterator ends the work as well.
             close = getattr(results, "close", None)
             if close is not None:
                 close()

@@ -361,7 +361,7 @@ def disk_full_named(out: Path) -> Iterator[None]:
             raise
         raise DiskFullError(
             f"{out}: the disk or the quota is full ({os.strerror(_NO_ROOM[0])}); make room, and "
-            "the same command goes on from here"
+            "the same command continues from here"
         ) from None
 
 

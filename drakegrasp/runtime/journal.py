@@ -19,8 +19,8 @@ SIGKILL, does not do that.
 
 The limit of a step is computing time: a process that is suspended, or shares its core with many,
 computes little while hours pass. A step that hangs without computing (it waits for ever) meets a
-limit of wall-clock time that is longer. A long suspension passes that, too; so a step has a second
-chance.
+limit of wall-clock time that is longer. A long suspension also passes that limit, so a
+step has a second chance.
 
 The file is text: a line of JSON with the unit's identity and the deaths before, the record, and
 what faulthandler wrote.
@@ -228,7 +228,7 @@ def open_journal(path: Path, identity: Mapping[str, Any]) -> Iterator[Journal]:
     path.parent.mkdir(parents=True, exist_ok=True)
     history = _read_history(path, identity)
     if history is None:
-        # Another process runs this unit, too: both will write the same shard.
+        # Another process runs this unit as well: both will write the same shard.
         yield NO_JOURNAL
         return
 

@@ -37,8 +37,8 @@ FRAMES: tuple[str, ...] = get_args(Frame)
 COUPLED = np.deg2rad(1.0)
 #: By so much fingers are opened where a posture has no pregrasp, in the unit of a closing joint.
 OPENED = np.deg2rad(20.0)
-#: Where a posture has no squeeze, the joint that moved most from the pregrasp to the grasp goes on
-#: by so much, and the others in proportion; 1 rad as 0.1 m of a slide.
+#: Where a posture has no squeeze, the joint that moved most from the pregrasp to the grasp moves
+#: on by so much, and the others in proportion; 1 rad as 0.1 m of a slide.
 SQUEEZED = np.deg2rad(20.0)
 #: A rotation that is off by less is exact but for rounding.
 EXACT = 1e-12

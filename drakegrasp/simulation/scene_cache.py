@@ -2,7 +2,7 @@
 
 In: an object, and what to simulate or draw it with. Out: its scene or its renderer, built now or
 kept from before. They are known by a digest of what they hold, so a copy of an object shares
-them. Objects under the same physics and hand share a diagram, too, see `swap_object`. A scene that
+them. Objects under the same physics and hand also share a diagram, see `swap_object`. A scene that
 is reset gives the same bits as a new one, so earlier use changes nothing.
 """
 

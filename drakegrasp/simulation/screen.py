@@ -115,7 +115,7 @@ def extra_margin(field: DistanceField) -> float:
 
 
 def _widened(config: ScreenConfig, field: DistanceField) -> ScreenConfig:
-    """Return the margins that cover the errors of this field, too."""
+    """Return the margins that cover the errors of this field as well."""
     extra = extra_margin(field)
     names = ("start_margin", "reach_margin", "block_margin", "clearance")
     return config.model_copy(update={name: getattr(config, name) + extra for name in names})

@@ -257,7 +257,7 @@ def lift_on(
 
 
 def _failed(start: TrialRecord, error: BaseException) -> TrialRecord:
-    """Return the record of an attempt whose simulation raised; the machine's failure goes on."""
+    """Return the record of an attempt whose simulation raised; raise failures of the machine."""
     if isinstance(error, TrialTimeout):
         return replace(start, outcome=Outcome.TIMEOUT)
     if isinstance(error, MachineError | MemoryError | OSError):

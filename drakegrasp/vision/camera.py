@@ -227,7 +227,7 @@ def visible_contacts(
     little inside the object, and on a surface that is seen at a slant the depth changes by much
     from one pixel to the next. So of the four pixels around it the farthest counts, and `BEFORE` is
     allowed. The patch of a grasp that is no sample may span an edge: a centre that the camera sees
-    farther than `BESIDE` from the object is hidden, too, as no image shows it.
+    farther than `BESIDE` from the object is hidden as well, as no image shows it.
 
     Args:
         p_TQ: Contact points (..., 3) [m].

@@ -5,7 +5,7 @@
 All grasps of the first round that were lifted to a verdict are judged, each once, from one view of
 its scene: a palm pose refined about one that holds is never tested, so it cannot be a sample. It
 prints JSON: AUC with its interval over objects, Brier score, and the reliability curve, which is
-drawn, too.
+drawn as well.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ def repeat_dataset(out: Path, large: Path, grasps: int) -> int:
         target.attrs.update(source.attrs)
         source.copy("objects", target)
 
-        # The numbers of trials and palm poses go on from copy to copy; the rest stays.
+        # The numbers of trials and palm poses continue from copy to copy; the rest stays.
         poses = int(source["trials/candidate"][:].max()) + 1
         shifts = {"trial_id": count, "candidate": poses}
         group = target.create_group("trials")

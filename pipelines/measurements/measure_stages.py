@@ -89,7 +89,7 @@ def main(
     build(sources, out, config, clock, show=False)
     end = time.perf_counter()
 
-    # The wall clock counts the time of other processes, too; CPU time is the share of this one.
+    # The wall clock counts the time of other processes as well; CPU time is the share of this one.
     core = (time.process_time() - begin_cpu) / (end - begin)
     times = stage_times(clock, core, assembled=end - clock.last, out=out)
     click.echo(json.dumps(asdict(times), indent=1))

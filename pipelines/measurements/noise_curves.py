@@ -7,7 +7,7 @@
 OUT is an assembled dataset. The script moves the contact points of samples by normal noise of
 several sizes (per coordinate), and verifies them as they are and with `snap_points`; and it tilts
 normals by a given angle in a random direction. Each line of noise.jsonl is a verdict; a run that is
-stopped goes on where it was, and another run with a larger number adds to it. Prints JSON: the
+stopped continues where it was, and another run with a larger number adds to it. Prints JSON: the
 share of grasps that hold, with the first wrist pose, and its interval of 95 %.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 

@@ -55,7 +55,7 @@ def shares(cases: Array) -> dict[str, float]:
 
 
 def look(out: Path, file: h5py.File, view: int, rows: Array) -> tuple[Array, Array, Array]:
-    """Return what is told of a view's contacts, their pixels from the mask, and free lines."""
+    """Return what the file says of a view's contacts, pixels from the mask, and free lines."""
     own = rows[file["visible/view"][:][rows] == view]
     grasps = file["visible/grasp"][:][own]
     contacts = file["grasps/p_TQ"][:][grasps].astype(float).reshape(-1, 3)

@@ -310,4 +310,4 @@ def test_ctrl_c_while_workers_start_is_one_line(tmp_path: Path, seconds: float) 
     os.killpg(process.pid, signal.SIGINT)
     said, errors = process.communicate(timeout=240)
     assert (process.returncode, said) == (130, "")
-    assert errors == "stopped; the same command goes on from here\n"
+    assert errors == "stopped; the same command continues from here\n"

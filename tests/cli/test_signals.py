@@ -46,7 +46,7 @@ def test_signal_in_an_import_ends_the_command_after_it(
         [sys.executable, "-c", COMMAND, str(tmp_path)], capture_output=True, text=True, timeout=60
     )
     assert (found.returncode, found.stdout) == (code, "whole: True\n")
-    assert found.stderr == "stopped; the same command goes on from here\n"
+    assert found.stderr == "stopped; the same command continues from here\n"
 
 
 def test_signal_that_the_shell_ignores_stays_ignored(tmp_path: Path) -> None:

@@ -292,7 +292,7 @@ def test_full_disk_is_one_line_wherever_it_fills(out: Path) -> None:
         check=True,
     )
     line = f"{out}: the disk or the quota is full (No space left on device); make room, and the "
-    line += "same command goes on from here 0"
+    line += "same command continues from here 0"
     assert run.stdout.splitlines() == [line] * len(limits)
     assert not run.stderr
     assert {name: (out / name).read_bytes() for name in FILES} == before

@@ -155,7 +155,7 @@ def test_client_that_is_stopped_goes_on(meshes: Path, undisturbed: Path, tmp_pat
         process.send_signal(number)
         _, errors = process.communicate(timeout=60)
         assert process.returncode == code
-        assert errors.splitlines()[-1] == "stopped; the same command goes on from here"
+        assert errors.splitlines()[-1] == "stopped; the same command continues from here"
         assert "Traceback" not in errors
         assert not (out / "build.lock").exists()
     said, _ = finish(start_build(meshes, out, workers=2))
@@ -347,7 +347,7 @@ def test_full_disk_of_the_client_is_one_error(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("drakegrasp.dataset.manifest.write_atomic", full)
-    with pytest.raises(DiskFullError, match=r"the disk or the quota is full .* goes on from here"):
+    with pytest.raises(DiskFullError, match=r"disk or the quota is full .* continues from here"):
         build(find_meshes(meshes), tmp_path / "out", config, run_here, show=False)
     assert not (tmp_path / "out").exists()
 

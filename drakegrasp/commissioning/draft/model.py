@@ -55,7 +55,7 @@ SIZES = (0.03, 3.0)
 #: Limits of hands' turning joints are within [rad], and masses of hands [kg], with an arm if there
 #: is one; else their units are others.
 SMALLEST_TURN, LARGEST_TURN, MASSES = 0.1, 2.0 * np.pi, (0.01, 60.0)
-#: A hull that reaches farther beyond its mesh [m] is told of: own choice, half of a fingertip.
+#: A hull that reaches farther beyond its mesh [m] gets a note: own choice, half of a fingertip.
 HOLLOW = 0.01
 #: Mass [kg] and radius [m] of a link that has neither mass nor shape but moves.
 BARE_MASS, BARE_RADIUS = 1e-3, 0.016
@@ -391,7 +391,7 @@ def _weld(
         members: The bodies, with their poses (4, 4).
         impossible: What is wrong with inertias that the model gives, by the names of bodies.
     """
-    # Shapes; what only is drawn collides, too, if nothing else does.
+    # Shapes; what only is drawn collides as well, if nothing else does.
     name, notes = max((body for body, _ in members), key=lambda body: body.weight).name, []
     solids, visuals = (
         [replace(s, X_LS=X_LB @ s.X_LS) for body, X_LB in members for s in getattr(body, kind)]
