@@ -141,7 +141,7 @@ def assemble(
 @described
 @dataset_argument()
 def scenes(out: Path, workers: int | None, quiet: bool, overrides: tuple[str, ...] = ()) -> None:
-    """Render scenes to train on, whose cameras do not depend on a grasp.
+    """Render views of scenes to train on, independent of grasps.
 
     The command writes OUT/scenes.hdf5: each object of OUT in each resting pose, seen by sixteen
     cameras (five fixed ones to test), with all hands that closed on it.

@@ -31,8 +31,8 @@ from drakegrasp.frames import make_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.protocols.protocol import DexGraspBench, Lift
 from drakegrasp.shapes.catalog import BuiltinObject
+from drakegrasp.verification.placing import METHODS
 from drakegrasp.verification.prediction import FRAMES
-from drakegrasp.verification.verify import METHODS
 
 #: Commands that take any setting of a configuration.
 SETTINGS_OF = ("build", "verify", "score", "bench-set", "bench")
