@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from pathlib import Path
 
 import pytest
 import yaml
@@ -49,7 +48,7 @@ BOTTLE = next(item.name for item in draw_builtin(CONFIG.builtin) if item.name.st
 
 
 @pytest.fixture(scope="module")
-def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def part(tmp_path_factory):
     """One object of the benchmark, with the manifest that a build would write."""
     out = tmp_path_factory.mktemp("benchmark")
     write_objects(out, CONFIG, only=[BOTTLE])
@@ -57,13 +56,13 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_every_object_is_published_and_no_other() -> None:
+def test_every_object_is_published_and_no_other():
     names = {item.name for item in draw_builtin(CONFIG.builtin)}
     assert published()["objects"].keys() == names
     assert len(names) >= 200
 
 
-def test_each_class_has_all_frictions_and_masses_are_used_alike() -> None:
+def test_each_class_has_all_frictions_and_masses_are_used_alike():
     items = draw_builtin(CONFIG.builtin)
     frictions: dict[str, set[float]] = {}
     for item in items:
@@ -74,7 +73,7 @@ def test_each_class_has_all_frictions_and_masses_are_used_alike() -> None:
     assert min(masses.values()) > len(items) / len(MASSES) / 2
 
 
-def test_draws_are_frozen() -> None:
+def test_draws_are_frozen():
     """Whoever makes the benchmark gets these; a change of them is another benchmark."""
     first = draw_builtin(CONFIG.builtin)[0]
     assert material_of(first) == FIRST_MATERIAL
@@ -83,9 +82,8 @@ def test_draws_are_frozen() -> None:
     assert len(NEW) == NEW_CLASSES
 
 
-def test_meshes_are_those_published_and_have_their_own_material(part: Path) -> None:
+def test_meshes_are_those_published_and_have_their_own_material(part):
     about = read_benchmark(part, SCORED, published()["versions"])
-    assert about is not None
     assert about["different_meshes"] == []
     assert about["other_settings"] == ""
     assert about["other_versions"] == {}
@@ -94,15 +92,12 @@ def test_meshes_are_those_published_and_have_their_own_material(part: Path) -> N
     assert (source.mass, source.friction) == material_of(item)
 
 
-def test_a_part_of_the_benchmark_is_not_frozen(part: Path) -> None:
+def test_a_part_of_the_benchmark_is_not_frozen(part):
     about = read_benchmark(part, SCORED, published()["versions"])
-    assert about is not None
     assert (about["objects"], about["of"], about["frozen"]) == (1, 256, False)
 
 
-def test_a_score_by_other_rules_is_not_frozen(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_score_by_other_rules_is_not_frozen(tmp_path, monkeypatch):
     whole = {"objects": {BOTTLE: published()["objects"][BOTTLE]}, "versions": {}}
     monkeypatch.setattr(benchmark, "published", lambda: whole)
     write_objects(tmp_path, CONFIG, only=[BOTTLE])
@@ -116,7 +111,7 @@ def test_a_score_by_other_rules_is_not_frozen(
 
 
 @pytest.mark.parametrize("manifest", [True, False])
-def test_a_folder_of_something_else_stays_as_it_is(tmp_path: Path, manifest: bool) -> None:
+def test_a_folder_of_something_else_stays_as_it_is(tmp_path, manifest):
     if manifest:
         write_manifest(Manifest(config=CONFIG, versions=installed_versions(CONFIG)), tmp_path)
     else:
@@ -127,7 +122,7 @@ def test_a_folder_of_something_else_stays_as_it_is(tmp_path: Path, manifest: boo
     assert list(tmp_path.iterdir()) == before
 
 
-def test_a_finished_benchmark_is_not_made_a_part_of_itself(tmp_path: Path) -> None:
+def test_a_finished_benchmark_is_not_made_a_part_of_itself(tmp_path):
     write_objects(tmp_path, CONFIG, only=[BOTTLE])
     stored = Manifest(
         config=CONFIG,
@@ -141,21 +136,18 @@ def test_a_finished_benchmark_is_not_made_a_part_of_itself(tmp_path: Path) -> No
     assert {path: path.read_bytes() for path in (tmp_path / BUILTIN_FOLDER).iterdir()} == before
 
 
-def test_other_meshes_versions_and_settings_are_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_meshes_versions_and_settings_are_named(tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark, "wavefront", lambda mesh: b"v 0 0 0\n")
     write_objects(tmp_path, CONFIG, only=[BOTTLE])
     other = load_config(PRESET, ["lift.hold_time=1"])
     write_manifest(Manifest(config=other, versions=installed_versions(other)), tmp_path)
     about = read_benchmark(tmp_path, SCORED, {**published()["versions"], "drake": "0"})
-    assert about is not None
     assert about["different_meshes"] == [BOTTLE]
     assert list(about["other_versions"]) == ["drake"]
     assert "lift.hold_time" in about["other_settings"]
 
 
-def test_another_dataset_is_no_benchmark_and_a_damaged_file_is_refused(tmp_path: Path) -> None:
+def test_another_dataset_is_no_benchmark_and_a_damaged_file_is_refused(tmp_path):
     assert read_benchmark(tmp_path, SCORED, {}) is None
     (tmp_path / BUILTIN_FOLDER).mkdir()
     (tmp_path / BUILTIN_FOLDER / BENCHMARK_FILE).write_text(json.dumps({"name": "x"}))
@@ -163,21 +155,19 @@ def test_another_dataset_is_no_benchmark_and_a_damaged_file_is_refused(tmp_path:
         read_benchmark(tmp_path, SCORED, {})
 
 
-def test_an_unknown_object_is_refused(tmp_path: Path) -> None:
+def test_an_unknown_object_is_refused(tmp_path):
     with pytest.raises(MeshError, match="'99_chair_1'"):
         write_objects(tmp_path, CONFIG, only=["99_chair_1"])
     assert not list(tmp_path.iterdir())
 
 
-def test_all_objects_test(part: Path) -> None:
+def test_all_objects_test(part):
     assert CONFIG.split.train_classes == ()
     said = yaml.safe_load((part / BUILTIN_FOLDER / "objects.yaml").read_text())
     assert said["objects"].keys() == {BOTTLE}
 
 
-def test_a_card_says_whether_all_rows_are_the_published_ones(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_card_says_whether_all_rows_are_the_published_ones(tmp_path, monkeypatch):
     out = make_dataset(tmp_path / "out", tmp_path, overrides=["split.train_classes=[]"])
     (out / BUILTIN_FOLDER).mkdir()
     about = {"objects": 3, "of": 3, "different_meshes": []}

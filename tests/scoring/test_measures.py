@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,24 +19,23 @@ from drakegrasp.scoring.measures import (
     estimates,
     resample,
 )
-from drakegrasp.scoring.verdict import Verdict
 
 DRAWS = resample([f"object {i}" for i in range(3)])
 
 
-def estimated(one: Judged, *objects: int) -> dict[str, dict[str, float]]:
+def estimated(one, *objects):
     """Return the measures of a set whose rows are of these objects."""
     return estimates(one, grouping(*objects), DRAWS, oracle=False)
 
 
-def of_verdicts(*verdicts: Verdict, **stated: Any) -> Judged:
+def of_verdicts(*verdicts, **stated):
     """Return a set with a prediction for each row that has this verdict."""
     count = len(verdicts)
     ranked = ranked_array("net", np.zeros((count, 18)), length=count, **stated)
     return Judged(name="net", ranked=(ranked,), verdicts=(verdicts,))
 
 
-def test_an_object_with_many_rows_counts_no_more_than_another() -> None:
+def test_an_object_with_many_rows_counts_no_more_than_another():
     rows = [["sample"], ["fails"], ["fails"], ["fails"], ["sample"], ["sample"]]
     found = estimated(judged("net", rows), 0, 0, 0, 0, 1, 2)
     assert found["headline"]["value"] == pytest.approx((0.25 + 1 + 1) / 3, abs=1e-6)
@@ -49,15 +47,13 @@ def test_an_object_with_many_rows_counts_no_more_than_another() -> None:
     ("measure", "rows"),
     [("headline", [1, 0, 0]), ("sample", [1, 1, 0]), ("success", [1, 0, 1]), ("held", [1, 1, 1])],
 )
-def test_the_headline_asks_for_a_sample_with_contacts_where_they_were_asked_for(
-    measure: str, rows: list[int]
-) -> None:
+def test_the_headline_asks_for_a_sample_with_contacts_where_they_were_asked_for(measure, rows):
     one = of_verdicts(verdict("sample"), verdict("sample", error=0.03), verdict("held"))
     # A row without prediction fails.
     assert grouping(0, 1, 2, 3).best_of_rows(one, one.table[measure]).tolist() == [[*rows, 0]]
 
 
-def test_the_k_best_of_a_row_count_in_success_at_k_only() -> None:
+def test_the_k_best_of_a_row_count_in_success_at_k_only():
     rows = [["fails", "sample", "fails"], ["fails", "fails", "sample"], ["sample"] * 3]
     found = estimated(judged("net", rows), 0, 1, 2)
     assert found["headline"]["value"] == pytest.approx(1 / 3, abs=1e-6)
@@ -65,7 +61,7 @@ def test_the_k_best_of_a_row_count_in_success_at_k_only() -> None:
     assert "success@5" not in found
 
 
-def test_intervals_are_of_objects_and_come_again() -> None:
+def test_intervals_are_of_objects_and_come_again():
     one = judged("net", [["sample"], ["fails"], ["fails"]])
     found = estimated(one, 0, 1, 2)["headline"]
     assert (found["low"], found["high"]) == (0.0, 1.0)
@@ -75,14 +71,14 @@ def test_intervals_are_of_objects_and_come_again() -> None:
     assert alone["low"] == alone["value"] == alone["high"]
 
 
-def test_objects_of_a_class_are_drawn_together() -> None:
+def test_objects_of_a_class_are_drawn_together():
     draws = resample(["a", "a", "b"])
     np.testing.assert_array_equal(draws[:, 0], draws[:, 1])
     np.testing.assert_allclose(draws.sum(axis=1), 1.0)
     assert set(np.round(draws[:, 2], 6)) == {0.0, 0.333333, 1.0}
 
 
-def test_a_difference_is_paired_by_object() -> None:
+def test_a_difference_is_paired_by_object():
     """Two equal sets differ by nothing in every resample, however wide their own intervals are."""
     one = judged("net", [["sample"], ["fails"], ["fails"]])
     same = difference(one, one, grouping(0, 1, 2), DRAWS)
@@ -93,13 +89,13 @@ def test_a_difference_is_paired_by_object() -> None:
     )
 
 
-def test_training_seeds_widen_the_interval() -> None:
+def test_training_seeds_widen_the_interval():
     good, bad = [["sample"]] * 3, [["fails"]] * 3
     one = estimated(judged("net", good, bad), 0, 1, 2)["headline"]
     assert (one["value"], one["low"], one["high"]) == (0.5, 0.0, 1.0)
 
 
-def test_training_seeds_of_both_sets_widen_a_difference() -> None:
+def test_training_seeds_of_both_sets_widen_a_difference():
     """Drawn apart: the better seeds of one may meet the worse of the other."""
     good, bad = [["sample"]] * 3, [["fails"]] * 3
     spread = judged("spread", good, bad)
@@ -110,20 +106,20 @@ def test_training_seeds_of_both_sets_widen_a_difference() -> None:
     assert (both["value"], both["low"], both["high"]) == (0.0, -1.0, 1.0)
 
 
-def test_the_curve_rises_with_the_distance() -> None:
+def test_the_curve_rises_with_the_distance():
     one = of_verdicts(verdict("held", error=0.012), verdict("held", error=0.05))
     assert curve(one, grouping(0, 1)) == [0.0] * 3 + [0.5] * 7 + [1.0] * 3
 
 
-def test_calibration_groups_by_confidence() -> None:
+def test_calibration_groups_by_confidence():
     words = ["fails"] * 5 + ["sample"] * 5
     groups = calibration(of_verdicts(*map(verdict, words), confidence=np.arange(10) / 10))
     assert [group["share"] for group in groups] == [0, 0, 0.5, 1, 1]
     assert calibration(judged("net", [["sample"]])) == []
 
 
-def test_diversity_is_one_along_a_line_and_falls_with_directions() -> None:
-    def variance(postures: np.ndarray) -> list[float] | None:
+def test_diversity_is_one_along_a_line_and_falls_with_directions():
+    def variance(postures):
         return diversity(
             of_verdicts(*(replace(verdict("sample"), posture=(*p,)) for p in postures))
         )
@@ -132,13 +128,13 @@ def test_diversity_is_one_along_a_line_and_falls_with_directions() -> None:
     assert variance(np.eye(4))[0] == pytest.approx(1 / 3, abs=1e-6)
 
 
-def test_coverage_is_of_own_grasps_with_a_good_one_near() -> None:
+def test_coverage_is_of_own_grasps_with_a_good_one_near():
     near = replace(verdict("sample"), contacts=(0.01,) * 9)
     one = of_verdicts(near, verdict("fails"), verdict("sample"))
     own = {0: np.zeros(9), 1: np.full(9, 0.015), 2: np.full(9, 0.5)}
     assert coverage(one, own, grouping(0, 0, 1)) == 0.5
 
 
-def test_classes_are_means_of_their_objects() -> None:
+def test_classes_are_means_of_their_objects():
     one, rows = judged("net", [["sample"], ["fails"], ["fails"]]), grouping(0, 0, 1)
     assert by_name(one, rows, rows.classes) == {"class 0": 0.5, "class 1": 0.0}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from drakegrasp.verification.placing import place_on_rows
 HAND = load_hand()
 
 
-def own_postures(data: GraspDataset, rows: np.ndarray) -> dict[str, Any]:
+def own_postures(data, rows):
     """The samples of some rows as arrays of a file of predicted postures, in {O}."""
     trials = Trials(data.path.parent)
     chosen = data.column("trial_id")[rows]
@@ -37,7 +36,7 @@ def own_postures(data: GraspDataset, rows: np.ndarray) -> dict[str, Any]:
     }
 
 
-def camera_poses(data: GraspDataset, rows: np.ndarray) -> np.ndarray:
+def camera_poses(data, rows):
     """X_OC of the camera of some rows."""
     X_TC = unpack_pose(data.column(f"object_props/frame_work2cam_{data.camera}")[rows])
     X_TO = unpack_pose(Trials(data.path.parent)["X_TO"][data.column("trial_id")[rows]])
@@ -45,15 +44,13 @@ def camera_poses(data: GraspDataset, rows: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> GraspDataset:
+def data(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scored")
     out = make_dataset(folder / "out", folder / "meshes", overrides=["split.by=class"])
     return GraspDataset(out / OTO, split="test")
 
 
-def test_postures_of_rows_are_ranked_and_bad_ones_keep_their_reason(
-    data: GraspDataset, tmp_path: Path
-) -> None:
+def test_postures_of_rows_are_ranked_and_bad_ones_keep_their_reason(data, tmp_path):
     given = own_postures(data, np.array([2, 0, 2, 1]))
     given["q_grasp"][2, 0] = np.nan
     names = data.column("object_props/object_name")[given["row"]]
@@ -72,9 +69,7 @@ def test_postures_of_rows_are_ranked_and_bad_ones_keep_their_reason(
     assert ranked.invalid[2] == "q_grasp must be finite numbers, got others"
 
 
-def test_posture_in_the_frame_of_the_rows_camera_is_that_in_the_objects(
-    data: GraspDataset, tmp_path: Path
-) -> None:
+def test_posture_in_the_frame_of_the_rows_camera_is_that_in_the_objects(data, tmp_path):
     rows = np.arange(len(data))
     given = own_postures(data, rows)
     X_OGs = given["X_FG"]
@@ -98,9 +93,7 @@ def test_posture_in_the_frame_of_the_rows_camera_is_that_in_the_objects(
         ({"confidence": np.zeros(3)}, r"confidence must be \(2,\), one per grasp"),
     ],
 )
-def test_what_belongs_to_no_row_is_refused(
-    data: GraspDataset, tmp_path: Path, changes: dict[str, Any], words: str
-) -> None:
+def test_what_belongs_to_no_row_is_refused(data, tmp_path, changes, words):
     np.savez(tmp_path / "p.npz", **(own_postures(data, np.array([0, 1])) | changes))
     with pytest.raises(GraspError, match=words) as caught:
         rank_file(tmp_path / "p.npz", data)
@@ -110,9 +103,7 @@ def test_what_belongs_to_no_row_is_refused(
 @pytest.mark.nightly
 @pytest.mark.sim
 @pytest.mark.slow
-def test_own_samples_given_back_as_postures_come_out_as_stored(
-    small_dataset: Path, tmp_path: Path
-) -> None:
+def test_own_samples_given_back_as_postures_come_out_as_stored(small_dataset, tmp_path):
     data = GraspDataset(small_dataset / OTO, split="test")
     rows = np.arange(min(len(data), 3))
     assert len(rows) > 1
@@ -151,15 +142,13 @@ def test_own_samples_given_back_as_postures_come_out_as_stored(
     assert (tmp_path / "card" / VERDICTS).read_bytes() == lines
 
 
-def test_a_protocol_cuts_an_object_once_for_all_that_is_scored(
-    data: GraspDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_protocol_cuts_an_object_once_for_all_that_is_scored(data, tmp_path, monkeypatch):
     """Postures and contacts are tried apart, and nothing is kept for another call."""
     pytest.importorskip("mujoco")
     cutting = pytest.importorskip("drakegrasp.mjcf.scene")
     cut, convex_parts = [], cutting.convex_parts
 
-    def counted(model: Any) -> Any:
+    def counted(model):
         cut.append(model.name)
         return convex_parts(model)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import h5py
 import numpy as np
 import pytest
@@ -15,7 +13,7 @@ from drakegrasp.exchange.contacts import read_contacts
 GRASPS = np.arange(2 * 3 * 18, dtype=float).reshape(2, 3, 18)
 
 
-def test_predictions_of_a_row_are_ranked_by_confidence_and_equal_ones_keep_their_order() -> None:
+def test_predictions_of_a_row_are_ranked_by_confidence_and_equal_ones_keep_their_order():
     ranked = ranked_array("a", GRASPS, length=2, confidence=[[0.1, 0.9, 0.9], [0.5, 0.4, 0.6]])
     assert ranked.of_row.tolist() == [0, 0, 0, 1, 1, 1]
     assert ranked.rank.tolist() == [0, 1, 2, 0, 1, 2]
@@ -24,23 +22,23 @@ def test_predictions_of_a_row_are_ranked_by_confidence_and_equal_ones_keep_their
     )
 
 
-def test_without_confidence_the_order_is_the_rank() -> None:
+def test_without_confidence_the_order_is_the_rank():
     ranked = ranked_array("a", GRASPS, length=2)
     np.testing.assert_array_equal(ranked.grasps, GRASPS.reshape(6, 18))
     assert ranked.confidence is None
 
 
-def test_a_confidence_that_is_no_number_ranks_last() -> None:
+def test_a_confidence_that_is_no_number_ranks_last():
     ranked = ranked_array("a", GRASPS[:1], length=1, confidence=[[np.nan, 0.2, 0.3]])
     np.testing.assert_array_equal(ranked.grasps[-1], GRASPS[0, 0])
 
 
-def test_bad_numbers_stay_as_they_are_failures_of_the_network() -> None:
+def test_bad_numbers_stay_as_they_are_failures_of_the_network():
     assert np.isnan(ranked_array("a", np.full((2, 18), np.nan), length=2).grasps).all()
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".h5", ".parquet"])
-def test_all_formats_give_the_same_predictions(tmp_path: Path, suffix: str) -> None:
+def test_all_formats_give_the_same_predictions(tmp_path, suffix):
     path, flat, confidence = tmp_path / f"p{suffix}", GRASPS.reshape(6, 18), np.arange(6.0)
     rows = np.array([4, 4, 4, 7, 7, 7])
     if suffix == ".npy":
@@ -72,13 +70,13 @@ def test_all_formats_give_the_same_predictions(tmp_path: Path, suffix: str) -> N
         ([0, 1], [0.5, 0.5], r"confidence must be \(2, 3\)"),
     ],
 )
-def test_what_does_not_fit_is_refused(rows: object, confidence: object, message: str) -> None:
+def test_what_does_not_fit_is_refused(rows, confidence, message):
     with pytest.raises(GraspError, match=message):
         ranked_array("a", GRASPS, length=5, rows=rows, confidence=confidence)
 
 
 @pytest.mark.parametrize("name", ["a.npy", "a.h5", "a.parquet", "a.txt"])
-def test_a_file_of_something_else_is_refused_by_name(tmp_path: Path, name: str) -> None:
+def test_a_file_of_something_else_is_refused_by_name(tmp_path, name):
     path = tmp_path / name
     path.write_bytes(b"something else")
     with pytest.raises(GraspError, match=name):

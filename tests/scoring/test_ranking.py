@@ -7,7 +7,6 @@ import pytest
 import trimesh
 
 import drakegrasp as dg
-from drakegrasp.arithmetic import Array
 from drakegrasp.frames import invert_pose, make_pose, rotation_about
 from drakegrasp.mesh.cloud import column_solid, hull_solid, read_cloud
 from drakegrasp.scoring.proposals import SAME
@@ -19,7 +18,7 @@ HALF = np.array([0.18, 0.03, 0.04])
 DOWN = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 2 * HALF[2] + 0.06])
 
 
-def seen(half: Array = HALF, turn: float = 0.0) -> Array:
+def seen(half=HALF, turn=0.0):
     """Return points on the top and on the sides +x and +y of a box on the table, turned [rad]."""
     x, y, z = (np.linspace(-each, each, int(each / 0.0015)) for each in half)
     faces = [(x, y, half[2:]), (half[:1], y, z), (x, half[1:2], z)]
@@ -29,16 +28,16 @@ def seen(half: Array = HALF, turn: float = 0.0) -> Array:
     return points @ rotation_about([0.0, 0.0, 1.0], turn).T
 
 
-def turned(X_TG: Array, degrees: float) -> Array:
+def turned(X_TG, degrees):
     """Return a palm pose turned about its own Gz."""
     return X_TG @ make_pose(rotation_about([0.0, 0.0, 1.0], np.deg2rad(degrees)), np.zeros(3))
 
 
-def moved(*p_GQ: float) -> Array:
+def moved(*p_GQ):
     return DOWN @ make_pose(np.eye(3), p_GQ)
 
 
-def test_a_grasp_across_the_narrow_side_beats_one_along_it() -> None:
+def test_a_grasp_across_the_narrow_side_beats_one_along_it():
     ranked = dg.rank([turned(DOWN, 90.0), DOWN], seen())
     assert ranked.order.tolist() == [1, 0]
     assert ranked.features["touch"][1].tolist() == [1.0, 1.0, 1.0]
@@ -47,7 +46,7 @@ def test_a_grasp_across_the_narrow_side_beats_one_along_it() -> None:
     assert ranked.features["robust"][1] == 1.0
 
 
-def test_a_hand_within_the_object_or_the_table_is_last() -> None:
+def test_a_hand_within_the_object_or_the_table_is_last():
     through = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.01])
     beside = through.copy()
     beside[0, 3], beside[2, 3] = 0.4, -0.1
@@ -67,21 +66,21 @@ def test_a_hand_within_the_object_or_the_table_is_last() -> None:
     ],
     ids=["held at its end", "off the middle", "too high"],
 )
-def test_a_worse_palm_is_told_by_its_feature(other: Array, feature: str, sign: int) -> None:
+def test_a_worse_palm_is_told_by_its_feature(other, feature, sign):
     ranked = dg.rank(np.stack([other, DOWN]), seen())
     assert ranked.order.tolist() == [1, 0]
     worse, better = ranked.features[feature]
     assert sign * (worse - better) > 0.0
 
 
-def test_a_ranking_turns_and_moves_with_the_object() -> None:
+def test_a_ranking_turns_and_moves_with_the_object():
     X = make_pose(rotation_about([0.0, 0.0, 1.0], 0.7), [0.1, -0.2, 0.0])
     palms = np.stack([DOWN, moved(0.1, 0.0, 0.0), turned(DOWN, 40.0)])
     there = dg.rank(X @ palms, seen(turn=0.7) + X[:3, 3])
     assert there.order.tolist() == dg.rank(palms, seen()).order.tolist()
 
 
-def test_proposals_begin_across_the_narrow_side_and_are_distinct() -> None:
+def test_proposals_begin_across_the_narrow_side_and_are_distinct():
     found = dg.propose(seen(turn=0.4), name="box")
     assert not found.refused
     assert found.frame == "table"
@@ -98,7 +97,7 @@ def test_proposals_begin_across_the_narrow_side_and_are_distinct() -> None:
 
 
 @pytest.mark.parametrize("hand", ["barrett", "franka", "allegro_four"])
-def test_any_hand_proposes_and_ranks(hand: str) -> None:
+def test_any_hand_proposes_and_ranks(hand):
     cloud = seen(np.array([0.05, 0.02, 0.03]))
     found = dg.propose(cloud, hand)
     ranked = dg.rank(found, cloud, hand)
@@ -110,7 +109,7 @@ def test_any_hand_proposes_and_ranks(hand: str) -> None:
     assert np.abs(found.q_grasp[first] - found.q_pregrasp[first]).max() > 0.0
 
 
-def test_postures_of_the_object_are_ranked_with_its_pose() -> None:
+def test_postures_of_the_object_are_ranked_with_its_pose():
     X_TO = make_pose(rotation_about([0.0, 0.0, 1.0], 0.3), [0.1, 0.0, 0.04])
     cloud = seen(turn=0.3)
     cloud[:, 0] += 0.1
@@ -124,7 +123,7 @@ def test_postures_of_the_object_are_ranked_with_its_pose() -> None:
         dg.rank(make_attempts(dg.load_hand(), names, X_OG, **own), cloud)
 
 
-def test_a_row_that_is_no_posture_is_last() -> None:
+def test_a_row_that_is_no_posture_is_last():
     found = dg.propose(seen())
     spoilt = found.refuse(["bad", *[""] * (len(found) - 1)])
     ranked = dg.rank(spoilt, seen())
@@ -133,7 +132,7 @@ def test_a_row_that_is_no_posture_is_last() -> None:
     assert np.isnan(ranked.features["arm"][0])
 
 
-def test_solids_fill_what_is_not_seen() -> None:
+def test_solids_fill_what_is_not_seen():
     points = read_cloud(seen())
     for solid in (hull_solid(points), column_solid(points)):
         inside, beside = np.float32([[0.0, 0.0, 0.03], [0.0, 0.04, 0.03]])
@@ -144,7 +143,7 @@ def test_solids_fill_what_is_not_seen() -> None:
         np.testing.assert_allclose(normals, [[0, 1, 0], [1, 0, 0]], atol=0.1)
 
 
-def test_the_columns_keep_what_the_hull_fills() -> None:
+def test_the_columns_keep_what_the_hull_fills():
     """A ring that is seen from above: a hand may reach into it."""
     ring = trimesh.creation.annulus(r_min=0.03, r_max=0.04, height=0.03)
     points = np.array(trimesh.sample.sample_surface(ring, 4000, seed=0)[0])
@@ -167,7 +166,7 @@ def test_the_columns_keep_what_the_hull_fills() -> None:
     ],
     ids=["two numbers", "few", "millimetres", "the table", "nan", "a wall"],
 )
-def test_a_cloud_that_is_none_is_refused(cloud: Array, words: str) -> None:
+def test_a_cloud_that_is_none_is_refused(cloud, words):
     with pytest.raises(dg.GraspError, match=words):
         dg.rank([DOWN], cloud)
     with pytest.raises(dg.GraspError, match=words):

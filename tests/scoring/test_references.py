@@ -14,7 +14,7 @@ from drakegrasp.scoring.references import REFERENCES, Scene
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
     out = make_dataset(folder / "out", folder / "meshes", overrides=["split.by=class"])
     data = GraspDataset(out / OTO, split="test")
@@ -24,9 +24,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 
 @pytest.mark.parametrize("name", REFERENCES)
-def test_every_reference_gives_a_grasp_with_unit_normals_for_each_row(
-    scene: Scene, name: str
-) -> None:
+def test_every_reference_gives_a_grasp_with_unit_normals_for_each_row(scene, name):
     grasps = REFERENCES[name].make(scene)
     assert grasps.shape == (len(scene.rows), 18)
     lengths = np.linalg.norm(grasps[:, 9:].reshape(-1, 3, 3), axis=-1)
@@ -34,17 +32,15 @@ def test_every_reference_gives_a_grasp_with_unit_normals_for_each_row(
     np.testing.assert_array_equal(REFERENCES[name].make(scene), grasps)
 
 
-def test_own_grasps_are_the_stored_ones(scene: Scene) -> None:
+def test_own_grasps_are_the_stored_ones(scene):
     np.testing.assert_array_equal(references.own(scene), scene.data.column("grasps"))
 
 
 @pytest.mark.parametrize("name", ["constant", "random"])
-def test_blind_rows_are_training_grasps_and_never_look(
-    scene: Scene, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_blind_rows_are_training_grasps_and_never_look(scene, name, monkeypatch):
     value = scene.data.value
 
-    def blind(field: str, row: int) -> object:
+    def blind(field, row):
         assert field not in ("images", "masks")
         return value(field, row)
 
@@ -54,12 +50,12 @@ def test_blind_rows_are_training_grasps_and_never_look(
     assert name != "constant" or len(made) == 1
 
 
-def test_the_nearest_image_of_a_training_image_is_itself(scene: Scene) -> None:
+def test_the_nearest_image_of_a_training_image_is_itself(scene):
     same = Scene(data=scene.train, rows=range(len(scene.train)), train=scene.train)
     np.testing.assert_array_equal(references.nearest_image(same), scene.train_grasps)
 
 
-def test_a_grasp_from_above_closes_level_across_the_object(scene: Scene) -> None:
+def test_a_grasp_from_above_closes_level_across_the_object(scene):
     poses = scene.data.column("object_props/frame_work2cam_oto")
     for row, grasp in zip(scene.rows, references.top_down(scene), strict=True):
         X_TC = unpack_pose(poses[row])
@@ -74,7 +70,7 @@ def test_a_grasp_from_above_closes_level_across_the_object(scene: Scene) -> None
         assert (((p_TQ - middle) * nhat_Q_T).sum(axis=1) > 0.0).all()
 
 
-def test_contacts_on_what_is_seen_lie_on_the_box_and_face_the_camera(scene: Scene) -> None:
+def test_contacts_on_what_is_seen_lie_on_the_box_and_face_the_camera(scene):
     """The faces of the boxes are planes, so the fitted normals are those of the faces."""
     for make in (references.palm_normals, references.surface_points):
         for row, grasp in zip(scene.rows, make(scene), strict=True):

@@ -24,14 +24,14 @@ pytestmark = pytest.mark.sim
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def path(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scenes")
     out = make_dataset(folder / "out", folder / "meshes", overrides=["split.by=class"])
     make_scenes(out, overrides=["scenes.views=3"])
     return out / "scenes.hdf5"
 
 
-def test_a_row_is_a_view_of_a_scene_with_a_sample(path: Path) -> None:
+def test_a_row_is_a_view_of_a_scene_with_a_sample(path):
     rows = open_rows(path, split="test")
     assert isinstance(rows, SceneRows) and len(rows) == 5 * len(
         set(rows.column("object_props/object_name"))
@@ -41,7 +41,7 @@ def test_a_row_is_a_view_of_a_scene_with_a_sample(path: Path) -> None:
     assert isinstance(open_rows(path.parent / OTO, split="test"), GraspDataset)
 
 
-def test_own_grasps_come_back_to_the_contacts_of_their_trials(path: Path) -> None:
+def test_own_grasps_come_back_to_the_contacts_of_their_trials(path):
     rows = open_rows(path, split="test")
     due = Trials(path.parent)[rows.column("trial_id")].columns(("closed_p_OQ", "X_TO"))
     placed = place_on_rows(rows.column("grasps"), rows)
@@ -52,7 +52,7 @@ def test_own_grasps_come_back_to_the_contacts_of_their_trials(path: Path) -> Non
     np.testing.assert_allclose(own, due["closed_p_OQ"], atol=1e-6)
 
 
-def test_images_show_the_object_where_the_grasp_is(path: Path) -> None:
+def test_images_show_the_object_where_the_grasp_is(path):
     rows = SceneRows(path, split="test")
     scene = Scene(data=rows, rows=range(len(rows)), train=open_rows(path, split="train"))
     for row, contacts in enumerate(own_contacts(rows, scene.rows)):
@@ -67,7 +67,7 @@ def test_images_show_the_object_where_the_grasp_is(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", REFERENCES)
-def test_every_reference_can_be_made_on_views(path: Path, name: str) -> None:
+def test_every_reference_can_be_made_on_views(path, name):
     rows = open_rows(path, split="test")
     train = open_rows(path, split="train")
     made = REFERENCES[name].make(Scene(data=rows, rows=range(len(rows)), train=train))
@@ -76,7 +76,7 @@ def test_every_reference_can_be_made_on_views(path: Path, name: str) -> None:
     np.testing.assert_allclose(lengths, 1.0, atol=1e-6)
 
 
-def test_scenes_of_other_trials_are_refused(path: Path, tmp_path: Path) -> None:
+def test_scenes_of_other_trials_are_refused(path, tmp_path):
     out = Path(shutil.copytree(path.parent, tmp_path / "out"))
     with h5py.File(out / "scenes.hdf5", "r+") as file:
         file.attrs["shards"] = "0" * 64

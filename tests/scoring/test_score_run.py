@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,21 +18,19 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
 from drakegrasp.foreign_files import read_json
 from drakegrasp.scoring.card import card_text
-from drakegrasp.scoring.run import VERDICTS, Score, own_contacts, score
+from drakegrasp.scoring.run import VERDICTS, own_contacts, score
 from drakegrasp.scoring.verdict import ranked_sets
 from drakegrasp.verification.placing import dataset_config, place_on_rows
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> GraspDataset:
+def data(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scored")
     out = make_dataset(folder / "out", folder / "meshes", overrides=["split.by=class"])
     return GraspDataset(out / OTO, split="test")
 
 
-def scored(
-    data: GraspDataset, /, given: Any = (), *, tries: FakeVerify | None = None, **changes: Any
-) -> Score:
+def scored(data, /, given=(), *, tries=None, **changes):
     """Return the score of predictions beside two reference rows; own grasps hold."""
     name, ranked = ranked_sets(given, data)
     values: dict[str, Any] = {
@@ -52,12 +49,12 @@ def scored(
     return score(**(values | changes))
 
 
-def is_own(data: GraspDataset) -> Any:
+def is_own(data):
     own = data.column("grasps")
     return lambda grasp: bool((np.abs(own - grasp).max(axis=1) < 1e-6).any())
 
 
-def test_predictions_stand_beside_reference_rows_on_the_same_rows(data: GraspDataset) -> None:
+def test_predictions_stand_beside_reference_rows_on_the_same_rows(data):
     predicted = data.column("grasps").astype(float)
     predicted[::2] = np.nan
     card = scored(data, predicted).card
@@ -71,7 +68,7 @@ def test_predictions_stand_beside_reference_rows_on_the_same_rows(data: GraspDat
     assert card["warnings"][0].startswith("only 2 test objects")
 
 
-def test_an_interrupted_score_goes_on(data: GraspDataset, tmp_path: Path) -> None:
+def test_an_interrupted_score_goes_on(data, tmp_path):
     """Also after a line that a crash cut off."""
     with pytest.raises(KeyboardInterrupt):
         scored(data, tries=FakeVerify(is_own(data), stop_after=3), folder=tmp_path)
@@ -87,36 +84,34 @@ def test_an_interrupted_score_goes_on(data: GraspDataset, tmp_path: Path) -> Non
     assert card == scored(data).card
 
 
-def other_friction(data: GraspDataset) -> dict[str, Any]:
+def other_friction(data):
     return {"config": dataset_config(data, overrides=("physics.friction_hand=0.5",))}
 
 
-def same_friction_for_all_rows(data: GraspDataset) -> dict[str, Any]:
+def same_friction_for_all_rows(data):
     return {"overridden": ("physics.friction_hand", "verify.max_tries")}
 
 
-def other_camera(data: GraspDataset) -> dict[str, Any]:
+def other_camera(data):
     path = data.path.parent / OTM
     return {"data": GraspDataset(path, split="test"), "train": GraspDataset(path, split="train")}
 
 
 @pytest.mark.parametrize("change", [other_friction, same_friction_for_all_rows, other_camera])
-def test_verdicts_of_other_rules_are_not_taken(
-    data: GraspDataset, tmp_path: Path, change: Callable[[GraspDataset], dict[str, Any]]
-) -> None:
+def test_verdicts_of_other_rules_are_not_taken(data, tmp_path, change):
     given, other = np.ones((len(data), 18)), FakeVerify(is_own(data))
     scored(data, given, references=(), folder=tmp_path)
     scored(data, given, references=(), **change(data), tries=other, folder=tmp_path)
     assert other.asked == len(data)
 
 
-def test_some_rows_of_each_object_are_the_same_for_all_sets(data: GraspDataset) -> None:
+def test_some_rows_of_each_object_are_the_same_for_all_sets(data):
     card = scored(data, per_object=1).card
     assert card["rows"] == card["objects"] == 2
     assert f"2 of the {len(data)} rows of the split were scored" in card["warnings"]
 
 
-def test_files_of_several_training_seeds_are_one_set(data: GraspDataset, tmp_path: Path) -> None:
+def test_files_of_several_training_seeds_are_one_set(data, tmp_path):
     grasps = data.column("grasps")
     np.save(tmp_path / "a.npy", grasps)
     np.save(tmp_path / "b.npy", np.zeros_like(grasps))
@@ -126,13 +121,13 @@ def test_files_of_several_training_seeds_are_one_set(data: GraspDataset, tmp_pat
     assert card["intervals"]["training_seeds"] == 2
 
 
-def test_next_to_nothing_has_no_sign(data: GraspDataset) -> None:
+def test_next_to_nothing_has_no_sign(data):
     card = scored(data, data.column("grasps")).card
     card["above"]["predictions"]["own"] = {"value": 0.1, "low": -0.001, "high": 0.2}
     assert "* predictions above own: 10 (0 to 20)\n" in card_text(card)
 
 
-def test_another_method_stands_beside_the_predictions(data: GraspDataset) -> None:
+def test_another_method_stands_beside_the_predictions(data):
     """Of all seeds, on the same rows, and before the reference rows."""
     grasps, rest = data.column("grasps"), np.zeros((len(data), 18))
     other = ranked_sets(grasps, data)[1] + ranked_sets(rest, data)[1]
@@ -146,7 +141,7 @@ def test_another_method_stands_beside_the_predictions(data: GraspDataset) -> Non
     assert (theirs["low"], theirs["high"]) == (-ours["high"], -ours["low"])
 
 
-def test_predictions_for_different_rows_are_refused(data: GraspDataset) -> None:
+def test_predictions_for_different_rows_are_refused(data):
     one = ranked_sets(data.column("grasps")[:1], data, rows=[0])[1]
     other = ranked_sets(data.column("grasps")[:1], data, rows=[1])[1]
     for changes in ({"predictions": one + other}, {"predictions": one, "against": ("b", other)}):
@@ -154,14 +149,14 @@ def test_predictions_for_different_rows_are_refused(data: GraspDataset) -> None:
             scored(data, **changes)
 
 
-def test_a_method_that_the_card_could_not_tell_is_refused(data: GraspDataset) -> None:
+def test_a_method_that_the_card_could_not_tell_is_refused(data):
     name, grasps = ranked_sets(data.column("grasps"), data)
     for given, of in ((data.column("grasps"), name), ((), "no predictions")):
         with pytest.raises(GraspError, match=f"against must be .* has another name, got {of}"):
             scored(data, given, against=(name, grasps))
 
 
-def other_hand(data: GraspDataset) -> dict[str, Any]:
+def other_hand(data):
     grasps = np.zeros((2, 24))
     return {
         "train": SimpleNamespace(path=Path("four.hdf5"), camera="oto", column=lambda name: grasps)
@@ -182,14 +177,12 @@ def other_hand(data: GraspDataset) -> dict[str, Any]:
         (other_hand, r"must be of the camera .* \(oto, 18 numbers\), got oto, 24 numbers"),
     ],
 )
-def test_what_cannot_be_scored_is_refused(
-    data: GraspDataset, change: Callable[[GraspDataset], dict[str, Any]], message: str
-) -> None:
+def test_what_cannot_be_scored_is_refused(data, change, message):
     with pytest.raises(GraspError, match=message):
         scored(data, **change(data))
 
 
-def test_without_blind_rows_a_card_says_so(data: GraspDataset) -> None:
+def test_without_blind_rows_a_card_says_so(data):
     card = scored(data, references=("own",)).card
     assert any(warning.startswith("no blind row") for warning in card["warnings"])
 
@@ -197,16 +190,14 @@ def test_without_blind_rows_a_card_says_so(data: GraspDataset) -> None:
 TRAINED_ON = "2 test objects are training objects, by their names"
 
 
-def test_objects_that_were_trained_on_are_a_warning(data: GraspDataset) -> None:
+def test_objects_that_were_trained_on_are_a_warning(data):
     card = scored(data, train=data).card
     assert TRAINED_ON in card["warnings"]
     other = scored(data).card
     assert not any("training objects" in warning for warning in other["warnings"])
 
 
-def test_objects_of_equal_names_and_other_meshes_are_other_objects(
-    data: GraspDataset, tmp_path: Path
-) -> None:
+def test_objects_of_equal_names_and_other_meshes_are_other_objects(data, tmp_path):
     """As built-in objects of another seed are; a file alone says nothing of meshes."""
     out = tmp_path / "other"
     shutil.copytree(data.path.parent, out)
@@ -221,14 +212,14 @@ def test_objects_of_equal_names_and_other_meshes_are_other_objects(
     assert TRAINED_ON in card["warnings"]
 
 
-def test_own_contacts_are_those_that_are_tried(data: GraspDataset) -> None:
+def test_own_contacts_are_those_that_are_tried(data):
     placed = place_on_rows(data.column("grasps"), data)
     for each in placed:
         found = own_contacts(data, [each.index])[0]
         np.testing.assert_allclose(found.reshape(3, 3), each.contacts()[0], atol=1e-6)
 
 
-def test_files_of_a_card_are_whole_and_come_again(data: GraspDataset, tmp_path: Path) -> None:
+def test_files_of_a_card_are_whole_and_come_again(data, tmp_path):
     predicted = np.repeat(data.column("grasps")[:, None], 5, axis=1).astype(float)
     predicted[:, 1:] = 0.0
     confidence = np.linspace(0.9, 0.1, 5 * len(data)).reshape(len(data), 5)

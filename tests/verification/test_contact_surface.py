@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
 from helpers.objects import box_model, model_of
 
-from drakegrasp.frames import Array
-from drakegrasp.objects.model import ObjectModel
-from drakegrasp.table import Table
 from drakegrasp.verification.hints import WALL, fit_surface
 
 EXTENTS = np.array([0.06, 0.08, 0.1])
@@ -20,12 +15,12 @@ OUTER, INNER = 0.04, 0.038
 
 
 @pytest.fixture(scope="module")
-def box(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+def box(tmp_path_factory):
     return box_model(tmp_path_factory.mktemp("box"), EXTENTS)
 
 
 @pytest.fixture(scope="module")
-def pot(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+def pot(tmp_path_factory):
     """A box, open at the top, with thin walls."""
     outer = trimesh.creation.box(2.0 * OUTER * np.ones(3))
     inner = trimesh.creation.box([2.0 * INNER, 2.0 * INNER, 2.0 * OUTER])
@@ -34,11 +29,11 @@ def pot(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
     return model_of(mesh, tmp_path_factory.mktemp("pot"), "1_pot_a")
 
 
-def fit(model: ObjectModel, p: Array) -> Table:
+def fit(model, p):
     return fit_surface(model, p, np.tile([0.0, 0.0, 1.0], (len(p), 1)))
 
 
-def test_distances_from_a_box_are_those_of_the_formula(box: ObjectModel) -> None:
+def test_distances_from_a_box_are_those_of_the_formula(box):
     half = EXTENTS / 2.0
     p = np.array(
         [[0.0, 0.0, half[2] + 0.01], half + np.array([3e-3, 4e-3, 0]), [0.0, 0.0, 0.0], half]
@@ -48,12 +43,12 @@ def test_distances_from_a_box_are_those_of_the_formula(box: ObjectModel) -> None
     np.testing.assert_allclose(found.nearest[:2], [[0.0, 0.0, half[2]], half], atol=1e-9)
 
 
-def outward(model: ObjectModel, p: Array, n: Array) -> list[bool]:
+def outward(model, p, n):
     """Return whether each normal points out of a face next to its point."""
     return [bool(cosine > 0.1) for cosine in fit_surface(model, p, n).agreement]
 
 
-def test_agreement_is_the_cosine_to_the_face(box: ObjectModel) -> None:
+def test_agreement_is_the_cosine_to_the_face(box):
     p = np.tile([EXTENTS[0] / 2.0, 0.0, 0.0], (3, 1))
     n = np.array([[1.0, 0.0, 0.0], [0.6, 0.8, 0.0], [-1.0, 0.0, 0.0]])
     np.testing.assert_allclose(fit_surface(box, p, n).agreement, [1.0, 0.6, -1.0], atol=1e-12)
@@ -62,7 +57,7 @@ def test_agreement_is_the_cosine_to_the_face(box: ObjectModel) -> None:
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 @pytest.mark.parametrize("off", [-0.002, 0.0, 0.002])
-def test_a_boxs_normals_point_out(box: ObjectModel, axis: int, side: float, off: float) -> None:
+def test_a_boxs_normals_point_out(box, axis, side, off):
     """Also where the point is a little inside or outside, and the normal leans."""
     out = side * np.eye(3)[axis]
     p = np.tile(out * (EXTENTS / 2.0 + off), (4, 1))
@@ -71,7 +66,7 @@ def test_a_boxs_normals_point_out(box: ObjectModel, axis: int, side: float, off:
     assert outward(box, p, n) == [True, False, True, False]
 
 
-def test_beside_an_edge_either_face_will_do(box: ObjectModel) -> None:
+def test_beside_an_edge_either_face_will_do(box):
     p = np.array([[EXTENTS[0] / 2.0, EXTENTS[1] / 2.0 - 0.001, 0.0]])
     x, y = np.eye(3)[:2]
     for normal, expected in ((x, True), (y, True), (-x, False), (-y, False)):
@@ -80,7 +75,7 @@ def test_beside_an_edge_either_face_will_do(box: ObjectModel) -> None:
     assert outward(box, p - [[0.0, 2.0 * WALL, 0.0]], y[None]) == [False]
 
 
-def test_both_sides_of_a_thin_wall_are_asked(pot: ObjectModel) -> None:
+def test_both_sides_of_a_thin_wall_are_asked(pot):
     """A point may be a few millimetres off, on the wrong side of the wall."""
     x = np.eye(3)[:1]
     for at in (OUTER, INNER, OUTER + 0.004, INNER - 0.004):
@@ -89,7 +84,7 @@ def test_both_sides_of_a_thin_wall_are_asked(pot: ObjectModel) -> None:
         assert outward(pot, at * x, np.eye(3)[1:2]) == [False]
 
 
-def test_sides_of_a_thick_plate_are_told_apart(tmp_path: Path) -> None:
+def test_sides_of_a_thick_plate_are_told_apart(tmp_path):
     """Also when the point is off the surface: the other side is no nearer for it."""
     plate = box_model(tmp_path, [0.1, 0.1, 0.008])
     z = np.eye(3)[2:]

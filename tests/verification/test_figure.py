@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,19 +10,16 @@ from helpers.hands import write_tongs
 from helpers.machine import needs_egl
 from helpers.objects import CUBE, box_model, from_above, standing
 from helpers.verdicts import some_fit, some_forces, some_try
-from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from drakegrasp.config import Config
 from drakegrasp.frames import X_WT
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
-from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.style import save_figure
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.scene import Scene, palm_pose
+from drakegrasp.simulation.scene import palm_pose
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.figure import verification_figure
 from drakegrasp.verification.result import Verification
@@ -37,30 +32,30 @@ P_OQ = CUBE / 2.0 * NHAT_Q_O
 
 
 @pytest.fixture(scope="module")
-def config() -> Config:
+def config():
     return load_config()
 
 
 @pytest.fixture(scope="module")
-def cube(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+def cube(tmp_path_factory):
     return box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3)
 
 
 @pytest.fixture(scope="module")
-def scene(cube: ObjectModel, config: Config) -> Scene:
+def scene(cube, config):
     return build_scene(cube, config.physics, load_hand(config.hand))
 
 
 @pytest.fixture(scope="module")
-def held(scene: Scene, cube: ObjectModel, config: Config) -> TrialRecord:
+def held(scene, cube, config):
     return run_attempt(scene, standing(cube), from_above(cube, 0.06), config)
 
 
 @pytest.fixture
-def verified(cube: ObjectModel) -> Callable[..., Verification]:
+def verified(cube):
     """Return a function that makes a result, of a grasp that was not tried unless told."""
 
-    def make(**values: object) -> Verification:
+    def make(**values):
         result: dict[str, object] = {
             "outcome": Outcome.DROPPED, "reason": "so it is",
             "placed": PlacedObject(model=cube, X_TO=standing(cube)),
@@ -73,20 +68,18 @@ def verified(cube: ObjectModel) -> Callable[..., Verification]:
     return make
 
 
-def dots_of(figure: Figure, panel: int) -> dict[str, bool]:
+def dots_of(figure, panel):
     """Return the dots of a panel, and whether each is drawn as one that is seen."""
     lines = {str(line.get_gid()): line for line in figure.axes[panel].lines}
     return {name: line.get_markerfacecolor() != "white" for name, line in lines.items()}
 
 
-def texts_of(figure: Figure) -> list[str]:
+def texts_of(figure):
     return [text.get_text() for text in figure.texts]
 
 
 @needs_egl
-def test_contacts_on_opposite_sides_are_each_seen_once(
-    verified: Callable[..., Verification], config: Config, tmp_path: Path
-) -> None:
+def test_contacts_on_opposite_sides_are_each_seen_once(verified, config, tmp_path):
     figure = verification_figure(verified())
     assert len(figure.axes) == 2
     first, second = dots_of(figure, 0), dots_of(figure, 1)
@@ -102,9 +95,7 @@ def test_contacts_on_opposite_sides_are_each_seen_once(
 
 
 @needs_egl
-def test_hand_whose_link_is_called_palm_is_shown(
-    verified: Callable[..., Verification], cube: ObjectModel, tmp_path: Path
-) -> None:
+def test_hand_whose_link_is_called_palm_is_shown(verified, cube, tmp_path):
     """The hand of the tutorial, over the cube."""
     X_OG = from_above(cube, 0.06).X_OG
     trial = TrialRecord(outcome=Outcome.START_COLLISION, X_TO=standing(cube), X_OG=X_OG)
@@ -124,12 +115,8 @@ def test_hand_whose_link_is_called_palm_is_shown(
 
 
 @needs_egl
-def test_dots_are_on_the_object_and_its_hand_is_shown(
-    verified: Callable[..., Verification], held: TrialRecord, config: Config
-) -> None:
+def test_dots_are_on_the_object_and_its_hand_is_shown(verified, held, config):
     assert held.outcome is Outcome.SUCCESS
-    assert held.closed is not None
-    assert held.lift is not None
     result = verified(
         outcome=Outcome.SUCCESS,
         tries=(some_try(held),),
@@ -165,9 +152,7 @@ def test_dots_are_on_the_object_and_its_hand_is_shown(
 
 
 @needs_egl
-def test_last_panel_shows_the_last_instant(
-    verified: Callable[..., Verification], held: TrialRecord, cube: ObjectModel, config: Config
-) -> None:
+def test_last_panel_shows_the_last_instant(verified, held, cube, config):
     closed = replace(held, lift=None)
     placed = replace(closed, outcome=Outcome.START_COLLISION, closed=None)
     for values, title in (
@@ -180,7 +165,7 @@ def test_last_panel_shows_the_last_instant(
 
 
 @needs_egl
-def test_row_that_is_no_grasp_shows_the_object_alone(verified: Callable[..., Verification]) -> None:
+def test_row_that_is_no_grasp_shows_the_object_alone(verified):
     nothing = np.full((3, 3), np.nan)
     row = verified(
         outcome=Outcome.INVALID, reason="number 1 is nan", p_OQ=nothing, nhat_Q_O=nothing
@@ -191,16 +176,14 @@ def test_row_that_is_no_grasp_shows_the_object_alone(verified: Callable[..., Ver
 
 
 @pytest.mark.parametrize("friction", [0.71, 0.1])
-def test_palm_is_where_the_lift_ended(cube: ObjectModel, config: Config, friction: float) -> None:
+def test_palm_is_where_the_lift_ended(cube, config, friction):
     """Without friction the cube is lost long before the palm has arrived."""
     physics = config.physics.model_copy(update={"friction_hand": friction})
     slick = config.model_copy(update={"physics": physics})
     scene = build_scene(cube, physics, load_hand(config.hand))
     record = run_attempt(scene, standing(cube), from_above(cube, 0.06), slick)
-    assert record.lift is not None
     assert record.lift.contacts.touching.any() == (friction > 0.5)
     # The coarse steps of a lift have a scene of their own.
-    assert scene.coarse_scene is not None
     X_WG = palm_pose(max(scene, scene.coarse_scene(), key=lambda stage: stage.time))
     X_WO = X_WT @ record.lift.X_TO
     np.testing.assert_allclose(X_WO @ record.lift.X_OG, X_WG, atol=1e-9)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -11,7 +9,6 @@ from helpers.assertions import refused
 from scipy.spatial.transform import Rotation
 
 from drakegrasp.frames import (
-    Array,
     invert_pose,
     make_pose,
     pack_pose,
@@ -27,7 +24,7 @@ from drakegrasp.verification.prediction import (
 )
 
 
-def one_grasp(seed: int = 0, k: int = 3) -> Array:
+def one_grasp(seed=0, k=3):
     """Return a grasp vector of k fingers, points within 5 cm of the origin."""
     rng = np.random.default_rng(seed)
     normals = rng.normal(size=(k, 3))
@@ -36,7 +33,7 @@ def one_grasp(seed: int = 0, k: int = 3) -> Array:
     )
 
 
-def random_pose(seed: int) -> Array:
+def random_pose(seed):
     rng = np.random.default_rng(seed)
     R = Rotation.random(random_state=rng).as_matrix()
     return make_pose(R, rng.uniform(-1.0, 1.0, 3))
@@ -46,7 +43,7 @@ def random_pose(seed: int) -> Array:
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 5])
-def test_points_come_first_then_normals_in_finger_order(k: int) -> None:
+def test_points_come_first_then_normals_in_finger_order(k):
     grasps = np.array([one_grasp(i, k) for i in range(4)])
     read = read_grasps(grasps, k)
     points, normals = read.points, read.normals
@@ -57,7 +54,7 @@ def test_points_come_first_then_normals_in_finger_order(k: int) -> None:
 
 
 @pytest.mark.parametrize("kind", [list, tuple, np.float32, np.float64])
-def test_one_grasp_is_a_set_of_one_of_any_kind_of_numbers(kind: Any) -> None:
+def test_one_grasp_is_a_set_of_one_of_any_kind_of_numbers(kind):
     read = read_grasps(kind(one_grasp().tolist()), 3)
     np.testing.assert_allclose(read.points[0], one_grasp()[:9].reshape(3, 3), atol=1e-7)
     np.testing.assert_allclose(np.linalg.norm(read.normals, axis=-1), 1.0, atol=1e-12)
@@ -67,7 +64,7 @@ def test_one_grasp_is_a_set_of_one_of_any_kind_of_numbers(kind: Any) -> None:
 @pytest.mark.parametrize(
     ("length", "told"), [(0.995, False), (1.005, False), (0.9, True), (100.0, True), (1e-3, True)]
 )
-def test_normals_are_normalised_and_that_is_told(length: float, told: bool) -> None:
+def test_normals_are_normalised_and_that_is_told(length, told):
     grasp = one_grasp()
     grasp[12:15] *= length
     read = read_grasps([one_grasp(), grasp], 3)
@@ -77,13 +74,13 @@ def test_normals_are_normalised_and_that_is_told(length: float, told: bool) -> N
     assert np.linalg.norm(grasp[12:15]) == pytest.approx(length)  # the caller's array is as it was
 
 
-def with_value(number: int, value: float) -> Array:
+def with_value(number, value):
     grasp = one_grasp()
     grasp[number] = value
     return grasp
 
 
-def without_normal() -> Array:
+def without_normal():
     grasp = one_grasp()
     grasp[12:15] = 0.0
     return grasp
@@ -105,7 +102,7 @@ def without_normal() -> Array:
         (7.0, "the row has 1 numbers, not 18"),
     ],
 )
-def test_a_bad_row_says_why_and_spoils_no_other(row: Any, reason: str) -> None:
+def test_a_bad_row_says_why_and_spoils_no_other(row, reason):
     read = read_grasps([one_grasp(1), row, one_grasp(2)], 3)
     assert read.invalid == ("", reason, "")
     assert np.isnan(read.points[1]).all() and np.isnan(read.normals[1]).all()
@@ -113,14 +110,14 @@ def test_a_bad_row_says_why_and_spoils_no_other(row: Any, reason: str) -> None:
         np.testing.assert_allclose(pack_grasp(read.points[i], read.normals[i]), one_grasp(seed))
 
 
-def test_rows_may_come_as_an_array_of_objects() -> None:
+def test_rows_may_come_as_an_array_of_objects():
     rows = np.empty(2, dtype=object)
     rows[:] = [one_grasp(), one_grasp()[:17]]
     assert read_grasps(rows, 3).invalid == ("", "the row has 17 numbers, not 18")
 
 
 @pytest.mark.parametrize("shape", [(17,), (19,), (2, 17), (1, 19), (), (0,), (2, 3, 18), (3, 6)])
-def test_other_sizes_are_refused(shape: tuple[int, ...]) -> None:
+def test_other_sizes_are_refused(shape):
     assert refused(read_grasps, np.zeros(shape), 3) == (
         "a grasp must be 18 numbers (3 points, then 3 outward normals), "
         f"got an array of shape {shape}"
@@ -139,7 +136,7 @@ def test_other_sizes_are_refused(shape: tuple[int, ...]) -> None:
         (None, "got None"),
     ],
 )
-def test_what_is_no_numbers_is_refused(value: Any, got: str) -> None:
+def test_what_is_no_numbers_is_refused(value, got):
     message = refused(read_grasps, value, 3)
     assert message.startswith("a grasp must be 18 numbers")
     assert got in message
@@ -150,7 +147,7 @@ def test_what_is_no_numbers_is_refused(value: Any, got: str) -> None:
 
 @pytest.mark.parametrize("single", [False, True], ids=["float64", "float32 rows"])
 @pytest.mark.parametrize("cameras", [1, 4], ids=["one camera", "one per grasp"])
-def test_the_frames_agree(single: bool, cameras: int) -> None:
+def test_the_frames_agree(single, cameras):
     X_TO, X_OM, X_TC = (
         random_pose(1),
         random_pose(2),
@@ -187,7 +184,7 @@ def test_the_frames_agree(single: bool, cameras: int) -> None:
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_no_grasps_have_no_contacts_in_any_frame(frame: str) -> None:
+def test_no_grasps_have_no_contacts_in_any_frame(frame):
     read = read_grasps(np.zeros((0, 18)), 3)
     assert read.points.shape == read.normals.shape == (0, 3, 3)
     for X in [np.eye(4), np.zeros((0, 4, 4))] if frame == "camera" else [None]:
@@ -215,6 +212,6 @@ def test_no_grasps_have_no_contacts_in_any_frame(frame: str) -> None:
         ),
     ],
 )
-def test_a_frame_out_of_place_is_refused(frame: Any, X: Array | None, message: str) -> None:
+def test_a_frame_out_of_place_is_refused(frame, X, message):
     text = refused(in_frame, read_grasps(np.ones((2, 18)), 3), frame, X)
     assert text.startswith(message)

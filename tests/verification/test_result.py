@@ -20,9 +20,7 @@ from drakegrasp.verification.result import Verification
 CONFIG = load_config()
 
 
-def lifted(
-    *, slip_mm: float, turn_deg: float, links: int, outcome: Outcome = Outcome.SUCCESS
-) -> Verification:
+def lifted(*, slip_mm, turn_deg, links, outcome=Outcome.SUCCESS):
     """Return the verdict on a grasp whose object moved so much in the hand."""
     box = trimesh.creation.box([0.06, 0.05, 0.12])
     model = make_object(
@@ -63,9 +61,7 @@ def lifted(
         (73.0, 98.0, 1, "held"),
     ],
 )
-def test_words_follow_from_slip_turn_and_other_links(
-    slip_mm: float, turn_deg: float, links: int, words: str
-) -> None:
+def test_words_follow_from_slip_turn_and_other_links(slip_mm, turn_deg, links, words):
     verdict = lifted(slip_mm=slip_mm, turn_deg=turn_deg, links=links)
     assert verdict.words == words
     assert verdict.held is verdict.success is True
@@ -74,7 +70,7 @@ def test_words_follow_from_slip_turn_and_other_links(
     assert repr(verdict) == f"Verification(hand, {words}: so it is)"
 
 
-def test_grasp_that_fails_is_none_of_the_words() -> None:
+def test_grasp_that_fails_is_none_of_the_words():
     verdict = lifted(slip_mm=0.0, turn_deg=0.0, links=0, outcome=Outcome.SLIPPED)
     assert (verdict.held, verdict.precision, verdict.stable) == (False, False, False)
     assert verdict.words == "fails: slipped"
@@ -93,9 +89,7 @@ def test_grasp_that_fails_is_none_of_the_words() -> None:
         (73.0, 98.0, 2, "2 other links touch it: no precision grasp, not stable."),
     ],
 )
-def test_explanation_tells_what_moved_and_what_touched(
-    slip_mm: float, turn_deg: float, links: int, said: str
-) -> None:
+def test_explanation_tells_what_moved_and_what_touched(slip_mm, turn_deg, links, said):
     text = lifted(slip_mm=slip_mm, turn_deg=turn_deg, links=links).explain()
     moved = f"slips by {slip_mm:.1f} mm and turns by {turn_deg:.1f}° in the hand"
     assert text.startswith("The grasp of vase holds: so it is. Before closing, the fingertips are ")
@@ -106,13 +100,13 @@ def test_explanation_tells_what_moved_and_what_touched(
     )
 
 
-def test_explanation_of_a_lost_object_gives_no_mark() -> None:
+def test_explanation_of_a_lost_object_gives_no_mark():
     text = lifted(slip_mm=80.0, turn_deg=9.0, links=0, outcome=Outcome.DROPPED).explain()
     assert text.startswith("The grasp of vase fails (dropped): so it is. ")
     assert text.endswith("touches it; 3 of 3 fingertips still touch it.")
 
 
-def test_what_forces_alone_hold_is_a_precision_grasp_that_is_stable() -> None:
+def test_what_forces_alone_hold_is_a_precision_grasp_that_is_stable():
     """Nothing moves where forces balance."""
     verdict = replace(
         lifted(slip_mm=90.0, turn_deg=0.0, links=0),
@@ -127,9 +121,7 @@ def test_what_forces_alone_hold_is_a_precision_grasp_that_is_stable() -> None:
     ("removal", "said"),
     [(Removal.KEPT, "it would be a sample;"), (Removal.SLID, "it would be no sample (slid);")],
 )
-def test_explanation_says_whether_it_is_a_sample_and_what_is_not_judged(
-    removal: Removal, said: str
-) -> None:
+def test_explanation_says_whether_it_is_a_sample_and_what_is_not_judged(removal, said):
     verdict = lifted(slip_mm=0.1, turn_deg=0.1, links=0)
     verdict = replace(verdict, tries=(replace(verdict.tries[0], removal=removal),))
     text = verdict.explain()
@@ -137,7 +129,7 @@ def test_explanation_says_whether_it_is_a_sample_and_what_is_not_judged(
     assert f"In a dataset {said} not judged: not_seen, flat_depth, outlier." in text
 
 
-def test_hints_and_normalised_normals_are_told() -> None:
+def test_hints_and_normalised_normals_are_told():
     verdict = replace(
         lifted(slip_mm=80.0, turn_deg=9.0, links=0, outcome=Outcome.DROPPED),
         hints=("points in millimetres instead of metres",),
@@ -148,7 +140,7 @@ def test_hints_and_normalised_normals_are_told() -> None:
     assert text.endswith("This would fit much better: points in millimetres instead of metres.")
 
 
-def test_held_within_a_distance_follows_from_the_farthest_contact() -> None:
+def test_held_within_a_distance_follows_from_the_farthest_contact():
     verdict = lifted(slip_mm=0.1, turn_deg=0.1, links=0)
     error = np.array([0.003, np.nan, 0.019])
     near = replace(verdict, tries=(replace(verdict.tries[0], contact_error=error),))

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -21,7 +19,6 @@ from drakegrasp.frames import make_pose, pack_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.result_files import (
@@ -38,7 +35,7 @@ RNG = np.random.default_rng(0)
 X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.1])
 
 
-def contacts() -> Contacts:
+def contacts():
     """Two fingertips touch, the second does not."""
     touching = np.array([True, False, True])
     return some_contacts(
@@ -52,7 +49,7 @@ def contacts() -> Contacts:
     )
 
 
-def results() -> list[Verification]:
+def results():
     """One of each kind: held by the hand, held by forces, missed by the hand, and no grasp."""
     box = trimesh.creation.box([0.06, 0.05, 0.12])
     model = make_object(
@@ -97,12 +94,12 @@ def results() -> list[Verification]:
 
 
 @pytest.fixture(scope="module")
-def found() -> list[Verification]:
+def found():
     return results()
 
 
-def lines_of(found: list[Verification]) -> list[dict[str, Any]]:
-    def refuse(constant: str) -> None:
+def lines_of(found):
+    def refuse(constant):
         raise AssertionError(f"{constant} is not strict JSON")
 
     return [
@@ -111,7 +108,7 @@ def lines_of(found: list[Verification]) -> list[dict[str, Any]]:
     ]
 
 
-def test_a_line_says_all_of_a_grasp_in_strict_json(found: list[Verification]) -> None:
+def test_a_line_says_all_of_a_grasp_in_strict_json(found):
     held, by_forces, missed, invalid = lines_of(found)
     assert [line["index"] for line in (held, by_forces, missed, invalid)] == [0, 1, 2, 3]
     assert [line["outcome"] for line in (held, by_forces, missed, invalid)] == [
@@ -156,12 +153,12 @@ def test_a_line_says_all_of_a_grasp_in_strict_json(found: list[Verification]) ->
     assert invalid["seconds"] == {"surface": 0.001}
 
 
-def test_numbers_are_short(found: list[Verification]) -> None:
+def test_numbers_are_short(found):
     (held, *_) = lines_of(found)
     assert held["fit_residual"] == [0.0, 0.001, 0.333333]
 
 
-def test_every_field_is_written_and_reads_back(found: list[Verification], tmp_path: Path) -> None:
+def test_every_field_is_written_and_reads_back(found, tmp_path):
     write_results(found, tmp_path / "r.h5", CONFIG)
     shape = sizes(fingers=3, joints=8, image=0)
     with h5py.File(tmp_path / "r.h5") as file:
@@ -190,7 +187,6 @@ def test_every_field_is_written_and_reads_back(found: list[Verification], tmp_pa
         assert np.array_equal(columns[name], [getattr(v, name) for v in found], equal_nan=True)
     assert np.array_equal(columns["X_OG"][0], pack_pose(X_OG))
     assert np.array_equal(columns["closed_q"][0], held.trial.closed.q)
-    assert held.closed is not None
     assert np.array_equal(columns["closed_p_OQ"][0], held.closed.p_OQ, equal_nan=True)
     assert np.array_equal(columns["closing_start"][0], [0.1, 0.2, 0.3])
     assert columns["solver_status"].tolist() == [0, -1, 0, -1]
@@ -202,7 +198,7 @@ def test_every_field_is_written_and_reads_back(found: list[Verification], tmp_pa
     assert math.isinf(columns["smallest_friction"][2])
 
 
-def test_equal_results_give_equal_bytes(found: list[Verification], tmp_path: Path) -> None:
+def test_equal_results_give_equal_bytes(found, tmp_path):
     """Whatever the clock said while they were found."""
     slower = [replace(v, seconds={"surface": 1.0, "fit": 2.0}) for v in found]
     write_results(found, tmp_path / "a.h5", CONFIG)
@@ -210,9 +206,7 @@ def test_equal_results_give_equal_bytes(found: list[Verification], tmp_path: Pat
     assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
 
 
-def test_lines_are_whole_in_the_end_and_not_lost_before(
-    found: list[Verification], tmp_path: Path
-) -> None:
+def test_lines_are_whole_in_the_end_and_not_lost_before(found, tmp_path):
     out = tmp_path / "new folder" / "run.1"
     with pytest.raises(KeyboardInterrupt), text_lines(out) as write:
         write(json_line(0, found[0]))
@@ -230,12 +224,12 @@ def test_lines_are_whole_in_the_end_and_not_lost_before(
     assert [p.name for p in tmp_path.iterdir()] == ["new folder"]
 
 
-def test_a_name_stands_for_two_files(tmp_path: Path) -> None:
+def test_a_name_stands_for_two_files(tmp_path):
     for name in ("run.h5", "run.jsonl", "run.hdf5", "run"):
         assert [p.name for p in result_paths(tmp_path / name)] == ["run.jsonl", "run.h5"]
 
 
-def test_place_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+def test_place_that_cannot_be_written_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "folder.h5").mkdir()
     with pytest.raises(DataError, match="must be in a folder that can be written"):

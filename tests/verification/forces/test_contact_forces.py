@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.verification.forces import (
     FRICTION_TOLERANCE,
     MAX_FRICTION,
-    ContactForces,
     ForceProgram,
     GraspContacts,
     contact_axes,
@@ -26,14 +25,14 @@ MU = 0.71
 ORIGIN = np.zeros(3)
 
 
-def ring(k: int, radius: float = 0.04) -> tuple[np.ndarray, np.ndarray]:
+def ring(k, radius=0.04):
     """Return k contacts around an upright cylinder at the height of its centre."""
     angles = 2.0 * np.pi * np.arange(k) / k
     normals = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(k)])
     return radius * normals, normals
 
 
-def smallest_forces(p, n, p_OOcm, wrench, friction, **limits) -> ContactForces:
+def smallest_forces(p, n, p_OOcm, wrench, friction, **limits):
     """Return the smallest forces of one wrench."""
     return ForceProgram(GraspContacts(p, n, p_OOcm, **limits), friction).smallest(wrench)
 
@@ -45,7 +44,7 @@ PINCH = (
 )
 
 
-def some_grasp(seed: int, k: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def some_grasp(seed, k=3):
     """Return a ring of contacts that are moved and tilted at random, and a centre of mass."""
     rng = np.random.default_rng(seed)
     p, n = ring(k)
@@ -54,7 +53,7 @@ def some_grasp(seed: int, k: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return p + rng.uniform(-0.005, 0.005, p.shape), n, rng.uniform(-0.005, 0.005, 3)
 
 
-def assert_in_cones(forces: ContactForces, n: np.ndarray, friction: float) -> None:
+def assert_in_cones(forces, n, friction):
     push = -np.einsum("ij,ij->i", forces.f_Q_O, n)
     tangential = np.linalg.norm(forces.f_Q_O + push[:, None] * n, axis=1)
     assert np.all(push >= -1e-6)
@@ -202,7 +201,7 @@ def test_no_forces_take_a_smaller_share_of_unequal_limits():
     assert weak.share == pytest.approx(normal / 20.0, rel=1e-6)
 
 
-def two_rings(offset: float, radius: float) -> tuple[np.ndarray, np.ndarray]:
+def two_rings(offset, radius):
     """Return rings of eight points on opposite faces, `offset` [m] beside the centre."""
     angles = 2.0 * np.pi * np.arange(8) / 8
     ring = radius * np.column_stack([np.cos(angles), np.zeros(8), np.sin(angles)])

@@ -5,20 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from helpers.objects import CUBE, box_model, standing
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.config import Config
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import fingertip_forces
 from drakegrasp.hand.settings import load_config
-from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.lift import PEAK_ACCELERATION, lift_duration
 from drakegrasp.verification.forces import (
     TORSION_RADIUS,
-    ForceVerdict,
     force_margin,
     hand_contacts,
     judge_forces,
@@ -31,36 +27,30 @@ N = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 @pytest.fixture(scope="module")
-def config() -> Config:
+def config():
     return load_config()
 
 
 @pytest.fixture(scope="module")
-def box(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+def box(tmp_path_factory):
     return box_model(tmp_path_factory.mktemp("box"), [CUBE] * 3)
 
 
-def judged(
-    box: ObjectModel,
-    config: Config,
-    p: npt.ArrayLike = P,
-    n: npt.ArrayLike = N,
-    X_TO: np.ndarray | None = None,
-) -> ForceVerdict:
+def judged(box, config, p=P, n=N, X_TO=None):
     return judge_forces(box, standing(box) if X_TO is None else X_TO, p, n, config)
 
 
-def heaviest(config: Config) -> float:
+def heaviest(config):
     """Return the force that carries the cube [N] where it is accelerated upwards the most."""
     distance = config.lift.p_TG[2] - HALF
     return GRAVITY + PEAK_ACCELERATION * distance / lift_duration(distance, config) ** 2
 
 
-def slippery(friction: float) -> Config:
+def slippery(friction):
     return load_config(overrides=[f"physics.friction_hand={friction}"])
 
 
-def test_finger_that_opposes_two_carries_half_of_the_load(box: ObjectModel, config: Config) -> None:
+def test_finger_that_opposes_two_carries_half_of_the_load(box, config):
     found = judged(box, config)
     force = heaviest(config) / (2.0 * config.physics.friction_hand)
     assert found.held and found.deciding is found.points
@@ -70,9 +60,7 @@ def test_finger_that_opposes_two_carries_half_of_the_load(box: ObjectModel, conf
     assert found.reason.startswith(f"normal forces of at most {force:.1f} N carry it: ")
 
 
-def test_more_friction_than_the_smallest_holds_and_less_does_not(
-    box: ObjectModel, config: Config
-) -> None:
+def test_more_friction_than_the_smallest_holds_and_less_does_not(box, config):
     contacts = hand_contacts(box, P, N, config)
     _, smallest = force_margin(box, standing(box), contacts, config)
     assert judged(box, slippery(1.001 * smallest)).held
@@ -81,16 +69,12 @@ def test_more_friction_than_the_smallest_holds_and_less_does_not(
     assert "more than the 34.5 N that the fingertip carries" in found.reason
 
 
-def test_friction_of_the_object_wins_over_the_configured_one(
-    box: ObjectModel, config: Config
-) -> None:
+def test_friction_of_the_object_wins_over_the_configured_one(box, config):
     found = judged(replace(box, friction=0.05), config)
     assert found.planned_force == pytest.approx(heaviest(config) / 0.1, rel=1e-6)
 
 
-def test_finger_below_the_object_as_it_lies_carries_it_almost_without_friction(
-    box: ObjectModel,
-) -> None:
+def test_finger_below_the_object_as_it_lies_carries_it_almost_without_friction(box):
     """The face of the single finger is the lower one of the lying cube."""
     X_TO, config = standing(box), slippery(1e-3)
     X_TO[:3, :3] = Rotation.from_rotvec([np.pi / 2.0, 0.0, 0.0]).as_matrix()
@@ -100,9 +84,7 @@ def test_finger_below_the_object_as_it_lies_carries_it_almost_without_friction(
 
 
 @pytest.mark.parametrize("p", [np.abs(P), [[0.01, HALF, 0.0]] * 3])
-def test_contacts_on_one_face_hold_nothing(
-    box: ObjectModel, config: Config, p: npt.ArrayLike
-) -> None:
+def test_contacts_on_one_face_hold_nothing(box, config, p):
     found = judged(box, config, p, np.abs(N))
     assert found.on_surface and not found.held
     assert found.planned_force == np.inf
@@ -112,9 +94,7 @@ def test_contacts_on_one_face_hold_nothing(
 # Predictions that lie
 
 
-def test_normals_that_lean_upwards_carry_no_more_than_the_surfaces_own(
-    box: ObjectModel,
-) -> None:
+def test_normals_that_lean_upwards_carry_no_more_than_the_surfaces_own(box):
     """At little friction they would point the forces up: the surface does not let them."""
     leaning = N - [0.0, 0.0, 0.8]
     leaning /= np.linalg.norm(leaning, axis=1, keepdims=True)
@@ -124,15 +104,13 @@ def test_normals_that_lean_upwards_carry_no_more_than_the_surfaces_own(
 
 
 @pytest.mark.parametrize(("away", "side"), [(0.009, "outside"), (-0.009, "inside")])
-def test_points_off_the_surface_fail_by_their_distance(
-    box: ObjectModel, config: Config, away: float, side: str
-) -> None:
+def test_points_off_the_surface_fail_by_their_distance(box, config, away, side):
     found = judged(box, config, P + away * N * [[0.0], [1.0], [0.0]], N)
     assert not found.held and not found.on_surface
     assert found.reason == f"contact 2 is 9.0 mm {side} the object's surface, more than 5 mm"
 
 
-def test_normals_off_the_surfaces_own_fail_by_their_angle(box: ObjectModel, config: Config) -> None:
+def test_normals_off_the_surfaces_own_fail_by_their_angle(box, config):
     found = judged(box, config, P, N * [[1.0], [1.0], [-1.0]])
     assert not found.held and not found.on_surface
     assert found.reason == "normal 3 is 180° off the surface's own, more than 45°"
@@ -141,7 +119,7 @@ def test_normals_off_the_surfaces_own_fail_by_their_angle(box: ObjectModel, conf
 # Two fingertips
 
 
-def test_two_fingertips_hold_by_patches_what_points_let_swing(box: ObjectModel) -> None:
+def test_two_fingertips_hold_by_patches_what_points_let_swing(box):
     """Beside the centre of mass, by less than the radius of a patch."""
     config = load_config(hand="franka")
     p = np.array([[TORSION_RADIUS / 2.0, HALF, 0.0], [TORSION_RADIUS / 2.0, -HALF, 0.0]])
@@ -154,7 +132,7 @@ def test_two_fingertips_hold_by_patches_what_points_let_swing(box: ObjectModel) 
     "setting",
     ["lift.drive=torque", "physics.friction_hand=0.2", "lift.max_acceleration=90"],
 )
-def test_each_setting_alone_decides(box: ObjectModel, setting: str) -> None:
+def test_each_setting_alone_decides(box, setting):
     """Finger 1, whose worm holds three times what its motor gives, opposes the other two."""
     heavy, order = replace(box, mass=3.0 * box.mass), [2, 0, 1]
     fast = "lift.max_speed=100"

@@ -20,7 +20,7 @@ from drakegrasp.verification.forces import (
 CUBE = np.vstack([np.eye(3), -np.eye(3)])
 
 
-def some_grasp(seed: int, k: int = 4) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def some_grasp(seed, k=4):
     """Return contacts all around an ellipsoid, with their normals, and a centre of mass."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(k, 3))
@@ -32,7 +32,7 @@ def some_grasp(seed: int, k: int = 4) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return directions * radii, normals, rng.uniform(-0.01, 0.01, 3)
 
 
-def edge_wrenches(p, n, p_OOcm, *, friction: float, length: float) -> np.ndarray:
+def edge_wrenches(p, n, p_OOcm, *, friction, length):
     """Return the wrenches (n, 6) of the cones' edges, summed contact by contact."""
     angles = 2.0 * np.pi * np.arange(FRICTION_EDGES) / FRICTION_EDGES
     found = []
@@ -107,7 +107,7 @@ def test_epsilon_is_the_radius_that_linear_programmes_find(seed):
     assert min(supports) == pytest.approx(epsilon, rel=1e-3)
 
 
-def smallest_support(edges: np.ndarray, start: np.ndarray) -> float:
+def smallest_support(edges, start):
     """Return a local minimum over unit directions u of the largest edge . u.
 
     With the other side of the sphere fixed by u . start = 1, each step is a linear programme.

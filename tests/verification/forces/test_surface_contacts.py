@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
 from helpers.objects import CUBE, box_model, model_of
 
-from drakegrasp.objects.model import ObjectModel
 from drakegrasp.verification.forces import (
     MAX_ANGLE,
     MAX_DISTANCE,
@@ -24,16 +21,16 @@ RIGHT, UP = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
 @pytest.fixture(scope="module")
-def box(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+def box(tmp_path_factory):
     return box_model(tmp_path_factory.mktemp("box"), [CUBE] * 3)
 
 
-def leaning(angle: float) -> np.ndarray:
+def leaning(angle):
     """Return a normal that leans from +x towards +z by an angle [rad]."""
     return np.array([np.cos(angle), 0.0, np.sin(angle)])
 
 
-def test_points_beside_a_face_select_it_and_its_normal(box: ObjectModel) -> None:
+def test_points_beside_a_face_select_it_and_its_normal(box):
     """In the air, inside and on it, with the angle of the prediction's own normal."""
     p = np.array([[HALF + 0.004, 0.01, 0.0], [HALF - 0.003, 0.01, 0.0], [HALF, 0.01, 0.0]])
     found = surface_contacts(box, p, [RIGHT, leaning(0.5), leaning(-0.2)])
@@ -46,7 +43,7 @@ def test_points_beside_a_face_select_it_and_its_normal(box: ObjectModel) -> None
 
 
 @pytest.mark.parametrize("inside", [False, True])
-def test_points_too_far_from_the_surface_are_off_it(box: ObjectModel, inside: bool) -> None:
+def test_points_too_far_from_the_surface_are_off_it(box, inside):
     sign = -1.0 if inside else 1.0
     p = [[HALF + sign * (MAX_DISTANCE + shift), 0.0, 0.0] for shift in (-1e-6, 1e-4, 0.01)]
     found = surface_contacts(box, p, [RIGHT] * 3)
@@ -54,21 +51,21 @@ def test_points_too_far_from_the_surface_are_off_it(box: ObjectModel, inside: bo
     assert found.inside.tolist() == [inside] * 3
 
 
-def test_normals_too_far_from_the_surfaces_own_are_off_it(box: ObjectModel) -> None:
+def test_normals_too_far_from_the_surfaces_own_are_off_it(box):
     angles = [MAX_ANGLE - 1e-6, MAX_ANGLE + 1e-6, np.pi]
     found = surface_contacts(box, [[HALF, 0.0, 0.0]] * 3, [leaning(angle) for angle in angles])
     assert np.allclose(found.angle, angles)
     assert found.off_surface.tolist() == [False, True, True]
 
 
-def test_at_an_edge_the_normal_chooses_between_the_faces(box: ObjectModel) -> None:
+def test_at_an_edge_the_normal_chooses_between_the_faces(box):
     edge = [HALF, 0.0, HALF]
     found = surface_contacts(box, [edge] * 2, [leaning(0.4), leaning(1.2)])
     assert np.allclose(found.nhat_Q_O, [RIGHT, UP])
     assert np.allclose(found.p_OQ, edge)
 
 
-def test_a_normal_cannot_name_the_other_side_of_a_wall(tmp_path: Path) -> None:
+def test_a_normal_cannot_name_the_other_side_of_a_wall(tmp_path):
     """No fingertip fits where a flipped normal would have it, e.g. within a bottle."""
     plate = box_model(tmp_path, [0.003, 0.1, 0.1])
     p = [[-0.0015, 0.01, 0.0], [0.0015, 0.01, 0.0]]
@@ -77,7 +74,7 @@ def test_a_normal_cannot_name_the_other_side_of_a_wall(tmp_path: Path) -> None:
     assert found.off_surface.tolist() == [True, False]
 
 
-def test_patch_on_a_plane_is_a_ring_with_the_planes_normal(box: ObjectModel) -> None:
+def test_patch_on_a_plane_is_a_ring_with_the_planes_normal(box):
     contacts = surface_contacts(box, [[HALF, 0.01, -0.005]], [RIGHT])
     points, normals = patch_points(box, contacts)
     assert points.shape == normals.shape == (1, 1 + RING_POINTS, 3)
@@ -87,7 +84,7 @@ def test_patch_on_a_plane_is_a_ring_with_the_planes_normal(box: ObjectModel) -> 
     assert np.allclose(normals, RIGHT)
 
 
-def test_patch_ends_at_a_sharp_edge(box: ObjectModel) -> None:
+def test_patch_ends_at_a_sharp_edge(box):
     """No finger that presses on one side holds by the other."""
     contacts = surface_contacts(box, [[HALF, 0.0, HALF - 0.001]], [RIGHT])
     points, normals = patch_points(box, contacts)
@@ -96,7 +93,7 @@ def test_patch_ends_at_a_sharp_edge(box: ObjectModel) -> None:
     assert np.allclose(normals, RIGHT)
 
 
-def test_patch_on_a_ball_has_the_normals_of_its_own_faces(tmp_path: Path) -> None:
+def test_patch_on_a_ball_has_the_normals_of_its_own_faces(tmp_path):
     radius = 0.02
     ball = model_of(trimesh.creation.icosphere(4, radius), tmp_path)
     contacts = surface_contacts(ball, [[radius, 0.0, 0.0]], [RIGHT])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -12,14 +10,12 @@ from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import DiagramBuilder
 
 from drakegrasp.errors import HandError
-from drakegrasp.frames import Array
 from drakegrasp.hand import shapes
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import hull_triangles, link_shapes, pad_surfaces
 from drakegrasp.verification.wrist_problem import (
     ROUNDING,
-    Pads,
     make_pads,
     nearest_on_pads,
     signed_distance,
@@ -31,7 +27,7 @@ HALF = np.array([0.012, 0.01, 0.03])
 MERGED = 2e-6
 
 
-def bodies() -> list[Array]:
+def bodies():
     """Return corners of a box, a tetrahedron and a Barrett fingertip: few planes and many."""
     hand = load_hand()
     tetrahedron = np.array([[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, 0.02, 0.0], [0.0, 0.0, 0.04]])
@@ -39,42 +35,40 @@ def bodies() -> list[Array]:
     return [trimesh.creation.box(2.0 * HALF).vertices, tetrahedron, fingertip]
 
 
-def whole_pads(corners: list[Array]) -> Pads:
+def whole_pads(corners):
     """Return fingertips that are pads all over."""
     return make_pads(corners, [()] * len(corners), [hull_triangles(c) for c in corners])
 
 
 @pytest.fixture(scope="module")
-def pads() -> Pads:
+def pads():
     return whole_pads(bodies())
 
 
 @pytest.fixture(scope="module")
-def hulls() -> list[trimesh.Trimesh]:
+def hulls():
     return [trimesh.convex.convex_hull(corners) for corners in bodies()]
 
 
-def points_about(hulls: list[trimesh.Trimesh], seed: int) -> Array:
+def points_about(hulls, seed):
     """Return one point for each hull, within its box made larger by 10 mm."""
     rng = np.random.default_rng(seed)
     low, high = np.swapaxes([hull.bounds for hull in hulls], 0, 1)
     return np.asarray(rng.uniform(low - 0.01, high + 0.01))
 
 
-def highest_plane(hull: trimesh.Trimesh, p: Array) -> float:
+def highest_plane(hull, p):
     """Return the largest height of a point above a face's plane."""
     return float(np.einsum("ij,ij->i", p - hull.triangles[:, 0], hull.face_normals).max())
 
 
-def hull_distance(hull: trimesh.Trimesh, p: Array) -> float:
+def hull_distance(hull, p):
     """Return trimesh's distance outside of the hull, negative inside."""
     return -float(trimesh.proximity.signed_distance(hull, p[None])[0])
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_smooth_distance_is_over_the_planes_by_its_rounding_at_most(
-    pads: Pads, hulls: list[trimesh.Trimesh], seed: int
-) -> None:
+def test_smooth_distance_is_over_the_planes_by_its_rounding_at_most(pads, hulls, seed):
     p = points_about(hulls, seed)
     distance = signed_distance(pads, p).distance
     exact = np.array([highest_plane(hull, q) for hull, q in zip(hulls, p, strict=True)])
@@ -87,9 +81,7 @@ def test_smooth_distance_is_over_the_planes_by_its_rounding_at_most(
     np.testing.assert_array_equal((distance < 0.0)[clear], np.array(inside)[clear])
 
 
-def test_before_the_middle_of_a_face_the_distance_is_the_exact_one(
-    pads: Pads, hulls: list[trimesh.Trimesh]
-) -> None:
+def test_before_the_middle_of_a_face_the_distance_is_the_exact_one(pads, hulls):
     box = whole_pads([trimesh.creation.box(2.0 * HALF).vertices])
     for axis in range(3):
         for height in (0.02, 0.003, 0.0, -0.001):
@@ -107,9 +99,7 @@ def test_before_the_middle_of_a_face_the_distance_is_the_exact_one(
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_derivatives_are_those_of_finite_differences(
-    pads: Pads, hulls: list[trimesh.Trimesh], seed: int
-) -> None:
+def test_derivatives_are_those_of_finite_differences(pads, hulls, seed):
     p, h = points_about(hulls, 100 + seed), 1e-6
     contact = signed_distance(pads, p)
     for axis in np.eye(3):
@@ -121,7 +111,7 @@ def test_derivatives_are_those_of_finite_differences(
         np.testing.assert_allclose(contact.normal_jacobian @ axis, turn, atol=1e-5 / ROUNDING)
 
 
-def test_normals_are_unit_vectors_along_the_gradient_which_is_shorter_at_edges(pads: Pads) -> None:
+def test_normals_are_unit_vectors_along_the_gradient_which_is_shorter_at_edges(pads):
     p = np.array([HALF, [0.03, 0.02, 0.04], [0.1, 0.0, 0.0]])
     contact = signed_distance(pads, p)
     np.testing.assert_allclose(np.linalg.norm(contact.normal, axis=1), 1.0, atol=1e-12)
@@ -133,7 +123,7 @@ def test_normals_are_unit_vectors_along_the_gradient_which_is_shorter_at_edges(p
     assert length[0] == pytest.approx(3.0**-0.5, abs=1e-5)
 
 
-def test_far_from_the_pad_nothing_overflows(pads: Pads) -> None:
+def test_far_from_the_pad_nothing_overflows(pads):
     for p in np.random.default_rng(0).normal(size=(5, 3, 3)):
         contact = signed_distance(pads, 1e3 * p)
         for values in (contact.distance, contact.normal, contact.gradient, contact.normal_jacobian):
@@ -141,7 +131,7 @@ def test_far_from_the_pad_nothing_overflows(pads: Pads) -> None:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_nearest_point_is_trimeshs_own(pads: Pads, hulls: list[trimesh.Trimesh], seed: int) -> None:
+def test_nearest_point_is_trimeshs_own(pads, hulls, seed):
     p = points_about(hulls, 200 + seed)
     near = nearest_on_pads(pads, p)
     for hull, q, found in zip(hulls, p, near, strict=True):
@@ -160,7 +150,7 @@ def test_nearest_point_is_trimeshs_own(pads: Pads, hulls: list[trimesh.Trimesh],
 REGION = ((2.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, -0.005))
 
 
-def half_box() -> Pads:
+def half_box():
     """Return two boxes, the first a pad in `REGION` only."""
     corners = trimesh.creation.box([0.02, 0.02, 0.06]).vertices
     whole = hull_triangles(corners)
@@ -170,7 +160,7 @@ def half_box() -> Pads:
     return make_pads([corners, corners], [REGION, ()], [half, whole])
 
 
-def test_pad_ends_at_its_region_without_a_face_there() -> None:
+def test_pad_ends_at_its_region_without_a_face_there():
     """Area of half a box, without the cuts: an end, and parts of two ends and of two sides."""
     pads = half_box()
     area = [float(trimesh.triangles.area(triangles).sum()) for triangles in pads.triangles]
@@ -178,7 +168,7 @@ def test_pad_ends_at_its_region_without_a_face_there() -> None:
     assert area[1] == pytest.approx(4.0 * 0.02 * 0.06 + 2.0 * 0.02**2)
 
 
-def test_nearest_point_of_a_pad_is_not_on_a_cut() -> None:
+def test_nearest_point_of_a_pad_is_not_on_a_cut():
     """Before the middle of the removed half, the pad begins at its border."""
     inside = np.tile([0.002, 0.004, 0.0], (2, 1))
     near = nearest_on_pads(half_box(), inside)
@@ -189,7 +179,7 @@ def test_nearest_point_of_a_pad_is_not_on_a_cut() -> None:
     assert abs(near[0, 1]) == pytest.approx(0.01) or abs(near[0, 2]) == pytest.approx(0.03)
 
 
-def test_point_outside_the_region_is_told_by_how_much() -> None:
+def test_point_outside_the_region_is_told_by_how_much():
     p = np.tile([-0.003, 0.006, 0.0], (2, 1))
     contact = signed_distance(half_box(), p)
     assert np.allclose(contact.outside, [[0.003, 0.001], [0.0, 0.0]])
@@ -200,7 +190,7 @@ def test_point_outside_the_region_is_told_by_how_much() -> None:
     assert not within.outside_gradient.any()
 
 
-def test_pads_of_the_barrett_hand_are_in_their_region() -> None:
+def test_pads_of_the_barrett_hand_are_in_their_region():
     hand = load_hand()
     for finger, triangles in zip(hand.fingers, pad_surfaces(hand.model, hand.fingers), strict=True):
         corners = triangles.reshape(-1, 3)
@@ -213,11 +203,11 @@ def test_pads_of_the_barrett_hand_are_in_their_region() -> None:
 
 
 @pytest.fixture(scope="module")
-def hand() -> Hand:
+def hand():
     return load_hand()
 
 
-def test_barretts_pad_points_are_on_their_fingertips(hand: Hand) -> None:
+def test_barretts_pad_points_are_on_their_fingertips(hand):
     """The median of contacts on a rounded pad is a little below its surface."""
     corners = [np.concatenate(link_shapes(hand.model)[link]) for link in hand.fingertip_links]
     p_FiP = np.array([finger.p_FiP for finger in hand.fingers])
@@ -225,7 +215,7 @@ def test_barretts_pad_points_are_on_their_fingertips(hand: Hand) -> None:
     assert off.max() < 2.5e-3
 
 
-def with_shape(folder: Path, shape: str) -> Path:
+def with_shape(folder, shape):
     """Write a gripper whose left finger is one shape."""
     capsule = "<capsule><radius>0.01</radius><length>0.08</length></capsule>"
     assert capsule in PINCER_SDF
@@ -241,7 +231,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("kind", SHAPES)
-def test_shapes_reach_as_far_as_drakes(tmp_path: Path, kind: str) -> None:
+def test_shapes_reach_as_far_as_drakes(tmp_path, kind):
     hand = load_hand(with_shape(tmp_path, SHAPES[kind]))
     # A polygon around a circle of 1 cm is 0.2 mm farther out, a ball's corners as much less.
     assert_reaches_as_far_as_drakes(hand, atol=3e-4)
@@ -252,7 +242,7 @@ def test_barretts_shapes_reach_as_far_as_drakes(hand: Hand) -> None:
     assert_reaches_as_far_as_drakes(hand, atol=1e-3)
 
 
-def assert_reaches_as_far_as_drakes(hand: Hand, *, atol: float) -> None:
+def assert_reaches_as_far_as_drakes(hand, *, atol):
     """In any direction each link ends where Drake's distance from a far point says."""
     far, rng = 1e3, np.random.default_rng(0)
     builder = DiagramBuilder()
@@ -286,7 +276,7 @@ def assert_reaches_as_far_as_drakes(hand: Hand, *, atol: float) -> None:
         ("<plane><normal>0 0 1</normal><size>1 1</size></plane>", "HalfSpace"),
     ],
 )
-def test_other_shapes_are_refused(tmp_path: Path, shape: str, got: str) -> None:
+def test_other_shapes_are_refused(tmp_path, shape, got):
     hand = load_hand(with_shape(tmp_path, shape))
     message = rf"rod: must be a box, cylinder, capsule, sphere or convex mesh, got {got}"
     with pytest.raises(HandError, match=message) as caught:

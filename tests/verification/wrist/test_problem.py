@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
 
@@ -11,8 +10,8 @@ import pytest
 from helpers.hands import PINCER, write_pincer
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.frames import Array, invert_pose, make_pose, rotate_vectors, transform_points
-from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.frames import invert_pose, make_pose, rotate_vectors, transform_points
+from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import (
     fingertip_poses,
     link_poses,
@@ -35,19 +34,19 @@ SEEDS = range(12)
 
 
 @cache
-def hand_of(name: str) -> Hand:
+def hand_of(name):
     return load_hand(name)
 
 
 @pytest.fixture(scope="module", params=["barrett", "pincer", "allegro", "franka"])
-def name(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> str:
+def name(request, tmp_path_factory):
     """Hands with a spread, with one joint per finger, with a preshape, with fingers that slide."""
     if request.param != "pincer":
         return str(request.param)
     return str(write_pincer(tmp_path_factory.mktemp("pincer"), fingers=with_regions()))
 
 
-def with_regions() -> list[object]:
+def with_regions():
     """Return the gripper's fingers with pads that face each other, on the outer 4 cm."""
     return [
         {**finger, "pad_region": [[0, 2.0 * inward, 0, 0], [0, 0, 1, 0.06]]}
@@ -55,15 +54,15 @@ def with_regions() -> list[object]:
     ]
 
 
-def unit(vectors: Array) -> Array:
+def unit(vectors):
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
-def random_pose(rng: np.random.Generator) -> Array:
+def random_pose(rng):
     return make_pose(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-0.3, 0.3, 3))
 
 
-def random_problem(name: str, seed: int) -> tuple[WristProblem, Array]:
+def random_problem(name, seed):
     """Return contacts some centimetres off a hand's fingertips, and an x away from the start."""
     rng = np.random.default_rng(seed)
     hand, X_OS = hand_of(name), random_pose(rng)
@@ -85,14 +84,14 @@ def random_problem(name: str, seed: int) -> tuple[WristProblem, Array]:
     return problem, np.concatenate([pose, c + rng.normal(scale=0.2, size=len(c))])
 
 
-def differences(function: Callable[[Array], Array], x: Array, h: float = 1e-6) -> Array:
+def differences(function, x, h=1e-06):
     """Return the derivative of a function of x by central differences, x last."""
     steps = h * np.eye(len(x))
     return np.stack([(function(x + s) - function(x - s)) / (2.0 * h) for s in steps], axis=-1)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_palm_and_fingertips_are_where_kinematics_puts_them(name: str, seed: int) -> None:
+def test_palm_and_fingertips_are_where_kinematics_puts_them(name, seed):
     problem, x = random_problem(name, seed)
     at = evaluate(problem, x)
     R_SG = Rotation.from_euler("XYZ", x[:3]).as_matrix()
@@ -114,7 +113,7 @@ def test_palm_and_fingertips_are_where_kinematics_puts_them(name: str, seed: int
 TERMS = ("distance", "normal", "closing", "pad", "posture", "region")
 
 
-def terms(hand: Hand) -> dict[str, slice]:
+def terms(hand):
     """Return which residuals of a hand's k fingers and m motors are of which term."""
     k, m = hand.closing_ratio.shape
     ends = np.cumsum([0, k, 3 * k, 3 * k, 3 * k, 1 + m, 2 * k])
@@ -122,7 +121,7 @@ def terms(hand: Hand) -> dict[str, slice]:
 
 
 @pytest.mark.parametrize("term", TERMS)
-def test_slope_of_each_term_is_that_of_finite_differences(name: str, term: str) -> None:
+def test_slope_of_each_term_is_that_of_finite_differences(name, term):
     """A term with a small weight could hide an error behind the others."""
     problem, x = random_problem(name, 90)
     at = evaluate(problem, x)
@@ -131,7 +130,7 @@ def test_slope_of_each_term_is_that_of_finite_differences(name: str, term: str) 
     rows = terms(hand)[term]
     assert terms(hand)["region"].stop == len(at.residuals)
 
-    def share(x: Array) -> Array:
+    def share(x):
         residuals = evaluate(problem, x).residuals[rows]
         return np.asarray(residuals @ residuals)
 
@@ -141,7 +140,7 @@ def test_slope_of_each_term_is_that_of_finite_differences(name: str, term: str) 
 
 
 @pytest.mark.parametrize("seed", SEEDS[:4])
-def test_rows_of_scalars_are_plain_derivatives(name: str, seed: int) -> None:
+def test_rows_of_scalars_are_plain_derivatives(name, seed):
     problem, x = random_problem(name, seed)
     hand = hand_of(name)
     for term in ("distance", "posture", "pad"):
@@ -152,14 +151,14 @@ def test_rows_of_scalars_are_plain_derivatives(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_closing_direction_is_how_the_fingertip_moves_at_the_point(name: str, seed: int) -> None:
+def test_closing_direction_is_how_the_fingertip_moves_at_the_point(name, seed):
     problem, x = random_problem(name, seed)
     at, hand, h = evaluate(problem, x), hand_of(name), 1e-6
     k = hand.num_fingers
     residual = at.residuals[terms(hand)["closing"]].reshape(k, 3) / CLOSING_WEIGHT
     direction = residual - problem.nhat_Q_O @ at.X_OG[:3, :3]
 
-    def material_points(closing: Array) -> Array:
+    def material_points(closing):
         X_GF = fingertip_poses(hand, spread=x[POSE], closing=closing)
         return np.asarray(np.einsum("kab,kb->ka", X_GF[:, :3, :3], at.p_FiQ) + X_GF[:, :3, 3])
 
@@ -169,7 +168,7 @@ def test_closing_direction_is_how_the_fingertip_moves_at_the_point(name: str, se
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_clearance_is_the_lowest_corners_height_within_the_rounding(name: str, seed: int) -> None:
+def test_clearance_is_the_lowest_corners_height_within_the_rounding(name, seed):
     problem, x = random_problem(name, seed)
     at, hand = evaluate(problem, x), hand_of(name)
     shapes = link_shapes(hand.model)
@@ -193,14 +192,14 @@ def test_clearance_is_the_lowest_corners_height_within_the_rounding(name: str, s
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_slope_of_the_clearance_is_that_of_finite_differences(name: str, seed: int) -> None:
+def test_slope_of_the_clearance_is_that_of_finite_differences(name, seed):
     problem, x = random_problem(name, seed)
     slope = differences(lambda x: evaluate(problem, x).clearance, x)
     np.testing.assert_allclose(evaluate(problem, x).clearance_jacobian, slope, atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_where_the_object_is_does_not_matter(name: str, seed: int) -> None:
+def test_where_the_object_is_does_not_matter(name, seed):
     """Contacts, table and start, moved together, make the same problem."""
     problem, x = random_problem(name, seed)
     X_AO = random_pose(np.random.default_rng(1000 + seed))
@@ -220,7 +219,7 @@ def test_where_the_object_is_does_not_matter(name: str, seed: int) -> None:
     np.testing.assert_allclose(there.clearance, here.clearance, atol=1e-12)
 
 
-def test_a_finger_closed_against_its_contact_leaves_little(name: str) -> None:
+def test_a_finger_closed_against_its_contact_leaves_little(name):
     """Contacts on the nominal points, normals against the pads: only rounding is left."""
     hand, constants = hand_of(name), hand_constants(hand_of(name))
     c = constants.limits.mean(axis=1)
@@ -253,7 +252,7 @@ def test_a_finger_closed_against_its_contact_leaves_little(name: str) -> None:
     assert np.all(wrong > 1.7)
 
 
-def test_posture_counts_a_slide_in_tenths_of_a_metre(name: str) -> None:
+def test_posture_counts_a_slide_in_tenths_of_a_metre(name):
     """A motor that is off by 0.1 m weighs as much as one that is off by a radian."""
     problem, x = random_problem(name, 3)
     hand = hand_of(name)

@@ -13,14 +13,13 @@ from scipy.spatial.transform import Rotation
 
 import drakegrasp.verification.wrist_solver
 from drakegrasp.frames import Array, invert_pose, make_pose, rotate_vectors, transform_points
-from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.verification.wrist_problem import hand_constants, nearest_on_pads, signed_distance
 from drakegrasp.verification.wrist_solver import (
     DIFFERENT,
     LEVER,
-    WristFit,
     find_starts,
     fit_wrist,
     make_postures,
@@ -32,7 +31,7 @@ UP, HIGH = np.array([0.0, 0.0, 1.0]), 5.0
 
 
 @cache
-def hand_of(name: str) -> Hand:
+def hand_of(name):
     return load_hand(name)
 
 
@@ -46,9 +45,7 @@ class Touch:
     nhat_Q_O: Array
 
 
-def touched(
-    name: str, seed: int, *, scatter: float = 0.005, closing_deg: tuple[float, float] = (20, 100)
-) -> Touch:
+def touched(name, seed, *, scatter=0.005, closing_deg=(20, 100)):
     """Return contacts on the pads of a hand in any posture and pose.
 
     Args:
@@ -76,15 +73,15 @@ def touched(
     )
 
 
-def fit(name: str, made: Touch, up_O: Array = UP, height: float = HIGH) -> list[WristFit]:
+def fit(name, made, up_O=UP, height=HIGH):
     return fit_wrist(hand_of(name), made.p_OQ, made.nhat_Q_O, up_O=up_O, height=height)
 
 
-def coordinates(fit: WristFit) -> Array:
+def coordinates(fit):
     return np.concatenate([[fit.spread], fit.closing])
 
 
-def lowest(name: str, fit: WristFit, up_O: Array, height: float) -> float:
+def lowest(name, fit, up_O, height):
     """Return how far over the table the lowest corner of palm and fingertips is [m]."""
     hand = hand_of(name)
     X_OF = fit.X_OG @ fingertip_poses(hand, spread=fit.spread, closing=fit.closing)
@@ -98,11 +95,11 @@ def lowest(name: str, fit: WristFit, up_O: Array, height: float) -> float:
 
 
 @pytest.fixture(scope="module")
-def pincer(tmp_path_factory: pytest.TempPathFactory) -> str:
+def pincer(tmp_path_factory):
     return str(write_pincer(tmp_path_factory.mktemp("pincer")))
 
 
-def test_contacts_that_the_hand_made_are_found_again() -> None:
+def test_contacts_that_the_hand_made_are_found_again():
     """Always the points; the normals but for a pad's corner that another place may fit as well."""
     turned = []
     for seed in range(30):
@@ -117,7 +114,7 @@ def test_contacts_that_the_hand_made_are_found_again() -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS[:6])
-def test_points_that_the_back_of_a_fingertip_touched_are_brought_onto_the_pad(seed: int) -> None:
+def test_points_that_the_back_of_a_fingertip_touched_are_brought_onto_the_pad(seed):
     """Near the tip but behind the pad: without the region the fit stays there, with it it moves."""
     barrett = hand_of("barrett")
     bare, hand = (
@@ -135,7 +132,7 @@ def test_points_that_the_back_of_a_fingertip_touched_are_brought_onto_the_pad(se
         nhat_Q_O=-np.einsum("kab,kb->ka", X_GF[:, :3, :3], normals),
     )
 
-    def farthest_outside(which: Hand) -> float:
+    def farthest_outside(which):
         found = fit_wrist(which, made.p_OQ, made.nhat_Q_O, up_O=UP, height=HIGH)[0]
         X_OF = found.X_OG @ fingertip_poses(hand, spread=found.spread, closing=found.closing)
         X_FO = invert_pose(X_OF)
@@ -147,7 +144,7 @@ def test_points_that_the_back_of_a_fingertip_touched_are_brought_onto_the_pad(se
 
 
 @pytest.mark.parametrize("seed", SEEDS[:10])
-def test_a_hand_of_two_fingers_finds_its_contacts_again(pincer: str, seed: int) -> None:
+def test_a_hand_of_two_fingers_finds_its_contacts_again(pincer, seed):
     best = fit(pincer, touched(pincer, seed, scatter=0.002, closing_deg=(5, 45)))[0]
     assert best.residual.max() < 2e-3
     assert np.rad2deg(best.normal_error.max()) < 15.0
@@ -156,7 +153,7 @@ def test_a_hand_of_two_fingers_finds_its_contacts_again(pincer: str, seed: int) 
 
 
 @pytest.mark.parametrize("seed", SEEDS[:8])
-def test_a_fit_is_as_good_as_it_says(seed: int) -> None:
+def test_a_fit_is_as_good_as_it_says(seed):
     """By the forward kinematics and the pads without rounding."""
     made, hand, constants = (
         touched("barrett", seed),
@@ -180,7 +177,7 @@ def test_a_fit_is_as_good_as_it_says(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS[:10])
-def test_joints_stay_within_their_limits(pincer: str, seed: int) -> None:
+def test_joints_stay_within_their_limits(pincer, seed):
     for name, closing_deg in (("barrett", (0, 140)), (pincer, (-6, 57))):
         lower, upper = coordinate_limits(hand_of(name)).T
         for found in fit(name, touched(name, seed, closing_deg=closing_deg)):
@@ -189,7 +186,7 @@ def test_joints_stay_within_their_limits(pincer: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS[:8])
-def test_where_the_object_is_does_not_matter(seed: int) -> None:
+def test_where_the_object_is_does_not_matter(seed):
     rng, made = np.random.default_rng(1000 + seed), touched("barrett", seed)
     X_AO = make_pose(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-1.0, 1.0, 3))
     up_O = X_AO[:3, :3].T @ UP
@@ -208,7 +205,7 @@ def test_where_the_object_is_does_not_matter(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS[:8])
-def test_the_hands_mirror_image_is_the_hand_with_two_fingers_swapped(seed: int) -> None:
+def test_the_hands_mirror_image_is_the_hand_with_two_fingers_swapped(seed):
     """Fingers 1 and 2 are mirror images in the palm's plane x = 0, finger 3 is its own."""
     made, mirror, swapped = touched("barrett", seed), np.diag([-1.0, 1.0, 1.0]), [1, 0, 2]
     best = fit("barrett", made)[0]
@@ -225,7 +222,7 @@ def test_the_hands_mirror_image_is_the_hand_with_two_fingers_swapped(seed: int) 
 
 
 @pytest.mark.parametrize("seed", SEEDS[:5])
-def test_contacts_given_to_other_fingers_fit_worse(seed: int) -> None:
+def test_contacts_given_to_other_fingers_fit_worse(seed):
     """Often not by much: three points on three large pads leave a lot open."""
     made = touched("barrett", seed, scatter=0.0, closing_deg=(40, 100))
     own = fit("barrett", made)[0].objective
@@ -235,13 +232,13 @@ def test_contacts_given_to_other_fingers_fit_worse(seed: int) -> None:
         assert other.objective > own
 
 
-def above(made: Touch, room: float) -> float:
+def above(made, room):
     """Return the height of {O} at which the lowest contact is so far above the table [m]."""
     return room - float((made.p_OQ @ UP).min())
 
 
 @pytest.mark.parametrize("seed", SEEDS[:12])
-def test_palm_and_fingertips_stay_over_the_table(seed: int) -> None:
+def test_palm_and_fingertips_stay_over_the_table(seed):
     """At most a millimetre or two of the rounding and of the last closing step are below."""
     made = touched("barrett", seed, scatter=0.0, closing_deg=(35, 100))
     height = above(made, 0.02)
@@ -249,7 +246,7 @@ def test_palm_and_fingertips_stay_over_the_table(seed: int) -> None:
         assert lowest("barrett", found, UP, height) > -2e-3
 
 
-def test_a_table_in_the_way_pushes_the_hand_up() -> None:
+def test_a_table_in_the_way_pushes_the_hand_up():
     pushed = 0
     for seed in SEEDS[:12]:
         made = touched("barrett", seed, scatter=0.0, closing_deg=(35, 100))
@@ -267,7 +264,7 @@ def test_a_table_in_the_way_pushes_the_hand_up() -> None:
     assert pushed >= 3
 
 
-def test_contacts_out_of_reach_leave_a_large_residual() -> None:
+def test_contacts_out_of_reach_leave_a_large_residual():
     angle = 2.0 * np.pi * np.arange(3) / 3.0
     outward = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(3)])
     p_OQ = 0.5 / np.sqrt(3.0) * outward  # an equilateral triangle with edges of 0.5 m
@@ -278,7 +275,7 @@ def test_contacts_out_of_reach_leave_a_large_residual() -> None:
         assert np.isfinite(each.X_OG).all()
 
 
-def test_contacts_in_one_point_are_no_crash() -> None:
+def test_contacts_in_one_point_are_no_crash():
     """Nonsense that a network may well predict."""
     for normals in (np.tile(UP, (3, 1)), np.eye(3)):
         for each in fit_wrist(hand_of("barrett"), np.zeros((3, 3)), normals, up_O=UP, height=HIGH):
@@ -289,7 +286,7 @@ def test_contacts_in_one_point_are_no_crash() -> None:
 
 
 @pytest.mark.parametrize("row", [0, 1234, 9000, -1])
-def test_a_posture_of_the_table_is_its_own_first_start(row: int) -> None:
+def test_a_posture_of_the_table_is_its_own_first_start(row):
     postures, rng = make_postures(hand_of("barrett")), np.random.default_rng(row + 1)
     X_OG = make_pose(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-1.0, 1.0, 3))
     p_OQ = transform_points(X_OG, postures.p_GP[row])
@@ -298,7 +295,7 @@ def test_a_posture_of_the_table_is_its_own_first_start(row: int) -> None:
     np.testing.assert_allclose(found, X_OG, atol=1e-9)
 
 
-def test_postures_are_within_the_limits_and_where_kinematics_puts_them(pincer: str) -> None:
+def test_postures_are_within_the_limits_and_where_kinematics_puts_them(pincer):
     for name in ("barrett", pincer):
         hand, postures = hand_of(name), make_postures(hand_of(name))
         lower, upper = coordinate_limits(hand).T
@@ -314,7 +311,7 @@ def test_postures_are_within_the_limits_and_where_kinematics_puts_them(pincer: s
             np.testing.assert_allclose(p, p_FP[0], atol=1e-12)
 
 
-def misfit(name: str, X_OG: Array, c: Array, made: Touch) -> float:
+def misfit(name, X_OG, c, made):
     """Return what is left between a posture's contacts, as arrows of length `LEVER`, and others."""
     hand, constants = hand_of(name), hand_constants(hand_of(name))
     X_OF = X_OG @ fingertip_poses(hand, spread=c[0], closing=hand.closing_ratio @ c[1:])
@@ -326,7 +323,7 @@ def misfit(name: str, X_OG: Array, c: Array, made: Touch) -> float:
 
 
 @pytest.mark.parametrize("seed", SEEDS[:8])
-def test_starts_differ_and_the_best_comes_first(pincer: str, seed: int) -> None:
+def test_starts_differ_and_the_best_comes_first(pincer, seed):
     for name in ("barrett", pincer):
         made = touched(name, seed)
         starts = find_starts(make_postures(hand_of(name)), made.p_OQ, made.nhat_Q_O, 5)
@@ -347,7 +344,7 @@ def test_starts_differ_and_the_best_comes_first(pincer: str, seed: int) -> None:
                     assert misfit(name, X_OG @ nudge, c, made) > least
 
 
-def test_starts_tell_left_from_right(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_starts_tell_left_from_right(monkeypatch):
     """Mirrored contacts have the same lengths and angles; their posture must be another."""
     monkeypatch.setattr(drakegrasp.verification.wrist_solver, "NEAREST", 1)
     postures, mirror = make_postures(hand_of("barrett")), np.diag([-1.0, 1.0, 1.0])
@@ -361,9 +358,7 @@ def test_starts_tell_left_from_right(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS[:8])
-def test_search_by_shape_finds_what_laying_over_every_posture_finds(
-    monkeypatch: pytest.MonkeyPatch, seed: int
-) -> None:
+def test_search_by_shape_finds_what_laying_over_every_posture_finds(monkeypatch, seed):
     postures, made = make_postures(hand_of("barrett")), touched("barrett", seed)
     (quick,) = find_starts(postures, made.p_OQ, made.nhat_Q_O, 1)
     monkeypatch.setattr(drakegrasp.verification.wrist_solver, "NEAREST", len(postures.coordinates))
@@ -372,7 +367,7 @@ def test_search_by_shape_finds_what_laying_over_every_posture_finds(
     assert misfit("barrett", *quick, made) < 1.2 * least
 
 
-def test_two_contacts_are_reached_from_all_around_their_line() -> None:
+def test_two_contacts_are_reached_from_all_around_their_line():
     p_OQ, outward = (
         np.array([[0.0, 0.02, 0.0], [0.0, -0.02, 0.0]]),
         np.array([[0.0, 1, 0], [0, -1, 0]]),
