@@ -6,6 +6,7 @@ values, which fill the memory as soon as something walks through them.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import yaml
@@ -47,6 +48,17 @@ def parse_yaml(text: str | bytes) -> Any:
         raise yaml.YAMLError(str(error)) from None
     finally:
         loader.dispose()
+
+
+def parse_yaml_once(text: str | bytes) -> Any:
+    """Return what `parse_yaml` does, for a small text that a process parses again and again.
+
+    The caller must not change it.
+    """
+    return _parsed(text.encode() if isinstance(text, str) else text)
+
+
+_parsed = lru_cache(maxsize=16)(parse_yaml)
 
 
 def _refuse_large(root: yaml.Node) -> None:

@@ -33,7 +33,7 @@ from drakegrasp.errors import HandError, one_line
 from drakegrasp.foreign_files import read_text
 from drakegrasp.frames import Array
 from drakegrasp.hand.files import MODELS
-from drakegrasp.yaml_text import parse_yaml
+from drakegrasp.yaml_text import parse_yaml, parse_yaml_once
 
 #: Version of the keys that this module reads.
 VERSION = 1
@@ -385,7 +385,7 @@ def read_hand_file(path: Path) -> HandFile:
         HandError: If a key or a value cannot be used, in one line.
     """
     try:
-        tree: Any = parse_yaml(read_text(path))
+        tree: Any = parse_yaml_once(read_text(path))
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise HandError(f"{path}: must be YAML, got text that is not ({one_line(error)})") from None
 

@@ -17,7 +17,6 @@ import re
 import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -39,7 +38,7 @@ from drakegrasp.hand.files import (
     rewritten,
 )
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
-from drakegrasp.yaml_text import parse_yaml
+from drakegrasp.yaml_text import parse_yaml, parse_yaml_once
 
 #: Limits of a hand's files, in all [byte] and their number: a dataset may be a stranger's.
 LARGEST, LARGEST_YAML, MOST_FILES = 2**29, 2**18, 1000
@@ -282,13 +281,8 @@ def _mentions(path: Path) -> list[str]:
 
 def _described(path: Path) -> Mapping[str, Any]:
     """Return the keys of a hand file; none if it is not one."""
-    return _keys_of(path.read_bytes())
-
-
-@lru_cache(maxsize=8)  # a command asks for those of one hand a dozen times
-def _keys_of(content: bytes) -> Mapping[str, Any]:
     try:
-        tree = parse_yaml(content)
+        tree = parse_yaml_once(path.read_bytes())
     except (yaml.YAMLError, UnicodeDecodeError):
         return {}
     return tree if isinstance(tree, dict) else {}

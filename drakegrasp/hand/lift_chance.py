@@ -21,7 +21,7 @@ from drakegrasp.config import HandSource
 from drakegrasp.errors import HandError, one_line
 from drakegrasp.foreign_files import read_text
 from drakegrasp.hand.files import chance_file
-from drakegrasp.yaml_text import parse_yaml
+from drakegrasp.yaml_text import parse_yaml_once
 
 #: Chances are multiples of this: the last bits of an exponential depend on the machine.
 GRID = 2.0**-20
@@ -89,7 +89,7 @@ def read_lift_chance(source: HandSource) -> LiftChance | None:
     if not path.is_file():
         return None
     try:
-        tree: Any = parse_yaml(read_text(path))
+        tree: Any = parse_yaml_once(read_text(path))
         weights = {str(name): float(value) for name, value in dict(tree["weights"]).items()}
         model = LiftChance(float(tree["bias"]), weights)
     except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
