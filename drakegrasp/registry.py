@@ -16,9 +16,9 @@ samplers: a `simulation.candidates.Sampler`, or a class as a file of the user's 
 
 A class of the user's own is named `file.py:Name`, and imported from the file's text. A
 configuration keeps the name without folders, followed by 16 digits of the file's SHA-256, so that a
-changed file is another setting. The text travels with the configuration to every worker and is
-written into no file: code is never imported from a dataset, and whoever needs that of one gives the
-file again.
+changed file is another setting. The text goes to every worker with the
+configuration and is written into no file: code is never imported from a dataset, and a command that
+needs it must be given the file again.
 """
 
 from __future__ import annotations

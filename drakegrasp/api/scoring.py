@@ -1,4 +1,4 @@
-"""Scoring predicted grasps beside reference rows, on Dask workers or in this process."""
+"""Scoring predicted grasps against reference rows, on Dask workers or in this process."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def score(
     show: bool = False,
     **workers: Unpack[Workers],
 ) -> Score:
-    """Return the score of predicted grasps beside reference rows; see docs/how-to/score.md.
+    """Return the score of predicted grasps against reference rows; see docs/how-to/score.md.
 
     Args:
         predictions: In the frame of the rows' camera: (n, 6k), one per row, or (n, m, 6k), m per

@@ -1,4 +1,4 @@
-"""Options of commands, made of signatures and docstrings, and what those of a build ask for.
+"""The options of commands, made from signatures and docstrings, and the request of a build.
 
 In: what click parsed. Out: a `BuildRequest`, with the configuration resolved.
 

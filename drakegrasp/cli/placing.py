@@ -219,7 +219,7 @@ def _rows_of(
 def _of_object(request: VerifyRequest, name: str, hand: Hand) -> Attempts:
     """Return the grasps of a file or a folder that are of an object, and say which are not.
 
-    A file of one other object is for this one: nothing else can be meant.
+    A file in which all rows name one other object is taken to be for this one.
 
     Raises:
         GraspError: If none is of it.

@@ -240,7 +240,7 @@ def packed_chunk(values: AnyArray, rows: int) -> bytes:
 
 
 def unpacked_chunk(chunk: bytes, skipped: int, like: h5py.Dataset) -> AnyArray:
-    """Return the row (1, ...) that is a chunk, as `create_field` and `write_fixed` pack it.
+    """Return the row (1, ...) of a chunk that `create_field` or `write_fixed` packed.
 
     Args:
         chunk: What HDF5 stores.

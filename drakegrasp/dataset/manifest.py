@@ -312,7 +312,7 @@ def same_results(name: str, *versions: str) -> bool:
 def origin_attributes(
     config: Config, versions: dict[str, str], fingers: Mapping[str, bool], joints: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the attributes of every file: conventions, configuration, versions, the hand's."""
+    """Return the attributes of every file: conventions, settings, versions, fingers, joints."""
     return {
         **{f"convention_{key}": text for key, text in CONVENTIONS.items()},
         "schema_version": SCHEMA_VERSION,

@@ -428,7 +428,7 @@ HOLD_FIELDS: tuple[Field, ...] = tuple(
               "filters, but for those of pictures and outliers"),
         Field("p_hold_held", "", "int32", "-", "-", "disturbed repeats that hold"),
         Field("p_hold_repeats", "", "int32", "-", "-",
-              "n: disturbed repeats with a verdict; 0 of an attempt that was not drawn"),
+              "n: disturbed repeats with a verdict; 0 for an attempt that was not drawn"),
         Field("p_hold_half_step", "", "float64", "-", "-",
               "whether it would be a sample, undisturbed, at half the time step: 1 or 0; NaN if "
               "that was not tried or has no verdict"),
@@ -795,8 +795,8 @@ SCENE_GRASP_FIELDS: tuple[Field, ...] = (
     *_WORDS,
     Field("sample", "", "bool", "-", "-", "whether it is a sample of the dataset"),
     Field("audited", "", "bool", "-", "-",
-          "whether it was to be lifted in any case: such hands are a fair share of those that may "
-          "lift", of="audited"),
+          "whether it was lifted whatever its chance: such hands are a fair sample of those "
+          "that may lift", of="audited"),
     Field("source", "", "uint8", "-", "-", "sampler of the palm pose, see /trials", of="source"),
     Field("family", "", "int32", "-", "-",
           "number of the first-round attempt that it was refined from or is, within the scene"),

@@ -245,7 +245,7 @@ def named(path: Path) -> Iterator[None]:
 def holds_postures(path: Path) -> bool:
     """Return whether a file that holds postures or predictions of contacts holds postures.
 
-    A folder does: no layout of contacts is one.
+    A folder always does, because predictions of contacts are single files.
 
     Raises:
         GraspError: If it cannot be read.

@@ -70,7 +70,7 @@ class TrialSetup:
         return cached_scene(model, config.physics, config.hand_source, attempt.preshape)
 
     def renew_scene(self) -> None:
-        """Take the scene anew, if Drake failed in the one that was kept."""
+        """Build the scene again if Drake failed in the one that was kept."""
         config = self.config
         self.scene = cached_scene(self.prepared.model, config.physics, config.hand_source)
 

@@ -16,7 +16,7 @@ from drakegrasp.objects.sources import MeshSource
 def nothing_trains(sources: Sequence[MeshSource], split: SplitConfig) -> str:
     """Return why no sample of these meshes can be in the split `train`; empty if one can.
 
-    A configuration that names no class to train on, as a benchmark's, means it.
+    Nothing is said of a configuration that names no class to train on, as a benchmark's does.
     """
     if split.train_classes == ():
         return ""

@@ -252,7 +252,7 @@ class Target:
         return [name for name in left if level is None or counts[name] < level]
 
     def _in_vain(self, units: Sequence[ShardHeader]) -> int:
-        """Return how many palm poses the last of some units have without a sample."""
+        """Return how many palm poses were tried since the last sample of some units."""
         last = takewhile(lambda unit: not self.found.get(unit, 0), reversed(units))
         return sum(unit.stop - unit.start for unit in last)
 

@@ -296,7 +296,7 @@ def _unit_of(event: dict[str, Any]) -> _Unit | None:
 def logged_times(out: Path, config: Config) -> StageTimes | None:
     """Return the mean times of a build's units so far, by its log, or None if none is done.
 
-    What a log does not tell, e.g. the sizes of files, is as in `MEASURED`. The log has wall-clock
+    What a log does not say, e.g. the sizes of files, is as in `MEASURED`. The log has wall-clock
     times: other work of the machines is in them.
 
     Args:

@@ -1,7 +1,7 @@
 """Datasets that were built apart, as one: halves by objects, or by seeds.
 
 In: directories of datasets of one configuration, whose seeds may differ. Out: a directory with the
-files of their objects and shards, under names that tell seeds apart, and what assembling makes of
+files of their objects and shards, under names that distinguish seeds, and what assembling makes of
 them. A mesh under several seeds is one object of the split.
 """
 
@@ -91,7 +91,7 @@ def merge(
 
 
 def _read_complete(out: Path, execute: Executor) -> Manifest:
-    """Return the manifest of a dataset that no build has to go on with."""
+    """Return the manifest of a dataset that is complete."""
     manifest = read_manifest(out)
     if not is_assembled(out, verify_shards=True, execute=execute):
         raise DataError(

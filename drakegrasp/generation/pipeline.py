@@ -112,7 +112,7 @@ def build(
     """Build or complete the dataset of some meshes in a directory.
 
     What is complete already, and of the same configuration and mesh, is not done again. Refused
-    meshes are reported; the others go on.
+    meshes are reported; the others are built.
 
     Args:
         sources: The meshes.

@@ -2,7 +2,7 @@
 
 In: the directory of a dataset, each prepared object and the rows of its closed hands in
 trials.hdf5. Out: the file, with places, pictures, closed hands and what cameras see of them; it
-appears when it is complete, and nothing else changes. Its bytes do not depend on who does them.
+appears when it is complete, and nothing else changes. Its bytes do not depend on the workers.
 """
 
 from __future__ import annotations
@@ -244,7 +244,7 @@ def _numbered(group: str, columns: Columns, rows: Mapping[str, int]) -> Columns:
 
 
 def _write_table(file: h5py.File, name: str, parts: Sequence[Columns]) -> None:
-    """Write the columns of a group that are no images of views."""
+    """Write the columns of a group, except the images of views."""
     group = file.require_group(name)
     for field in SCENE_TABLES[name]:
         if field.name not in group and field.name in parts[0]:

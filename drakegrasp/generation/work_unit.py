@@ -227,7 +227,7 @@ class _Experiment:
 
     @contextmanager
     def _step(self, step: str) -> Iterator[None]:
-        """Run a step that is no attempt: that it ended its process is not the grasp's fault.
+        """Run a step that is not an attempt: if its process dies there, no grasp is to blame.
 
         Raises:
             MachineError: If it did.
@@ -343,7 +343,7 @@ class _Experiment:
         samples: Sequence[int],
         first: int,
     ) -> dict[str, AnyArray]:
-        """Return the columns of how much the lifts of a round bear that are drawn for it.
+        """Return the columns of what the lifts of a round that are drawn for it tolerate.
 
         The least friction of a success goes into its row of `/looks`.
         """
@@ -368,7 +368,7 @@ class _Experiment:
         return holds
 
     def _certificate(self, attempt: Attempt, row: int, *, held: bool) -> dict[str, float]:
-        """Return how much an attempt bears, see `certify`; empty if that ended its process."""
+        """Return how much an attempt tolerates, see `certify`; empty if its process died there."""
         step, config, prepared = f"certify {row}", self._config, self._setup.prepared
         if self._journal.verdict(step) is not None:
             return {}

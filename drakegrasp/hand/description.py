@@ -233,7 +233,7 @@ def load_hand(source: HandSource = "barrett") -> Hand:
 
 
 def load_plain_hand(source: HandSource, where: str) -> Hand:
-    """Return a hand for what knows one preshape only.
+    """Return a hand for callers that support a single preshape only.
 
     Args:
         source: See `load_hand`.

@@ -47,7 +47,7 @@ Vector = tuple[Finite, Finite, Finite]
 HalfSpace = tuple[Finite, Finite, Finite, Finite]
 #: What a closing joint does when it is pushed open; see docs/explanation/physics.md, "Drive".
 Drive = Literal["worm", "torque", "locked"]
-#: Contact this far beside a pad region counts as the pad's [m]. Shapes are polyhedra, MuJoCo's
+#: Contact this far outside a pad region counts as the pad's [m]. Shapes are polyhedra, MuJoCo's
 #: contacts are at their corners, and a border is drawn along an edge: that of the Barrett Hand
 #: misses the corners of the tip by 0.9 mm. A patch is nine times as wide.
 PAD_BAND = 0.001
@@ -174,12 +174,12 @@ class Finger:
     def on_pad(self, p_FiQ: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Return (...,) whether contact at (..., 3) of the fingertip link [m] is the pad's.
 
-        It is in the pad region, and as far as `PAD_BAND` beside it.
+        It is in the pad region, or at most `PAD_BAND` outside it.
         """
         return np.asarray(self.beside_pad(p_FiQ) <= PAD_BAND)
 
     def beside_pad(self, p_FiQ: npt.ArrayLike) -> Array:
-        """Return (...,) how far points (..., 3) of the fingertip link are beside the region [m].
+        """Return (...,) how far points (..., 3) of the fingertip link are outside the region [m].
 
         It is the distance from the farthest of the region's planes, negative within.
         """

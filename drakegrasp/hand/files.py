@@ -60,7 +60,7 @@ def refuse_outside(path: Path, folder: Path) -> None:
 def chance_file(source: HandSource) -> Path:
     """Return the file of the weights by which lifts are chosen, which few hands have.
 
-    It lies beside the hand file: `<name>_chance.yaml` of `<name>_hand.yaml`.
+    It lies next to the hand file: `<name>_chance.yaml` of `<name>_hand.yaml`.
 
     Raises:
         HandError: If there is no such hand.

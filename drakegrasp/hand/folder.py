@@ -42,7 +42,7 @@ from drakegrasp.yaml_text import parse_yaml, parse_yaml_once
 
 #: Limits of a hand's files, in all [byte] and their number: a dataset may be a stranger's.
 LARGEST, LARGEST_YAML, MOST_FILES = 2**29, 2**18, 1000
-#: Files of licences beside a hand file or its model; files of which lines are about licences.
+#: Files of licences next to a hand file or its model; files of which lines are about licences.
 _LICENCE = re.compile(r"(LICEN[CS]E|COPYING|NOTICE)([._ -].*)?", re.IGNORECASE)
 _README = re.compile(r"(README(\..*)?|package\.xml)", re.IGNORECASE)
 _MENTION = re.compile(r"licen[cs]e|copyright", re.IGNORECASE)
@@ -66,9 +66,9 @@ def hand_digest(source: HandSource) -> str:
 
 
 def is_hand(source: HandSource, digest: str | None) -> bool:
-    """Return whether the files of a hand have a digest.
+    """Return whether a digest is that of the files of a hand.
 
-    Version 0.2 took that of the model and the hand file before they are rewritten.
+    Version 0.2 took the digest of the model and the hand file before they are rewritten.
 
     Raises:
         HandError: As `hand_folder`.
@@ -397,7 +397,7 @@ def _is_there(carried: CarriedHand) -> bool:
 
 
 def _refuse_other_files(content: HandFolder, folder: Path) -> None:
-    """Refuse a folder that may be somebody's own: a build replaces and removes what is in its own.
+    """Refuse a folder with files of the user: a build replaces and removes what is in it.
 
     Raises:
         DataError: If it is there, and no copy of the hand that a build left when it was killed.
@@ -415,7 +415,7 @@ def _refuse_other_files(content: HandFolder, folder: Path) -> None:
 
 
 def _write(content: HandFolder, folder: Path) -> None:
-    """Write the files of a hand; what a build has left there of another one goes."""
+    """Write the files of a hand; remove what a build has left there of another one."""
     shutil.rmtree(folder, ignore_errors=True)
     with atomic_folder(folder) as temporary:
         for place in (*content.texts, *content.files):

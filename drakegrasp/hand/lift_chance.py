@@ -1,8 +1,8 @@
 """The chance that a lift gives a sample, by what is known when the hand has closed.
 
-In: the contacts of closed hands, and the weights in a small file beside the hand's. Out: chances,
+In: the contacts of closed hands, and the weights in a small file next to the hand's. Out: chances,
 by a logistic model (docs/explanation/sampling.md). Its features are normals, forces, distances and
-moments; nothing tells one object from another. Does not import Drake.
+moments; none depends on which object it is. Does not import Drake.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ JointDrive = tuple[Array, float]
 
 
 def _is_no_twin(record: logging.LogRecord) -> bool:
-    """Return whether a message of Drake says what no exception says again."""
+    """Return whether no exception repeats a message of Drake."""
     return not record.getMessage().startswith("SDFormat Error")
 
 
@@ -416,7 +416,7 @@ def _extended(chain: Chain, joint: Any, drives: Mapping[str, JointDrive]) -> Cha
 
 
 def refuse_joints_of_others(described: HandFile, chains: Sequence[Chain]) -> None:
-    """Refuse a finger that moves a joint of another one alone; bars beside all fingers may follow.
+    """Refuse a finger that moves a joint of another one; joints outside all fingers may follow.
 
     Raises:
         HandError: If one does.

@@ -1,4 +1,4 @@
-"""What a mesh file declares: polygons come in, triangles go out; nothing is passed over in silence.
+"""What a mesh file declares: polygons come in, triangles go out; nothing is silently ignored.
 
 Here are what the readers of all formats share, and that of STL.
 """

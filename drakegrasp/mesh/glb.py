@@ -90,7 +90,7 @@ def _read_chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def _refuse_description(tree: dict[str, Any]) -> None:
-    """Refuse a file that trimesh would read without what it needs, or would not end to read.
+    """Refuse a file that trimesh would read only in part, or never finish reading.
 
     Raises:
         ValueError: If its shape needs an extension, it has too many nodes, or one has no place.

@@ -109,7 +109,7 @@ class _Binary:
         return self._any_rows(element) if columns is None else columns
 
     def finish(self) -> None:
-        """Refuse bytes behind the last element."""
+        """Refuse bytes after the last element."""
         rest = len(self._data[self._at :].rstrip(b"\0 \t\r\n"))
         if rest:
             raise ValueError(f"{rest:,} bytes more than its header declares")
@@ -210,7 +210,7 @@ class _Text:
         }
 
     def finish(self) -> None:
-        """Refuse lines behind the last element."""
+        """Refuse lines after the last element."""
         rest = len(self._lines) - self._at
         if rest:
             raise ValueError(f"{rest:,} lines more than its header declares")

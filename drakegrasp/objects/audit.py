@@ -90,7 +90,7 @@ class AuditRow:
         gyration: Radius of gyration over that of the convex hull.
         collision_faces: Number of faces for contact.
         collision_error: Largest distance of these from the solid [m].
-        memory: Of a worker for this object, beside what it needs anyway [B].
+        memory: Of a worker for this object, besides its usual memory [B].
         preparing: Most memory of a worker while it prepares the mesh, in all [B].
         width: Least distance of two opposed sides [m], see `least_width`.
         model: The object.
@@ -141,11 +141,11 @@ def audit(
     Args:
         directory: The meshes, as for `find_meshes`.
         units: Unit of their lengths.
-        manifest: Their YAML file, if it is not beside them.
+        manifest: Their YAML file, if it is not in the same folder.
         opening: Largest distance of the hand's fingertips [m], see `hand.kinematics.opening`;
             objects that are wider everywhere get a warning.
         flat: See `hand.kinematics.flat_limits` [m]; objects that stand lower get one as well.
-        progress: Is told of each mesh.
+        progress: Called for each mesh.
 
     Raises:
         MeshError: As `find_meshes` does; a bad mesh is a row, not an error.

@@ -431,5 +431,5 @@ def forecast_memory(faces: int) -> float:
 
 
 def needed_limit(memory: float) -> float:
-    """Return the limit of a worker's memory [B] with which it may take so much [B]."""
+    """Return the limit of a worker's memory [B] that lets it use a given amount [B]."""
     return STEP * math.ceil(memory / ENDED / STEP)

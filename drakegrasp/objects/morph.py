@@ -9,8 +9,8 @@ Axis and origin are our own choice: the axis is one of x, y and z, and passes th
 the footprint at the height of the base. So what is flat at the base stays flat and on the table.
 
 `morph_meshes` writes morphs of all meshes of a directory: `<class>_<name>_m<k>.obj` in metres, +z
-up. An `objects.yaml` beside them keeps the class of the mesh that each comes from, else each would
-be a class of its own, and its name as their group: in a split by object all morphs of a mesh, and
+up. An `objects.yaml` in their folder keeps the class of each one's mesh (else each would be a
+class of its own) and its name as their group: in a split by object all morphs of a mesh, and
 the mesh itself, stay together.
 """
 
@@ -217,8 +217,8 @@ def morph_meshes(
         per_mesh: Morphs of each mesh.
         seed: Of the draws.
         units: Unit of the meshes' lengths.
-        manifest: Their YAML file, if it is not beside them.
-        progress: Is told of each morph.
+        manifest: Their YAML file, if it is not in the same folder.
+        progress: Called for each morph.
 
     Raises:
         MeshError: If there is no mesh, `out` holds anything, or no mesh can be morphed.

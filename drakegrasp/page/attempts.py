@@ -163,7 +163,7 @@ class Attempts(Gallery):
         return {**super().identity(i), "number": name_of(self.snapshot, i)}
 
     def summary(self, query: Query, chosen: Places) -> dict[str, Any]:
-        """Return what the gallery says besides its cards."""
+        """Return what the gallery shows besides its cards."""
         snapshot = self.snapshot
         return {
             "title": snapshot.out.name or str(snapshot.out),

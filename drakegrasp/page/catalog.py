@@ -380,11 +380,11 @@ class Catalog:
 
 
 class Watched(Generic[Found]):
-    """A file beside the dataset's own, read again when it or the dataset changes.
+    """A further file of a dataset, read again when it or the dataset changes.
 
     Args:
         path: The file.
-        read: Reads it, with its stamp, beside a state of the dataset.
+        read: Reads it, with its stamp, for a state of the dataset.
     """
 
     def __init__(self, path: Path, read: Callable[[Path, Stamp, Snapshot], Found]) -> None:
@@ -394,7 +394,7 @@ class Watched(Generic[Found]):
         self._known: tuple[Snapshot, Stamp, Found] | None = None
 
     def current(self, snapshot: Snapshot) -> Found:
-        """Return what the file holds beside a state of the dataset.
+        """Return what the file holds, for a state of the dataset.
 
         Raises:
             DataError: If the file cannot be read, or is not of this dataset.

@@ -122,7 +122,7 @@ class Query:
     default: Mapping[str, str]
 
     def __getitem__(self, name: str) -> str:
-        """Return what is asked for; empty for anything."""
+        """Return the chosen value of a parameter; empty for any value."""
         value = self.values.get(name, "")
         return "" if value == "any" and name in self.default else value
 

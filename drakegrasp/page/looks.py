@@ -243,7 +243,7 @@ class HandView:
         self.problem = ""
 
     def load(self) -> None:
-        """Load the hand; a hand that cannot be loaded here is a `problem`, and no error."""
+        """Load the hand; a hand that cannot be loaded here is a `problem`, not an error."""
         with self._lock:
             if self._scene is not None or self.problem:
                 return
@@ -364,10 +364,9 @@ def contacts_of(
 
     Args:
         row: Of the dataset or of verdicts.
-        when: With what the names of its columns begin.
+        when: The prefix of the names of its columns.
         X_TO: (4, 4), resting pose of the object.
-        kind: Of the contacts, as the view tells them apart; those of another than `force` have no
-            forces.
+        kind: Of the contacts, as the view distinguishes them; only the kind `force` has forces.
     """
     points, normals, forces = (row.get(f"{when}{name}") for name in ("p_OQ", "nhat_Q_O", "f_Q_O"))
     if kind not in ("", "force") and points is not None:

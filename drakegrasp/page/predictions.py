@@ -1,4 +1,4 @@
-"""Predictions and their verdicts on the page, beside the rows of the dataset that they are for.
+"""Predictions and their verdicts on the page, with the rows of the dataset that they are for.
 
 In: the HDF5 file that `drakegrasp verify --out` writes, and a snapshot of the dataset. What filters
 and sorting need is in memory; all else of a verdict is read when a page shows it. A field that the
@@ -242,7 +242,7 @@ class Predictions(Gallery):
         }
 
     def _verdict(self, i: int) -> list[tuple[str, str]]:
-        """Return the words of a verdict, each with the name of its look."""
+        """Return the words of a verdict, each with its style class."""
         words = {word for word in VERDICTS if word in self.table and self.table[word][i]}
         if "held" in words:
             return [("held", word) for word in WORDS if word in words]

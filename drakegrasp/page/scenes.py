@@ -1,4 +1,4 @@
-"""Scenes to train on, on the page: the scenes.hdf5 of a dataset beside its other files."""
+"""Scenes to train on, on the page: the scenes.hdf5 of a dataset, with its other files."""
 
 from __future__ import annotations
 

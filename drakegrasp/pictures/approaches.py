@@ -262,7 +262,7 @@ def palm_poses_figure(
     captions: Mapping[str, str] | None = None,
     name: str = "",
 ) -> Figure:
-    """Return the approach rays of palm poses to a mesh, a panel per method.
+    """Return a figure of the approach rays of palm poses to a mesh, a panel per method.
 
     Args:
         vertices: Of the mesh, (n, 3) in {O} [m].

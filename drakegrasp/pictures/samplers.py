@@ -148,7 +148,7 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
 
 
 def palm_rays(candidates: Candidates, standoff: float, count: int) -> Array:
-    """Return the first approach rays of palm poses, from a stand-off to the surface.
+    """Return the approach rays of the first palm poses, from a stand-off to the surface.
 
     Args:
         candidates: Of the object, in drawing order, which is random.

@@ -127,8 +127,8 @@ def read_benchmark(out: Path, config: Config, versions: Mapping[str, str]) -> di
     Args:
         out: The directory.
         config: By which grasps are tried; the published one tries the first wrist pose only.
-        versions: Of the packages that try the grasps; those that are not the published ones are in
-            what is returned, because simulated values may then differ.
+        versions: Of the packages that try the grasps. Those that differ from the published ones are
+            returned, because simulated values may then differ.
 
     Raises:
         DataError: If its file, or the data file beside it, is damaged.

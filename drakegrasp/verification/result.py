@@ -91,7 +91,7 @@ class Verification:
         smallest_friction: Smallest friction coefficient at which forces within the hand's limit
             hold the object at the contacts; inf if none does.
         seconds: Wall-clock time by stage [s].
-        stand: Which of the resting poses that a posture may be for gave this verdict, the best.
+        stand: The resting pose of this verdict: the best of those in which a posture was tried.
     """
 
     method: str

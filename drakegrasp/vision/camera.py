@@ -220,7 +220,7 @@ def visible_contacts(
     depth: npt.NDArray[np.floating],
     mask: npt.NDArray[np.uint8],
 ) -> npt.NDArray[np.bool_]:
-    """Return whether (...,) a camera sees contacts; those that are NaN it does not.
+    """Return whether (...,) a camera sees contacts; False for contacts that are NaN.
 
     A contact is hidden if its normal points away from the camera, or if the ray from it to the
     camera meets the object or the table first. It is the centre of a pressed patch, so it may lie a

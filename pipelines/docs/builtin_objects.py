@@ -39,7 +39,7 @@ class change no earlier one. The same seed gives the same mesh files on every ma
 
 `--per-class` (`builtin.per_class`) is {BuiltinConfig().per_class} by default: of the objects of
 a class one is [tested](outcomes.md#split) and the others train. Both options are stored in
-`manifest.json`, and a build goes on only with the same.
+`manifest.json`, and a build continues only with the same.
 
 Every object is one watertight solid of at most 3000 triangles. It stands or lies on z = 0 as it
 does on a table, z up, and stays so when it is dropped. Hollow things have walls of 4.5 to 6 mm.

@@ -49,7 +49,7 @@ OUT/
   trials.hdf5              a row per attempt, whatever its outcome
   grasping_oto.hdf5        samples, camera rolled with the palm
   grasping_otm.hdf5        the same samples, image up is world up
-  scenes.hdf5              views that know no grasp, with all closed hands; only if asked for
+  scenes.hdf5              views that do not depend on a grasp, with all closed hands; if asked for
   DATACARD.md, .json       what it is, how it was made, counts, licences, known limits
   log.jsonl                what happened while it was built, and when: a line of JSON per event
   reject.json              grasps that an inspection rejects; only if there was one
@@ -67,13 +67,13 @@ Only the data files, `grasping_*.hdf5`, are needed to train. With `objects/`, `h
 `manifest.json`, every trial can be replayed.
 
 `hand/` is copied when a build begins, and read by workers and by every later command. Files below
-the hand file keep their places and bytes. A model that names others, by an absolute path, one that
-leads out of its folder, or `package://`, is rewritten: they are in `hand/files/`. `versions` in the
-manifest has a digest of hand file, model, weights and meshes, without their paths: a build goes on
-with a hand of the same digest, wherever it is and whatever its file is called, `merge` demands the
-same digest, and `check` compares it. Datasets of version 0.2 and before have no `hand/`: a hand of
-the package is then the installed one, and a hand file is read at its path; a build that goes on
-adds it.
+the hand file keep their places and bytes. A model that names files by an absolute path, by
+one that leads out of its folder, or by `package://`, is rewritten: these files are in
+`hand/files/`. `versions` in the manifest has a digest of hand file, model, weights and meshes,
+without their paths: a build continues with a hand of the same digest, wherever it is and whatever
+its file is called, `merge` demands the same digest, and `check` compares it. Datasets of version
+0.2 and before have no `hand/`: a hand of the package is then the installed one, and a hand file is
+read at its path; a build that continues adds it.
 """
 
 _CONTRACT = """## What makes two files equal
@@ -105,8 +105,8 @@ table then, and the forces of the fingertips need not balance.
 Files of the `schema_version` above are read. Any other version is refused with a line that names
 the file and both versions: build the dataset again, in another directory. Version 4 came with
 resting poses, sampler, refined palm poses, weights, chance and audit. Version 2 had no conditions
-of an attempt, and no mass, density, friction, scale and axis of each object. Version 1 had other
-labels, too: fingers that the object pushed open, and contacts anywhere on a fingertip's link.
+of an attempt, and no mass, density, friction, scale and axis of each object. Version 1 also
+had other labels: fingers that the object pushed open, and contacts anywhere on a fingertip's link.
 
 ## Seals
 
@@ -190,7 +190,7 @@ equal bytes.
 """
 
 _ROWS = """
-Where the grasps are for rows of a dataset, a group `/rows` beside it says which, with the
+Where the grasps are for rows of a dataset, a further group `/rows` says which, with the
 attributes `split`, `camera` and `shards` of the data file:
 """
 

@@ -1,8 +1,7 @@
 """Which fingers close against which, where they touch, and whether other links meet before.
 
 In: the joints of a model's fingers, and how they may close. Out: `Grip`s, the best first: a finger,
-often a thumb, and one or two that it meets. Every way to close of every finger is compared with
-those of every other one. The pad of a fingertip is the part of its surface that faces the closing
+often a thumb, and one or two that it meets. For each pair of fingers, all ways to close of both are compared. The pad of a fingertip is the part of its surface that faces the closing
 motion.
 """
 

@@ -145,7 +145,7 @@ class Findings:
         self._bad.setdefault((file, group), set()).update(rows)
 
     def bad(self, file: str, group: str) -> Rows:
-        """Return the rows (n,) of a group that break a rule or cannot be read, rising."""
+        """Return the rows (n,) of a group that break a rule or cannot be read, in order."""
         return np.array(sorted(self._bad.get((file, group), ())), dtype=np.int64)
 
     def of_rows(self, file: str, group: str, start: int, stop: int) -> Findings:

@@ -6,7 +6,7 @@ is bounded, and judged in tasks, by an `Executor`. Imports no Drake.
 
 Of a whole dataset the files are compared first with what assembling gives again of its shards:
 samples are derived by the functions that write them, stored images are compared byte for byte. All
-other rules do not ask how a value was made: verdicts, poses, images, meshes.
+other rules compare values with each other: verdicts, poses, images, meshes.
 `trials`, `samples` and `scenes` apply them in an order, see `rows`.
 """
 

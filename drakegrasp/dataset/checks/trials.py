@@ -218,7 +218,7 @@ def required_of(batch: Batch) -> AnyArray:
 
 
 def contacts(batch: Batch) -> Iterator[Violation]:
-    """Fingertips that touch have a patch, and push into an object that is held.
+    """Fingertips that touch have a contact patch, and the forces on a held object point into it.
 
     A patch may span an edge or a thin rim: its mean normal then does not tell the direction of the
     force. So that rule is for successes only, and only where friction turns a force by less than
