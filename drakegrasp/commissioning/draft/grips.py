@@ -1,8 +1,8 @@
 """Which fingers close against which, where they touch, and whether other links meet before.
 
 In: the joints of a model's fingers, and how they may close. Out: `Grip`s, the best first: a finger,
-often a thumb, and one or two that it meets. For each pair of fingers, all ways to close of both are compared. The pad of a fingertip is the part of its surface that faces the closing
-motion.
+often a thumb, and one or two that it meets. For each pair of fingers, all ways to close of both are
+compared. The pad of a fingertip is the part of its surface that faces the closing motion.
 """
 
 from __future__ import annotations
