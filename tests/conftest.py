@@ -55,6 +55,16 @@ def small_config() -> Config:
     return load_config(overrides=SMALL)
 
 
+@pytest.fixture
+def builds_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `drakegrasp build` do the work in this process, and start no others."""
+
+    def build_here(objects: Path, out: Path, *, config: Config, show: bool, **_: object) -> object:
+        return build(find_meshes(objects), out, config, run_here, show=show)
+
+    monkeypatch.setattr("drakegrasp.api.building.build_dataset", build_here)
+
+
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
     """Return a folder that one process of a run makes; the others wait for it, and all only read.
 

@@ -22,7 +22,6 @@ from helpers.commands import run
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 from helpers.tiers import in_second_tier
 
-from drakegrasp.config import Config
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import CARD_FILES
@@ -30,12 +29,9 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.generation.counts import Counts
-from drakegrasp.generation.pipeline import build
 from drakegrasp.generation.work_unit import UnitSummary
-from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime import files as file_set
-from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.progress import silent
 from drakegrasp.simulation.trial import TrialRecord
 
@@ -173,8 +169,10 @@ def samples(out: Path) -> list[int]:
     return [*counts, 0 if read_manifest(out).config.filters.max_slip == SLIP / 2 else 9]
 
 
-@pytest.mark.parametrize("command", ["stats", "check", "assemble"])
-@pytest.mark.parametrize("rename", range(RENAMES))
+@pytest.mark.parametrize(
+    ("command", "rename"),
+    [("stats", k) for k in range(RENAMES)] + [(c, LISTED + 1) for c in ("check", "assemble")],
+)
 def test_files_appear_together_whenever_assembling_is_killed(
     killed: list[Path], tmp_path: Path, rename: int, command: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -212,16 +210,12 @@ def _crash(*arguments: object) -> TrialRecord:
 
 
 @pytest.mark.sim
+@pytest.mark.usefixtures("builds_here")
 def test_crashes_that_no_physics_explains_end_the_build_with_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All attempts crash; the same command says so again, though it has nothing left to do."""
-
-    def build_here(objects: Path, out: Path, *, config: Config, show: bool, **_: Any) -> Any:
-        return build(find_meshes(objects), out, config, run_here, show=show)
-
     monkeypatch.setattr("drakegrasp.generation.work_unit.try_attempt", _crash)
-    monkeypatch.setattr("drakegrasp.api.building.build_dataset", build_here)
     (tmp_path / "meshes").mkdir()
     trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "meshes" / "1_box.obj")
     few = ("--set", "candidates.max=1")

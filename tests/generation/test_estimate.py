@@ -12,6 +12,7 @@ from helpers.scripts import load_script
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drakegrasp.config import Config
 from drakegrasp.dataset.lock import BuildLog
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import ConfigError, DataError
@@ -168,14 +169,13 @@ def test_lines_name_the_source() -> None:
 
 @pytest.mark.sim
 @pytest.mark.slow
-def test_storage_adds_up_to_the_directory(small_dataset: Path) -> None:
+def test_storage_adds_up_to_the_directory(small_dataset: Path, small_config: Config) -> None:
     """The sizes by row, put together again, are the size of the dataset."""
     sizes = load_script("measurements/measure_stages").measure_storage(small_dataset)
     assert all(size > 0.0 for size in sizes.values())
-    config = load_config(overrides=["candidates.max=40", "unit_candidates=10"])
     funnel = count_funnel(small_dataset)
     held, kept = funnel.removals.sum(), funnel.removals[:, Removal.KEPT].sum()
     shares = {"successes": held / funnel.outcomes.sum(), "samples": kept / held}
-    plan = plan_build(3, config, 1, replace(MEASURED, **shares, **sizes))
+    plan = plan_build(3, small_config, 1, replace(MEASURED, **shares, **sizes))
     whole = sum(p.stat().st_size for p in small_dataset.rglob("*") if p.is_file())
     assert plan.bytes == pytest.approx(whole, rel=0.1)

@@ -236,11 +236,8 @@ def with_manifest(edit: Callable[[dict], object]) -> Callable[[Path, Path], list
     return spoil
 
 
-def built_with(*overrides: str) -> Callable[[Path, Path], list[Path]]:
-    def build_other(sound: Path, copy: Path) -> list[Path]:
-        return [sound, make_dataset(copy.parent / "b", copy.parent / "meshes", overrides=overrides)]
-
-    return build_other
+def built_with(room: str, key: str, value: float) -> Callable[[Path, Path], list[Path]]:
+    return with_manifest(lambda manifest: manifest["config"][room].update({key: value}))
 
 
 def with_another_shard(sound: Path, copy: Path) -> list[Path]:
@@ -276,12 +273,12 @@ def under_another_seed(edit: Callable[[dict], object]) -> Callable[[Path, Path],
     ("make", "said"),
     [
         (
-            built_with("physics.friction_hand=0.5"),
+            built_with("physics", "friction_hand", 0.5),
             "differs in physics.friction_hand (0.71 there, 0.5 here)",
         ),
-        (built_with("camera.fov_y_deg=40"), "differs in camera.fov_y_deg"),
-        (built_with("candidates.max=99"), "differs in candidates.max"),
-        (built_with("filters.max_slip=0.004"), "differs in filters.max_slip"),
+        (built_with("camera", "fov_y_deg", 40.0), "differs in camera.fov_y_deg"),
+        (built_with("candidates", "max", 99), "differs in candidates.max"),
+        (built_with("filters", "max_slip", 0.004), "differs in filters.max_slip"),
         (with_manifest(lambda m: m["versions"].update(drake="1.0")), "must be of drake "),
         (with_manifest(lambda m: m["versions"].update(hand="0")), "must be of hand "),
         (with_manifest(lambda m: m["versions"].update(drakegrasp="0.1")), "be of drakegrasp "),

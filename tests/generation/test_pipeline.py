@@ -77,13 +77,13 @@ def again(small_meshes: Path, small_config: Config) -> Again:
 
 def test_every_attempt_has_a_row_and_every_success_a_look(small_dataset: Path) -> None:
     funnel = count_funnel(small_dataset)
-    assert np.all(funnel.candidates == 40)
+    assert np.all(funnel.candidates == 16)
     with h5py.File(small_dataset / "trials.hdf5") as file:
         keys = ("object", "candidate", "standoff_index")
         rows = list(zip(*(file[f"trials/{key}"][:].tolist() for key in keys), strict=True))
         outcomes, ids = file["trials/outcome"][:], file["successes/trial_id"][:]
         kept = ids[file["successes/removal"][:] == Removal.KEPT]
-    assert rows == list(product(range(3), range(40), range(3)))
+    assert rows == list(product(range(3), range(16), range(3)))
     assert ids.tolist() == np.flatnonzero(outcomes == Outcome.SUCCESS).tolist()
     with h5py.File(small_dataset / "grasping_otm.hdf5") as file:
         sampled = np.concatenate([file[split]["trial_id"][:] for split in file])
@@ -98,11 +98,16 @@ def test_dataset_keeps_every_invariant(small_dataset: Path) -> None:
 def test_number_of_workers_changes_nothing(
     small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path
 ) -> None:
-    report = build_dataset(
-        small_meshes, tmp_path / "out", config=small_config, workers=2, show=False
+    """One of three objects is left for the workers to prepare and to try."""
+    out = tmp_path / "out"
+    shutil.copytree(
+        small_dataset, out, ignore=shutil.ignore_patterns("11_box_slim*", "*.*5", "*.json")
     )
-    assert report.simulated == 12
-    assert_same_dataset(small_dataset, tmp_path / "out")
+    for path in small_dataset.glob("shards/[18]0_*/*"):
+        shutil.copy(path, out / path.relative_to(small_dataset))
+    report = build_dataset(small_meshes, out, config=small_config, workers=2, show=False)
+    assert report.simulated == 4
+    assert_same_dataset(small_dataset, out)
 
 
 def test_second_build_simulates_nothing(out: Path, again: Again) -> None:
@@ -118,10 +123,8 @@ def _flip_byte(shard: Path) -> None:
     shard.write_bytes(bytes(content))
 
 
-def test_changed_filter_needs_no_simulation(out: Path, again: Again) -> None:
-    config = load_config(
-        overrides=["candidates.max=40", "unit_candidates=10", "filters.min_depth_variance=1"]
-    )
+def test_changed_filter_needs_no_simulation(out: Path, small_config: Config, again: Again) -> None:
+    config = override_config(small_config, ["filters.min_depth_variance=1"])
     report = again(out, _nothing_runs, config=config)
     assert report.assembly.removed.get(Removal.KEPT, 0) == 0
     assert report.assembly.grasps > 0
@@ -207,14 +210,10 @@ def test_build_keeps_what_an_inspection_rejected(meshes: Path, out: Path, again:
 
 
 def test_max_grasps_cuts_after_the_last_wanted_one(
-    small_dataset: Path, tmp_path: Path, again: Again
+    small_dataset: Path, small_config: Config, tmp_path: Path, again: Again
 ) -> None:
     """The rows are those of the full dataset up to each object's first success."""
-    config = load_config(
-        overrides=["candidates.max=40", "unit_candidates=10", "filters.outlier_sigma=0"],
-        max_grasps=1,
-    )
-    again(tmp_path / "out", config=config)
+    again(tmp_path / "out", config=override_config(small_config, ["max_grasps=1"]))
     few, full = count_funnel(tmp_path / "out"), count_funnel(small_dataset)
     found = full.outcomes[:, Outcome.SUCCESS] > 0
     assert np.array_equal(few.outcomes[:, Outcome.SUCCESS], found.astype(int))
@@ -242,11 +241,12 @@ def test_damage_beyond_the_last_wanted_grasp_is_nobodys(
     assert_same_dataset(small_dataset, out)
 
 
-def test_other_configuration_is_refused_and_nothing_changes(out: Path, again: Again) -> None:
+def test_other_configuration_is_refused_and_nothing_changes(
+    out: Path, small_config: Config, again: Again
+) -> None:
     before = sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*") if p.is_file())
     with pytest.raises(DataError, match=r"differs in seed \(0 there, 1 here\); choose another"):
-        config = load_config(overrides=["candidates.max=40", "unit_candidates=10"], seed=1)
-        again(out, _nothing_runs, config=config)
+        again(out, _nothing_runs, config=override_config(small_config, ["seed=1"]))
     assert sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*") if p.is_file()) == before
 
 
@@ -293,7 +293,7 @@ def test_names_with_spaces_and_other_alphabets_work(tmp_path: Path) -> None:
     for name in ("1_чашка большая_a", "2_crème brûlée_b"):
         trimesh.creation.box([0.06, 0.06, 0.12]).export(meshes / f"{name}.obj")
     out = tmp_path / "Daten ü"
-    config = load_config(overrides=["candidates.max=6"])
+    config = load_config(overrides=["candidates.max=2"])
     build(find_meshes(meshes), out, config, run_here, show=False)
     assert count_funnel(out).names == ("1_чашка большая_a", "2_crème brûlée_b")
     assert count_funnel(out).classes == ("чашка большая", "crème brûlée")
@@ -332,8 +332,8 @@ def test_replay_says_what_differs(out: Path) -> None:
     assert not again.same
     assert set(again.differences) == names
     assert again.differences["spread"] == again.differences["outcome"] == pytest.approx(1.0)
-    with pytest.raises(DataError, match="trial must be 0 to 359, got 360"):
-        replay_trial(out, 360)
+    with pytest.raises(DataError, match="trial must be 0 to 143, got 144"):
+        replay_trial(out, 144)
 
     # Nothing was refined here.
     with h5py.File(out / "trials.hdf5", "r+") as file:
@@ -354,7 +354,10 @@ def test_wrong_use_of_workers_is_refused(tmp_path: Path, small_meshes: Path) -> 
 
 
 @pytest.mark.cluster
-def test_scheduler_that_is_not_there_is_named(tmp_path: Path, small_meshes: Path) -> None:
+def test_scheduler_that_is_not_there_is_named(
+    tmp_path: Path, small_meshes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drakegrasp.cluster.connect.CONNECT_SECONDS", 1.0)
     with pytest.raises(MachineError, match="must be a running Dask scheduler"):
         build_dataset(small_meshes, tmp_path / "out", scheduler="tcp://127.0.0.1:9", tls=False)
     with pytest.raises(ConfigError, match=r"begins with tls://, got tcp://127\.0\.0\.1:9: anybody"):

@@ -33,7 +33,7 @@ NAME = "11_box_slim"
 
 @pytest.fixture(scope="module")
 def config() -> Config:
-    return load_config("randomized", overrides=[*SMALL, "candidates.max=20"])
+    return load_config("randomized", overrides=SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -97,13 +97,13 @@ def test_replay_gives_the_same_bits(randomized: Path, tmp_path: Path, outcome: O
 
 
 def test_images_differ_in_light_and_colour(randomized: Path) -> None:
-    data = GraspDataset(randomized / "grasping_oto.hdf5", split="train")
+    data = GraspDataset(randomized / "grasping_oto.hdf5", split="test")
     means = np.array([s.image[:3, s.mask == 1].mean(axis=1) for s in data])
     assert np.ptp(means, axis=0).min() > 0.1
 
 
 def test_grasps_are_verified_with_their_own_friction_and_mass(randomized: Path) -> None:
-    data = GraspDataset(randomized / "grasping_oto.hdf5", split="train")
+    data = GraspDataset(randomized / "grasping_oto.hdf5", split="test")
     rows = [len(data) - 1, 0]
     grasps = np.array([data[row].grasp for row in rows])
     usual = load_prepared(randomized, NAME, read_manifest(randomized).config).model

@@ -102,8 +102,8 @@ def assert_sound(model: ObjectModel) -> None:
     np.testing.assert_allclose(model.half_extents, high, atol=1e-12)
 
 
-#: Palm poses per object of the small dataset; enough for samples to train and to test on.
+#: Four units of each object of the small dataset, enough for samples to train and to test on.
 SMALL = [
-    *("candidates.max=40", "unit_candidates=10"),
+    *("candidates.max=16", "unit_candidates=4", "split.train_classes=[wineglass]"),
     *("filters.outlier_sigma=0", "filters.require=held", "filters.max_normal_angle_deg=null"),
 ]
