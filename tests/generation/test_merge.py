@@ -34,7 +34,7 @@ from drakegrasp.generation.merge import merge
 from drakegrasp.generation.pipeline import build
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.files import MODELS
-from drakegrasp.hand.settings import load_config
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.page.catalog import Catalog
@@ -228,16 +228,27 @@ def with_manifest(edit: Callable[[dict], object]) -> Callable[[Path, Path], list
 
     def spoil(sound: Path, copy: Path) -> list[Path]:
         edit_manifest(copy, edit)
-        for name in (*BOTH, TRIALS):
-            with h5py.File(copy / name, "r+") as file:
-                file.attrs["signature"] = read_manifest(copy).signature()
-        return [sound, copy]
+        return [sound, signed(copy)]
 
     return spoil
 
 
-def built_with(room: str, key: str, value: float) -> Callable[[Path, Path], list[Path]]:
-    return with_manifest(lambda manifest: manifest["config"][room].update({key: value}))
+def signed(out: Path) -> Path:
+    """Return a dataset whose files are now said to be of its manifest."""
+    for name in (*BOTH, TRIALS):
+        with h5py.File(out / name, "r+") as file:
+            file.attrs["signature"] = read_manifest(out).signature()
+    return out
+
+
+def built_with(override: str) -> Callable[[Path, Path], list[Path]]:
+    def say(sound: Path, copy: Path) -> list[Path]:
+        manifest = read_manifest(copy)
+        config = override_config(manifest.config, [override])
+        write_manifest(replace(manifest, config=config), copy)
+        return [sound, signed(copy)]
+
+    return say
 
 
 def with_another_shard(sound: Path, copy: Path) -> list[Path]:
@@ -273,12 +284,12 @@ def under_another_seed(edit: Callable[[dict], object]) -> Callable[[Path, Path],
     ("make", "said"),
     [
         (
-            built_with("physics", "friction_hand", 0.5),
+            built_with("physics.friction_hand=0.5"),
             "differs in physics.friction_hand (0.71 there, 0.5 here)",
         ),
-        (built_with("camera", "fov_y_deg", 40.0), "differs in camera.fov_y_deg"),
-        (built_with("candidates", "max", 99), "differs in candidates.max"),
-        (built_with("filters", "max_slip", 0.004), "differs in filters.max_slip"),
+        (built_with("camera.fov_y_deg=40.0"), "differs in camera.fov_y_deg"),
+        (built_with("candidates.max=99"), "differs in candidates.max"),
+        (built_with("filters.max_slip=0.004"), "differs in filters.max_slip"),
         (with_manifest(lambda m: m["versions"].update(drake="1.0")), "must be of drake "),
         (with_manifest(lambda m: m["versions"].update(hand="0")), "must be of hand "),
         (with_manifest(lambda m: m["versions"].update(drakegrasp="0.1")), "be of drakegrasp "),
