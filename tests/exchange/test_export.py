@@ -53,12 +53,12 @@ def test_missing_dataset_is_refused_before_anything_is_written(tmp_path: Path) -
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("form", registry.names("exporters"))
-def test_dataset_without_samples_is_refused(dataset: Path, tmp_path: Path, form: str) -> None:
+def test_dataset_without_samples_is_refused(dataset: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(dataset, tmp_path / "out"))
     assemble(out, overrides=["filters.max_slip=1e-9"])
-    with pytest.raises(DataError, match="must have samples to export, got none"):
-        export_dataset(out, tmp_path / "to", form)
+    for form in registry.names("exporters"):
+        with pytest.raises(DataError, match="must have samples to export, got none"):
+            export_dataset(out, tmp_path / "to", form)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 

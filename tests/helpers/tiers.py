@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
+
+
+def few(cases: Sequence[Any], count: int = 3) -> list[Any]:
+    """Return cases that repeat a test, all but the first few of which are for the night."""
+    return [*cases[:count], *map(in_second_tier, cases[count:])]
 
 
 def in_second_tier(case: Any) -> Any:

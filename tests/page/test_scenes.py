@@ -154,17 +154,21 @@ def change(name: str, value: object) -> Callable[[Path], None]:
     ],
 )
 def test_file_that_cannot_be_shown_is_a_line(
-    spoiled: Path, spoil: Callable[[Path], None], line: str, tmp_path: Path
+    spoiled: Path, spoil: Callable[[Path], None], line: str
 ) -> None:
     spoil(spoiled / "scenes.hdf5")
     with TestClient(make_app(Inspection(spoiled)), base_url="http://127.0.0.1:8321") as client:
         answer = client.get("/scenes")
         assert answer.status_code == 400 and line in Tags(answer.text).text
         assert 'href="/scenes"' in client.get("/").text
-    # Files without a server say it, too, and hold all else.
+
+
+def test_files_without_a_server_say_what_cannot_be_shown(spoiled: Path, tmp_path: Path) -> None:
+    """And hold all else."""
+    damage(spoiled / "scenes.hdf5")
     write_site(spoiled, tmp_path / "site")
     index = Tags((tmp_path / "site" / "index.html").read_text(encoding="utf-8")).text
-    assert "Scenes are left out" in index and line in index
+    assert "Scenes are left out" in index and "must be the scenes of a dataset, got none" in index
     assert not (tmp_path / "site" / "scenes.html").exists()
 
 

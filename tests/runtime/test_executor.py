@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import pytest
+from helpers.tiers import few
 
 from drakegrasp.cluster.connect import connect
 from drakegrasp.errors import ConfigError, MachineError
@@ -149,7 +150,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("seconds", [0.05, 0.6])
+@pytest.mark.parametrize("seconds", few([0.05, 0.6], 1))
 def test_ctrl_c_while_processes_start_says_nothing(tmp_path: Path, seconds: float) -> None:
     """It reaches every process of the terminal, also one that has just begun."""
     script = tmp_path / "script.py"

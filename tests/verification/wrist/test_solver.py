@@ -9,6 +9,7 @@ from itertools import combinations, permutations
 import numpy as np
 import pytest
 from helpers.hands import write_pincer
+from helpers.tiers import few
 from scipy.spatial.transform import Rotation
 
 import drakegrasp.verification.wrist_solver
@@ -113,7 +114,7 @@ def test_contacts_that_the_hand_made_are_found_again():
     assert max(turned) < 40.0
 
 
-@pytest.mark.parametrize("seed", SEEDS[:6])
+@pytest.mark.parametrize("seed", few(SEEDS[:6]))
 def test_points_that_the_back_of_a_fingertip_touched_are_brought_onto_the_pad(seed):
     """Near the tip but behind the pad: without the region the fit stays there, with it it moves."""
     barrett = hand_of("barrett")
@@ -143,7 +144,7 @@ def test_points_that_the_back_of_a_fingertip_touched_are_brought_onto_the_pad(se
     assert farthest_outside(hand) < 2e-3
 
 
-@pytest.mark.parametrize("seed", SEEDS[:10])
+@pytest.mark.parametrize("seed", few(SEEDS[:10]))
 def test_a_hand_of_two_fingers_finds_its_contacts_again(pincer, seed):
     best = fit(pincer, touched(pincer, seed, scatter=0.002, closing_deg=(5, 45)))[0]
     assert best.residual.max() < 2e-3
@@ -152,7 +153,7 @@ def test_a_hand_of_two_fingers_finds_its_contacts_again(pincer, seed):
     assert best.closing.shape == best.residual.shape == best.normal_error.shape == (2,)
 
 
-@pytest.mark.parametrize("seed", SEEDS[:8])
+@pytest.mark.parametrize("seed", few(SEEDS[:8]))
 def test_a_fit_is_as_good_as_it_says(seed):
     """By the forward kinematics and the pads without rounding."""
     made, hand, constants = (
@@ -176,7 +177,7 @@ def test_a_fit_is_as_good_as_it_says(seed):
         assert np.linalg.det(R) > 0.0
 
 
-@pytest.mark.parametrize("seed", SEEDS[:10])
+@pytest.mark.parametrize("seed", few(SEEDS[:10]))
 def test_joints_stay_within_their_limits(pincer, seed):
     for name, closing_deg in (("barrett", (0, 140)), (pincer, (-6, 57))):
         lower, upper = coordinate_limits(hand_of(name)).T
@@ -185,7 +186,7 @@ def test_joints_stay_within_their_limits(pincer, seed):
             assert np.all((lower <= c) & (c <= upper)), (lower, c, upper)
 
 
-@pytest.mark.parametrize("seed", SEEDS[:8])
+@pytest.mark.parametrize("seed", few(SEEDS[:8]))
 def test_where_the_object_is_does_not_matter(seed):
     rng, made = np.random.default_rng(1000 + seed), touched("barrett", seed)
     X_AO = make_pose(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-1.0, 1.0, 3))
@@ -204,7 +205,7 @@ def test_where_the_object_is_does_not_matter(seed):
     np.testing.assert_allclose(there[0].X_OG, X_AO @ here[0].X_OG, atol=1e-3)
 
 
-@pytest.mark.parametrize("seed", SEEDS[:8])
+@pytest.mark.parametrize("seed", few(SEEDS[:8]))
 def test_the_hands_mirror_image_is_the_hand_with_two_fingers_swapped(seed):
     """Fingers 1 and 2 are mirror images in the palm's plane x = 0, finger 3 is its own."""
     made, mirror, swapped = touched("barrett", seed), np.diag([-1.0, 1.0, 1.0]), [1, 0, 2]
@@ -221,7 +222,7 @@ def test_the_hands_mirror_image_is_the_hand_with_two_fingers_swapped(seed):
     assert image.spread == pytest.approx(best.spread, abs=1e-3)
 
 
-@pytest.mark.parametrize("seed", SEEDS[:5])
+@pytest.mark.parametrize("seed", few(SEEDS[:5]))
 def test_contacts_given_to_other_fingers_fit_worse(seed):
     """Often not by much: three points on three large pads leave a lot open."""
     made = touched("barrett", seed, scatter=0.0, closing_deg=(40, 100))
@@ -237,7 +238,7 @@ def above(made, room):
     return room - float((made.p_OQ @ UP).min())
 
 
-@pytest.mark.parametrize("seed", SEEDS[:12])
+@pytest.mark.parametrize("seed", few(SEEDS[:12]))
 def test_palm_and_fingertips_stay_over_the_table(seed):
     """At most a millimetre or two of the rounding and of the last closing step are below."""
     made = touched("barrett", seed, scatter=0.0, closing_deg=(35, 100))
@@ -322,7 +323,7 @@ def misfit(name, X_OG, c, made):
     return float(np.sum(p**2) + np.sum((p + LEVER * n) ** 2))
 
 
-@pytest.mark.parametrize("seed", SEEDS[:8])
+@pytest.mark.parametrize("seed", few(SEEDS[:8]))
 def test_starts_differ_and_the_best_comes_first(pincer, seed):
     for name in ("barrett", pincer):
         made = touched(name, seed)
@@ -357,7 +358,7 @@ def test_starts_tell_left_from_right(monkeypatch):
     assert np.abs(image - wanted).max() > DIFFERENT
 
 
-@pytest.mark.parametrize("seed", SEEDS[:8])
+@pytest.mark.parametrize("seed", few(SEEDS[:8]))
 def test_search_by_shape_finds_what_laying_over_every_posture_finds(monkeypatch, seed):
     postures, made = make_postures(hand_of("barrett")), touched("barrett", seed)
     (quick,) = find_starts(postures, made.p_OQ, made.nhat_Q_O, 1)
