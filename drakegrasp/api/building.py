@@ -26,9 +26,10 @@ from drakegrasp.generation.pipeline import (
     build_locked,
     posture_config,
     refuse_missing,
+    refuse_part,
     refuse_unusable,
 )
-from drakegrasp.generation.request import BUILTIN, refuse_unknown
+from drakegrasp.generation.request import BUILTIN, Part, read_part, refuse_unknown
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import carry_hand
 from drakegrasp.hand.settings import load_config
@@ -52,6 +53,7 @@ def build_dataset(
     manifest: str | Path | None = None,
     only: Sequence[str] = (),
     postures: str | Path | Attempts | None = None,
+    part: str | None = None,
     client: Client | None = None,
     show: bool = True,
     **workers: Unpack[Workers],
@@ -70,6 +72,8 @@ def build_dataset(
         only: Names of the objects to build; all if empty.
         postures: Instead of drawn palm poses: a file of postures, or a table of them. Only the
             objects that it names are built; rows that are no posture are told, and left out.
+        part: Only a part of the work units, e.g. "3/16": `merge` joins the directories of all
+            parts. Not with a number of samples.
         client: A Dask client whose workers do the work, e.g. of `connect`.
         show: Whether to show progress on standard error.
         workers: Instead of a client, the arguments of `connect`; one process per core without any.
@@ -78,7 +82,7 @@ def build_dataset(
         MeshError: If there is no mesh.
         GraspError: If no row of the postures is one of an object that is there.
         ConfigError: If both workers and a scheduler are given, the address is empty, or the
-            scheduler wants no certificate although `tls` says so.
+            scheduler wants no certificate although `tls` says so; or if the part is none.
         DataError: If `out` cannot be used, another process builds there, or no mesh can be
             simulated.
         MachineError: If there is no scheduler, the workers cannot do the work, or no room is
@@ -91,7 +95,16 @@ def build_dataset(
     if isinstance(postures, str | Path):
         postures = read_attempts(Path(postures), hand)
     sources = find_sources(objects, units, manifest)
-    return build_on(cluster, sources, out, config, only=only, postures=postures, show=show)
+    return build_on(
+        cluster,
+        sources,
+        out,
+        config,
+        only=only,
+        postures=postures,
+        part=None if part is None else read_part(part),
+        show=show,
+    )
 
 
 def find_sources(
@@ -115,6 +128,7 @@ def build_on(
     *,
     only: Sequence[str] = (),
     postures: Attempts | None = None,
+    part: Part | None = None,
     show: bool = True,
 ) -> BuildReport:
     """Build a dataset on the workers of a cluster; see `build_dataset`.
@@ -129,6 +143,7 @@ def build_on(
         config: All the rules.
         only: As for `build_dataset`.
         postures: As for `build_dataset`.
+        part: As for `build_dataset`.
         show: Whether to show progress on standard error.
 
     Raises:
@@ -139,6 +154,7 @@ def build_on(
         MachineError: If a worker would give other results than this machine.
     """
     refuse_unusable(config)
+    refuse_part(part, config)
     config = posture_config(config, postures)
     known = draw_builtin(config.builtin) if sources is None else sources
     refuse_unknown(only, [each.name for each in known])
@@ -178,6 +194,7 @@ def build_on(
             execute,
             dead=dead,
             postures=postures,
+            part=part,
             pool=execute.pool,
             show=show,
         )

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @click.command(cls=Command)
 @described
-def build(times: Path | None, plan: bool = False, **options: Any) -> None:
+def build(times: Path | None, plan: bool = False, part: str | None = None, **options: Any) -> None:
     """Build a dataset from a directory of meshes.
 
     The command simulates grasps of every object and writes trials.hdf5,
@@ -39,6 +39,7 @@ def build(times: Path | None, plan: bool = False, **options: Any) -> None:
 
     Options:
         BUILD, CONNECTION
+        --part I/N: Only do every Nth work unit from the Ith on; `merge` joins the OUT of all N.
         --plan: Only print the hours and bytes that the build would take.
         --times
     """
@@ -48,6 +49,8 @@ def build(times: Path | None, plan: bool = False, **options: Any) -> None:
     request = parse_request(options)
     if plan and request.postures is not None:
         raise click.UsageError("--plan must be used without --postures: a row is an attempt")
+    if plan and part is not None:
+        raise click.UsageError("--plan must be used without --part: it is of the whole build")
     if plan:
         print_plan(request, workers["workers"], times)
         return
@@ -59,6 +62,7 @@ def build(times: Path | None, plan: bool = False, **options: Any) -> None:
         manifest=request.manifest,
         only=request.only,
         postures=request.postures,
+        part=part,
         **workers,
         show=request.show,
     )
@@ -186,8 +190,8 @@ def merge(
 ) -> None:
     """Make one dataset of several that were built apart.
 
-    Only their objects, their seeds, and what --set sets for all of them may differ. INTO must be
-    new or empty, and appears when it is complete; OUTS do not change.
+    Only their objects, their seeds, their parts (`build --part`), and what --set sets for all of
+    them may differ. INTO must be new or empty, and appears when it is complete; OUTS do not change.
 
     Options:
         ASSEMBLED, --workers
@@ -306,6 +310,7 @@ def print_report(report: BuildReport) -> None:
     for entry in report.refused:
         say(f"refused: {entry.name}: {entry.reason}")
     for name in ("grasping_oto.hdf5", "grasping_otm.hdf5", "trials.hdf5"):
-        say(str(report.out / name))
+        if report.assembly is not None:
+            say(str(report.out / name))
     if report.unexplained:
         raise click.exceptions.Exit(1)

@@ -1,4 +1,4 @@
-"""Datasets that were built apart, as one: halves by objects, or by seeds.
+"""Datasets that were built apart, as one: by objects, by seeds, or by work units.
 
 In: directories of datasets of one configuration, whose seeds may differ. Out: a directory with the
 files of their objects and shards, under names that distinguish seeds, and what assembling makes of
@@ -28,7 +28,7 @@ from drakegrasp.dataset.manifest import (
     with_postprocessing,
     write_manifest,
 )
-from drakegrasp.dataset.paths import model_path, plan_path, shards_folder
+from drakegrasp.dataset.paths import ASSEMBLED_FILES, model_path, plan_path, shards_folder
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import DataError
@@ -77,6 +77,7 @@ def merge(
     if into.exists() and (not into.is_dir() or any(into.iterdir())):
         raise DataError(f"{into}: must be a new or empty directory, got one that is in use")
     manifests = {out: with_postprocessing(_read_complete(out, execute), overrides) for out in outs}
+    incomplete = [out for out in outs if _is_part(out)]
     _refuse_differences(manifests)
     parts = _parts(manifests)
     manifest = _merged_manifest(manifests, parts)
@@ -87,18 +88,40 @@ def merge(
             _take_files(part, folder)
         manifest = _with_hand(manifest, manifests.values(), folder)
         write_manifest(manifest, folder)
+        _refuse_missing(manifest, folder, incomplete)
         return assemble_locked(folder, manifest, execute=execute, progress=progress)
 
 
 def _read_complete(out: Path, execute: Executor) -> Manifest:
-    """Return the manifest of a dataset that is complete."""
+    """Return the manifest of a dataset that is complete, or of a part of one."""
     manifest = read_manifest(out)
-    if not is_assembled(out, verify_shards=True, execute=execute):
+    if not _is_part(out) and not is_assembled(out, verify_shards=True, execute=execute):
         raise DataError(
             f"{out}: must be a complete dataset, got one whose files are not of all its shards; "
             "complete it with `drakegrasp build` or `assemble`"
         )
     return manifest
+
+
+def _is_part(out: Path) -> bool:
+    """Return whether a directory has shards and none of the files that are of all of them."""
+    return not any((out / name).exists() for name in ASSEMBLED_FILES)
+
+
+def _refuse_missing(manifest: Manifest, folder: Path, parts: Sequence[Path]) -> None:
+    """Refuse parts that together lack a work unit.
+
+    Raises:
+        DataError: If they do.
+    """
+    missing = [header for header in manifest.headers() if not header.path(folder).exists()]
+    # With `max_grasps` those behind the last wanted grasp need not be there.
+    if parts and missing and manifest.config.max_grasps is None:
+        first = missing[0]
+        raise DataError(
+            f"{parts[0]}: must be a complete dataset, or given with all other parts of its build, "
+            f"got none that has {first.object_name}, palm poses {first.start} to {first.stop - 1}"
+        )
 
 
 def _refuse_differences(manifests: Mapping[Path, Manifest]) -> None:

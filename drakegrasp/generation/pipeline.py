@@ -9,7 +9,7 @@ from __future__ import annotations
 import socket
 import sys
 import time
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -40,6 +40,7 @@ from drakegrasp.errors import (
     DataError,
     DrakegraspError,
     GraspError,
+    counted,
     listed,
     printable,
 )
@@ -47,6 +48,7 @@ from drakegrasp.frames import unpack_pose
 from drakegrasp.generation.cautions import nothing_trains, too_heavy
 from drakegrasp.generation.counts import Counts, refuse_two_ends
 from drakegrasp.generation.prepare import PrepareTask, prepare_one
+from drakegrasp.generation.request import Part
 from drakegrasp.generation.scenes import make_scenes_locked
 from drakegrasp.generation.work_unit import (
     WorkUnit,
@@ -84,7 +86,7 @@ class BuildReport:
         unexplained: A line for each object so many of whose attempts crashed or timed out that the
             machine must be at fault; the dataset is complete, but its labels are wrong there.
         assembled: Whether the files were written now, or were those of all shards already.
-        assembly: What the files hold.
+        assembly: What the files hold; None after a part of a build that others go on with.
     """
 
     out: Path
@@ -96,7 +98,7 @@ class BuildReport:
     notices: tuple[str, ...]
     unexplained: tuple[str, ...]
     assembled: bool
-    assembly: Assembly
+    assembly: Assembly | None
 
 
 def build(
@@ -106,6 +108,7 @@ def build(
     execute: Executor,
     *,
     postures: Attempts | None = None,
+    part: Part | None = None,
     pool: WorkerPool | None = None,
     show: bool = True,
 ) -> BuildReport:
@@ -120,12 +123,13 @@ def build(
         config: All the rules.
         execute: Does the work.
         postures: See `build_locked`.
+        part: See `build_locked`.
         pool: The executor's processes, if they are started again when they die: then a crash or
             a hang costs one attempt. Without, crashes propagate to the caller.
         show: Whether to show progress on standard error.
 
     Raises:
-        ConfigError: As `refuse_unusable`.
+        ConfigError: As `refuse_unusable`, and `refuse_part`.
         DataError: If the directory cannot be used, another process builds there, or no mesh
             can be simulated.
         GraspError: If no row of the postures is one of these objects.
@@ -134,10 +138,19 @@ def build(
         MachineError: If the workers cannot do the work.
     """
     refuse_unusable(config)
+    refuse_part(part, config)
     drive_of(load_hand(config.hand_source), config.lift)
     with build_lock(out) as dead:
         return build_locked(
-            sources, out, config, execute, dead=dead, postures=postures, pool=pool, show=show
+            sources,
+            out,
+            config,
+            execute,
+            dead=dead,
+            postures=postures,
+            part=part,
+            pool=pool,
+            show=show,
         )
 
 
@@ -172,6 +185,18 @@ def refuse_unusable(config: Config) -> None:
     own_filters(config.filters)
 
 
+def refuse_part(part: Part | None, config: Config) -> None:
+    """Refuse a part of a build that ends when there are enough samples.
+
+    Raises:
+        ConfigError: If it is one: which units it needs depends on all of them.
+    """
+    if part is not None and config.has_target:
+        raise ConfigError(
+            "part must be left out with samples and samples_per_object, which need all units"
+        )
+
+
 def build_locked(
     sources: Sequence[MeshSource],
     out: Path,
@@ -180,6 +205,7 @@ def build_locked(
     *,
     dead: Holder | None,
     postures: Attempts | None = None,
+    part: Part | None = None,
     pool: WorkerPool | None = None,
     show: bool = True,
 ) -> BuildReport:
@@ -193,13 +219,15 @@ def build_locked(
         dead: Who held the lock before and died, as `build_lock` yields it.
         postures: What is tried instead of palm poses of samplers; the configuration knows it by
             its digest, see `posture_config`. Bad rows are reported and left out.
+        part: Which work units are done, all if None. The files are written when all units are
+            there.
         pool: The executor's processes, as for `build`.
         show: Whether to show progress on standard error.
 
     Raises:
         DataError, DiskFullError, MachineError: As for `build`.
     """
-    job = _Build(out, execute, pool, postures, show=show)
+    job = _Build(out, execute, pool, postures, part, show=show)
     with disk_full_named(out):
         # The directory must be ours, and the dataset in it must be of these meshes.
         known = claim_directory(out, config)
@@ -233,10 +261,12 @@ class _Build:
         execute: Executor,
         pool: WorkerPool | None,
         postures: Attempts | None,
+        part: Part | None,
         *,
         show: bool,
     ) -> None:
         self._out, self._execute, self._pool = out, execute, pool
+        self._part, self._left = part, 0
         self._postures, self._show, self.log = postures, show, BuildLog(out)
 
     def run(
@@ -247,7 +277,7 @@ class _Build:
         notices: list[str],
     ) -> BuildReport:
         """Prepare, simulate, assemble."""
-        out, execute, start = self._out, self._execute, time.monotonic()
+        out, start = self._out, time.monotonic()
 
         # The manifest comes first: without one a directory holds no dataset.
         hand, versions = load_hand(config.hand_source), installed_versions(config)
@@ -283,16 +313,11 @@ class _Build:
         if self._pool is not None:
             sweep_temporary(out)
 
-        # Assemble the shards, unless the files are of these very shards already.
-        stale = not is_assembled(out, verify_shards=True, execute=execute)
-        if stale:
-            with self._progress("assemble", "tasks") as report:
-                assemble_locked(out, manifest, execute=execute, progress=report)
-        else:
-            write_card(out)  # the licence of a mesh may be stated otherwise now
-        if config.scenes.when == "assembled" and (stale or not (out / SCENES_FILE).is_file()):
-            with self._progress("scenes", "objects") as report:
-                make_scenes_locked(out, execute=execute, progress=report)
+        # The files are of all work units: a part leaves them to whoever has the others.
+        stale = False if self._left else self._assemble(manifest)
+        if self._left:
+            others = counted(self._left, "work unit")
+            notices.append(f"{others} of other parts left; `drakegrasp merge` joins all parts")
 
         # Report.
         if counts.damaged:
@@ -311,8 +336,27 @@ class _Build:
             notices=tuple(notices),
             unexplained=unexplained,
             assembled=stale,
-            assembly=summarise(out),
+            assembly=None if self._left else summarise(out),
         )
+
+    def _assemble(self, manifest: Manifest) -> bool:
+        """Assemble the shards, unless the files are of these very shards already.
+
+        Returns:
+            Whether the files were written now.
+        """
+        out, execute = self._out, self._execute
+        stale = not is_assembled(out, verify_shards=True, execute=execute)
+        if stale:
+            with self._progress("assemble", "tasks") as report:
+                assemble_locked(out, manifest, execute=execute, progress=report)
+        else:
+            write_card(out)  # the licence of a mesh may be stated otherwise now
+        scenes = manifest.config.scenes.when == "assembled"
+        if scenes and (stale or not (out / SCENES_FILE).is_file()):
+            with self._progress("scenes", "objects") as report:
+                make_scenes_locked(out, execute=execute, progress=report)
+        return stale
 
     def _progress(self, stage: str, unit: str) -> AbstractContextManager[Report]:
         return progress_bar(stage, unit, show=self._show)
@@ -440,8 +484,14 @@ class _Build:
         target = counts.target
         if target is None:
             # An object may have enough grasps by the time that there is room for its next unit.
-            headers = (h for h in every.headers() if counts.needs(h) and h not in done)
-            self._run_units(headers, every, counts)
+            def due(*, mine: bool) -> Iterator[ShardHeader]:
+                for unit, header in enumerate(every.headers()):
+                    is_mine = self._part is None or self._part.has(unit)
+                    if is_mine == mine and counts.needs(header) and header not in done:
+                        yield header
+
+            self._run_units(due(mine=True), every, counts)
+            self._left = sum(1 for _ in due(mine=False))
             return counts, every
 
         # Round after round until the target is met.

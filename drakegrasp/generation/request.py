@@ -1,13 +1,14 @@
-"""What a caller asks to be built."""
+"""What a caller asks to be built, and which part of it."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drakegrasp.errors import MeshError, listed
+from drakegrasp.errors import ConfigError, MeshError, listed
 
 if TYPE_CHECKING:
     from drakegrasp.config import Config
@@ -40,6 +41,36 @@ class BuildRequest:
     only: tuple[str, ...]
     postures: Path | None
     show: bool
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the work units of a build, for jobs that do not know of each other.
+
+    Attributes:
+        number: Which part, from 1 on.
+        of: Number of parts.
+    """
+
+    number: int
+    of: int
+
+    def has(self, unit: int) -> bool:
+        """Return whether a work unit, counted from 0, belongs to the part."""
+        return unit % self.of == self.number - 1
+
+
+def read_part(text: str) -> Part:
+    """Return the part that a text such as 3/16 names.
+
+    Raises:
+        ConfigError: If it names none.
+    """
+    match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text.strip())
+    part = Part(*map(int, match.groups())) if match else Part(0, 0)
+    if not 1 <= part.number <= part.of:
+        raise ConfigError(f"part must be I/N, with I from 1 to N, got {text[:40]!r}")
+    return part
 
 
 def refuse_unknown(only: Sequence[str], names: Sequence[str]) -> None:

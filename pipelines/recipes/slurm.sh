@@ -3,7 +3,7 @@
 # each that reaches its walltime is replaced. Run it where jobs are submitted, in tmux or
 # screen: this process hands out the work. Partition, account and the like are taken from
 # ~/.config/dask/jobqueue.yaml (see jobqueue.yaml beside this file).
-# Needs: pip install 'drakegrasp[slurm]'.
+# Needs: pip install 'drakegrasp[jobqueue]'.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 
