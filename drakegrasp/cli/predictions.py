@@ -313,7 +313,8 @@ def score(
             times.
         --train FILE: Data file whose training rows give the reference rows. [default: --dataset]
         --reference NAME (references): Score these reference rows only; may be given several times:
-            own, nearest image, constant, random, top-down, palm normals, surface. [default: all]
+            own, nearest image, constant, random, top-down, closing, palm normals, surface.
+            [default: all]
         --per-object N: Rows of each object, at most.
         --set
         --protocol NAME|FILE.py:NAME: The rule of a verdict, see `drakegrasp verify`. All but lift

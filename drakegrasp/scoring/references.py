@@ -1,6 +1,7 @@
 """Reference rows: predictions that the program makes itself, to be scored beside a network's.
 
-In: the rows to score, and training rows. Out: a grasp per row in the camera's frame. `constant` and
+In: the rows to score, and training rows. Out: a grasp per row, contacts in the camera's frame or
+postures in {T}. `constant` and
 `random` never look at the image. The camera stands at a fixed place of the palm, so a grasp in its
 frame gives the wrist away: a network that is not far above these two has learned nothing.
 """
@@ -16,9 +17,15 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.errors import GraspError, HandError
 from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.grasp import pack_grasp, unpack_grasp
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.scoring.proposals import propose
+from drakegrasp.scoring.ranking import rank
 from drakegrasp.seeding import Stream, object_key
+from drakegrasp.simulation.attempts import Attempts, make_attempts
+from drakegrasp.verification.placing import dataset_config
 from drakegrasp.vision.camera import project, unproject
 
 #: Cells along each edge of the image descriptor.
@@ -235,11 +242,49 @@ def _on_surface(scene: Scene, choose: Callable[[Scene, int, Pixels, int], Sequen
     return np.array(grasps)
 
 
+def closing(scene: Scene) -> Attempts:
+    """Return of `propose` what `rank` puts first, for the visible points of each row.
+
+    A row of which no grasp can be proposed is no grasp, and says why.
+    """
+    # A row is NaN until something is proposed.
+    hand = load_hand(dataset_config(scene.data).hand_source)
+    poses = unpack_pose(scene.data.column(f"object_props/frame_work2cam_{scene.data.camera}"))
+    count, joints = len(scene.rows), len(hand.joint_names)
+    X_TG = np.full((count, 4, 4), np.nan)
+    q, reasons = np.full((2, count, joints), np.nan), [""] * count
+
+    for i, row in enumerate(scene.rows):
+        try:
+            best = _chosen(transform_points(poses[row], scene.visible(row)[1]), hand)
+        except (GraspError, HandError) as reason:
+            reasons[i] = str(reason)
+        else:
+            X_TG[i], q[:, i] = best.X_FG[0], [best.q_grasp[0], best.q_pregrasp[0]]
+
+    return make_attempts(
+        hand,
+        scene.data.column("object_props/object_name")[list(scene.rows)].tolist(),
+        X_TG,
+        q[0],
+        q_pregrasp=q[1],
+        frame="table",
+        invalid=reasons,
+        of_row=np.array(scene.rows, dtype=np.int64),
+    )
+
+
+def _chosen(p_TQ: Array, hand: Hand) -> Attempts:
+    """Return the one grasp of points (n, 3) in {T} that closing the hand puts first."""
+    grasps = propose(p_TQ, hand)
+    return grasps.at([int(rank(grasps, p_TQ, hand).order[0])])
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reference:
     """A maker of reference rows: what it makes, in words, and whether it needs training rows."""
 
-    make: Callable[[Scene], Array]
+    make: Callable[[Scene], Array | Attempts]
     words: str
     trained: bool = True
 
@@ -252,6 +297,9 @@ REFERENCES = {
     "random": Reference(make=random_train, words="a random training grasp (blind)"),
     "top-down": Reference(
         make=top_down, words="from above, across the minor axis of what is seen", trained=False
+    ),
+    "closing": Reference(
+        make=closing, words="from above, chosen by closing on what is seen", trained=False
     ),
     "palm normals": Reference(make=palm_normals, words="rays about the palm's direction"),
     "surface": Reference(make=surface_points, words="random visible points", trained=False),

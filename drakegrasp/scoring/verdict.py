@@ -58,16 +58,18 @@ def rank(table: Attempts) -> Attempts:
 
 def rank_array(
     name: str,
-    grasps: npt.ArrayLike,
+    grasps: npt.ArrayLike | Attempts,
     data: GraspDataset,
     rows: Sequence[int] | npt.NDArray[np.int64] | None = None,
     confidence: npt.ArrayLike | None = None,
 ) -> Attempts:
     """Return predicted contacts of an array, ranked; see `read_several`.
 
+    A table of predictions for rows is ranked as it is.
+
     Args:
         name: What errors and the card call them.
-        grasps: (n, 6k), or (n, m, 6k).
+        grasps: (n, 6k), or (n, m, 6k); or a table with `of_row`.
         data: The split.
         rows: (n,), the row that each is for.
         confidence: (n,) or (n, m).
@@ -75,6 +77,9 @@ def rank_array(
     Raises:
         GraspError: If they cannot be used.
     """
+    if isinstance(grasps, Attempts):
+        sha256 = hashlib.sha256(np.ascontiguousarray(grasps.numbers()).tobytes()).hexdigest()
+        return rank(replace(grasps, file=name, sha256=sha256))
     fingers = data.column("grasps").shape[1] // 6
     with named(Path(name)):
         array = as_numbers(grasps, "grasps must be numbers")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.datasets import OTO, make_dataset
 
+import drakegrasp as dg
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.frames import rotate_vectors, transform_points, unpack_pose
 from drakegrasp.grasp import unpack_grasp
@@ -23,7 +24,11 @@ def scene(tmp_path_factory):
     )
 
 
-@pytest.mark.parametrize("name", REFERENCES)
+#: Those that are grasps of contacts.
+CONTACTS = [name for name in REFERENCES if name != "closing"]
+
+
+@pytest.mark.parametrize("name", CONTACTS)
 def test_every_reference_gives_a_grasp_with_unit_normals_for_each_row(scene, name):
     grasps = REFERENCES[name].make(scene)
     assert grasps.shape == (len(scene.rows), 18)
@@ -79,3 +84,23 @@ def test_contacts_on_what_is_seen_lie_on_the_box_and_face_the_camera(scene):
             away = np.linalg.norm(seen[:, None] - points[None], axis=-1).min(axis=0)
             assert away.max() < 1e-6
             assert ((points * normals).sum(axis=1) <= 0.0).all()
+
+
+def test_closing_gives_the_posture_that_is_ranked_first_for_what_is_seen(scene):
+    table = references.closing(scene)
+    assert table.of_row.tolist() == list(scene.rows)
+    assert not table.refused
+    assert table.frame == "table"
+    poses = scene.data.column("object_props/frame_work2cam_oto")
+    for i, row in enumerate(scene.rows):
+        cloud = transform_points(unpack_pose(poses[row]), scene.visible(row)[1])
+        found = dg.propose(cloud)
+        best = found.X_FG[dg.rank(found, cloud).order[0]]
+        np.testing.assert_array_equal(table.X_FG[i], best)
+
+
+def test_a_row_of_which_nothing_is_seen_is_no_grasp(scene, monkeypatch):
+    visible = Scene.visible
+    monkeypatch.setattr(Scene, "visible", lambda self, row: [x[:5] for x in visible(self, row)])
+    table = references.closing(scene)
+    assert "10 or more, got 5" in table.invalid[0]
