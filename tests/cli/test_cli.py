@@ -259,8 +259,7 @@ def test_bad_meshes_are_one_line_and_leave_nothing(tmp_path: Path, make, words: 
 
 
 @pytest.mark.sim
-@pytest.mark.slow
-@pytest.mark.cluster
+@pytest.mark.usefixtures("builds_here")
 def test_build_reports_and_says_when_nothing_is_left_to_do(
     small_meshes: Path, tmp_path: Path
 ) -> None:

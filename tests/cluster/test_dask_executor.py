@@ -31,6 +31,7 @@ def test_scheduler_is_more_patient_than_the_limits_of_steps() -> None:
     assert patience > wall_limit(PREPARE_SECONDS)
 
 
+@pytest.mark.nightly
 def test_worker_that_takes_its_time_to_end_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     def late(cluster: SpecCluster, timeout: float | None = None) -> None:
         close(cluster, timeout)
@@ -163,6 +164,7 @@ def test_where_workers_may_come_the_work_waits(cluster: LocalCluster) -> None:
         assert sorted(found) == ["1", "2", "3", "4"]
 
 
+@pytest.mark.nightly
 def test_lost_scheduler_is_one_error(tmp_path: Path) -> None:
     command, file = [sys.executable, "-m"], tmp_path / "scheduler.json"
     options = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]

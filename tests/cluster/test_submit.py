@@ -341,6 +341,7 @@ def test_scheduler_file_that_is_being_written_is_read_again(
         pass
 
 
+@pytest.mark.nightly
 @pytest.mark.cluster
 @pytest.mark.slow
 def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ def touch_late(path: Path) -> Path:
     return path
 
 
+@pytest.mark.nightly
 def test_what_is_begun_ends_before_the_executor_does(tmp_path: Path) -> None:
     """Nothing is written behind the back of who has stopped; what waits is not begun."""
     paths = [tmp_path / str(k) for k in range(8)]

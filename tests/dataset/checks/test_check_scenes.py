@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from helpers import datasets
 
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.generation.scenes import make_scenes
@@ -17,8 +18,12 @@ pytestmark = pytest.mark.sim
 
 
 @pytest.fixture(scope="module")
-def made(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = Path(shutil.copytree(sound, tmp_path_factory.mktemp("scenes") / "out"))
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of one box with scenes."""
+    folder = tmp_path_factory.mktemp("scenes")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(datasets, "BOXES", dict(list(datasets.BOXES.items())[:1]))
+        out = datasets.make_dataset(folder / "out", folder / "meshes")
     make_scenes(out, overrides=["scenes.views=3"])
     return out
 
