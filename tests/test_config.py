@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
+from helpers import meshes
 from pydantic import BaseModel, ValidationError
 
 from drakegrasp.config import (
@@ -25,156 +26,7 @@ from drakegrasp.errors import ConfigError, DrakegraspError
 from drakegrasp.hand.settings import load_config, override_config
 
 #: Every field of every section, none at its default.
-ONE_OF_EVERYTHING = """
-hand: /somewhere/hand.yaml
-seed: 7
-unit_candidates: 20
-attempt_seconds: 30.0
-max_grasps: 500
-samples: 300
-samples_per_object: 20
-samples_patience: 700
-objects:
-  mass: 0.5
-  max_collision_faces: 2000
-  resting_poses: 4
-  min_diagonal: 0.02
-  max_diagonal: 1.5
-builtin:
-  per_class: 5
-  seed: 6
-physics:
-  time_step: 0.002
-  friction_hand: 0.8
-  friction_table: 0.6
-  fingertip_modulus: 5.0e+6
-  link_modulus: 6.0e+6
-  table_modulus: 7.0e+6
-  dissipation: 10.0
-  relaxation_time: 0.01
-  solver: sap
-  contact_force: 0.1
-  coarse_steps: 2
-  max_speed: 5.0
-  finger_load: 15.0
-settle:
-  drop_height: 0.1
-  max_time: 10.0
-  max_linear_speed: 2.0e-3
-  max_angular_speed: 2.0e-2
-  rest_time: 0.3
-  time_step: 0.001
-candidates:
-  method: normals
-  max: 100
-  global_x_deg: [0, 90]
-  global_y_deg: [0, 120, 240]
-  global_z_deg: [10]
-  local_x_deg: [0, 60]
-  local_y_deg: [0, 72]
-  local_z_deg: [20]
-  jitter_deg: 5
-  postures: 00c0ffee00c0ffee
-  standoffs: [0.05]
-  spreads_deg: [0, 90]
-screen:
-  mode: "off"
-  start_margin: 0.003
-  reach_margin: 0.004
-  block_margin: 0.006
-  clearance: 0.005
-close:
-  max_time: 3.0
-  stop_speed: 0.02
-  check_period: 0.2
-  scrape_depth: 0.001
-lift:
-  drive: locked
-  release_time: 0.1
-  p_TG: [0.1, 0.0, 0.5]
-  max_speed: 0.4
-  max_acceleration: 2.0
-  hold_time: 0.5
-  check_period: 0.05
-  # The default, as the other value excludes `filters.require: held`.
-  stop_when: never
-  stop_slip: 0.03
-  stop_turn_deg: 30.0
-  least_chance: 0.3
-  least_depth_variance: 0.0005
-certify:
-  repeats: 5
-  share: 0.5
-  share_others: 0.25
-  share_tested: 0.75
-  palm_noise: 0.001
-  palm_noise_deg: 2.0
-  friction_noise: 0.2
-  mass_noise: 0.3
-  friction_steps: 3
-camera:
-  distance: 0.3
-  size: 64
-  fov_y_deg: 40.0
-  near: 0.02
-  far: 1.0
-scenes:
-  when: assembled
-  place: 0.2
-  views: 8
-  distance: [0.5, 0.8]
-  elevation_deg: [30, 60]
-  aim: 0.03
-  roll_deg: 10
-  width: 160
-  height: 120
-  fov_y_deg: 45
-  near: 0.1
-  far: 2
-randomize:
-  object_colour: 0.5
-  table_colour: 0.4
-  light_angle_deg: 20.0
-  light_strength: [0.5, 1.2]
-  camera_shift: 0.01
-  camera_turn_deg: 5.0
-  depth_noise: [0.001, 0.002]
-  depth_baseline: 0.02
-  friction_hand: [0.8, 1.2]
-  friction_table: [0.6, 1.4]
-  mass: [0.9, 1.1]
-refine:
-  children: 3
-  generations: 2
-  shift: 0.01
-  turn_deg: 5.0
-  spared: 0.2
-filters:
-  min_depth_variance: 0.002
-  min_camera_height: 0.02
-  outlier_sigma: 3.0
-  max_surface_distance: 0.003
-  require: held
-  max_slip: 0.02
-  max_turn_deg: 20.0
-  other_links: 1
-  max_normal_angle_deg: 20.0
-  max_suspicion: 3.0
-  max_penetration: 0.004
-  max_imbalance: 0.1
-  max_normal_sum: 0.5
-  max_slip_use: 0.9
-  own: ["my_filter.py:Wide@0123456789abcdef"]
-split:
-  valid_fraction: 0.2
-  by: class
-  test_fraction: 0.2
-  train_classes: [mug, bottle]
-verify:
-  max_contact_error: 0.015
-  open_margin_deg: 10.0
-  max_tries: 3
-"""
+ONE_OF_EVERYTHING = Path(meshes.__file__).with_name("one_of_everything.yaml")
 
 #: Where the released code differs from the paper (original_system.md, 2.1); its hand's
 #: friction is the product of the object's 0.71 and the finger's 10.
@@ -264,7 +116,7 @@ def write(tmp_path: Path, text: str) -> Path:
     return path
 
 
-EVERYTHING = dict(leaves(yaml.safe_load(ONE_OF_EVERYTHING)))
+EVERYTHING = dict(leaves(yaml.safe_load(ONE_OF_EVERYTHING.read_text())))
 DEFAULT_VALUES = dict(leaves(load_config().to_dict()))
 
 
@@ -282,14 +134,14 @@ def test_one_of_everything_has_no_default() -> None:
     assert same == ["lift.stop_when"]
 
 
-def test_one_of_everything_arrives_as_written(tmp_path: Path) -> None:
-    config = load_config(write(tmp_path, ONE_OF_EVERYTHING))
+def test_one_of_everything_arrives_as_written() -> None:
+    config = load_config(ONE_OF_EVERYTHING)
     assert dict(leaves(config.to_dict())) == EVERYTHING
 
 
-def test_resolved_values_load_again_to_the_same(tmp_path: Path) -> None:
+def test_resolved_values_load_again_to_the_same() -> None:
     """The manifest keeps `to_dict` as JSON; that must be enough to go on from."""
-    config = load_config(write(tmp_path, ONE_OF_EVERYTHING))
+    config = load_config(ONE_OF_EVERYTHING)
     assert parse_config(json.loads(json.dumps(config.to_dict()))) == config
 
 
@@ -590,7 +442,7 @@ def test_simulation_hash_does_not_depend_on_the_order_of_keys(tmp_path: Path) ->
         keys = rng.sample(list(tree), len(tree))
         return {k: shuffled(tree[k], rng) if isinstance(tree[k], dict) else tree[k] for k in keys}
 
-    tree = yaml.safe_load(ONE_OF_EVERYTHING)
+    tree = yaml.safe_load(ONE_OF_EVERYTHING.read_text())
     other = shuffled(tree, random.Random(0))
     assert list(other) != list(tree)
     text = yaml.safe_dump(other, sort_keys=False)
