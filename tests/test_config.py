@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 import yaml
-from helpers import meshes
 from pydantic import BaseModel, ValidationError
 
 from drakegrasp.config import (
@@ -26,7 +25,7 @@ from drakegrasp.errors import ConfigError, DrakegraspError
 from drakegrasp.hand.settings import load_config, override_config
 
 #: Every field of every section, none at its default.
-ONE_OF_EVERYTHING = Path(meshes.__file__).with_name("one_of_everything.yaml")
+ONE_OF_EVERYTHING = Path(__file__).parent / "helpers" / "one_of_everything.yaml"
 
 #: Where the released code differs from the paper (original_system.md, 2.1); its hand's
 #: friction is the product of the object's 0.71 and the finger's 10.
