@@ -15,14 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.checks.images import (
-    DEPTH_TOLERANCE,
-    border_of,
-    off_mesh,
-    off_table,
-    points_of,
-    some_of,
-)
 from drakegrasp.dataset.checks.rows import (
     POSITION_TOLERANCE,
     AnyArray,
@@ -37,7 +29,15 @@ from drakegrasp.dataset.checks.rows import (
     ranges,
     rigid,
 )
-from drakegrasp.dataset.checks.samples import group_of
+from drakegrasp.dataset.checks.samples import (
+    DEPTH_TOLERANCE,
+    border_of,
+    group_of,
+    off_mesh,
+    off_table,
+    points_of,
+    some_of,
+)
 from drakegrasp.dataset.manifest import ObjectEntry
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.scenes import GRASPS_FOLLOW_FROM, LIFTED, grasps_of_trials

@@ -26,7 +26,7 @@ from helpers.datasets import (
 )
 from scipy import ndimage
 
-from drakegrasp.dataset.checks import images as image_rules
+from drakegrasp.dataset.checks import samples as image_rules
 from drakegrasp.dataset.checks.rows import Findings, look_at
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.schema import CAMERAS
