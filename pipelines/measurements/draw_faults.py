@@ -28,8 +28,7 @@ JUDGES = ("simulation", "verification")
 OTHERS = ("hand", "mesh", "objects", "vision", "dataset", "generation", "scoring")
 #: Modules and folders that draw a picture or tell a story: they decide nothing.
 _TELLING = {
-    *("dataset/card.py", "dataset/holding.py", "dataset/shortfall.py", "dataset/log.py"),
-    *("generation/cautions.py", "hand/files.py", "scoring/card.py"),
+    *("dataset/card.py", "generation/cautions.py", "hand/files.py", "scoring/card.py"),
     *("verification/figure.py", "vision/probe_image.py"),
 }
 #: How many imports may lie between a module and a test, in its room and elsewhere.
@@ -73,6 +72,8 @@ def modules(rooms: Sequence[str]) -> list[str]:
         for path in (ROOT / "drakegrasp" / room).rglob("*.py")
         if path.name != "__init__.py"
     )
+    if gone := [name for name in _TELLING if not (ROOT / "drakegrasp" / name).exists()]:
+        sys.exit(f"modules that tell must be there, got none for {', '.join(sorted(gone))}")
     telling = [p for p in found if {str(p), *map(str, p.parents)} & _TELLING]
     return [f"drakegrasp/{path}" for path in found if path not in telling]
 
