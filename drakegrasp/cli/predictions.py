@@ -222,19 +222,14 @@ def _verify_by_protocol(
 
 def _is_foreign(request: VerifyRequest, assets: Path | None) -> bool:
     """Return whether the grasps are files of DexGraspBench."""
-    import numpy as np
+    from drakegrasp.protocols.files import is_grasp_file
 
     path = request.grasps
     if Path(request.hand or "").suffix == ".xml" or assets is not None:
         return True
     if path.is_dir():
         return any(path.rglob("*.npy"))
-    try:
-        return path.suffix == ".npy" and np.load(path, mmap_mode="r") is None
-    except ValueError:  # an array of Python objects
-        return True
-    except OSError:
-        return False
+    return path.suffix == ".npy" and is_grasp_file(path)
 
 
 #: The MJCF of the hand, the folder of objects, and the file of each grasp, or why it has none.

@@ -149,12 +149,20 @@ def export(
         --about YAML: For format hf: name, version, url, creators, published, licence, citation.
         --quiet
     """
-    from drakegrasp.exchange.export import Publication, export_dataset, not_said, read_publication
+    from drakegrasp.exchange.export import (
+        Publication,
+        export_dataset,
+        names_publishers,
+        not_said,
+        read_publication,
+    )
     from drakegrasp.foreign_files import refuse_link
 
     # What is said of the publishers; the option is stronger than the file.
-    if form != "hf" and about:
-        raise click.UsageError(f"--about is for --to hf, got --to {form}")
+    publishes = names_publishers(form)
+    for option, value in (("--about", about), ("--licence", licence)):
+        if value and not publishes:
+            raise click.UsageError(f"{option} must be left out with --to {form}, got {value}")
     publication = Publication() if about is None else read_publication(about)
     if licence:
         publication = publication.model_copy(update={"licence": licence})
@@ -165,5 +173,5 @@ def export(
     with progress_bar("export", "sample", show=not quiet) as progress:
         count = export_dataset(out, directory, form, publication=publication, progress=progress)
     say(f"{counted(count, 'sample')} in {directory}")
-    if form == "hf" and (missing := not_said(publication)):
+    if publishes and (missing := not_said(publication)):
         say(f"before it is published, --about should say: {', '.join(missing)}")

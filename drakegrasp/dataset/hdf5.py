@@ -7,7 +7,7 @@ as fast; it is used where the package `deflate` is installed, with the same resu
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -160,7 +160,7 @@ def read_rows(
     group: h5py.Group,
     field: Field,
     rows: slice = slice(None),
-    sizes: Mapping[str, int] | None = None,
+    fields: Iterable[Field] = (),
 ) -> AnyArray:
     """Return rows (n, ...) of a field; one that an older file lacks is derived, or has no value.
 
@@ -168,7 +168,8 @@ def read_rows(
         group: The group of the field.
         field: The field.
         rows: The rows.
-        sizes: Lengths of the letters in the shape of a field that may have no value.
+        fields: Of the group: the shapes of those that are there say what the letters in the shape
+            of a field without a value stand for.
 
     Raises:
         DataError: If the field must be there, and is not.
@@ -182,7 +183,17 @@ def read_rows(
     if field.derive is not None and all(name in group for name in field.needs):
         return field.derive({name: group[name][rows] for name in field.needs})
     (count, *_) = next(each.shape for each in group.values() if isinstance(each, h5py.Dataset))
-    return field.empty(len(range(count)[rows]), sizes or {})
+    return field.empty(len(range(count)[rows]), sizes_in(group, fields))
+
+
+def sizes_in(group: h5py.Group, fields: Iterable[Field]) -> dict[str, int]:
+    """Return the lengths of the letters in the shapes of those fields that a group has."""
+    found: dict[str, int] = {}
+    for field in fields:
+        if field.name in group:
+            axes = zip(field.axes, group[field.name].shape[1:], strict=False)
+            found |= {axis: length for axis, length in axes if isinstance(axis, str)}
+    return {"k": found["6k"] // 6, **found} if "6k" in found else found
 
 
 def create_field(

@@ -239,7 +239,7 @@ class GraspDataset:
         _refuse_other_fields([name])
         group = self._open()[self.split]
         try:
-            return read_rows(group, FIELDS[name], slice(start, stop), _sizes(group))
+            return read_rows(group, FIELDS[name], slice(start, stop), FIELDS.values())
         except Exception as error:
             raise self._as_damage(error) from None
 
@@ -272,7 +272,7 @@ class GraspDataset:
         if name not in self._fields:
             field = group.get(name)
             if field is None:
-                field = read_rows(group, FIELDS[name], sizes=_sizes(group))
+                field = read_rows(group, FIELDS[name], fields=FIELDS.values())
             self._fields[name] = ImageRows(field) if FIELDS[name].sample else field
         return self._fields[name]
 
@@ -322,10 +322,6 @@ def _content(file: h5py.File, split: str) -> str:
     digest = hashlib.sha256(str(file.attrs.get("signature")).encode())
     digest.update(file[split]["trial_id"][:].tobytes())
     return digest.hexdigest()
-
-
-def _sizes(group: h5py.Group) -> dict[str, int]:
-    return {"k": group["grasps"].shape[1] // 6}
 
 
 def _refuse_other_fields(names: Sequence[str]) -> None:

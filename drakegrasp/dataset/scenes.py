@@ -164,7 +164,9 @@ class SceneDataset:
                 read_texts(file["objects"][key]) for key in ("name", "class_name")
             )
             self.tables: Mapping[str, Mapping[str, AnyArray]] = {
-                group: {f.name: read_rows(file[group], f) for f in fields if not f.sample}
+                group: {
+                    f.name: read_rows(file[group], f, fields=fields) for f in fields if not f.sample
+                }
                 for group, fields in SCENE_TABLES.items()
                 if group not in ("objects", "visible")
             }
@@ -588,7 +590,7 @@ class SceneRows(GraspDataset):
     """
 
     def __init__(self, path: str | Path, *, split: str = "train") -> None:
-        self.path, self.split, self.camera = Path(path), split, CAMERA
+        self.path, self.split, self.camera = Path(path).absolute(), split, CAMERA
         self._file: h5py.File | None = None
         self._fields, self._process = {}, -1
         self._data = data = SceneDataset(

@@ -14,7 +14,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from drakegrasp.dataset.hdf5 import AnyArray, read_column, write_fixed
+from drakegrasp.dataset.hdf5 import AnyArray, read_column, sizes_in, write_fixed
 from drakegrasp.dataset.opening import (
     COUNT,
     TEXT,
@@ -113,7 +113,7 @@ def read_field(trials: h5py.Group, field: Field) -> AnyArray:
         OSError: If it is missing or cannot be read.
     """
     if field.optional and field.name not in trials:
-        return field.empty(len(trials["outcome"]), {})
+        return field.empty(len(trials["outcome"]), sizes_in(trials, trial_columns()))
     return read_column(trials, field.name)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.hdf5 import AnyArray, read_names, read_rows, read_texts
+from drakegrasp.dataset.hdf5 import AnyArray, read_names, read_rows, read_texts, sizes_in
 from drakegrasp.dataset.opening import (
     open_samples,
     open_trials,
@@ -227,9 +227,10 @@ class Trials:
         if outcome is not None:
             wanted = [outcome] if isinstance(outcome, str | Outcome) else outcome
             mask &= np.isin(self["outcome"], [_outcome(each) for each in wanted])
-        for key, name in (("name", object_name), ("class_name", class_name)):
+        names = {"object_name": object_name, "class_name": class_name}
+        for key, name in names.items():
             if name is not None:
-                own = self.objects[key] == name
+                own = self.objects["name" if key == "object_name" else key] == name
                 if not own.any():
                     raise DataError(f"{key} must be one of the dataset's, got {name!r}")
                 mask &= own[self["object"]]
@@ -362,7 +363,7 @@ class Trials:
             else:
                 series[name] = values
 
-        # Numbers that stand for something become words.
+        # Outcomes and splits become words.
         if "outcome" in series:
             labels = {outcome.value: outcome.label for outcome in Outcome}
             series["outcome"] = [labels[int(value)] for value in series["outcome"]]
@@ -442,8 +443,7 @@ class Trials:
         sizes = {"k": 0, "j": 0}
         if self._parts:
             with self._open(self._parts[0]) as file:
-                touching, q = file["trials/closed_touching"], file["trials/closed_q"]
-                sizes = {"k": touching.shape[1], "j": q.shape[1]}
+                sizes = sizes_in(file["trials"], FIELDS.values())
         derived = {"removal": np.uint8, "split": np.uint8}
         return {
             name: FIELDS[name].empty(0, sizes)
@@ -475,7 +475,7 @@ def _stored(
         codes: What its numbers may stand for, see `refuse_other_codes`; None for measured values.
     """
     near = slice(int(rows[0]), int(rows[-1]) + 1)
-    values = read_rows(trials, FIELDS[name], near)
+    values = read_rows(trials, FIELDS[name], near, FIELDS.values())
     if codes is not None:
         path = Path(trials.file.filename)
         refuse_other_codes(path, f"/trials/{name}", values, codes, near.start)

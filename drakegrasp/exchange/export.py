@@ -1,7 +1,7 @@
 """Export: the samples of a dataset in the format of another tool.
 
 In: the directory of a dataset and a format. Out: a new directory, complete or absent. Each format
-is a module with one function that writes a directory; `FORMATS` names them.
+is a module with one function that writes a directory; the registry names them.
 """
 
 from __future__ import annotations
@@ -122,11 +122,15 @@ def export_dataset(
         raise DataError(f"{directory}: must be a new or empty directory, got one that holds files")
 
     write = registry.find("exporters", form)
-    about = {"publication": publication or Publication()}
-    told = about if "publication" in inspect.signature(write).parameters else {}
+    told = {"publication": publication or Publication()} if names_publishers(form) else {}
     with atomic_folder(directory) as folder:
         count: int = write(out, folder, progress, **told)
     return count
+
+
+def names_publishers(form: str) -> bool:
+    """Return whether an exporter takes a `Publication`."""
+    return "publication" in inspect.signature(registry.find("exporters", form)).parameters
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -130,7 +130,8 @@ def _shard_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
     # The end of a shard's name is that of the object's poses.
     key, number = snapshot.key(i), snapshot.table.object[i]
     *_, unit = snapshot.config.unit_ranges(key.candidate + 1)
-    (path,) = shards_folder(snapshot.out, key.object).glob(f"{unit.start:07d}-*.h5")
+    # More palm poses continue in a shard of another end; the names sort by their ends.
+    path = max(shards_folder(snapshot.out, key.object).glob(f"{unit.start:07d}-*.h5"))
     due = snapshot.own_hashes.get(key.object, snapshot.config_hash), snapshot.meshes[number]
     with open_hdf5(path) as file:
         # A shard of another configuration or mesh has other attempts.

@@ -318,18 +318,21 @@ def find_protocol(name: str, code: Mapping[str, str] | None = None) -> tuple[Pro
     Raises:
         ConfigError: If there is none of that name, or the user's own cannot be imported or made.
     """
-    if ":" not in name and registry.is_known("protocols", name):
-        return registry.find("protocols", name)(), name
-    if ":" not in name:
-        known = listed(registry.names("protocols"))
-        raise ConfigError(f"protocol must be one of {known}, or FILE.py:NAME, got {name!r}")
-
-    # A user's own comes from a file that is given now, never from a dataset.
     stored = name
-    if code is None:
-        stored, text = read_class(name)
-        code = {stored: text}
-    found = own_class(stored, code, key="protocol", method="run", takes=("scene", "motion"))
+    if ":" not in name:
+        if not registry.is_known("protocols", name):
+            known = listed(registry.names("protocols"))
+            raise ConfigError(f"protocol must be one of {known}, or FILE.py:NAME, got {name!r}")
+        found = registry.find("protocols", name)
+    else:
+        # A user's own comes from a file that is given now, never from a dataset.
+        if code is None:
+            stored, text = read_class(name)
+            code = {stored: text}
+        found = own_class(stored, code, key="protocol", method="run", takes=("scene", "motion"))
+    if found is Lift:
+        return Lift(), stored
+
     made = run_own(stored, found)
     if not isinstance(made, MujocoProtocol):
         raise ConfigError(f"{name}: must be a subclass of MujocoProtocol, got {found.__name__}")

@@ -90,7 +90,7 @@ def rank(
 
     Args:
         proposals: Postures of `propose` or `make_attempts`, in {T} or with their X_TO; or palm
-            poses X_TG (n, 4, 4), for which the hand is open.
+            poses X_TG (n, 4, 4) or (4, 4), for which the hand is open.
         cloud: (n, 3), points of the object alone in {T} [m]; the table is z = 0.
         hand: A hand, or what `load_hand` takes; the default one if None.
         spread: Of palm poses [rad].
@@ -100,6 +100,8 @@ def rank(
         HandError: If the hand cannot be used, or several of its fingers move one link.
     """
     points, hand = read_cloud(cloud), chosen_hand(hand)
+    if not isinstance(proposals, Attempts):
+        proposals = read_pose(proposals, "proposals").reshape(-1, 4, 4)
     starts = _starts(proposals, hand, spread)
     solids = hull_solid(points), column_solid(points)
 
@@ -108,7 +110,7 @@ def rank(
     for i, start in starts.items():
         near = round(start.spread / SPREAD_STEP) * SPREAD_STEP
         groups.setdefault((start.preshape, near), []).append(i)
-    count = len(proposals)  # type: ignore[arg-type]
+    count = len(proposals)
     columns = {"score": np.full(count, -1.0)}
     for (preshape, near), rows in groups.items():
         chosen = [starts[i] for i in rows]
@@ -144,12 +146,12 @@ def closed_on(points: Array, hand: Hand, X_TG: Array, spread: float) -> Array:
     return _places(hand, paths, lookup, np.zeros((len(X_TG), hand.num_fingers))) * _steps(paths)
 
 
-def _starts(proposals: Attempts | npt.ArrayLike, hand: Hand, spread: float) -> dict[int, Attempt]:
+def _starts(proposals: Attempts | Array, hand: Hand, spread: float) -> dict[int, Attempt]:
     """Return how each proposal begins, with {T} as its object's frame; rows that are none lack."""
     if not isinstance(proposals, Attempts):
         preshape = 0 if hand.preshapes else None
-        poses = read_pose(proposals, "proposals").reshape(-1, 4, 4)
-        return {i: Attempt(X_OG=X, spread=spread, preshape=preshape) for i, X in enumerate(poses)}
+        made = (Attempt(X_OG=X, spread=spread, preshape=preshape) for X in proposals)
+        return dict(enumerate(made))
     starts = {}
     for i in np.flatnonzero([not reason for reason in proposals.invalid]).tolist():
         X_TO = proposals.X_TO[i]

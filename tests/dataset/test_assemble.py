@@ -33,7 +33,7 @@ from drakegrasp.frames import (
 )
 from drakegrasp.grasp import pack_grasp, unpack_grasp
 from drakegrasp.runtime.executor import processes
-from drakegrasp.runtime.files import refuse_broken_seal
+from drakegrasp.runtime.files import refuse_broken_seal, seal
 
 FILES = (OTO, OTM, TRIALS)
 
@@ -58,6 +58,14 @@ def test_assembling_again_gives_the_same_bytes(out: Path) -> None:
         (out / name).unlink()
     assemble(out)
     assert [(out / name).read_bytes() for name in FILES] == before
+
+
+def test_shards_without_a_column_that_they_may_lack_are_assembled(out: Path) -> None:
+    for path in out.glob("shards/*/*.h5"):
+        with h5py.File(path, "a") as file:
+            del file["trials/unused"]
+        seal(path)
+    assert assemble(out).removed == {Removal.KEPT: 9}
 
 
 def test_shard_without_a_success_has_trials_only(tmp_path: Path) -> None:

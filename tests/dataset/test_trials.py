@@ -119,7 +119,7 @@ def test_removed_success_is_no_sample(out: Path) -> None:
     ("filters", "got"),
     [
         ({"outcome": "won"}, "outcome must be one of success, .*, got 'won'"),
-        ({"object_name": "mug"}, "name must be one of the dataset's, got 'mug'"),
+        ({"object_name": "mug"}, "^object_name must be one of the dataset's, got 'mug'"),
         ({"class_name": "mug"}, "class_name must be one of the dataset's, got 'mug'"),
     ],
 )

@@ -95,6 +95,13 @@ def test_success_that_is_no_sample_has_the_images_of_its_shard(out: Path) -> Non
     np.testing.assert_array_equal(look.image, expected.image)
 
 
+def test_a_build_that_grew_has_the_images_of_its_longer_shard(out: Path) -> None:
+    assemble(out, rejected=[0])
+    (path,) = sorted(out.glob("shards/*/0000000-*.h5"))[:1]
+    shutil.copy(path, path.with_name("0000000-0000001.h5"))
+    assert read_look(Catalog(out).current(), 0, "oto") is not None
+
+
 def test_data_files_alone_are_enough_for_images(out: Path) -> None:
     for folder in ("shards", "objects"):
         shutil.rmtree(out / folder)

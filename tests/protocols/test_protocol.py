@@ -12,6 +12,7 @@ import trimesh
 from helpers.jaws import EDGE, HAND, HERE, box_folder, changed, jaws
 
 from drakegrasp import registry
+from drakegrasp.errors import ConfigError
 from drakegrasp.exchange.dexgraspbench import write_object
 from drakegrasp.protocols.files import ObjectFolder, read_object_folder
 from drakegrasp.protocols.protocol import (
@@ -187,6 +188,17 @@ def test_protocols_have_a_name_a_source_and_words_for_a_paper(name: str) -> None
     assert protocol.name == name
     assert protocol.source
     assert type(protocol).__doc__ and len(type(protocol).__doc__) > 80
+
+
+def test_a_protocol_of_another_package_is_checked_like_an_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Both(DexGraspBench):
+        mass, density = 0.1, 1000.0
+
+    monkeypatch.setattr(registry, "find", lambda *_: Both)
+    with pytest.raises(ConfigError, match="mass or density must be None, and only one of them"):
+        find_protocol("dexgraspbench")
 
 
 def test_a_simulation_that_diverges_is_no_success(judge: Judge) -> None:

@@ -46,6 +46,10 @@ def test_a_grasp_across_the_narrow_side_beats_one_along_it():
     assert ranked.features["robust"][1] == 1.0
 
 
+def test_one_palm_pose_is_one_proposal():
+    assert dg.rank(DOWN, seen()).score.tolist() == dg.rank([DOWN], seen()).score.tolist()
+
+
 def test_a_hand_within_the_object_or_the_table_is_last():
     through = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.01])
     beside = through.copy()

@@ -35,7 +35,13 @@ from drakegrasp.dataset.schema import (
     sources_of,
     with_derived,
 )
-from drakegrasp.dataset.shards import ShardHeader, open_shard, read_trials
+from drakegrasp.dataset.shards import (
+    ShardHeader,
+    open_shard,
+    read_field,
+    read_trials,
+    trial_columns,
+)
 from drakegrasp.errors import ConfigError, listed
 from drakegrasp.filters import NEEDED, Flags, Removal, Rule, first_removal, is_outlier
 from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
@@ -130,7 +136,8 @@ def survey_object(task: SurveyTask) -> Survey:
             left = None if left is None else left - len(hits)
             count = int(hits[-1]) + 1 if left == 0 else len(outcome)
 
-            found = {n: read_column(file["trials"], n)[hits] for n in TRIAL_COLUMNS}
+            own = (f for f in trial_columns() if f.name in TRIAL_COLUMNS)
+            found = {f.name: read_field(file["trials"], f)[hits] for f in own}
             found |= {n: read_column(file["looks"], n)[: len(hits)] for n in LOOK_COLUMNS}
             images = file["looks/image_otm"]
             found["depth_otm"] = images[: len(hits), 3] if len(hits) else np.zeros((0, 1, 1))

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from drakegrasp.config import Config, parse_stored
 from drakegrasp.dataset.assembly.survey import lens_attributes
-from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.hdf5 import open_hdf5, sizes_in
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.opening import (
     DATA_TABLES,
@@ -227,8 +227,8 @@ class CheckedFile:
                 continue
             if f.name in own or not f.optional:
                 columns[f.name] = (own[f.name].asstr() if f.dtype == "str" else own[f.name])[choice]
-            elif not f.shape:
-                columns[f.name] = f.empty(len(rows), {})
+            else:
+                columns[f.name] = f.empty(len(rows), sizes_in(own, self.fields[group]))
         # In files made before it a derived number of a trial is derived here.
         for f in self.fields[group]:
             if f.derive is not None and f.name not in own and {*f.needs} <= {*columns}:
