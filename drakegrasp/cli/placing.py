@@ -172,6 +172,8 @@ def _place_on_rows(
         config=given,
         overrides=overrides,
     )
+    if table.bare:
+        say(table.bare, err=True)
     return placed, config, PredictedRows.of(path, data.split, rows)
 
 
@@ -244,9 +246,9 @@ def _of_object(request: VerifyRequest, name: str, hand: Hand) -> Attempts:
 
 
 def _say_nameless(table: Attempts) -> None:
-    """Say how many postures name no resting pose."""
-    if table.nameless:
-        say(table.nameless, err=True)
+    """Say how many postures name no resting pose, and how many no joints."""
+    for told in filter(None, (table.nameless, table.bare)):
+        say(told, err=True)
 
 
 def _refuse_given(how: str, **options: object) -> None:

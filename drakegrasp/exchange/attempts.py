@@ -25,7 +25,14 @@ import numpy.typing as npt
 from drakegrasp import registry
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import DrakegraspError, GraspError, MachineError, listed, one_line
+from drakegrasp.errors import (
+    DrakegraspError,
+    GraspError,
+    HandError,
+    MachineError,
+    listed,
+    one_line,
+)
 from drakegrasp.exchange.contacts import read_contacts
 from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
 from drakegrasp.frames import Array, unpack_pose
@@ -154,6 +161,12 @@ def read_arrays(path: Path, hand: Hand, nameless: bool = False) -> dict[str, Any
     return _of_arrays(_read_arrays(path), nameless)
 
 
+def read_palms(path: Path, hand: Hand, nameless: bool = False) -> dict[str, Any] | None:
+    """Return the palm poses of a .npy file of (n, 4, 4) numbers; None for another."""
+    poses = _poses_alone(path)
+    return None if poses is None else _of_arrays({"X_FG": poses}, nameless)
+
+
 def read_columns(path: Path, hand: Hand, nameless: bool = False) -> dict[str, Any]:
     """Return the postures of a table, which may name no object if `nameless`."""
     return _of_columns(*_read_columns(path), nameless)
@@ -176,7 +189,7 @@ def _made(hand: Hand, raw: dict[str, Any]) -> Attempts:
     said = {name: value for name, value in raw.items() if name not in ("hand", "trial")}
     try:
         return make_attempts(hand, **said)
-    except (TypeError, ValueError) as error:
+    except (HandError, TypeError, ValueError) as error:
         raise GraspError(one_line(error)) from None
 
 
@@ -255,10 +268,10 @@ def holds_postures(path: Path) -> bool:
     suffix = path.suffix.lower()
     try:
         if suffix == ".npy" and path.is_file():
-            return is_grasp_file(path)
+            return is_grasp_file(path) or _poses_alone(path) is not None
         if suffix in ARRAYS[1:] and path.is_file():
             with open_hdf5(path) as file:
-                return "q_grasp" in file
+                return not {"q_grasp", "X_FG", "quaternion"}.isdisjoint(file)
         if suffix in TABLES and path.is_file():
             return bool({"object", "qw"} & set(_column_names(path)))
     except MachineError:
@@ -324,6 +337,17 @@ def _read_arrays(path: Path) -> dict[str, Any]:
         raise GraspError(f"must be a readable file of arrays, got: {one_line(error)}") from None
 
 
+def _poses_alone(path: Path) -> Array | None:
+    """Return the poses (n, 4, 4) of a .npy file of such; None if it holds anything else."""
+    try:
+        poses = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, EOFError, ValueError, TypeError):
+        return None
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or poses.dtype.kind not in "fiu":
+        return None
+    return np.array(poses, dtype=float)
+
+
 def _refuse_large(size: int) -> None:
     """Refuse arrays that are larger than any postures: a small file can unpack to terabytes."""
     if size > MOST_BYTES:
@@ -343,8 +367,7 @@ def _of_arrays(arrays: Mapping[str, Any], nameless: bool) -> dict[str, Any]:
             f"arrays must be some of {', '.join(_KNOWN)}, got {', '.join(map(repr, unknown))}"
             f"{_leading_on(arrays, unknown)}"
         )
-    needed = ["q_grasp"] if nameless or "row" in arrays else ["object", "q_grasp"]
-    missing = [name for name in needed if name not in arrays]
+    missing = [] if nameless or "row" in arrays or "object" in arrays else ["object"]
     if "X_FG" not in arrays and not {"position", "quaternion"} <= set(arrays):
         missing.append("X_FG (or position and quaternion)")
     if missing:
@@ -392,7 +415,7 @@ def _leading_on(arrays: Mapping[str, Any], unknown: Sequence[str]) -> str:
                 f"file; {name} is of shape {shape}"
             )
         if shape[-2:] in ((4, 4), (3, 4)):
-            return f": poses of the palm go by the name X_FG, with object and q_grasp, not {name}"
+            return f": poses of the palm go by the name X_FG, with object, not {name}"
     return ""
 
 
@@ -514,8 +537,6 @@ def _of_columns(
     place = [*("x", "y", "z"), *("qw", "qx", "qy", "qz")]
     needed = place if nameless or "row" in columns else ["object", *place]
     missing = [name for name in needed if name not in columns]
-    if not any(name.startswith("grasp_") for name in columns):
-        missing.append("a grasp_JOINT for each joint")
     if missing:
         raise GraspError(f"columns must include {', '.join(missing)}, got {listed(list(columns))}")
 
@@ -525,6 +546,7 @@ def _of_columns(
     # The joints of each stage, in the order of the grasp.
     q: dict[str, Any] = {}
     joints: list[str] | None = None
+    alone = np.ones(len(invalid), dtype=bool)
     for stage in ("grasp", "pregrasp", "squeeze"):
         names = [n.removeprefix(f"{stage}_") for n in columns if n.startswith(f"{stage}_")]
         if names:
@@ -534,6 +556,7 @@ def _of_columns(
             q[f"q_{stage}"] = np.column_stack(
                 [_floats(columns, f"{stage}_{n}", invalid) for n in joints]
             )
+            alone &= _empty(columns, [f"{stage}_{n}" for n in joints])
     numbers = np.column_stack([_floats(columns, name, invalid) for name in place])
     known = {n: _floats(columns, n, invalid) for n in _SCALARS if n in columns}
     told_under = {n: _floats(columns, n, invalid) for n in CONDITIONS if n in columns}
@@ -547,6 +570,7 @@ def _of_columns(
         "link": _link(told("link")),
         "frame": _only(told("frame"), "frame") or "object",
         **q,
+        "alone": alone,
         "joints": joints,
         **known,
         "said": None if "source" not in columns else [str(text) for text in columns["source"]],
@@ -555,6 +579,12 @@ def _of_columns(
         "invalid": [one or other for one, other in zip(invalid, reasons, strict=True)],
         "preshape": [str(name or "") for name in columns.get("preshape", ())] or None,
     }
+
+
+def _empty(columns: Mapping[str, list[Any]], names: Sequence[str]) -> npt.NDArray[np.bool_]:
+    """Return (n,) whether all cells of a row are empty in some columns."""
+    rows = zip(*(columns[name] for name in names), strict=True)
+    return np.array([all(cell in (None, "") for cell in row) for row in rows], dtype=bool)
 
 
 def _floats(

@@ -320,6 +320,7 @@ def write_grasps(
         if isinstance(posture, str):
             found.append(posture)
             continue
+        assert posture.q_grasp is not None, "`fitted_postures` refuses a palm pose alone"
         grasp = ClosedGrasp(
             trial_id=number,
             split="",
@@ -353,6 +354,8 @@ def fitted_postures(
     def posture_of(i: int, grasp: PlacedGrasp) -> Posture | str:
         if grasp.invalid or i in fitted:
             return grasp.invalid or fitted[i]
+        if np.isnan(grasp.attempt.q_grasp).all():
+            return "joints must be given with a protocol, got a palm pose alone"
         # Nobody named its resting pose.
         if (count := len(grasp.stands)) > 1:
             return f"resting must be 0 to {count - 1} with a protocol, got none"

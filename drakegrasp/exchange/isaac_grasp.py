@@ -34,6 +34,8 @@ from drakegrasp.yaml_text import parse_yaml
 
 #: What a file of ours says of its origin.
 CREATED_WITH = "drakegrasp"
+#: Keys of the joints of a grasp, and of those before it.
+_STAGES = ("cspace_position", "pregrasp_cspace_position")
 #: What `drakegrasp export --help` says of the format.
 HELP = "a YAML file per object: poses of the palm link, joints by name"
 
@@ -100,7 +102,8 @@ def grasp_entry(hand: Hand, grasp: ClosedGrasp) -> dict[str, Any]:
 def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
     """Return the grasps of a file as arguments of `make_attempts`; its name is that of the object.
 
-    The object's frame is that of its mesh file; in what drakegrasp itself exports it is {O}.
+    The object's frame is that of its mesh file; in what drakegrasp itself exports it is {O}. A
+    grasp without `cspace_position` is a palm pose alone, as GraspGen writes them.
 
     Raises:
         GraspError: If it is none.
@@ -117,12 +120,15 @@ def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
     if not isinstance(grasps, dict) or not grasps:
         raise GraspError(f"{path}: grasps must be there, got none")
 
-    # Each grasp with the joints of the first that names some.
-    stages = [each.get("cspace_position") for each in grasps.values() if isinstance(each, dict)]
+    # Each grasp with the joints of the first that names some; without any it is a palm pose alone.
+    told = [each for each in grasps.values() if isinstance(each, dict)]
+    stages = [each[key] for each in told for key in _STAGES if key in each]
     named = next((stage for stage in stages if isinstance(stage, dict) and stage), None)
-    if named is None:
+    if named is None and stages:
         raise GraspError(f"{path}: grasps must have cspace_position, joints by name, got none")
-    joints, invalid = [str(joint) for joint in named], [""] * len(grasps)
+    joints, invalid = [str(joint) for joint in named or ()], [""] * len(grasps)
+    stated = np.full(len(grasps), np.nan)
+    alone = np.zeros(len(grasps), dtype=bool)
     ours = tree.get("created_with") == CREATED_WITH
     numbers = np.full((len(grasps), 7 + 2 * len(joints)), np.nan)
     known = np.full((len(grasps), 8 + len(CONDITIONS)), np.nan)
@@ -130,19 +136,20 @@ def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
     for i, (name, grasp) in enumerate(grasps.items()):
         try:
             numbers[i] = _isaac_numbers(grasp, joints)
+            alone[i], stated[i] = _STAGES[0] not in grasp, _confidence(grasp)
             if ours:
                 known[i], preshape[i] = _of_export(grasp), str(grasp.get("preshape", ""))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            invalid[i] = (
-                f"{name} must have position, orientation and cspace_position of the joints "
-                f"{', '.join(joints)}, got none ({one_line(error)})"
-            )
+            must, names = "position and orientation", ", ".join(joints)
+            if joints:
+                must = f"position, orientation and cspace_position of the joints {names}"
+            invalid[i] = f"{name} must have {must}, got none ({one_line(error)})"
     X_FL, reasons = quaternion_poses(numbers[:, :3], numbers[:, 3:7])
     X_TO, no_rest = quaternion_poses(known[:, :3], known[:, 3:7])
-    told = np.isfinite(known[:, :7]).any(axis=1)
+    lies = np.isfinite(known[:, :7]).any(axis=1)
     invalid = [
         one or (f"resting_pose: {other}" if other and is_told else "")
-        for one, other, is_told in zip(invalid, no_rest, told, strict=True)
+        for one, other, is_told in zip(invalid, no_rest, lies, strict=True)
     ]
     trials = known[:, 7]
     grasp_q, pregrasp_q = np.split(numbers[:, 7:], 2, axis=1)
@@ -151,9 +158,9 @@ def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
         "X_FG": X_FL,
         "link": hand.palm_link,
         "frame": "object" if ours else "mesh",
-        "q_grasp": grasp_q,
-        "q_pregrasp": pregrasp_q,
-        "joints": joints,
+        **({"q_grasp": grasp_q, "q_pregrasp": pregrasp_q, "joints": joints} if joints else {}),
+        "alone": alone,
+        "confidence": None if ours or np.isnan(stated).all() else stated,
         "said": [
             f"{name}, confidence {grasp.get('confidence') if isinstance(grasp, dict) else None}"
             for name, grasp in grasps.items()
@@ -177,9 +184,16 @@ def _of_export(grasp: Any) -> list[float]:
     return [float(value) for value in found]
 
 
+def _confidence(grasp: Any) -> float:
+    """Return what a grasp says of its confidence; NaN if that is no number."""
+    stated = grasp.get("confidence")
+    return float(stated) if isinstance(stated, int | float) else np.nan
+
+
 def _isaac_numbers(grasp: Any, joints: list[str]) -> list[float]:
-    """Return position, quaternion, grasp and pregrasp of a grasp; NaN for a missing pregrasp."""
-    turn, before = grasp["orientation"], grasp.get("pregrasp_cspace_position")
-    q = [grasp["cspace_position"], before or dict.fromkeys(joints, np.nan)]
+    """Return position, quaternion, grasp and pregrasp of a grasp; NaN for what is missing."""
+    turn, nothing = grasp["orientation"], dict.fromkeys(joints, np.nan)
+    closed, before = _STAGES
+    q = [grasp.get(closed, nothing), grasp.get(before) or nothing]
     place = [*grasp["position"], turn["w"], *turn["xyz"]]
     return [float(v) for v in (*place, *(stage[joint] for stage in q for joint in joints))]

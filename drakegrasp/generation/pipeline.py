@@ -300,8 +300,8 @@ class _Build:
         write_manifest(manifest, out)
         self._warn(too_heavy(manifest))
         if self._postures is not None:
-            refused, nameless = _refused(self._postures, manifest), self._postures.nameless
-            for told in filter(None, (refused, nameless)):
+            table = self._postures
+            for told in filter(None, (_refused(table, manifest), table.nameless, table.bare)):
                 self._warn(told)
                 notices.append(told)
 

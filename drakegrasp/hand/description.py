@@ -12,7 +12,7 @@ positions are `closing_ratio` times those of these fingers. Frames: B palm link,
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from drakegrasp.hand.file_format import (
     Finger,
     HandFile,
     Spread,
+    foreign_frames,
     rated_load,
     read_hand_file,
 )
@@ -67,6 +68,7 @@ class Hand:
     model: ModelFile
     palm_link: str  # frame B
     X_BG: Array  # (4, 4), palm frame, +Gz out of the palm
+    frames: dict[str, Array]  # X_BA (4, 4), frames of other tools by their names
     fingers: tuple[Finger, ...]  # in grasp order
     drive: Drive  # of the closing joints
     spread: Spread
@@ -92,6 +94,24 @@ class Hand:
     def num_fingers(self) -> int:
         """Number of fingers, k."""
         return len(self.fingers)
+
+    def palm_in(self, link: str) -> Array:
+        """Return the pose X_AG (4, 4) of the palm frame in frame A: the palm link, or a tool's.
+
+        Args:
+            link: Name of the palm link or of one of `frames`; empty for the palm frame itself.
+
+        Raises:
+            HandError: If it is none of these.
+        """
+        if not link:
+            return np.eye(4)
+        if link == self.palm_link:
+            return self.X_BG
+        if link not in self.frames:
+            known = ", ".join(map(repr, (self.palm_link, *self.frames)))
+            raise HandError(f"link must be 'palm' for the palm frame, or {known}, got {link!r}")
+        return multiply(invert_pose(self.frames[link]), self.X_BG)
 
     def at(self, preshape: int | None) -> Hand:
         """Return the hand in a preshape of the given index; this one if None or if it has none."""
@@ -263,8 +283,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
     plant = MultibodyPlant(0.0)
     instance = add_model(plant, model)
     palm = described.palm
-    R_BG = RollPitchYaw(np.deg2rad(palm.rpy_deg)).ToRotationMatrix()
-    X_BG = make_pose(R_BG.matrix(), palm.p_BG)
+    X_BG = _pose(palm.rpy_deg, palm.p_BG)
 
     # Assign each joint to a coordinate, or to its position in the preshape.
     joints = find_joints(plant, instance)
@@ -310,6 +329,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         model=model,
         palm_link=palm.link,
         X_BG=X_BG,
+        frames={n: _pose(f.rpy_deg, f.p_BA) for n, f in foreign_frames(described).items()},
         fingers=described.driven_fingers(),
         drive=described.drive,
         spread=described.spread,
@@ -328,6 +348,10 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         link_chains={name: carried[name] for name in bodies if name in carried},
         lift_chance=None,
     )
+
+
+def _pose(rpy_deg: Sequence[float], p: Sequence[float]) -> Array:
+    return make_pose(RollPitchYaw(np.deg2rad(rpy_deg)).ToRotationMatrix().matrix(), p)
 
 
 def _refuse_other_kinds(described: HandFile, joints: dict[str, Any]) -> None:

@@ -216,6 +216,14 @@ class Palm(BaseModel):
     rpy_deg: Vector = (0.0, 0.0, 0.0)
 
 
+class ForeignFrame(BaseModel):
+    """The frame A in which another tool says where the hand is, in the palm link's frame B."""
+
+    model_config = _STRICT
+    p_BA: Vector = (0.0, 0.0, 0.0)  # [m]
+    rpy_deg: Vector = (0.0, 0.0, 0.0)
+
+
 class HandFile(BaseModel):
     """The YAML file."""
 
@@ -237,6 +245,7 @@ class HandFile(BaseModel):
     ] = (0.0,)
     payload: Positive | None = None  # largest mass that the hand is made for [kg]
     rated_load: Positive | None = None  # largest force of a fingertip that its maker allows [N]
+    frames: dict[Name, ForeignFrame] = {}  # of other tools, by their names
 
     @model_validator(mode="after")
     def _check(self) -> HandFile:
@@ -303,6 +312,10 @@ class HandFile(BaseModel):
             if given and not used:
                 yield f"{key} must be left out: no closing joint {how}"
 
+        # Names that files already give the palm frame and the palm link.
+        for name in {"palm", self.palm.link} & set(self.frames):
+            yield f"frames.{name} must have another name, got that of the palm"
+
         # Angles of a spread that the hand does not have.
         if not self.spread.joints and set(self.spreads_deg) != {0.0}:
             yield f"spreads_deg must be [0] without spread.joints, got {list(self.spreads_deg)}"
@@ -362,6 +375,24 @@ def rated_load(described: HandFile) -> float | None:
 def _rated_loads() -> list[tuple[HandFile, float]]:
     loads: dict[str, float] = parse_yaml(read_text(MODELS / "rated_loads.yaml"))
     return [(read_hand_file(MODELS / f"{name}_hand.yaml"), loads[name]) for name in loads]
+
+
+def foreign_frames(described: HandFile) -> dict[str, ForeignFrame]:
+    """Return the frames of other tools by their names; of a package's hand as `rated_load` does."""
+    of_package = (frames for other, frames in _foreign_frames() if other == described)
+    return described.frames or next(of_package, {})
+
+
+@cache
+def _foreign_frames() -> list[tuple[HandFile, dict[str, ForeignFrame]]]:
+    frames: dict[str, dict[str, Any]] = parse_yaml(read_text(MODELS / "frames.yaml"))
+    return [
+        (
+            read_hand_file(MODELS / f"{name}_hand.yaml"),
+            {tool: ForeignFrame.model_validate(frame) for tool, frame in own.items()},
+        )
+        for name, own in frames.items()
+    ]
 
 
 def with_efforts(finger: Finger, limit: float, holding: float | None, *, slides: bool) -> Finger:

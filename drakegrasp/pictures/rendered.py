@@ -77,6 +77,8 @@ PANELS = ((0.0, "open"), (0.5, "half closed"), (1.0, "closed"))
 PAD_LIFT = 4e-4
 #: Length and radius of the axes of the palm frame [m], and their colours.
 AXIS, AXIS_RADIUS = 0.05, 0.0012
+#: Length of those of other tools [m], and how much nearer to white their colours are.
+FOREIGN_AXIS, PALE = 0.12, 0.5
 AXIS_COLOURS = {"Gx": "#CC3333", "Gy": "#339933", "Gz": "#3355CC"}
 #: Lights of a hand: one at the camera and one from above, as in the images of a dataset.
 _TOWARDS = (("camera", [0.0, 0.0, 1.0], 0.6), ("world", [0.3, 0.4, -1.0], 0.7))
@@ -150,6 +152,7 @@ def picture_hand(hand: Hand, png: Path, *, across: float) -> None:
         hide_ticks(axes)
     entries = [(f"pad of {finger.name}", _colour(i)) for i, finger in enumerate(hand.fingers)]
     entries += list(AXIS_COLOURS.items())
+    entries += [(f"{tool}: paler axes", INK) for tool in hand.frames]
     letters = [len(label) + SPACE for label, _ in entries]
     for i, (label, colour) in enumerate(entries):
         left = 0.1 + sum(letters[:i]) * (width - 0.2) / sum(letters)
@@ -173,14 +176,17 @@ def _add_marks(plant: MultibodyPlant, instance: ModelInstanceIndex, hand: Hand) 
         colour = np.array(to_rgba(_colour(i)))
         plant.RegisterVisualGeometry(body, RigidTransform(), mesh, f"drakegrasp pad {i}", colour)
 
-    # The axes.
-    for name, direction in zip(AXIS_COLOURS, np.eye(3), strict=True):
-        X_WA = RigidTransform(
-            RotationMatrix.MakeFromOneVector(direction, 2), 0.5 * AXIS * direction
-        )
-        colour = np.array(to_rgba(AXIS_COLOURS[name]))
-        shape = Cylinder(AXIS_RADIUS, AXIS)
-        plant.RegisterVisualGeometry(plant.world_body(), X_WA, shape, name, colour)
+    # The axes, and paler and longer ones of other tools' frames, which begin within the hand.
+    frames = {"": np.eye(4)} | {tool: invert_pose(hand.palm_in(tool)) for tool in hand.frames}
+    for tool, X_GA in frames.items():
+        length, pale = (FOREIGN_AXIS, PALE) if tool else (AXIS, 0.0)
+        for name, direction in zip(AXIS_COLOURS, np.eye(3), strict=True):
+            along = RotationMatrix.MakeFromOneVector(direction, 2)
+            X_AC = RigidTransform(along, 0.5 * length * direction)
+            colour = (1.0 - pale) * np.array(to_rgba(AXIS_COLOURS[name])) + pale
+            shape = Cylinder(AXIS_RADIUS, length)
+            X_WC = RigidTransform(X_GA) @ X_AC
+            plant.RegisterVisualGeometry(plant.world_body(), X_WC, shape, f"{tool} {name}", colour)
 
 
 def _lifted(pad: Array) -> tuple[Array, Array]:

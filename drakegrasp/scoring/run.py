@@ -234,9 +234,11 @@ def _verdicts(
     content = f"{data.content} {data.camera}"
     keys = []
     for each in sets:
+        # Palm poses alone may differ in their preshape alone.
         frame = "" if each.grasps is not None else f" posture in {each.frame}"
-        numbers = zip(each.of_row.tolist(), each.numbers(), strict=True)
-        keys.append([verdict_key(settings, content + frame, *of) for of in numbers])
+        shapes = [name and f" of {name}" for name in each.preshape]
+        numbers = zip(shapes, each.of_row.tolist(), each.numbers(), strict=True)
+        keys.append([verdict_key(settings, content + frame + s, *of) for s, *of in numbers])
 
     # Contacts of all sets are tried together, postures file by file; each verdict is kept as soon
     # as it is known. Those of an object in a resting pose stand together: verdicts come in this

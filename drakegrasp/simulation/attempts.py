@@ -22,7 +22,7 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.errors import NAMED, GraspError, listed
 from drakegrasp.frames import FARTHEST, NO_MESH_FRAME, X_WT, Array, invert_pose, make_pose
-from drakegrasp.hand.description import Hand
+from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.candidates import (
@@ -32,6 +32,7 @@ from drakegrasp.simulation.candidates import (
     is_audited,
 )
 from drakegrasp.simulation.posture import (
+    BESIDE_GRASP,
     Posture,
     exact_pose,
     joint_order,
@@ -48,6 +49,8 @@ TABLE_FRAMES: tuple[str, ...] = get_args(TableFrame)
 MOST_POSES = 1e6
 #: What `resting` is where nobody named a resting pose: all of the object are tried.
 UNTOLD = -1
+#: What `preshape` is where a palm pose alone is tried in each preshape of the hand.
+EACH = "each"
 #: How far the length of a quaternion may be from one.
 UNIT_TOLERANCE = 1e-3
 #: What of a table of postures decides a build. Why a row is none follows from the others, and from
@@ -74,21 +77,23 @@ class Attempts:
         X_TO: (n, 4, 4), its pose on the table, which names the resting pose by itself; NaN: not
             told.
         X_FG: (n, 4, 4), pose of the palm in the frame.
-        q_grasp: (n, j), joint positions of the grasp [rad or m].
+        q_grasp: (n, j), joint positions of the grasp [rad or m]; a row of NaN: a palm pose alone,
+            which closes from the open hand.
         q_pregrasp, q_squeeze: (n, j); a row of NaN: not given.
         frame: One of `TABLE_FRAMES`.
         X_TC: (n, 4, 4), pose of the camera in {T}, for the frame "camera".
         scale: (n,), metres per unit of length of the mesh file that the posture is for; NaN: any.
         log_density: (n,), logarithm of the density of the draw; NaN: not known.
         said: (n,), where it comes from, in words.
-        preshape: (n,), name of the hand's preshape; empty: all fingers close.
+        preshape: (n,), name of the hand's preshape; empty: all fingers close; `EACH`.
         conditions: (n, 3), the `CONDITIONS` under which it held; NaN: not told. A verdict is
             reached under them; a build draws its own.
         row: (n,), row in the file.
         invalid: (n,), why a row is no posture; empty where it is one.
         of_row: (n,), of predictions: the row of a dataset's split that each is for.
         confidence: (n,), of predictions: greater is better.
-        link: Whether the file speaks of the palm link, as is told in hints.
+        link: Of what the file speaks in place of the palm frame, as is told in hints: the palm link
+            or a frame of another tool; empty: of the palm frame.
         X_FG_xyzw: (n, 4, 4), likewise: X_FG if its quaternions were meant x, y, z, w.
         grasps: (n, 6k), of contacts: the numbers as they were given; None of postures.
         points, normals: (n, k, 3), contact points [m] and unit normals in the frame of the
@@ -116,7 +121,7 @@ class Attempts:
     invalid: tuple[str, ...]
     of_row: Any = None
     confidence: Any = None
-    link: bool = False
+    link: str = ""
     X_FG_xyzw: Array | None = None
     grasps: Array | None = None
     points: Array | None = None
@@ -187,6 +192,24 @@ class Attempts:
             "tried in all that are known of its object (objects.resting_poses drops more)"
         )
 
+    @property
+    def bare(self) -> str:
+        """How many rows are palm poses alone, and what becomes of them; empty if none."""
+        if self.grasps is not None:
+            return ""
+        without = np.isnan(self.q_grasp).all(axis=1)
+        rows = [i for i in np.flatnonzero(without) if not self.invalid[i]]
+        if not rows:
+            return ""
+        return (
+            f"{len(rows):,} of {len(self):,} rows of the postures have a palm pose and no joints: "
+            "the open hand closes"
+        )
+
+    def shapes(self, i: int, hand: Hand) -> tuple[str, ...]:
+        """Return the preshapes in which a row is tried: the one that it names, or each."""
+        return hand.preshape_names if self.preshape[i] == EACH else (self.preshape[i],)
+
     def stands(self, i: int, poses: Array) -> list[int]:
         """Return which resting poses (r, 4, 4) of its object a row is for, as indices.
 
@@ -253,7 +276,7 @@ def make_attempts(
     hand: Hand,
     objects: Sequence[str],
     X_FG: npt.ArrayLike,
-    q_grasp: npt.ArrayLike,
+    q_grasp: npt.ArrayLike | None = None,
     *,
     q_pregrasp: npt.ArrayLike | None = None,
     q_squeeze: npt.ArrayLike | None = None,
@@ -272,6 +295,7 @@ def make_attempts(
     of_row: Any = None,
     confidence: Any = None,
     X_FG_xyzw: Array | None = None,
+    alone: npt.ArrayLike = False,
 ) -> Attempts:
     """Return a table of postures, after checking every row by itself.
 
@@ -279,12 +303,13 @@ def make_attempts(
         hand: The hand.
         objects: (n,), names of the objects.
         X_FG: (n, 4, 4), poses of the palm, or of the link, in the frame.
-        q_grasp: (n, m), of the joints.
+        q_grasp: (n, m), of the joints; None: every row is a palm pose alone.
         q_pregrasp: (n, m); rows of NaN are not given.
         q_squeeze: (n, m); rows of NaN are not given.
         joints: (m,), names of the joints; None: all, in the plant's order. A joint that the hand
             file couples, or that the preshapes of all rows keep, may be missing.
-        link: Name of the palm link, if the poses are of it; None: of the palm frame.
+        link: Name of the palm link, or of one of the hand's `frames`, if the poses are of it; None:
+            of the palm frame.
         resting: (n,), index of the object's resting pose; where NaN, or None, all are tried.
         X_TO: (n, 4, 4), poses of the objects on the table, instead; rows of NaN are not given.
         frame: One of `TABLE_FRAMES`.
@@ -293,26 +318,27 @@ def make_attempts(
         log_density: (n,), of the draws.
         said: (n,), where each comes from.
         invalid: (n,), why a row is known to be no posture; empty where it may be one.
-        preshape: (n,), names of the hand's preshapes; empty: all fingers close.
+        preshape: (n,), names of the hand's preshapes; empty: all fingers close. A palm pose alone
+            may be tried in `EACH`.
         conditions: (n, 3), `CONDITIONS`; NaN: those of the object and of the configuration.
         of_row: (n,), of predictions.
         confidence: (n,), of predictions.
         X_FG_xyzw: (n, 4, 4), X_FG if its quaternions were meant x, y, z, w.
+        alone: (n,), whether a row is a palm pose alone, with no joints at any stage.
 
     Raises:
         GraspError: If there is no row, the arrays differ in length, or the joints or the link are
             none of this hand.
+        HandError: If the hand has no such link.
     """
     given = {"q_grasp": q_grasp, "q_pregrasp": q_pregrasp, "q_squeeze": q_squeeze}
     given = {name: q for name, q in given.items() if q is not None}
     count = len(objects)
+    palms = np.broadcast_to(np.asarray(q_grasp is None or alone, dtype=bool), (count,))
     names = tuple(name or "" for name in preshape or [""] * count)
-    unknown, kept = _known_preshapes(names, count, hand)
+    unknown, kept = _known_preshapes(names, palms, hand)
     q = _in_order(hand, count, list(joint_order(hand) if joints is None else joints), given, kept)
-    if link not in (None, hand.palm_link):
-        raise GraspError(
-            f"link must be 'palm' for the palm frame, or {hand.palm_link!r}, got {link!r}"
-        )
+    X_AG = hand.palm_in(link or "")
     if not count:
         raise GraspError("postures must be at least one row, got none")
     if frame not in TABLE_FRAMES:
@@ -333,13 +359,16 @@ def make_attempts(
     pregrasp, squeeze = (
         _numbers(q.get(name), size, name, bad, some=True) for name in ("q_pregrasp", "q_squeeze")
     )
-    X = np.asarray(X_FG) if link is None else multiply(np.asarray(X_FG), hand.X_BG)
+    for name, stage in (("q_pregrasp", pregrasp), ("q_squeeze", squeeze)):
+        for i in np.flatnonzero(palms & ~np.isnan(stage).all(axis=1)):
+            bad[i] = bad[i] or f"{name} must be {BESIDE_GRASP}"
+    X = np.asarray(X_FG) if link is None else multiply(np.asarray(X_FG), X_AG)
     if link is not None and X_FG_xyzw is not None:
-        X_FG_xyzw = multiply(X_FG_xyzw, hand.X_BG)
+        X_FG_xyzw = multiply(X_FG_xyzw, X_AG)
     return Attempts(
         objects=tuple(objects),
         X_FG=_poses(X, count, "the palm's pose", bad),
-        q_grasp=_numbers(q["q_grasp"], size, "q_grasp", bad),
+        q_grasp=_numbers(q.get("q_grasp"), size, "q_grasp", bad, some=palms),
         q_pregrasp=pregrasp,
         q_squeeze=squeeze,
         frame=frame,
@@ -355,7 +384,7 @@ def make_attempts(
         invalid=tuple(bad),
         of_row=of_row,
         confidence=confidence,
-        link=link is not None,
+        link=link or "",
         X_FG_xyzw=X_FG_xyzw,
     )
 
@@ -467,12 +496,12 @@ def _numbers(
     name: str,
     bad: list[str],
     *,
-    some: bool = False,
+    some: bool | npt.NDArray[np.bool_] = False,
     each: bool = False,
 ) -> Array:
     """Return an array of a shape; `bad` gets the reason for each row of it that is not finite.
 
-    Where `some` are enough, a row may be all NaN; where `each` is by itself, any number may be.
+    Where `some` (rows) are enough, a row may be all NaN; where `each` is by itself, any number may.
     """
     if value is None:
         return np.full(shape, np.nan)
@@ -487,17 +516,23 @@ def _numbers(
 
 
 def _known_preshapes(
-    names: Sequence[str], count: int, hand: Hand
+    names: Sequence[str], palms: npt.NDArray[np.bool_], hand: Hand
 ) -> tuple[list[str], list[Mapping[str, float] | None]]:
     """Return for each row why the hand lacks its preshape, and the joints that the preshape keeps.
+
+    `palms` (n,) says which rows are palm poses alone.
 
     Raises:
         GraspError: If they are of another number of rows.
     """
+    count = len(palms)
     if len(names) != count:
         raise GraspError(f"preshape must be of {count} rows, got {len(names)}")
     reasons, kept = [""] * count, list[Mapping[str, float] | None]()
     for i, name in enumerate(names):
+        if name == EACH and palms[i] and hand.preshapes:
+            kept.append(None)
+            continue
         try:
             kept.append(hand.at(preshape_index(hand, name or None)).preshape)
         except GraspError as error:
@@ -620,12 +655,19 @@ def given_candidates(
         X_OM: Pose of its mesh file's frame in {O}, (4, 4).
         config: All the rules.
     """
-    # Its rows, in {O}; one that names no resting pose is tried in each.
+    # Its rows, in {O}; one that names no resting pose is tried in each, one of `EACH` preshape too.
     table = table.refuse(misfits(table, model.name, model.scale, X_TO)).of_object(model.name)
-    tried = [(i, k) for i in range(len(table)) for k in table.stands(i, X_TO)]
+    hand = load_hand(config.hand_source)
+    tried = [
+        (i, k, shape)
+        for i in range(len(table))
+        for k in table.stands(i, X_TO)
+        for shape in table.shapes(i, hand)
+    ]
     tried = tried[: config.candidates.max]
-    count, table = len(tried), table.at([i for i, _ in tried])
-    resting = np.array([k for _, k in tried], dtype=np.int64)
+    count, table = len(tried), table.at([i for i, _, _ in tried])
+    table = replace(table, preshape=tuple(shape for _, _, shape in tried))
+    resting = np.array([k for _, k, _ in tried], dtype=np.int64)
     X_OG = [table.posture(i, X_TO[k], X_OM).X_OG for i, k in enumerate(resting)]
 
     return Candidates(
@@ -643,10 +685,11 @@ def given_candidates(
 
 def _posture(rows: Attempts | Table, i: int, X_OG: Array) -> Posture:
     """Return the posture of a row; NaN stands for a stage that it lacks."""
-    before, after = (
-        None if np.isnan(q).any() else q for q in (rows.q_pregrasp[i], rows.q_squeeze[i])
+    grasp, before, after = (
+        None if np.isnan(q).any() else q
+        for q in (rows.q_grasp[i], rows.q_pregrasp[i], rows.q_squeeze[i])
     )
-    return Posture(X_OG, rows.q_grasp[i], before, after, str(rows.preshape[i]) or None)
+    return Posture(X_OG, grasp, before, after, str(rows.preshape[i]) or None)
 
 
 def posture_attempts(

@@ -1,10 +1,10 @@
-"""Postures: a wrist pose with the positions of all joints, and the trial that follows from one.
+"""Postures: a wrist pose with the positions of all joints or alone, and the trial that follows.
 
 In: what a network or another tool says of a grasp. Out: a `Posture`, checked and held in {O}, from
-it the `Attempt` of a trial, and the trial of one on an object. Where the posture follows the
-couplings of the hand file, the hand's own motors close it, as they close every attempt. Where it
-does not, each joint has a motor of its own, which goes from the pregrasp to the grasp and on to the
-squeeze.
+it the `Attempt` of a trial, and the trial of one on an object. A wrist pose alone closes from the
+open hand, as an attempt of a sampler does. Where joints follow the couplings of the hand file, the
+hand's own motors close it, as they close every attempt. Where they do not, each joint has a motor
+of its own, which goes from the pregrasp to the grasp and on to the squeeze.
 """
 
 from __future__ import annotations
@@ -42,6 +42,8 @@ OPENED = np.deg2rad(20.0)
 SQUEEZED = np.deg2rad(20.0)
 #: A rotation that is off by less is exact but for rounding.
 EXACT = 1e-12
+#: What a pregrasp or a squeeze must be.
+BESIDE_GRASP = "given beside q_grasp, got it alone"
 #: A closing joint this near to zero is that of the open hand [rad or m].
 OPEN = 1e-6
 
@@ -50,18 +52,19 @@ OPEN = 1e-6
 class Posture:
     """A wrist pose and joint positions of a hand of j joints, in the plant's order.
 
-    The order is that of the stored `closed_q`: `joint_order` names the joints.
+    The order is that of the stored `closed_q`: `joint_order` names the joints. Without joints the
+    hand closes from its open posture.
 
     Attributes:
         X_OG: Pose of the palm (4, 4).
-        q_grasp: (j,), when the fingers hold the object [rad or m].
+        q_grasp: (j,), when the fingers hold the object [rad or m]; None: not told.
         q_pregrasp: (j,), where the trial begins; None: the grasp, opened by 20 degrees.
         q_squeeze: (j,), the target of motors that press; None: beyond the grasp.
         preshape: Name of the hand's preshape, whose fingers alone close and must touch; None: all.
     """
 
     X_OG: Array
-    q_grasp: Array
+    q_grasp: Array | None = None
     q_pregrasp: Array | None = None
     q_squeeze: Array | None = None
     preshape: str | None = None
@@ -70,7 +73,7 @@ class Posture:
 def make_posture(
     hand: Hand,
     X_FG: npt.ArrayLike,
-    q_grasp: npt.ArrayLike,
+    q_grasp: npt.ArrayLike | None = None,
     q_pregrasp: npt.ArrayLike | None = None,
     q_squeeze: npt.ArrayLike | None = None,
     *,
@@ -85,7 +88,7 @@ def make_posture(
     Args:
         hand: The hand.
         X_FG: Pose of the palm (4, 4) in the frame; (3, 4) or (12,) will do.
-        q_grasp: (j,), joint positions of the grasp [rad or m].
+        q_grasp: (j,), joint positions of the grasp [rad or m]; None: the open hand closes.
         q_pregrasp: (j,), where the trial begins.
         q_squeeze: (j,), where the motors press to.
         frame: "object" {O}, "table" {T}, "camera" {C} or "world" {W}.
@@ -95,8 +98,9 @@ def make_posture(
         preshape: Name of one of the hand's preshapes; None: all fingers close.
 
     Raises:
-        GraspError: If a pose is not one, a vector has another length or is not finite, a joint is
-            missing, the hand has no such preshape, or the frame is unknown or lacks its pose.
+        GraspError: If a pose is not one, a vector has another length or is not finite, a pregrasp
+            or a squeeze is without a grasp, a joint is missing, the hand has no such preshape, or
+            the frame is unknown or lacks its pose.
     """
     preshape_index(hand, preshape)
     vectors = {"q_grasp": q_grasp, "q_pregrasp": q_pregrasp, "q_squeeze": q_squeeze}
@@ -104,9 +108,11 @@ def make_posture(
     size = len(hand.joint_names) if joints is None else len(joints)
     q: dict[str, Array | None] = dict.fromkeys(vectors)
     for name, value in vectors.items():
-        if value is None and name != "q_grasp":
+        if value is None:
             continue
-        vector = as_numbers(value, f"{name} must be {size} joint positions")  # type: ignore[arg-type]
+        if q_grasp is None:
+            raise GraspError(f"{name} must be {BESIDE_GRASP}")
+        vector = as_numbers(value, f"{name} must be {size} joint positions")
         if vector.shape != (size,) or not np.isfinite(vector).all():
             got = "numbers that are not" if vector.shape == (size,) else f"shape {vector.shape}"
             raise GraspError(f"{name} must be {size} finite joint positions, got {got}")
@@ -114,7 +120,6 @@ def make_posture(
 
     X_OF = _frame_in_object(frame, X_TO, X_TC)
     X_OG = multiply(X_OF, exact_pose(X_FG, "the palm's pose"))
-    assert q["q_grasp"] is not None
     return Posture(X_OG, q["q_grasp"], q["q_pregrasp"], q["q_squeeze"], preshape)
 
 
@@ -187,9 +192,10 @@ def _places(order: Sequence[str], joints: Sequence[str]) -> list[int]:
 def start_of(posture: Posture, hand: Hand) -> Attempt:
     """Return what the trial of a posture starts from.
 
-    The rule: the hand file's motors close the fingers if in every given vector each coupled joint
-    is where its finger's closing joint puts it, and all spread joints agree, within 1 degree. Else
-    each joint has a motor of its own. Fingers that its preshape leaves out have none.
+    The rule: without joints the open hand closes, in the posture's preshape and at the hand's first
+    spread. Else the hand file's motors close the fingers if in every given vector each coupled
+    joint is where its finger's closing joint puts it, and all spread joints agree, within 1 degree.
+    Else each joint has a motor of its own. Fingers that its preshape leaves out have none.
 
     Raises:
         GraspError: If the hand has no such preshape.
@@ -201,6 +207,8 @@ def start_of(posture: Posture, hand: Hand) -> Attempt:
 
 def _start_of(posture: Posture, hand: Hand) -> Attempt:
     """Return what the trial of a posture starts from, of a hand all of whose fingers close."""
+    if posture.q_grasp is None:
+        return Attempt(X_OG=posture.X_OG, spread=float(np.deg2rad(hand.spreads_deg[0])))
     given = [q for q in (posture.q_pregrasp, posture.q_grasp, posture.q_squeeze) if q is not None]
     start = opened(posture.q_grasp, hand) if posture.q_pregrasp is None else posture.q_pregrasp
     own_motors = not all(follows_couplings(q, hand) for q in given)

@@ -19,10 +19,10 @@ from drakegrasp.errors import HandError
 from drakegrasp.frames import X_WT, Array, invert_pose, rotate_vectors, transform_points
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.kinematics import fingertip_poses
+from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.posture import Posture, joint_order, preshape_index
+from drakegrasp.simulation.posture import Posture, joint_order, preshape_index, start_of
 from drakegrasp.table import Table
 from drakegrasp.verification.forces import surface_feet
 from drakegrasp.verification.placing import PlacedGrasp
@@ -174,18 +174,25 @@ def find_posture_hints(
 
     p_OQ, _ = fingertips(posture.X_OG)
     fit = fit_surface(thing.model, p_OQ, np.zeros_like(p_OQ))
+    # Where the fingers of a palm pose alone would have been is not known.
+    distance = np.zeros(0) if posture.q_grasp is None else fit.distance
     if fit.distance.mean() <= FAR:
-        return (), fit.distance
+        return (), distance
 
     # Where the given pose is: lengths in another unit move the palm with it.
     X_AG, X_OA, attempt = grasp.attempt.X_FG[0], grasp.X_OA(thing), grasp.attempt
-    p_AL = (multiply(X_AG, invert_pose(hand.X_BG)) if attempt.link else X_AG)[:3, 3]
+    X_AL = multiply(X_AG, invert_pose(hand.palm_in(attempt.link))) if attempt.link else X_AG
+    p_AL = X_AL[:3, 3]
     meant = dict[str, Array]()
     if attempt.X_FG_xyzw is not None and np.isfinite(attempt.X_FG_xyzw).all():
         meant["quaternions x, y, z, w instead of w, x, y, z"] = attempt.X_FG_xyzw[0]
     if not attempt.link:
         at_link = f"poses of the palm link instead of the palm (link: {hand.palm_link})"
         meant[at_link] = multiply(X_AG, hand.X_BG)
+    for name in hand.frames:
+        if name != attempt.link:
+            at_tool = f"poses in the frame of {name} (link: {name})"
+            meant[at_tool] = multiply(X_AL, hand.palm_in(name))
     readings: list[Reading] = [
         (text, "", *fingertips(multiply(X_OA, X))) for text, X in meant.items()
     ]
@@ -195,7 +202,7 @@ def find_posture_hints(
             X[:3, 3] += (factor - 1.0) * p_AL
             readings.append((name, unit, *fingertips(multiply(X_OF, X))))
     place = _better_place(thing.model, fit, readings).replace("points", "positions of the palm")
-    return (place,) if place else (), fit.distance
+    return (place,) if place else (), distance
 
 
 def count_hints(hints: Iterable[tuple[str, ...]]) -> list[tuple[str, int]]:
@@ -225,13 +232,18 @@ def _better_place(model: ObjectModel, fit: Table, readings: Iterable[Reading]) -
 def _fingertips(hand: Hand, posture: Posture) -> Array:
     """Return the nominal contact points p_GQ (m, 3) of the fingers that a posture closes.
 
+    A palm pose alone closes the hand until something stops it: there it counts as half closed.
+
     Raises:
         HandError: If the hand has fingertips without such points.
     """
     index = {name: i for i, name in enumerate(joint_order(hand))}
     q = posture.q_grasp
-    spread = float(q[index[hand.spread.joints[0]]]) if hand.spread.joints else 0.0
-    closing = np.array([q[index[finger.closing_joint]] for finger in hand.fingers])
+    if q is None:
+        spread, closing = start_of(posture, hand).spread, coordinate_limits(hand)[1:].mean(axis=1)
+    else:
+        spread = float(q[index[hand.spread.joints[0]]]) if hand.spread.joints else 0.0
+        closing = np.array([q[index[finger.closing_joint]] for finger in hand.fingers])
     X_GF = fingertip_poses(hand, spread=spread, closing=closing)
     points = np.einsum("kab,kb->ka", X_GF[:, :3, :3], hand_constants(hand).pad_points)
     unused = unused_fingers(hand.unused_in(preshape_index(hand, posture.preshape)), len(points))

@@ -134,23 +134,29 @@ def _lift_by_hand(base: Verification) -> Verification:
 
 
 def _best_stand(base: Verification, grasp: PlacedGrasp) -> Verification:
-    """Try a posture in each resting pose that it may be for, and return the best verdict."""
+    """Try a posture in each resting pose and preshape that it is for; return the best verdict."""
+    shapes = grasp.attempt.shapes(0, load_hand(base.config.hand_source))
     found = [
-        _try_posture(replace(base, placed=placed, stand=k), grasp)
+        (_try_posture(replace(base, placed=placed, stand=k), grasp, shape), shape)
         for k, placed in enumerate(grasp.stands)
+        for shape in shapes
     ]
-    best = max(found, key=lambda v: (v.held, v.stable, v.precision, v.outcome.stage, -v.stand))
-    if grasp.attempt.names_pose(0):
-        return best
-    told = "in the one resting pose that is known, as none is named"
-    if len(found) > 1:
-        told = f"the best of {len(found)} resting poses, as none is named: {best.stand}"
-    return replace(best, reason=f"{best.reason} ({told})")
+    best, shape = max(
+        found, key=lambda f: (f[0].held, f[0].stable, f[0].precision, f[0].outcome.stage)
+    )
+    told, poses = list[str](), len(grasp.stands)
+    if not grasp.attempt.names_pose(0):
+        told.append("in the one resting pose that is known, as none is named")
+        if poses > 1:
+            told = [f"the best of {poses} resting poses, as none is named: {best.stand}"]
+    if len(shapes) > 1:
+        told.append(f"the best of {len(shapes)} preshapes: {shape}")
+    return replace(best, reason=f"{best.reason} ({'; '.join(told)})") if told else best
 
 
-def _try_posture(base: Verification, grasp: PlacedGrasp) -> Verification:
-    """Try a posture, which says wrist and joints itself."""
-    posture = grasp.posture(base.placed)
+def _try_posture(base: Verification, grasp: PlacedGrasp, preshape: str) -> Verification:
+    """Try a posture, which says wrist and joints itself, in a preshape; empty for none."""
+    posture = replace(grasp.posture(base.placed), preshape=preshape or None)
     with timed(base.seconds, "simulate"):
         trial = run_trial(base.placed, posture, base.config)
     start = start_of(posture, load_hand(base.config.hand_source))

@@ -298,6 +298,86 @@ def test_palm_link_named_palm_is_no_palm_frame_in_files_of_others(tmp_path):
     np.testing.assert_allclose(table.X_FG[0], X @ leap.X_BG, atol=1e-9)
 
 
+# Palm poses alone
+
+
+def write_palms(folder: Path, form: str, poses: np.ndarray = POSES) -> Path:
+    """Palm poses without joints, of the mug, in any layout."""
+    path = folder / f"mug.{form}"
+    content = {"object": ["mug"] * len(poses), "X_FG": poses}
+    if form == "npz":
+        np.savez(path, **content)
+    elif form == "h5":
+        with h5py.File(path, "w") as file:
+            for name, value in content.items():
+                file[name] = value
+    elif form == "npy":
+        np.save(path, poses)
+    elif form == "csv":
+        rows = [[*X[:3, 3], *quaternion(X)] for X in poses]
+        lines = ["x,y,z,qw,qx,qy,qz", *(",".join(map(repr, map(float, row))) for row in rows)]
+        path.write_text("\n".join(lines))
+    else:
+        # As `save_to_isaac_grasp_format` of GraspGen writes it.
+        grasps = {
+            f"grasp_{i}": {
+                "confidence": 0.5 + 0.1 * i,
+                "position": X[:3, 3].tolist(),
+                "orientation": {"w": float(quaternion(X)[0]), "xyz": quaternion(X)[1:].tolist()},
+            }
+            for i, X in enumerate(poses)
+        }
+        tree = {"format": "isaac_grasp", "format_version": 1.0, "grasps": grasps}
+        path.write_text(yaml.dump(tree, default_flow_style=False, sort_keys=False))
+    return path
+
+
+@pytest.mark.parametrize("form", ["npz", "h5", "npy", "csv", "yaml"])
+def test_a_palm_pose_needs_no_joints(tmp_path, form):
+    path = write_palms(tmp_path, form)
+    assert posture_files.holds_postures(path)
+    table = read_attempts(path, HAND, of="mug")
+    assert table.invalid == ("", "")
+    X_LG = HAND.X_BG if form == "yaml" else np.eye(4)
+    np.testing.assert_allclose(table.X_FG, POSES @ X_LG, atol=1e-9)
+    assert np.isnan(table.q_grasp).all() and table.posture(1, np.eye(4), np.eye(4)).q_grasp is None
+    assert table.bare.startswith("2 of 2 rows of the postures have a palm pose and no joints")
+
+
+def test_rows_with_and_without_joints_share_a_file(tmp_path):
+    """An empty cell is nothing; a NaN is a number that went wrong."""
+    lines = write_csv(tmp_path).read_text().splitlines()
+    cells = lines[2].split(",")
+    joints = slice(8, 8 + 3 * len(ORDER))
+    for value, alone in (("", True), ("nan", False)):
+        row = [*cells[: joints.start], *[value] * 3 * len(ORDER), *cells[joints.stop :]]
+        (tmp_path / "q.csv").write_text("\n".join([*lines[:2], ",".join(row)]))
+        table = read_attempts(tmp_path / "q.csv", HAND)
+        np.testing.assert_array_equal(table.q_grasp[0], GRASP[0])
+        assert (table.invalid[1] == "") == alone
+    cells[8 : 8 + len(ORDER)] = [""] * len(ORDER)
+    (tmp_path / "q.csv").write_text("\n".join([*lines[:2], ",".join(cells)]))
+    assert "q_grasp must be finite" in read_attempts(tmp_path / "q.csv", HAND).invalid[1]
+
+
+def test_a_palm_pose_in_each_preshape_has_no_joints(tmp_path):
+    hand = load_hand("allegro_four")
+    q = np.zeros((1, len(joint_order(hand))))
+    content = {"object": ["mug"], "X_FG": POSES[:1], "preshape": ["each"]}
+    np.savez(tmp_path / "p.npz", **content)
+    table = read_attempts(tmp_path / "p.npz", hand)
+    assert table.invalid == ("",) and table.shapes(0, hand) == hand.preshape_names
+    assert "preshape must be left out" in read_attempts(tmp_path / "p.npz", HAND).invalid[0]
+    np.savez(tmp_path / "p.npz", **content, q_grasp=q)
+    assert "preshape must be one of" in read_attempts(tmp_path / "p.npz", hand).invalid[0]
+
+
+def test_joints_before_a_grasp_without_joints_are_refused(tmp_path):
+    np.savez(tmp_path / "p.npz", object=OBJECTS, X_FG=POSES, q_pregrasp=PREGRASP)
+    reasons = read_attempts(tmp_path / "p.npz", HAND).invalid
+    assert all("q_pregrasp must be given beside q_grasp" in reason for reason in reasons)
+
+
 # Rows that are no postures
 
 
@@ -464,7 +544,7 @@ def test_dictionaries_that_are_no_grasps_are_refused_in_a_line(tmp_path, changes
     [
         (
             *("a.csv", "x,y\n1,2\n"),
-            "columns must include object, z, qw, qx, qy, qz, a grasp_JOINT for each joint, got",
+            "columns must include object, z, qw, qx, qy, qz, got",
         ),
         ("a.csv", "x,x\n1,2\n", "columns must have different names, got x twice"),
         ("a.npz", "junk", "must be a readable file of arrays"),
@@ -542,13 +622,13 @@ def test_a_table_from_a_spreadsheet_is_read(tmp_path, comma, blank, mark):
 
 def test_all_that_is_missing_is_told_at_once(tmp_path):
     np.savez(tmp_path / "p.npz", joints=np.array(ORDER))
-    with pytest.raises(GraspError, match=r"object, q_grasp, X_FG \(or position and .* must"):
+    with pytest.raises(GraspError, match=r"object, X_FG \(or position and .* must"):
         read_attempts(tmp_path / "p.npz", HAND)
     (tmp_path / "p.csv").write_text("x,y,z,qw\n0,0,0,1\n")
-    with pytest.raises(GraspError, match="include object, qx, qy, qz, a grasp_JOINT for each jo"):
+    with pytest.raises(GraspError, match="include object, qx, qy, qz, got"):
         read_attempts(tmp_path / "p.csv", HAND)
     # With the name of the object, none is needed in the file.
-    with pytest.raises(GraspError, match="include qx, qy, qz, a grasp_JOINT for each joint, got"):
+    with pytest.raises(GraspError, match="include qx, qy, qz, got"):
         read_attempts(tmp_path / "p.csv", HAND, of="mug")
 
 

@@ -250,6 +250,33 @@ def test_public_trial_closes_the_fingers_of_the_preshape(cube, given, tmp_path):
     assert trial.closed.contacts.touching.tolist() == [True, True]
 
 
+def test_a_palm_pose_alone_closes_from_the_open_hand(tmp_path):
+    """As an attempt of a sampler does: at the hand's first spread, in the preshape it names."""
+    hand = load_hand(write_with_preshapes(tmp_path, pair="F1 F3"))
+    hand = replace(hand, spreads_deg=(10.0, 20.0))
+    start = start_of(make_posture(hand, X), hand)
+    assert (start.closing, start.path, start.preshape, start.unused) == (None, None, None, 0)
+    shaped = replace(hand.preshapes[0], spreads_deg=hand.spreads_deg)
+    hand = replace(hand, preshapes=(shaped,))
+    start = start_of(make_posture(hand, X, preshape="pair"), hand)
+    assert (start.preshape, start.unused) == (0, hand.unused_in(0)) and start.unused
+    assert start.spread == pytest.approx(np.deg2rad(10.0))
+    np.testing.assert_array_equal(start.X_OG, X)
+    assert "q_squeeze must be given beside q_grasp" in refused(
+        make_posture, hand, X, q_squeeze=np.zeros(8)
+    )
+
+
+@pytest.mark.sim
+def test_trial_of_a_palm_pose_alone_is_that_of_the_open_hand(cube, config, given):
+    placed = PlacedObject(model=cube, X_TO=standing(cube), config=config)
+    alone = run_trial(placed, Posture(given.X_OG))
+    open_hand = np.zeros_like(given.q_grasp)
+    whole = run_trial(placed, Posture(given.X_OG, open_hand, open_hand))
+    assert alone.outcome is whole.outcome is Outcome.SUCCESS
+    np.testing.assert_array_equal(alone.closed.q, whole.closed.q)
+
+
 def test_a_preshape_that_the_hand_lacks_is_refused(tmp_path):
     shaped = load_hand(write_with_preshapes(tmp_path, pair="F1 F3"))
     q = np.zeros(8)
