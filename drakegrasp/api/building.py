@@ -6,7 +6,7 @@ These are the functions that `drakegrasp` exports and the command line calls.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
@@ -54,6 +54,7 @@ def build_dataset(
     only: Sequence[str] = (),
     postures: str | Path | Attempts | None = None,
     part: str | None = None,
+    read_as: Mapping[str, str] | None = None,
     client: Client | None = None,
     show: bool = True,
     **workers: Unpack[Workers],
@@ -74,6 +75,8 @@ def build_dataset(
             objects that it names are built; rows that are no posture are told, and left out.
         part: Only a part of the work units, e.g. "3/16": `merge` joins the directories of all
             parts. Not with a number of samples.
+        read_as: What is said of all postures of a file: `frame` and `link`, whatever it says
+            itself, and the `preshape` of rows that name none.
         client: A Dask client whose workers do the work, e.g. of `connect`.
         show: Whether to show progress on standard error.
         workers: Instead of a client, the arguments of `connect`; one process per core without any.
@@ -93,7 +96,7 @@ def build_dataset(
     hand = load_hand(config.hand_source)
     drive_of(hand, config.lift)
     if isinstance(postures, str | Path):
-        postures = read_attempts(Path(postures), hand)
+        postures = read_attempts(Path(postures), hand, read_as=read_as)
     sources = find_sources(objects, units, manifest)
     return build_on(
         cluster,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -48,6 +48,7 @@ def score(
     *,
     rows: Sequence[int] | None = None,
     confidence: npt.ArrayLike | None = None,
+    read_as: Mapping[str, str] | None = None,
     against: str | Path | Sequence[str | Path] | None = None,
     train: GraspDataset | None = None,
     references: Sequence[str] = tuple(REFERENCES),
@@ -70,6 +71,8 @@ def score(
         dataset: The split whose rows the predictions are for.
         rows: With an array: (n,), the row of each; all rows, in order, if None.
         confidence: With an array: (n,) or (n, m), greater is better.
+        read_as: What is said of all postures of files: `frame` and `link`, whatever these say, and
+            the `preshape` of rows that name none.
         against: File or files of another method for the same rows: the card says by how much the
             headline is above its, object by object.
         train: Training rows for reference rows; the split `train` of the same file if None.
@@ -95,8 +98,10 @@ def score(
     if unknown:
         raise GraspError(f"references must be of {', '.join(REFERENCES)}, got {unknown[0]!r}")
     settings = ("verify.max_tries=1", *overrides)
-    name, ranked = ranked_sets(predictions, dataset, rows=rows, confidence=confidence)
-    other = None if against is None else _method(against, dataset)
+    name, ranked = ranked_sets(
+        predictions, dataset, rows=rows, confidence=confidence, read_as=read_as
+    )
+    other = None if against is None else _method(against, dataset, read_as)
     rule, stored = find_protocol(protocol)
     peer = not isinstance(rule, Lift)
     elsewhere = client or workers.get("scheduler") or workers.get("scheduler_file")
@@ -142,14 +147,14 @@ def score(
     return scored
 
 
-def _method(files: object, dataset: GraspDataset) -> Method:
+def _method(files: object, dataset: GraspDataset, read_as: Mapping[str, str] | None) -> Method:
     """Return the name and the predictions of another method."""
     given = [files] if isinstance(files, str | Path) else files
     if not isinstance(given, list | tuple) or not given:
         raise GraspError(f"against must be a file or a list of files, got {files!r}")
     if wrong := [each for each in given if not isinstance(each, str | Path)]:
         raise GraspError(f"against must have files of predictions, got {wrong[0]!r}")
-    return ranked_sets(given, dataset)
+    return ranked_sets(given, dataset, read_as=read_as)
 
 
 def _versions() -> dict[str, str]:

@@ -51,6 +51,8 @@ def build(times: Path | None, plan: bool = False, part: str | None = None, **opt
         raise click.UsageError("--plan must be used without --postures: a row is an attempt")
     if plan and part is not None:
         raise click.UsageError("--plan must be used without --part: it is of the whole build")
+    if request.read_as and request.postures is None:
+        raise click.UsageError(f"--{next(iter(request.read_as))} must be used with --postures")
     if plan:
         print_plan(request, workers["workers"], times)
         return
@@ -63,6 +65,7 @@ def build(times: Path | None, plan: bool = False, part: str | None = None, **opt
         only=request.only,
         postures=request.postures,
         part=part,
+        read_as=request.read_as,
         **workers,
         show=request.show,
     )

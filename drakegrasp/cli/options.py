@@ -118,6 +118,8 @@ class VerifyRequest:
     overrides: tuple[str, ...] = ()
     out: Path | None = None
     rows: str | None = None
+    link: str | None = None
+    preshape: str | None = None
 
 
 def described(function: F, request: type | None = None) -> F:
@@ -197,6 +199,8 @@ def _shared(
     units: str = "m",
     manifest: Path | None = None,
     postures: Annotated[Path | None, EXISTING] = None,
+    link: str | None = None,
+    preshape: str | None = None,
     only: tuple[str, ...] = (),
     out: Path,
     config: str | None = None,
@@ -231,6 +235,10 @@ def _shared(
         --postures FILE|DIR: Try these postures (wrist and joints) instead of drawn palm poses, on
             the objects that they name: .npz, .hdf5, .csv, .parquet, DexGraspBench .npy or
             isaac_grasp .yaml.
+        --link NAME: Of what the poses in files of postures are, whatever these say: palm, the palm
+            link, or a frame of another tool that the hand file names, e.g. graspgen.
+        --preshape NAME: Preshape of the rows of postures that name none; each, for palm poses
+            alone: all of them in turn.
         --only NAME: Build this object only; may be given several times.
         --out DIR: Directory of the dataset. The same command continues an interrupted build.
         --config YAML|PRESET: Configuration: a file, or the preset paper, fast, randomized or
@@ -290,7 +298,8 @@ SETTINGS = {
 #: Names of options: of a build, and of who does the work.
 BUILD = (
     *("--objects", "--per-class", "--objects-seed", "--out", "--config", "--set", "--candidates"),
-    *("--max-grasps", "--samples", "--samples-per-object", "--postures", "--only", "--certify"),
+    *("--max-grasps", "--samples", "--samples-per-object", "--postures", "--link", "--preshape"),
+    *("--only", "--certify"),
     *("--seed", "--units", "--manifest", "--quiet"),
 )
 _TLS_FILES = ("--tls-ca-file", "--tls-cert", "--tls-key")
@@ -365,7 +374,14 @@ def parse_request(options: Mapping[str, Any]) -> BuildRequest:
         only=options["only"],
         postures=options["postures"],
         show=not options["quiet"],
+        read_as=chosen_reading(options),
     )
+
+
+def chosen_reading(options: Mapping[str, Any]) -> dict[str, str]:
+    """Return what options say of all postures, see `exchange.attempts.read_attempts`."""
+    names = ("frame", "link", "preshape")
+    return {name: options[name] for name in names if options.get(name) is not None}
 
 
 def chosen_settings(options: Mapping[str, Any]) -> list[str]:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.cli.console import say
-from drakegrasp.cli.options import VerifyRequest
+from drakegrasp.cli.options import VerifyRequest, chosen_reading
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset, PredictedRows
@@ -87,10 +87,10 @@ def _dataset_of(request: VerifyRequest, postures: bool) -> Path | None:
 
 def _posture_dataset(request: VerifyRequest) -> Path | None:
     """Return --dataset, on which postures are tried if there is no --object."""
-    # They say their frame themselves, and need no fit.
+    # Their camera is that of a row, and they need no fit.
     _refuse_given(
         "left out with postures",
-        frame=request.frame,
+        frame="camera" if request.frame == "camera" else None,
         camera=request.camera,
         method=None if request.method == "hand" else request.method,
         snap_points=request.snap_points or None,
@@ -109,6 +109,7 @@ def _posture_dataset(request: VerifyRequest) -> Path | None:
 
 def _contact_dataset(request: VerifyRequest) -> Path | None:
     """Return the data file whose rows give the objects: --dataset, or GRASPS itself."""
+    _refuse_given("given with postures only", link=request.link, preshape=request.preshape)
     if request.mesh is not None and request.dataset is not None:
         raise GraspError("--object or --dataset must be given, got both")
     if request.mesh is not None or request.dataset is not None:
@@ -159,7 +160,12 @@ def _place_on_rows(
     if request.config is not None:
         given, overrides = load_config(request.config, overrides), ()
     config = dataset_config(data, given, request.hand, overrides)
-    table = read_attempts(request.grasps, load_hand(config.hand_source), of=data)
+    table = read_attempts(
+        request.grasps,
+        load_hand(config.hand_source),
+        of=data,
+        read_as=chosen_reading(vars(request)),
+    )
     rows = choose_rows(data, _rows_of(request, table.of_row), len(table))
     placed = place_on_rows(
         table,
@@ -183,7 +189,9 @@ def _place_on_objects(
     """Return postures on the objects of a dataset that they name, and the configuration."""
     out = dataset.parent if dataset.is_file() else dataset
     config = override_config(read_manifest(out).config, request.overrides)
-    table = read_attempts(request.grasps, load_hand(config.hand_source))
+    table = read_attempts(
+        request.grasps, load_hand(config.hand_source), read_as=chosen_reading(vars(request))
+    )
     _say_nameless(table)
     own = config if request.overrides else None
     return place_on_dataset(table, out, own, overrides=request.overrides), config, None
@@ -227,7 +235,9 @@ def _of_object(request: VerifyRequest, name: str, hand: Hand) -> Attempts:
         GraspError: If none is of it.
     """
     path = request.grasps
-    table = read_attempts(path, hand, of=name, split=request.split)
+    table = read_attempts(
+        path, hand, of=name, split=request.split, read_as=chosen_reading(vars(request))
+    )
     own = [i for i, each in enumerate(table.objects) if each in ("", name)]
     others = sorted(set(table.objects) - {"", name})
     if not others:

@@ -18,6 +18,7 @@ from drakegrasp.cli.options import (
     PATH,
     SPLITS,
     VerifyRequest,
+    chosen_reading,
     chosen_workers,
     described,
 )
@@ -81,7 +82,8 @@ def verify(
         --rows 0,4,7-9|FILE.npy: With --dataset: the row of the split that each grasp is for, where
             the file does not say. [default: all rows]
         --frame: Frame of the grasps; mesh, with --object, has the axes and the origin of the file.
-            [default: object; with --dataset camera]
+            [default: object; with --dataset camera; of postures as the file says]
+        --link, --preshape
         --camera FILE: With --object and --frame camera: .npy file with the camera's pose in the
             table-top frame X_TC, as (4, 4), or per grasp as (n, 4, 4) or (n, 12).
         --method: hand: close a simulated hand on the contacts and lift. forces: ask whether forces
@@ -283,6 +285,9 @@ def score(
     train: Path | None = None,
     references: tuple[str, ...] = (),
     per_object: Annotated[int | None, click.IntRange(1)] = None,
+    frame: Annotated[str | None, click.Choice(["object", "camera", "table", "world"])] = None,
+    link: str | None = None,
+    preshape: str | None = None,
     protocol: str = "lift",
     out: Path = Path("score"),
     as_json: bool = False,
@@ -311,7 +316,8 @@ def score(
             own, nearest image, constant, random, top-down, closing, palm normals, surface.
             [default: all]
         --per-object N: Rows of each object, at most.
-        --set
+        --frame: Frame of all postures, whatever their files say.
+        --link, --preshape, --set
         --protocol NAME|FILE.py:NAME: The rule of a verdict, see `drakegrasp verify`. All but lift
             try the first wrist pose of a prediction in MuJoCo.
         --out DIR: Folder of the card and of the verdicts; the same command continues from there.
@@ -347,6 +353,7 @@ def score(
         train=trained,
         references=references,
         per_object=per_object,
+        read_as=chosen_reading({"frame": frame, "link": link, "preshape": preshape}),
         protocol=protocol,
         out=out,
         again=_command(context),

@@ -105,7 +105,9 @@ def submit(
     running = present(cluster.connected(request.out), request.show)
     postures = None
     if request.postures is not None:
-        postures = read_attempts(request.postures, load_hand(request.config.hand_source))
+        postures = read_attempts(
+            request.postures, load_hand(request.config.hand_source), read_as=request.read_as
+        )
     report = build_on(
         running,
         sources,

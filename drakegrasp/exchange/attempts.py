@@ -51,7 +51,7 @@ from drakegrasp.verification.placing import choose_rows, read_several
 from drakegrasp.verification.prediction import read_grasps
 
 #: What a file says of all its rows together.
-_OF_FILE = ("frame", "link", "joints", "hand")
+_OF_FILE = ("frame", "link", "joints", "hand", "of_objects")
 #: Suffixes of the layouts.
 ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml", ".yml")
 #: Arrays are smaller, all together [bytes]: two million postures of a hand with 16 joints.
@@ -75,6 +75,7 @@ def read_attempts(
     of: str | GraspDataset | None = None,
     split: str | None = None,
     several: bool = False,
+    read_as: Mapping[str, str] | None = None,
 ) -> Attempts:
     """Return the postures of a file, or of all files of a folder, or contacts, as one table.
 
@@ -85,12 +86,15 @@ def read_attempts(
         hand: The hand.
         of: Name of the object of rows that name none; None: each must. Or the split of a dataset
             whose rows they are for: then `row` says which, or they are one for each row, or
-            exported samples, of which those of the split count. Their objects and the poses of the
-            frame "camera" are those of the rows; `Attempts.of_row` has the rows. Contacts name no
-            object, so they must be of something.
+            exported samples, of which those of the split count, or isaac_grasp of others, whose
+            every grasp is for every row of its object. Their
+            objects and the poses of the frame "camera" are those of the rows; `Attempts.of_row` has
+            the rows. Contacts name no object, so they must be of something.
         split: Group of an HDF5 file of contacts; that of the dataset if it is for one.
         several: Whether the contacts are for rows of a dataset, of which each may have several
             (n, m, 6k), with a confidence.
+        read_as: What the caller says of all postures: `frame` and `link`, which are stronger than
+            what the file says, and the `preshape` of rows that name none.
 
     Raises:
         GraspError: If it is no file of postures of this hand, or names no object.
@@ -107,25 +111,29 @@ def read_attempts(
             return read_grasps(said["grasps"], hand.num_fingers, rows=said["rows"])
 
     # Postures of a file, or of all files of a folder.
+    read_as = read_as or {}
     if isinstance(of, GraspDataset):
-        return _for_rows(path, hand, of)
+        return _for_rows(path, hand, of, read_as)
     if not path.is_dir():
         with named(path):
-            return _made(hand, _named(_raw(path, hand, nameless=of is not None), of))
+            return _made(hand, _named(_raw(path, hand, read_as, nameless=of is not None), of))
     found = list[Attempts | str]()
     for each in files_in(path):
         try:
             with named(each):
-                found.append(_made(hand, _named(_raw(each, hand), of)))
+                found.append(_made(hand, _named(_raw(each, hand, read_as), of)))
         except GraspError as error:
             found.append(str(error))
     return join_attempts(found)
 
 
-def _raw(path: Path, hand: Hand, *, nameless: bool = False) -> dict[str, Any]:
-    """Return what a file says of its postures, as arguments of `make_attempts`.
+def _raw(
+    path: Path, hand: Hand, read_as: Mapping[str, str], *, nameless: bool = False
+) -> dict[str, Any]:
+    """Return what file and caller say of postures, as arguments of `make_attempts`.
 
-    Beside these, `hand` is the name of the hand and `trial` (n,) the trials that samples were.
+    Beside these, `hand` is the name of the hand, `trial` (n,) the trials that samples were, and
+    `of_objects` says that the rows are for objects, wherever these are.
 
     Raises:
         GraspError: If it is no file of postures.
@@ -147,8 +155,20 @@ def _raw(path: Path, hand: Hand, *, nameless: bool = False) -> dict[str, Any]:
                 got = f"{type(error).__name__} ({one_line(error)})"
                 raise GraspError(f"must be readable by the importer {name}, got {got}") from error
             if raw is not None:
-                return dict(raw)
+                return _as_asked(dict(raw), read_as)
     raise GraspError(f"must be a file of postures ({', '.join(suffixes())}), got another")
+
+
+def _as_asked(raw: dict[str, Any], read_as: Mapping[str, str]) -> dict[str, Any]:
+    """Return what a file says with what the caller says, see `read_attempts`."""
+    if "frame" in read_as:
+        raw["frame"] = read_as["frame"]
+    if "link" in read_as:
+        raw["link"] = _link([read_as["link"]])
+    if shape := read_as.get("preshape"):
+        named = raw.get("preshape") or [""] * len(raw["objects"])
+        raw["preshape"] = [name or shape for name in named]
+    return raw
 
 
 def suffixes() -> tuple[str, ...]:
@@ -186,22 +206,24 @@ def _made(hand: Hand, raw: dict[str, Any]) -> Attempts:
     told = raw.get("hand")
     if told not in (None, hand.name):
         raise GraspError(f"hand must be {told}, as the file says, got {hand.name} (--hand)")
-    said = {name: value for name, value in raw.items() if name not in ("hand", "trial")}
+    beside = ("hand", "trial", "of_objects")
+    said = {name: value for name, value in raw.items() if name not in beside}
     try:
         return make_attempts(hand, **said)
     except (HandError, TypeError, ValueError) as error:
         raise GraspError(one_line(error)) from None
 
 
-def _for_rows(path: Path, hand: Hand, data: GraspDataset) -> Attempts:
+def _for_rows(path: Path, hand: Hand, data: GraspDataset, read_as: Mapping[str, str]) -> Attempts:
     """Return the postures that are for rows of a split, see `read_attempts`."""
     tables, files = list[Attempts](), files_in(path) if path.is_dir() else [path]
     for each in files:
         with named(each):
-            raw = _of_split(_raw(each, hand, nameless=True), data)
+            raw = _of_split(_raw(each, hand, read_as, nameless=True), data)
             if len(raw["objects"]):
-                # Between files confidence is not compared.
-                known = raw if len(files) == 1 else {**raw, "confidence": None}
+                # Between files confidence is not compared, unless they are of different objects.
+                kept = len(files) == 1 or raw.get("of_objects")
+                known = raw if kept else {**raw, "confidence": None}
                 tables.append(_on_rows(known, data, hand))
     if not tables:
         raise GraspError(
@@ -211,20 +233,28 @@ def _for_rows(path: Path, hand: Hand, data: GraspDataset) -> Attempts:
 
 
 def _of_split(raw: dict[str, Any], data: GraspDataset) -> dict[str, Any]:
-    """Return exported samples that are of the split, with their rows; other postures as they are.
+    """Return postures that are of the split, with their rows; where nobody knows, as they are.
 
-    The trial of a sample says which row it is.
+    The trial of an exported sample says which row it is. What is for an object is for each of its
+    rows.
     """
-    if raw.get("of_row") is not None or raw.get("trial") is None:
+    if raw.get("of_row") is not None or not (raw.get("of_objects") or "trial" in raw):
         return raw
-    row_of = {trial: row for row, trial in enumerate(data.column("trial_id").tolist())}
-    trials = raw["trial"].tolist()
-    there = [i for i, trial in enumerate(trials) if trial in row_of]
+    told, column = raw["objects"], "object_props/object_name"
+    if not raw.get("of_objects"):
+        if raw["trial"] is None:
+            return raw
+        told, column = raw["trial"].tolist(), "trial_id"
+    rows_of = dict[Any, list[int]]()
+    for row, one in enumerate(data.column(column).tolist()):
+        rows_of.setdefault(one, []).append(row)
+    pairs = [(i, row) for i, one in enumerate(told) for row in rows_of.get(one, ())]
+    there = [i for i, _ in pairs]
     known = {
         name: value if value is None or name in _OF_FILE else taken(value, there)
         for name, value in raw.items()
     }
-    return {**known, "of_row": np.array([row_of[trials[i]] for i in there], np.int64)}
+    return {**known, "of_row": np.array([row for _, row in pairs], np.int64)}
 
 
 def _on_rows(raw: dict[str, Any], data: GraspDataset, hand: Hand) -> Attempts:

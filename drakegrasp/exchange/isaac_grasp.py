@@ -170,6 +170,7 @@ def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
         "conditions": known[:, 8:],
         "preshape": preshape,
         "trial": None if np.isnan(trials).any() else trials.astype(np.int64),
+        "of_objects": not ours,
         "hand": str(tree["hand"]) if ours and "hand" in tree else None,
     }
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,6 +31,7 @@ class BuildRequest:
         only: Names of the objects to build; all if empty.
         postures: File of postures that are tried instead of drawn palm poses.
         show: Whether to show progress on standard error.
+        read_as: What is said of all postures, see `exchange.attempts.read_attempts`.
     """
 
     objects: str
@@ -41,6 +42,7 @@ class BuildRequest:
     only: tuple[str, ...]
     postures: Path | None
     show: bool
+    read_as: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from drakegrasp.frames import Array, as_numbers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.protocols.protocol import PostureVerdict
-from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.attempts import EACH, Attempts
 from drakegrasp.verification.placing import PlacedGrasp, dataset_config, read_several
 from drakegrasp.verification.result import Verification
 
@@ -88,7 +88,7 @@ def rank_array(
         return rank(replace(table, file=name, sha256=sha256))
 
 
-def rank_file(path: Path, data: GraspDataset) -> Attempts:
+def rank_file(path: Path, data: GraspDataset, read_as: Mapping[str, str] | None = None) -> Attempts:
     """Return the predictions of a file, ranked; see `read_attempts`.
 
     Raises:
@@ -96,8 +96,12 @@ def rank_file(path: Path, data: GraspDataset) -> Attempts:
         ConfigError, HandError, DataError, MachineError: If dataset or hand cannot be used.
     """
     hand = load_hand(dataset_config(data).hand_source)
-    table = read_attempts(path, hand, of=data, several=True)
+    table = read_attempts(path, hand, of=data, several=True, read_as=read_as)
     with named(path):
+        if table.grasps is None and EACH in table.preshape:
+            raise GraspError(
+                f"preshape must be one for a score, which tries nothing twice, got {EACH}"
+            )
         return rank(replace(table, file=str(path), sha256=digest_of(path)))
 
 
@@ -107,6 +111,7 @@ def ranked_sets(
     *,
     rows: Sequence[int] | None = None,
     confidence: npt.ArrayLike | None = None,
+    read_as: Mapping[str, str] | None = None,
 ) -> tuple[str, tuple[Attempts, ...]]:
     """Return the name of what is scored, and its predictions by training seed.
 
@@ -115,6 +120,7 @@ def ranked_sets(
         data: The split.
         rows: With an array: the row of each.
         confidence: With an array: of each.
+        read_as: With files of postures, see `read_attempts`.
 
     Raises:
         GraspError: If they cannot be used, or rows or confidence are given with files.
@@ -135,7 +141,7 @@ def ranked_sets(
     # Files, each of a training seed.
     if rows is not None or confidence is not None:
         raise GraspError("rows and confidence must be in the files if files are given, got them")
-    found = tuple(rank_file(Path(path), data) for path in paths)
+    found = tuple(rank_file(Path(path), data, read_as) for path in paths)
     names = [Path(path).name for path in paths]
     if len(found) < 2:
         return (names or [""])[0], found
