@@ -20,10 +20,12 @@ import pytest
 import yaml
 from helpers.commands import run
 
+import drakegrasp as dg
 from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.hand.description import load_hand
 from drakegrasp.simulation.candidates import Source
+from drakegrasp.simulation.posture import joint_order
 
 # Where torch is said to be there, a test that skips is a failure.
 if os.environ.get("DRAKEGRASP_TORCH") != "1":
@@ -156,6 +158,7 @@ def test_a_judge_chooses_from_the_proposals_that_compete(
         data=tmp_path / "scenes.hdf5",
         split="test",
         judge=tmp_path / "judge.pt",
+        choose="chance",
         proposals=1,
         views=None,
     )
@@ -163,6 +166,24 @@ def test_a_judge_chooses_from_the_proposals_that_compete(
     with torch.no_grad():
         found = predict_postures(checkpoint, arguments)
     assert found["confidence"] == pytest.approx(torch.tensor([7.0]).sigmoid().numpy())
+
+
+def test_closing_ranks_a_networks_proposals_with_grasps_from_above() -> None:
+    """A palm within the object is last; joints keep the order of the data."""
+    x, y = np.meshgrid(np.linspace(-0.05, 0.05, 30), np.linspace(-0.025, 0.025, 15))
+    cloud = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.08)])
+    hand = load_hand()
+    joints = joint_order(hand)[::-1]
+    inside = np.diag([1.0, -1.0, -1.0, 1.0])[None]
+    q = np.zeros((1, len(joints)))
+    own = predict.Choice(inside, q, q, np.ones(1))
+    found = predict.chosen_by_closing(own, cloud, hand, joints)
+    above = dg.propose(cloud, hand)
+    assert len(found.confidence) == 1 + len(above)
+    assert found.confidence.argmin() == 0 and found.confidence.max() > 0.5
+    assert np.array_equal(found.q_grasp[1:], above.q_grasp[:, ::-1])
+    # Too little is seen of this object.
+    assert predict.chosen_by_closing(own, cloud[:3], hand, joints) is own
 
 
 def test_coordinates_of_a_hand_keep_its_couplings() -> None:

@@ -2,6 +2,7 @@
 
   python pipelines/baseline/predict.py postures.pt OUT/scenes.hdf5 predicted.h5
   python pipelines/baseline/predict.py postures.pt OUT/scenes.hdf5 judged.h5 --judge classifier.pt
+  python pipelines/baseline/predict.py postures.pt OUT/scenes.hdf5 closed.h5 --choose closing
   python pipelines/baseline/predict.py contacts.pt OUT/grasping_oto.hdf5 predicted.h5
 
 Postures are written as `drakegrasp build --postures` reads them, with the row of the split that
@@ -14,7 +15,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -31,8 +32,13 @@ from torch import Tensor
 from train import SEEN
 
 import drakegrasp as dg
+from drakegrasp.arithmetic import Array
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import DataError, DrakegraspError
+from drakegrasp.hand.description import load_hand
 from drakegrasp.runtime.progress import progress_bar
+from drakegrasp.simulation.attempts import join_attempts, make_attempts
+from drakegrasp.simulation.posture import joint_order
 
 #: Two proposals are one if palms are nearer than both [m, rad].
 SAME = (0.01, np.deg2rad(15))
@@ -52,6 +58,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("out", type=Path, help="HDF5 file to write")
     parser.add_argument("--split", default="test", help="[default: test]")
     parser.add_argument("--judge", type=Path, help="checkpoint of the classifier that ranks")
+    parser.add_argument(
+        "--choose",
+        choices=("chance", "closing"),
+        default="chance",
+        help="what ranks: the network's or the judge's chance, or drakegrasp.rank, together with "
+        "grasps from above  [default: chance]",
+    )
     parser.add_argument("--proposals", type=int, default=5, help="of each view  [default: 5]")
     parser.add_argument("--views", type=int, help="of each scene  [default: all]")
     arguments = parser.parse_args(argv)
@@ -99,6 +112,10 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
         classifier.load_state_dict(said["weights"])
         judge = classifier, of_judge
 
+    closing_hand = None
+    if arguments.choose == "closing":
+        closing_hand = load_hand(read_manifest(arguments.data.parent).config.hand_source)
+
     # The views that `drakegrasp score` counts, in its order.
     data = dg.SceneDataset(
         arguments.data, split=arguments.split, negatives="none", balance="view", grasps=1
@@ -115,20 +132,26 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
             if judge is not None:
                 clouds = batch["points"][:, :SEEN].expand(len(X_TG), -1, -1)
                 confidence = judge[0](clouds, X_TG, judge[1].coordinates(q))[:, 1].sigmoid()
-            order = confidence.argsort(descending=True, stable=True)[: arguments.proposals]
 
-            # Back to where the cloud was, and into the object's frame.
+            # Back to where the cloud was.
             X_TG[:, :3, 3] += batch["shift"]
-            X_OG = torch.linalg.inv(torch.from_numpy(item["X_AO"]).double()) @ X_TG.double()
+            table = Choice(X_TG.numpy(), q.numpy(), hand.opened(q).numpy(), confidence.numpy())
+            if closing_hand is not None:
+                cloud = item["points"][item["on_object"]]
+                table = chosen_by_closing(table, cloud, closing_hand, data.joints)
+            order = np.argsort(-table.confidence, kind="stable")[: arguments.proposals]
+
+            # Into the object's frame.
+            X_OG = np.linalg.inv(item["X_AO"].astype(float)) @ table.X_TG[order].astype(float)
             scene = int(item["scene"])
             rows = {
                 "object": [data.names[int(item["object"])]] * len(order),
                 "resting": [int(data.tables["scenes"]["resting"][scene, 0])] * len(order),
                 "row": [index] * len(order),
-                "X_FG": X_OG[order].numpy(),
-                "q_grasp": q[order].numpy(),
-                "q_pregrasp": hand.opened(q)[order].numpy(),
-                "confidence": confidence[order].numpy(),
+                "X_FG": X_OG,
+                "q_grasp": table.q_grasp[order],
+                "q_pregrasp": table.q_pregrasp[order],
+                "confidence": table.confidence[order],
             }
             for key, values in rows.items():
                 found[key].extend(values)
@@ -136,6 +159,45 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
     arrays: dict[str, Any] = {key: np.array(values) for key, values in found.items()}
     arrays["object"] = np.array(found["object"], dtype=h5py.string_dtype())
     return arrays | {"frame": "object", "joints": np.array(data.joints, dtype=h5py.string_dtype())}
+
+
+class Choice(NamedTuple):
+    """n proposals for a view: X_TG (n, 4, 4), joints (n, j) closed and open, confidence (n,)."""
+
+    X_TG: Array
+    q_grasp: Array
+    q_pregrasp: Array
+    confidence: Array
+
+
+def chosen_by_closing(found: Choice, cloud: Array, hand: dg.Hand, joints: Sequence[str]) -> Choice:
+    """Return proposals and grasps from above, with what `drakegrasp.rank` says as confidence.
+
+    A view that shows too little for that keeps the proposals as they are.
+
+    Args:
+        found: Of the network.
+        cloud: (n, 3), points on the object in {T} [m].
+        hand: The hand.
+        joints: (j,), names of its joints.
+    """
+    try:
+        above = dg.propose(cloud, hand)
+    except dg.GraspError:
+        return found
+    own = make_attempts(
+        hand,
+        above.objects[:1] * len(found.X_TG),
+        found.X_TG,
+        found.q_grasp,
+        q_pregrasp=found.q_pregrasp,
+        joints=joints,
+        frame="table",
+    )
+    both = join_attempts([own, above])
+    order = [joint_order(hand).index(name) for name in joints]
+    q = both.q_grasp[:, order], both.q_pregrasp[:, order]
+    return Choice(both.X_FG, *q, dg.rank(both, cloud, hand).score)
 
 
 COLUMNS = ("object", "resting", "row", "X_FG", "q_grasp", "q_pregrasp", "confidence")
