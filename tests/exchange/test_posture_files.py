@@ -261,21 +261,28 @@ def test_several_grasps_of_one_dictionary_are_rows(tmp_path):
     np.testing.assert_allclose(table.X_FG, POSES[[0, 0, 0]], atol=1e-9)
 
 
+def isaac_grasp(X_GB: np.ndarray, **stages: dict[str, float]) -> dict[str, Any]:
+    w, *xyz = quaternion(X_GB).tolist()
+    place = {"position": X_GB[:3, 3].tolist(), "orientation": {"w": w, "xyz": xyz}}
+    return {"confidence": 0.5, **place, **stages}
+
+
+def write_isaac(path: Path, **grasps: Any) -> Path:
+    tree = {"format": "isaac_grasp", "format_version": 1.0, "grasps": grasps}
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    return path
+
+
 def test_isaac_grasp_is_of_the_object_that_its_file_is_named_after(tmp_path):
     for i, name in enumerate(OBJECTS):
-        X = POSES[i] @ np.linalg.inv(HAND.X_BG)
-        w, *xyz = quaternion(X).tolist()
-        grasp = {
-            "confidence": 0.5,
-            "position": X[:3, 3].tolist(),
-            "orientation": {"w": w, "xyz": xyz},
-            "cspace_position": dict(zip(ORDER, GRASP[i].tolist(), strict=True)),
-            "pregrasp_cspace_position": dict(zip(ORDER, PREGRASP[i].tolist(), strict=True)),
-        }
-        tree = {"format": "isaac_grasp", "format_version": 1.0, "grasps": {"grasp_0": grasp}}
+        grasp = isaac_grasp(
+            POSES[i] @ np.linalg.inv(HAND.X_BG),
+            cspace_position=dict(zip(ORDER, GRASP[i].tolist(), strict=True)),
+            pregrasp_cspace_position=dict(zip(ORDER, PREGRASP[i].tolist(), strict=True)),
+        )
         # Names in another order of files than of objects.
-        (tmp_path / f"{i}").mkdir()
-        (tmp_path / f"{i}" / f"{name}.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
+        write_isaac(tmp_path / f"{i}" / f"{name}.yaml", grasp_0=grasp)
     table = read_attempts(tmp_path, HAND)
     assert_both(table)
     assert table.said[0] == "grasp_0, confidence 0.5"
@@ -283,19 +290,10 @@ def test_isaac_grasp_is_of_the_object_that_its_file_is_named_after(tmp_path):
 
 def test_palm_link_named_palm_is_no_palm_frame_in_files_of_others(tmp_path):
     leap = load_hand("leap")
-    order, X = joint_order(leap), POSES[0]
     assert leap.palm_link == "palm" and not np.allclose(leap.X_BG, np.eye(4))
-    w, *xyz = quaternion(X).tolist()
-    grasp = {
-        "confidence": 0.5,
-        "position": X[:3, 3].tolist(),
-        "orientation": {"w": w, "xyz": xyz},
-        "cspace_position": dict.fromkeys(order, 0.1),
-    }
-    tree = {"format": "isaac_grasp", "format_version": 1.0, "grasps": {"grasp_0": grasp}}
-    (tmp_path / "mug.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
-    table = read_attempts(tmp_path / "mug.yaml", leap)
-    np.testing.assert_allclose(table.X_FG[0], X @ leap.X_BG, atol=1e-9)
+    grasp = isaac_grasp(POSES[0], cspace_position=dict.fromkeys(joint_order(leap), 0.1))
+    table = read_attempts(write_isaac(tmp_path / "mug.yaml", grasp_0=grasp), leap)
+    np.testing.assert_allclose(table.X_FG[0], POSES[0] @ leap.X_BG, atol=1e-9)
 
 
 # Palm poses alone
@@ -442,17 +440,12 @@ def test_file_in_a_folder_that_is_no_grasp_is_a_row_of_its_own(tmp_path):
 
 
 def test_grasp_of_isaac_grasp_that_is_none_is_a_row_of_its_own(tmp_path):
-    place = {"position": [0.0, 0.0, 0.1], "orientation": {"w": 1.0, "xyz": [0.0, 0.0, 0.0]}}
-    whole = {**place, "cspace_position": dict.fromkeys(ORDER, 0.1)}
-    grasps = {
-        "a": 5,
-        "b": {**whole, "position": [0.0]},
-        "c": whole,
-        "d": {**whole, "orientation": {"w": 0.0, "xyz": [0.0, 0.0, 0.0]}},
-    }
-    tree = {"format": "isaac_grasp", "format_version": 1.0, "grasps": grasps}
-    (tmp_path / "mug.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
-    table = read_attempts(tmp_path / "mug.yaml", HAND)
+    whole = isaac_grasp(np.eye(4), cspace_position=dict.fromkeys(ORDER, 0.1))
+    turned = {**whole, "orientation": {"w": 0.0, "xyz": [0.0, 0.0, 0.0]}}
+    path = write_isaac(
+        tmp_path / "mug.yaml", a=5, b={**whole, "position": [0.0]}, c=whole, d=turned
+    )
+    table = read_attempts(path, HAND)
     assert [bool(reason) for reason in table.invalid] == [True, True, False, True]
     assert table.invalid[1].startswith("b must have position, orientation and cspace_position")
     np.testing.assert_array_equal(table.q_grasp[2], 0.1)
@@ -471,16 +464,21 @@ class Evil:
         return os.mkdir, (str(self.mark),)
 
 
+def write_pickle(path: Path, content: Any, protocol: int) -> Path:
+    """As `write_dictionary`, by any protocol."""
+    array = np.empty((), dtype=object)
+    array[()] = content
+    head = {"descr": "|O", "fortran_order": False, "shape": ()}
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, head)
+        pickle.dump(array, file, protocol=protocol)
+    return path
+
+
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 def test_pickle_that_runs_something_is_refused_and_not_run(tmp_path, protocol):
-    array = np.empty((), dtype=object)
-    array[()] = dexgraspbench(obj_scale=Evil(tmp_path / "ran"))
-    path = tmp_path / "0.npy"
-    with path.open("wb") as file:
-        np.lib.format.write_array_header_1_0(
-            file, {"descr": "|O", "fortran_order": False, "shape": ()}
-        )
-        pickle.dump(array, file, protocol=protocol)
+    evil = dexgraspbench(obj_scale=Evil(tmp_path / "ran"))
+    path = write_pickle(tmp_path / "0.npy", evil, protocol)
     with pytest.raises(GraspError, match=r"got \w+\.mkdir; nothing of it was run"):
         read_attempts(path, HAND)
     assert not (tmp_path / "ran").exists()
@@ -488,14 +486,7 @@ def test_pickle_that_runs_something_is_refused_and_not_run(tmp_path, protocol):
 
 def test_pickles_of_every_protocol_are_read(tmp_path):
     for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
-        array = np.empty((), dtype=object)
-        array[()] = dexgraspbench()
-        path = tmp_path / f"{protocol}.npy"
-        with path.open("wb") as file:
-            np.lib.format.write_array_header_1_0(
-                file, {"descr": "|O", "fortran_order": False, "shape": ()}
-            )
-            pickle.dump(array, file, protocol=protocol)
+        write_pickle(tmp_path / f"{protocol}.npy", dexgraspbench(), protocol)
     np.testing.assert_array_equal(
         read_attempts(tmp_path, HAND).q_grasp, GRASP[[0] * (protocol + 1)]
     )
@@ -568,7 +559,11 @@ def test_other_files_are_refused_in_a_line(tmp_path, name, content, words):
 
 
 def test_damaged_stream_is_refused_in_a_line(tmp_path):
-    """Zlib has an error of its own for what cannot be inflated."""
+    """Zlib has an error of its own for what cannot be inflated; one array is no file of several."""
+    np.save(tmp_path / "one.npy", GRASP)
+    (tmp_path / "one.npy").rename(tmp_path / "one.npz")
+    with pytest.raises(GraspError, match="must be a readable file of arrays"):
+        read_attempts(tmp_path / "one.npz", HAND)
     np.savez_compressed(tmp_path / "a.npz", **arrays())
     content = bytearray((tmp_path / "a.npz").read_bytes())
     name, extra = (int.from_bytes(content[at : at + 2], "little") for at in (26, 28))
@@ -579,13 +574,6 @@ def test_damaged_stream_is_refused_in_a_line(tmp_path):
     ) as caught:
         read_attempts(tmp_path / "a.npz", HAND)
     assert "\n" not in str(caught.value)
-
-
-def test_array_that_is_named_as_several_is_refused(tmp_path):
-    with (tmp_path / "a.npz").open("wb") as file:
-        np.save(file, GRASP)
-    with pytest.raises(GraspError, match="must be a readable file of arrays"):
-        read_attempts(tmp_path / "a.npz", HAND)
 
 
 def test_frame_that_some_rows_lack_is_refused(tmp_path):
