@@ -62,7 +62,7 @@ test: $(DEV)   ## the tests of every change: the first tier, but for the pages i
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not server and not nightly and not browser'
 
 test-fast: $(DEV)  ## of these the ones without simulations and clusters
-	$(BIN)/python -m pytest -n 2 -m 'not sim and not cluster and not slow and not nightly'
+	$(BIN)/python -m pytest -n 2 -m 'not sim and not cluster and not slow and not nightly and not browser'
 
 test-nightly: $(DEV)  ## the second tier: kills, hangs, full disks, spoilt files, repeats
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'nightly and not server'

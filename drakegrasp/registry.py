@@ -10,7 +10,7 @@ exporters: a function (dataset, folder, progress) that returns the number of sam
 hands: the path of a hand file.
 importers: a function (path, hand) that returns arguments of `simulation.attempts.make_attempts`, or
     None for a file of another format. The name ends with the suffix of the files.
-protocols: a subclass of `protocols.protocol.MujocoProtocol`.
+protocols: a subclass of `protocols.protocol.MujocoProtocol`; `lift` alone is none.
 rules: a `filters.Rule`. Those of the package are `filters.RULES`: each has a limit and a code.
 samplers: a `simulation.candidates.Sampler`, or a class as a file of the user's own has it.
 

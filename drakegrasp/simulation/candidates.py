@@ -65,7 +65,7 @@ class Source(IntEnum):
     ROTATIONS = 0
     NORMALS = 1
     REFINE = 2
-    OWN = 3  # one of the user's own
+    OWN = 3  # any other: of the package, as `above`, of another one, or of the user
     POSTURES = 4  # none: the posture comes from outside
 
 
