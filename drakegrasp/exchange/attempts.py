@@ -570,45 +570,35 @@ def _of_columns(
     if missing:
         raise GraspError(f"columns must include {', '.join(missing)}, got {listed(list(columns))}")
 
-    def told(name: str) -> list[str | None]:
-        return [v for v, none in zip(columns.get(name, ()), invalid, strict=False) if not none]
+    def numbers(*names: str) -> Array:
+        return np.column_stack([_floats(columns, name, invalid) for name in names])
 
-    # The joints of each stage, in the order of the grasp.
-    q: dict[str, Any] = {}
-    joints: list[str] | None = None
+    # As arrays: the joints of each stage in the order of the grasp, the place, numbers and texts.
+    arrays: dict[str, Any] = {}
     alone = np.ones(len(invalid), dtype=bool)
     for stage in ("grasp", "pregrasp", "squeeze"):
         names = [n.removeprefix(f"{stage}_") for n in columns if n.startswith(f"{stage}_")]
         if names:
-            joints = joints or names
+            joints = arrays.setdefault("joints", names)
             if set(names) != set(joints):
                 raise GraspError(f"{stage}_ columns must be of the joints of grasp_, got others")
-            q[f"q_{stage}"] = np.column_stack(
-                [_floats(columns, f"{stage}_{n}", invalid) for n in joints]
-            )
-            alone &= _empty(columns, [f"{stage}_{n}" for n in joints])
-    numbers = np.column_stack([_floats(columns, name, invalid) for name in place])
-    known = {n: _floats(columns, n, invalid) for n in _SCALARS if n in columns}
-    told_under = {n: _floats(columns, n, invalid) for n in CONDITIONS if n in columns}
-    known |= _conditions(told_under, len(numbers))
-    X_FL, reasons = quaternion_poses(numbers[:, :3], numbers[:, 3:])
-    said = {n: _floats(columns, n, invalid) for n in ("row", "confidence") if n in columns}
-    whole = "row" in said and np.array_equal(said["row"], np.floor(said["row"]))
-    return {
-        "objects": [str(name) for name in columns.get("object", [""] * len(numbers))],
-        "X_FG": X_FL,
-        "link": _link(told("link")),
-        "frame": _only(told("frame"), "frame") or "object",
-        **q,
-        "alone": alone,
-        "joints": joints,
-        **known,
-        "said": None if "source" not in columns else [str(text) for text in columns["source"]],
-        "of_row": said["row"].astype(np.int64) if whole else said.get("row"),
-        "confidence": said.get("confidence"),
-        "invalid": [one or other for one, other in zip(invalid, reasons, strict=True)],
-        "preshape": [str(name or "") for name in columns.get("preshape", ())] or None,
-    }
+            cells = [f"{stage}_{n}" for n in joints]
+            arrays[f"q_{stage}"] = numbers(*cells)
+            alone &= _empty(columns, cells)
+    arrays["position"], arrays["quaternion"] = np.split(numbers(*place), [3], axis=1)
+    for name in filter(columns.__contains__, (*_SCALARS, *CONDITIONS, "row", "confidence")):
+        arrays[name] = numbers(name)[:, 0]
+    if "row" in arrays and np.array_equal(arrays["row"], np.floor(arrays["row"])):
+        arrays["row"] = arrays["row"].astype(np.int64)
+    for name in filter(columns.__contains__, ("object", "source", "preshape", *_OF_FILE[:2])):
+        # A bad row tells nothing of all rows.
+        texts = zip(columns[name], invalid, strict=True)
+        told = [str(text or "") for text, bad in texts if name not in _OF_FILE or not bad]
+        arrays[name] = np.array(told, dtype=object)
+    raw = _of_arrays(arrays, nameless)
+    reasons = [one or other for one, other in zip(invalid, raw["invalid"], strict=True)]
+    # The names of columns leave no doubt about quaternions.
+    return {**raw, "alone": alone, "invalid": reasons, "X_FG_xyzw": None}
 
 
 def _empty(columns: Mapping[str, list[Any]], names: Sequence[str]) -> npt.NDArray[np.bool_]:

@@ -331,43 +331,30 @@ def make_attempts(
             none of this hand.
         HandError: If the hand has no such link.
     """
-    given = {"q_grasp": q_grasp, "q_pregrasp": q_pregrasp, "q_squeeze": q_squeeze}
-    given = {name: q for name, q in given.items() if q is not None}
+    # What all rows share: preshapes and joints of the hand, the palm's frame, the table's frame.
     count = len(objects)
     palms = np.broadcast_to(np.asarray(q_grasp is None or alone, dtype=bool), (count,))
     names = tuple(name or "" for name in preshape or [""] * count)
-    unknown, kept = _known_preshapes(names, palms, hand)
-    q = _in_order(hand, count, list(joint_order(hand) if joints is None else joints), given, kept)
+    no_preshape, kept = _known_preshapes(names, palms, hand)
+    given = {"q_grasp": q_grasp, "q_pregrasp": q_pregrasp, "q_squeeze": q_squeeze}
+    order = list(joint_order(hand) if joints is None else joints)
+    q = _in_order(hand, count, order, {k: v for k, v in given.items() if v is not None}, kept)
     X_AG = hand.palm_in(link or "")
-    if not count:
-        raise GraspError("postures must be at least one row, got none")
-    if frame not in TABLE_FRAMES:
-        raise GraspError(f"frame must be one of {', '.join(TABLE_FRAMES)}, got {frame!r}")
-    if (X_TC is None) == (frame == "camera"):
-        raise GraspError("X_TC must be given with the frame camera, and only then")
+    _refuse_table(count, frame, X_TC)
 
-    # Numbers that every row must have, and those that a row may lack.
-    bad, size = [""] * count if invalid is None else list(invalid), (count, len(hand.joint_names))
-    where = _numbers(resting, (count,), "resting", bad, some=True)
-    named = (where >= 0) & (where < MOST_POSES) & (where == np.floor(where))
-    for i in np.flatnonzero(~(named | np.isnan(where))):
-        bad[i] = bad[i] or f"resting must be the index of a resting pose, got {where[i]:g}"
-    known = _numbers(conditions, (count, len(CONDITIONS)), "conditions", bad, each=True)
-    for i, k in np.argwhere(known <= 0.0):
-        bad[i] = bad[i] or f"{CONDITIONS[k]} must be positive, got {known[i, k]:g}"
-    bad = [one or other for one, other in zip(bad, unknown, strict=True)]
-    pregrasp, squeeze = (
-        _numbers(q.get(name), size, name, bad, some=True) for name in ("q_pregrasp", "q_squeeze")
-    )
-    for name, stage in (("q_pregrasp", pregrasp), ("q_squeeze", squeeze)):
-        for i in np.flatnonzero(palms & ~np.isnan(stage).all(axis=1)):
-            bad[i] = bad[i] or f"{name} must be {BESIDE_GRASP}"
-    X = np.asarray(X_FG) if link is None else multiply(np.asarray(X_FG), X_AG)
-    if link is not None and X_FG_xyzw is not None:
-        X_FG_xyzw = multiply(X_FG_xyzw, X_AG)
+    # Numbers that every row must have, and those that a row may lack; `bad` says why a row is none.
+    bad = [""] * count if invalid is None else list(invalid)
+    stands = _resting(resting, count, bad)
+    under = _conditions(conditions, count, bad)
+    bad = [one or other for one, other in zip(bad, no_preshape, strict=True)]
+    size = (count, len(hand.joint_names))
+    pregrasp, squeeze = _beside_grasp(q, palms, size, bad)
+    if link is not None:
+        X_FG = multiply(np.asarray(X_FG), X_AG)
+        X_FG_xyzw = None if X_FG_xyzw is None else multiply(X_FG_xyzw, X_AG)
     return Attempts(
         objects=tuple(objects),
-        X_FG=_poses(X, count, "the palm's pose", bad),
+        X_FG=_poses(X_FG, count, "the palm's pose", bad),
         q_grasp=_numbers(q.get("q_grasp"), size, "q_grasp", bad, some=palms),
         q_pregrasp=pregrasp,
         q_squeeze=squeeze,
@@ -377,9 +364,9 @@ def make_attempts(
         log_density=_numbers(log_density, (count,), "log_density", bad, some=True),
         said=("",) * count if said is None else tuple(said),
         preshape=names,
-        conditions=known,
+        conditions=under,
         row=np.arange(count, dtype=np.int64),
-        resting=np.where(named, where, UNTOLD).astype(np.int64),
+        resting=stands,
         X_TO=_poses(X_TO, count, "X_TO", bad, some=True),
         invalid=tuple(bad),
         of_row=of_row,
@@ -387,6 +374,45 @@ def make_attempts(
         link=link or "",
         X_FG_xyzw=X_FG_xyzw,
     )
+
+
+def _refuse_table(count: int, frame: str, X_TC: npt.ArrayLike | None) -> None:
+    if not count:
+        raise GraspError("postures must be at least one row, got none")
+    if frame not in TABLE_FRAMES:
+        raise GraspError(f"frame must be one of {', '.join(TABLE_FRAMES)}, got {frame!r}")
+    if (X_TC is None) == (frame == "camera"):
+        raise GraspError("X_TC must be given with the frame camera, and only then")
+
+
+def _resting(told: npt.ArrayLike | None, count: int, bad: list[str]) -> npt.NDArray[np.int64]:
+    """Return indices (n,) of resting poses, `UNTOLD` for NaN."""
+    where = _numbers(told, (count,), "resting", bad, some=True)
+    named = (where >= 0) & (where < MOST_POSES) & (where == np.floor(where))
+    for i in np.flatnonzero(~(named | np.isnan(where))):
+        bad[i] = bad[i] or f"resting must be the index of a resting pose, got {where[i]:g}"
+    return np.where(named, where, UNTOLD).astype(np.int64)
+
+
+def _conditions(told: npt.ArrayLike | None, count: int, bad: list[str]) -> Array:
+    """Return the `CONDITIONS` (n, 3), which are positive where they are told."""
+    known = _numbers(told, (count, len(CONDITIONS)), "conditions", bad, each=True)
+    for i, k in np.argwhere(known <= 0.0):
+        bad[i] = bad[i] or f"{CONDITIONS[k]} must be positive, got {known[i, k]:g}"
+    return known
+
+
+def _beside_grasp(
+    q: Mapping[str, Array], palms: npt.NDArray[np.bool_], size: tuple[int, int], bad: list[str]
+) -> tuple[Array, Array]:
+    """Return pregrasp and squeeze (n, j) [rad or m], which a palm pose alone (n,) cannot have."""
+    pregrasp, squeeze = (
+        _numbers(q.get(name), size, name, bad, some=True) for name in ("q_pregrasp", "q_squeeze")
+    )
+    for name, stage in (("q_pregrasp", pregrasp), ("q_squeeze", squeeze)):
+        for i in np.flatnonzero(palms & ~np.isnan(stage).all(axis=1)):
+            bad[i] = bad[i] or f"{name} must be {BESIDE_GRASP}"
+    return pregrasp, squeeze
 
 
 def join_attempts(parts: Sequence[Attempts | str]) -> Attempts:
