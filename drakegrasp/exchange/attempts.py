@@ -343,11 +343,13 @@ def files_in(folder: Path) -> list[Path]:
 def digest_of(path: Path) -> str:
     """Return the SHA-256 of a file, or of all files of postures in a folder."""
     if path.is_file():
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    digest = hashlib.sha256()
-    for each in files_in(path):
-        digest.update(hashlib.sha256(each.read_bytes()).digest())
-    return digest.hexdigest()
+        return _sha256(path).hex()
+    return hashlib.sha256(b"".join(map(_sha256, files_in(path)))).hexdigest()
+
+
+def _sha256(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").digest()
 
 
 # Arrays

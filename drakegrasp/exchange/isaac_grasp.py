@@ -21,6 +21,7 @@ from drakegrasp.dataset.paths import model_path
 from drakegrasp.errors import GraspError, one_line
 from drakegrasp.exchange.dexgraspbench import pose_vector
 from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
+from drakegrasp.foreign_files import read_text
 from drakegrasp.frames import invert_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
@@ -109,7 +110,7 @@ def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
         GraspError: If it is none.
     """
     try:
-        tree: Any = parse_yaml(path.read_text(encoding="utf-8"))
+        tree: Any = parse_yaml(read_text(path))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise GraspError(f"{path}: must be YAML, got: {one_line(error)}") from None
     if not isinstance(tree, dict) or tree.get("format") != "isaac_grasp":
