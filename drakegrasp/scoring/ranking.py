@@ -46,7 +46,7 @@ LEVER = 0.05
 #: Rounds and rate of the search for the shares of the fingers.
 ROUNDS, RATE = 100, 1.0
 #: Logistic weights of `push`, `opposition`, `arm` [1/m] and `gap` [1/m], and the constant: fitted
-#: to lifts of the Barrett hand.
+#: to lifts of the Barrett hand, see docs/results/choice.md.
 WEIGHTS = {"push": 4.0, "opposition": 2.0, "arm": -20.0, "gap": -50.0}
 CONSTANT = -3.0
 
