@@ -47,18 +47,19 @@ def submit(
     """Build a dataset on a cluster, whose workers the command starts.
 
     \b
-        drakegrasp submit --cluster local ...
-        drakegrasp submit --cluster ssh node1 node2 --cores 16 --interface eth0 ...
-        drakegrasp submit --cluster slurm --workers 200 --walltime 04:00:00 ...
-        drakegrasp submit --address tls://10.0.0.1:8786 ...
+        drakegrasp submit --cluster local OPTIONS
+        drakegrasp submit --cluster ssh node1 node2 --cores 16 OPTIONS
+        drakegrasp submit --cluster slurm --workers 200 OPTIONS
+        drakegrasp submit --address tls://10.0.0.1:8786 OPTIONS
 
     The command first prints what will run and how long it is expected to take; --dry-run stops
     there. The same command continues an interrupted build, on any cluster. See
     docs/how-to/clusters.md for the details and pipelines/recipes/ for an example of each.
 
     Options:
-        --cluster (kind): Where the work runs. Hosts follow ssh, an address follows scheduler, and a
-            path follows scheduler-file.
+        --cluster KIND (kind): Where the work runs: local, ssh, slurm, pbs, lsf, sge, htcondor, oar,
+            kubernetes, scheduler, scheduler-file, or a kind of another package. Hosts follow ssh,
+            an address follows scheduler, and a path follows scheduler-file.
         --address ADDRESS: Use the running Dask scheduler at this address, instead.
         BUILD
         --workers N: Processes in all. [default with local: one per core]

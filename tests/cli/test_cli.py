@@ -35,7 +35,7 @@ from drakegrasp.verification.placing import METHODS
 from drakegrasp.verification.prediction import FRAMES
 
 #: Commands that take any setting of a configuration.
-SETTINGS_OF = ("build", "verify", "score", "bench-set", "bench")
+SETTINGS_OF = ("build", "submit", "verify", "score", "bench-set", "bench")
 
 
 def test_help_answers_without_loading_the_simulator() -> None:
