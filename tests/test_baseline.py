@@ -24,7 +24,7 @@ import drakegrasp as dg
 from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.hand.description import load_hand
-from drakegrasp.simulation.candidates import Source
+from drakegrasp.simulation.attempt import Source
 from drakegrasp.simulation.posture import joint_order
 
 # Where torch is said to be there, a test that skips is a failure.

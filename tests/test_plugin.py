@@ -27,7 +27,8 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.protocols.protocol import DexGraspBench, find_protocol
 from drakegrasp.protocols.scene import ProtocolScene
-from drakegrasp.simulation.candidates import Source, sample_candidates
+from drakegrasp.simulation.attempt import Source
+from drakegrasp.simulation.candidates import sample_candidates
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "examples" / "plugin"
 PACKAGE = "drakegrasp-example-plugin"

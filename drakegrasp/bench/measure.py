@@ -36,7 +36,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.allocator import allocator
 from drakegrasp.runtime.environment import one_thread, timed
 from drakegrasp.runtime.progress import Report, silent
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.trial import TrialRecord
 

@@ -37,7 +37,7 @@ from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.objects.model import ObjectModel, make_object
 from drakegrasp.outcomes import LOST, Outcome
 from drakegrasp.runtime.environment import one_thread
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.trial import TrialRecord, run_attempt

@@ -18,7 +18,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.recording import record_attempt
 from drakegrasp.runtime.environment import one_thread
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.trial import start_meetings
 

@@ -53,7 +53,7 @@ from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.files import atomic_hdf5, disk_full_named
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.simulation.candidates import Source
+from drakegrasp.simulation.attempt import Source
 from drakegrasp.simulation.conditions import Conditions, conditions_from, usual_materials
 from drakegrasp.simulation.scene_cache import cached_renderer
 from drakegrasp.vision.camera import RING, Lens, draw_viewpoint, fixed_viewpoints, visible_contacts

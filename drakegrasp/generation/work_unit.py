@@ -58,7 +58,7 @@ from drakegrasp.runtime.journal import (
     inject_fault,
     open_journal,
 )
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.robustness import certify, is_drawn
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord, has_only_scraped

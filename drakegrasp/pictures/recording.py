@@ -26,7 +26,7 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.pictures.style import PREDICTED
 from drakegrasp.runtime.environment import allow_network
 from drakegrasp.runtime.files import write_atomic
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
 from drakegrasp.simulation.scene import ObjectScene, Scene, reset_attempt, reset_object
 from drakegrasp.simulation.trial import TrialRecord, run_attempt

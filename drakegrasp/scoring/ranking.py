@@ -21,8 +21,8 @@ from drakegrasp.frames import read_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.finger_sweep import FingerPath, HandPaths, hand_paths
 from drakegrasp.mesh.cloud import Solid, column_solid, hull_solid, read_cloud
+from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.attempts import Attempts
-from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.posture import start_of
 from drakegrasp.simulation.screen import PointLookup, points_at
 from drakegrasp.table import Table

@@ -25,12 +25,8 @@ from drakegrasp.frames import FARTHEST, NO_MESH_FRAME, X_WT, Array, invert_pose,
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.simulation.candidates import (
-    Attempt,
-    Candidates,
-    Source,
-    is_audited,
-)
+from drakegrasp.simulation.attempt import Attempt, Source
+from drakegrasp.simulation.candidates import Candidates, is_audited
 from drakegrasp.simulation.posture import (
     BESIDE_GRASP,
     Posture,

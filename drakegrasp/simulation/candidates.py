@@ -19,7 +19,6 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from functools import partial
 from typing import Protocol
 
@@ -36,7 +35,7 @@ from drakegrasp.mesh.crossings import first_hits
 from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.simulation.conditions import Conditions
+from drakegrasp.simulation.attempt import Attempt, Source
 from drakegrasp.simulation.samplers import (
     OwnPoses,
     above_table,
@@ -57,16 +56,6 @@ _DENSITY_GRID = 2.0**-32
 _SAMPLER, _CHILD, _AUDIT = 2, 1, 3
 #: One of so many attempts is lifted in any case, whatever its chance of a sample and its image.
 AUDIT = 10
-
-
-class Source(IntEnum):
-    """The sampler of a palm pose. Values are stored in files: never renumber them."""
-
-    ROTATIONS = 0
-    NORMALS = 1
-    REFINE = 2
-    OWN = 3  # any other: of the package, as `above`, of another one, or of the user
-    POSTURES = 4  # none: the posture comes from outside
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,65 +88,6 @@ class Candidates:
 
     def __len__(self) -> int:
         return len(self.X_OG)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Attempt:
-    """What a trial starts from, and how a dataset counts it.
-
-    An attempt of the first round is a candidate at a stand-off. It is number 0 of its family; the
-    children of number n have the numbers n c + 1 to n c + c, where c is `refine.children`.
-
-    Attributes:
-        X_OG: Pose of the palm (4, 4) before the fingers close; the candidate's own where its ray
-            misses.
-        spread: Angle of the spread joints [rad].
-        closing: Positions of the closing joints (k,) [rad or m] at the start; None is the open
-            hand.
-        ray_hits: Whether the palm ray meets the object; true if no ray places the palm.
-        conditions: Friction, mass, looks and cameras; None are the usual ones.
-        audited: Whether the closed hand is lifted in any case, whatever its chance and its image.
-        path: Of a posture that spread and closing cannot say: positions (3, j) of all joints
-            [rad or m], in the plant's order: where the trial begins, where the fingers hold the
-            object, and where motors of their own go on to, and press.
-        own_motors: Whether each joint has a motor of its own; else the hand file's close the
-            fingers until they stop, and what they do not move keeps its place.
-        preshape: Index of the hand's preshape; None if all fingers close.
-        unused: Fingers that the preshape leaves out, see `Hand.unused_in`.
-        candidate: Index of the candidate of its object.
-        standoff_index: Index into `candidates.standoffs`.
-        standoff: Distance of the palm from the surface point along -Gz [m]; of the family's first
-            attempt.
-        seed: Seed from which `spread` was drawn.
-        resting: Index of the object's resting pose.
-        source: The sampler.
-        log_density: Logarithm of the density of the draw, see the schema.
-        child, parent: Its number in its family, and that of its parent; 0 for the first.
-        generation: Number of parents before it.
-        posture_row: Row of a posture in its file; NaN for a palm pose of a sampler.
-    """
-
-    X_OG: Array
-    spread: float
-    closing: Array | None = None
-    ray_hits: bool = True
-    conditions: Conditions | None = None
-    audited: bool = False
-    path: Array | None = None
-    own_motors: bool = False
-    preshape: int | None = None
-    unused: int = 0
-    candidate: int = 0
-    standoff_index: int = 0
-    standoff: float = np.nan
-    seed: int = 0
-    resting: int = 0
-    source: Source = Source.ROTATIONS
-    log_density: float = np.nan
-    child: int = 0
-    parent: int = 0
-    generation: int = 0
-    posture_row: float = np.nan
 
 
 class Sampler(Protocol):
@@ -386,7 +316,7 @@ def palm_ray_distance(mesh: trimesh.Trimesh, X_OG: Array) -> Array:
     return np.where(np.isfinite(distance), distance, np.nan)
 
 
-def make_attempts(
+def standoff_attempts(
     candidates: Candidates,
     indices: range,
     config: CandidateConfig,

@@ -33,7 +33,7 @@ from drakegrasp.hand.kinematics import open_together
 from drakegrasp.mesh.distance_field import DistanceField
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Attempt, Source
+from drakegrasp.simulation.attempt import Attempt, Source
 
 Counts = npt.NDArray[np.int64]
 

@@ -20,7 +20,7 @@ from drakegrasp.errors import MachineError, first_line
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.conditions import Materials, usual_materials
 from drakegrasp.simulation.construction import set_materials
 from drakegrasp.simulation.contacts import (

@@ -27,7 +27,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread, timed
 from drakegrasp.runtime.executor import Executor
 from drakegrasp.runtime.progress import Report
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import run_trial, start_of

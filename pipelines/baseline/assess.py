@@ -28,7 +28,7 @@ from train import judged
 
 import drakegrasp as dg
 from drakegrasp.errors import DrakegraspError
-from drakegrasp.simulation.candidates import Source
+from drakegrasp.simulation.attempt import Source
 
 #: The two questions that the classifier answers.
 LABELS = ("held", "sample")

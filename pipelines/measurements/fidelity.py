@@ -34,7 +34,7 @@ from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.seeding import Stream
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.drive import drive_of
 

@@ -55,7 +55,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.seeding import Stream
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.conditions import usual_conditions
 from drakegrasp.simulation.scene_cache import cached_scene
 from drakegrasp.simulation.trial import TrialRecord, run_attempt

@@ -33,7 +33,8 @@ from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.runtime.executor import run_here
-from drakegrasp.simulation.candidates import Candidates, Source, sample_candidates
+from drakegrasp.simulation.attempt import Source
+from drakegrasp.simulation.candidates import Candidates, sample_candidates
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "own-sampler.md"
 

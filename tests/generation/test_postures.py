@@ -37,12 +37,12 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.files import seal
 from drakegrasp.scoring.verdict import verdict_of
+from drakegrasp.simulation.attempt import Source
 from drakegrasp.simulation.attempts import (
     Attempts,
     make_attempts,
     unknown_objects,
 )
-from drakegrasp.simulation.candidates import Source
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import place_object
 from drakegrasp.simulation.posture import joint_order

@@ -27,7 +27,8 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.still_scene import StillScene
-from drakegrasp.simulation.candidates import Attempt, Candidates, Source, make_attempts
+from drakegrasp.simulation.attempt import Attempt, Source
+from drakegrasp.simulation.candidates import Candidates, standoff_attempts
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.trial import TrialRecord
 
@@ -105,7 +106,7 @@ def test_preshapes_are_drawn_after_the_spreads() -> None:
     rules = CandidateConfig(standoffs=(0.05, 0.07), spreads_deg=(0.0, 10.0, 20.0))
 
     def attempts(preshapes: int) -> list:
-        made = make_attempts(drawn, range(count), rules, name="x", seed=3, preshapes=preshapes)
+        made = standoff_attempts(drawn, range(count), rules, name="x", seed=3, preshapes=preshapes)
         return list(made)
 
     without, shaped = attempts(0), attempts(3)

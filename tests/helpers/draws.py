@@ -29,11 +29,7 @@ from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.seeding import Stream
 from drakegrasp.shapes.catalog import export_builtin
 from drakegrasp.simulation.above import Above
-from drakegrasp.simulation.candidates import (
-    make_attempts,
-    normal_candidates,
-    palm_motion,
-)
+from drakegrasp.simulation.candidates import normal_candidates, palm_motion, standoff_attempts
 from drakegrasp.simulation.conditions import draw_conditions
 from drakegrasp.simulation.robustness import _noise_factor
 from drakegrasp.simulation.samplers import rotation_candidates
@@ -74,7 +70,7 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     prepared = prepare(source, config)
     model, candidates = prepared.model, prepared.candidates
     attempts = list(
-        make_attempts(
+        standoff_attempts(
             candidates, range(len(candidates)), config.candidates, name=source.name, seed=7
         )
     )

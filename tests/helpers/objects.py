@@ -13,11 +13,8 @@ from drakegrasp.config import Config
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
-from drakegrasp.simulation.candidates import (
-    Attempt,
-    make_attempts,
-    sample_candidates,
-)
+from drakegrasp.simulation.attempt import Attempt
+from drakegrasp.simulation.candidates import sample_candidates, standoff_attempts
 from drakegrasp.simulation.samplers import R_OG0
 
 #: Edge of the cube that the hand can grasp from above [m].
@@ -54,7 +51,7 @@ def drawn_attempts(
     """Yield all attempts that a build draws for an object: a test takes as many as it needs."""
     candidates = sample_candidates(model, X_TO, config.candidates, seed)
     every = range(len(candidates))
-    return make_attempts(candidates, every, config.candidates, name=model.name, seed=seed)
+    return standoff_attempts(candidates, every, config.candidates, name=model.name, seed=seed)
 
 
 def from_above(model: ObjectModel, standoff: float, *, spread: float = 0.0) -> Attempt:

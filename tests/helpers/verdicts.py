@@ -9,7 +9,7 @@ import numpy as np
 from drakegrasp.filters import Removal
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.trial import Closed, TrialRecord

@@ -26,7 +26,7 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures import recording
 from drakegrasp.pictures.recording import record_attempt
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
 from drakegrasp.simulation.trial import run_attempt
 from drakegrasp.verification.figure import record_verification

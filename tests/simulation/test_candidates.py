@@ -22,15 +22,14 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.seeding import Stream, object_key
+from drakegrasp.simulation.attempt import Attempt, Source
 from drakegrasp.simulation.candidates import (
-    Attempt,
     Candidates,
-    Source,
     children,
-    make_attempts,
     normal_candidates,
     palm_ray_distance,
     sample_candidates,
+    standoff_attempts,
 )
 from drakegrasp.simulation.samplers import ray_meets_box, rotation_candidates
 
@@ -545,7 +544,7 @@ def some_candidates(n: int = 30) -> Candidates:
 
 def attempts(indices: range, *, name: str = "thing", seed: int = 0) -> list[Attempt]:
     config = load_config().candidates
-    return list(make_attempts(some_candidates(), indices, config, name=name, seed=seed))
+    return list(standoff_attempts(some_candidates(), indices, config, name=name, seed=seed))
 
 
 def test_every_candidate_is_tried_at_every_standoff() -> None:

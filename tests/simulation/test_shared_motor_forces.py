@@ -19,7 +19,7 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel, make_object
 from drakegrasp.simulation import drive as drive_module
 from drakegrasp.simulation import screen as centring
-from drakegrasp.simulation.candidates import Attempt, Source
+from drakegrasp.simulation.attempt import Attempt, Source
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.drive import disengage, drive_of, engage, opening_torques
 from drakegrasp.simulation.scene import (

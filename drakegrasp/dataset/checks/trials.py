@@ -40,7 +40,7 @@ from drakegrasp.hand.folder import is_hand
 from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp, read_lift_chance
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome, Stage
-from drakegrasp.simulation.candidates import Source
+from drakegrasp.simulation.attempt import Source
 from drakegrasp.simulation.conditions import draw_conditions
 from drakegrasp.simulation.verdict import (
     is_lost_sample,

@@ -1,0 +1,84 @@
+"""An attempt: what a trial starts from. It is plain data and needs no Drake.
+
+Samplers make attempts of palm poses (`candidates`), a posture from outside becomes one (`posture`),
+and `trial.run_attempt` tries one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from drakegrasp.arithmetic import Array
+from drakegrasp.simulation.conditions import Conditions
+
+
+class Source(IntEnum):
+    """The sampler of a palm pose. Values are stored in files: never renumber them."""
+
+    ROTATIONS = 0
+    NORMALS = 1
+    REFINE = 2
+    OWN = 3  # any other: of the package, as `above`, of another one, or of the user
+    POSTURES = 4  # none: the posture comes from outside
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Attempt:
+    """What a trial starts from, and how a dataset counts it.
+
+    An attempt of the first round is a candidate at a stand-off. It is number 0 of its family; the
+    children of number n have the numbers n c + 1 to n c + c, where c is `refine.children`.
+
+    Attributes:
+        X_OG: Pose of the palm (4, 4) before the fingers close; the candidate's own where its ray
+            misses.
+        spread: Angle of the spread joints [rad].
+        closing: Positions of the closing joints (k,) [rad or m] at the start; None is the open
+            hand.
+        ray_hits: Whether the palm ray meets the object; true if no ray places the palm.
+        conditions: Friction, mass, looks and cameras; None are the usual ones.
+        audited: Whether the closed hand is lifted in any case, whatever its chance and its image.
+        path: Of a posture that spread and closing cannot say: positions (3, j) of all joints
+            [rad or m], in the plant's order: where the trial begins, where the fingers hold the
+            object, and where motors of their own go on to, and press.
+        own_motors: Whether each joint has a motor of its own; else the hand file's close the
+            fingers until they stop, and what they do not move keeps its place.
+        preshape: Index of the hand's preshape; None if all fingers close.
+        unused: Fingers that the preshape leaves out, see `Hand.unused_in`.
+        candidate: Index of the candidate of its object.
+        standoff_index: Index into `candidates.standoffs`.
+        standoff: Distance of the palm from the surface point along -Gz [m]; of the family's first
+            attempt.
+        seed: Seed from which `spread` was drawn.
+        resting: Index of the object's resting pose.
+        source: The sampler.
+        log_density: Logarithm of the density of the draw, see the schema.
+        child, parent: Its number in its family, and that of its parent; 0 for the first.
+        generation: Number of parents before it.
+        posture_row: Row of a posture in its file; NaN for a palm pose of a sampler.
+    """
+
+    X_OG: Array
+    spread: float
+    closing: Array | None = None
+    ray_hits: bool = True
+    conditions: Conditions | None = None
+    audited: bool = False
+    path: Array | None = None
+    own_motors: bool = False
+    preshape: int | None = None
+    unused: int = 0
+    candidate: int = 0
+    standoff_index: int = 0
+    standoff: float = np.nan
+    seed: int = 0
+    resting: int = 0
+    source: Source = Source.ROTATIONS
+    log_density: float = np.nan
+    child: int = 0
+    parent: int = 0
+    generation: int = 0
+    posture_row: float = np.nan
