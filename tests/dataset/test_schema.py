@@ -36,6 +36,7 @@ from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Stage
 from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.table import Table
 from drakegrasp.verification.result import Verification
 
 SIZES = sizes(fingers=3, joints=4, image=8)
@@ -91,6 +92,8 @@ def _leads_to_something(root: type, path: str) -> bool:
     """Return whether a path of attributes is one of a class, by its annotations."""
     for name in path.split("."):
         kinds = [k for k in (*get_args(root), root) if k is not NoneType and isinstance(k, type)]
+        if Table in kinds:  # whose columns are no attributes of its class
+            return True
         hints = [get_type_hints(kind).get(name, getattr(kind, name, None)) for kind in kinds]
         # A property has the type that it returns.
         hints = [
