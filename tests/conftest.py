@@ -65,35 +65,38 @@ def builds_here(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("drakegrasp.api.building.build_dataset", build_here)
 
 
-def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
-    """Return a folder that one process of a run makes; the others wait for it, and all only read.
+@pytest.fixture(scope="session")
+def made_once(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Callable[[str, Callable[[Path], object]], Path]:
+    """Returns the folder of a name, which one process of a run makes; all others only read it."""
 
-    Args:
-        factory: Of this process.
-        name: Of the folder.
-        make: Makes it.
-    """
-    common = factory.getbasetemp()
-    common = common.parent if "PYTEST_XDIST_WORKER" in os.environ else common
-    folder, made = common / name, common / f"{name}.made"
-    with open(common / f"{name}.lock", "wb") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not made.exists():
-            make(folder)
-            made.touch()
-    return folder
+    def once(name: str, make: Callable[[Path], object]) -> Path:
+        common = tmp_path_factory.getbasetemp()
+        common = common.parent if "PYTEST_XDIST_WORKER" in os.environ else common
+        folder, made = common / name, common / f"{name}.made"
+        with open(common / f"{name}.lock", "wb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not made.exists():
+                make(folder)
+                made.touch()
+        return folder
+
+    return once
 
 
 @pytest.fixture(scope="session")
 def small_dataset(
-    small_meshes: Path, small_config: Config, tmp_path_factory: pytest.TempPathFactory
+    small_meshes: Path,
+    small_config: Config,
+    made_once: Callable[[str, Callable[[Path], object]], Path],
 ) -> Path:
     """A dataset built in one process, without Dask. Read only: copy it to change it."""
 
     def make(out: Path) -> None:
         build(find_meshes(small_meshes), out, small_config, run_here, show=False)
 
-    return made_once(tmp_path_factory, "small_dataset", make)
+    return made_once("small_dataset", make)
 
 
 @pytest.fixture(scope="session")

@@ -68,6 +68,7 @@ def rows_of_two_objects(data: GraspDataset) -> list[int]:
 
 @pytest.mark.slow
 @pytest.mark.cluster
+@pytest.mark.nightly
 def test_workers_change_nothing(test_split: GraspDataset, tmp_path: Path) -> None:
     rows = rows_of_two_objects(test_split)[:2]
     grasps = test_split.column("grasps")[rows].astype(float)

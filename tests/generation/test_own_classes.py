@@ -197,6 +197,7 @@ def test_a_sampler_far_away_is_told_how_far(
     assert len(near) == 1 and np.isnan(near.distance).all()
 
 
+@pytest.mark.nightly
 def test_a_set_with_filters_of_its_own_is_merged_and_assembled_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

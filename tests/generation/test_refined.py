@@ -75,12 +75,12 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> list[MeshSource]:
 
 @pytest.fixture(scope="module")
 def refined(
-    sources: list[MeshSource], config: Config, tmp_path_factory: pytest.TempPathFactory
+    sources: list[MeshSource],
+    config: Config,
+    made_once: Callable[[str, Callable[[Path], object]], Path],
 ) -> Path:
     """The dataset. Read only."""
-    out = tmp_path_factory.mktemp("refined") / "out"
-    build(sources, out, config, run_here, show=False)
-    return out
+    return made_once("refined", lambda out: build(sources, out, config, run_here, show=False))
 
 
 def trials(out: Path) -> dict[str, np.ndarray]:
@@ -325,6 +325,7 @@ def test_counts_are_of_the_first_round(refined: Path, config: Config) -> None:
         assert 0 < row.effective <= row.samples or row.samples == row.effective == 0
 
 
+@pytest.mark.nightly
 def test_more_palm_poses_extend_a_dataset(
     refined: Path, sources: list[MeshSource], config: Config, tmp_path: Path
 ) -> None:

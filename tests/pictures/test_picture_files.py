@@ -43,6 +43,7 @@ def no_render(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.sim
+@pytest.mark.nightly
 @needs_egl
 def test_the_same_dataset_gives_the_same_bytes(
     sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
