@@ -38,6 +38,7 @@ from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.protocols.files import is_grasp_file
+from drakegrasp.runtime.plain_pickle import npy_header
 from drakegrasp.simulation.attempts import (
     CONDITIONS,
     Attempts,
@@ -372,12 +373,15 @@ def _read_arrays(path: Path) -> dict[str, Any]:
 def _poses_alone(path: Path) -> Array | None:
     """Return the poses (n, 4, 4) of a .npy file of such; None if it holds anything else."""
     try:
-        poses = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, EOFError, ValueError, TypeError):
+        refuse_irregular(path, MOST_BYTES)
+        with path.open("rb") as file:
+            shape, dtype = npy_header(file)
+            if len(shape) != 3 or shape[1:] != (4, 4) or dtype.kind not in "fiu":
+                return None
+            file.seek(0)
+            return np.lib.format.read_array(file, allow_pickle=False).astype(float)
+    except (OSError, EOFError, ValueError, TypeError, KeyError, ArithmeticError, MemoryError):
         return None
-    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or poses.dtype.kind not in "fiu":
-        return None
-    return np.array(poses, dtype=float)
 
 
 def _refuse_large(size: int) -> None:

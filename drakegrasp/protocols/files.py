@@ -20,7 +20,7 @@ from drakegrasp.errors import DataError, GraspError, one_line
 from drakegrasp.foreign_files import read_json
 from drakegrasp.frames import Array
 from drakegrasp.protocols.protocol import GraspMotion
-from drakegrasp.runtime.plain_pickle import read_plain_pickle
+from drakegrasp.runtime.plain_pickle import npy_header, read_plain_pickle
 
 #: Keys of the postures, in the order of `GraspMotion`.
 POSTURES = {"pregrasp": "pregrasp_qpos", "grasp": "grasp_qpos", "squeeze": "squeeze_qpos"}
@@ -67,12 +67,8 @@ def is_grasp_file(path: Path) -> bool:
     """Return whether a .npy file holds Python objects, as such files do, and no numbers."""
     try:
         with path.open("rb") as file:
-            version = np.lib.format.read_magic(file)
-            read = np.lib.format.read_array_header_1_0
-            if version != (1, 0):
-                read = np.lib.format.read_array_header_2_0
-            return bool(read(file)[2].hasobject)
-    except (OSError, EOFError, ValueError, TypeError, ArithmeticError, MemoryError):
+            return bool(npy_header(file)[1].hasobject)
+    except (OSError, EOFError, ValueError, TypeError, KeyError, ArithmeticError, MemoryError):
         return False
 
 

@@ -166,7 +166,7 @@ def read_plain_pickle(path: Path) -> Any:
 
         # One element, and that a Python object.
         stream = io.BytesIO(data)
-        shape, dtype = _header(stream)
+        shape, dtype = npy_header(stream)
         if dtype.hasobject and shape == ():
             found = _plain(_PlainUnpickler(stream).load(), {})
             return found.item() if isinstance(found, np.ndarray) else found
@@ -184,7 +184,7 @@ def read_plain_pickle(path: Path) -> Any:
     raise GraspError(f"{path}: must hold one dictionary, got an array of {dtype}, shape {shape}")
 
 
-def _header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
+def npy_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
     """Return the shape and type of the array of a .npy file; the file is then at its data."""
     version = np.lib.format.read_magic(file)
     read = {
