@@ -87,10 +87,10 @@ def read_attempts(
         hand: The hand.
         of: Name of the object of rows that name none; None: each must. Or the split of a dataset
             whose rows they are for: then `row` says which, or they are one for each row, or
-            exported samples, of which those of the split count, or isaac_grasp of others, whose
-            every grasp is for every row of its object. Their
-            objects and the poses of the frame "camera" are those of the rows; `Attempts.of_row` has
-            the rows. Contacts name no object, so they must be of something.
+            exported samples, of which those of the split count, or isaac_grasp files of others, in
+            which each grasp is for every row of its object. Objects and the poses of the frame
+            "camera" are those of the rows; `Attempts.of_row` has the rows. Contacts name no object,
+            so they must be of something.
         split: Group of an HDF5 file of contacts; that of the dataset if it is for one.
         several: Whether the contacts are for rows of a dataset, of which each may have several
             (n, m, 6k), with a confidence.
