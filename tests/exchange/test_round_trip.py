@@ -56,9 +56,9 @@ SAMPLES = (
     *("lift.least_chance=0", "lift.least_depth_variance=0"),
 )
 
-#: Formats of an export that only go out: contacts, pictures, or scenes, from which no posture of
-#: the hand is read.
-ONLY_OUT = {"hf", "original", "glb", "mjcf"}
+#: Formats of an export that only go out: contacts, meshes, pictures, or scenes, from which no
+#: posture of the hand is read.
+ONLY_OUT = {"hf", "original", "meshes", "glb", "mjcf"}
 #: Layouts of postures that users write.
 OWN = ("npz", "hdf5", "csv", "parquet")
 
@@ -263,3 +263,39 @@ def test_what_names_no_resting_pose_is_tried_in_all_and_the_best_is_told(
         (row, k) for row in range(len(samples)) for k in range(poses)
     ]
     assert check_dataset(again) == []
+
+
+@pytest.mark.sim
+@pytest.mark.nightly
+def test_palms_on_exported_meshes_are_the_same_trials(
+    out: Path, samples: Trials, written: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """A network adds poses in the frame of `file` to the table of rows, and nothing else."""
+    folder, hand = written("meshes"), load_hand(HAND)
+    with (folder / "rows_train.csv").open(newline="") as text:
+        rows = list(csv.DictReader(text))
+
+    # Poses of the palm link, of samples in the third resting pose and of another.
+    chosen = [*np.flatnonzero(samples["resting"] == 2)[:2], 0]
+    X_OB = unpack_pose(samples["X_OG"]) @ np.linalg.inv(hand.X_BG)
+    with (tmp_path / "palms.csv").open("w", newline="") as text:
+        table = csv.DictWriter(
+            text, [*rows[0], *("x", "y", "z", "qw", "qx", "qy", "qz"), "preshape"]
+        )
+        table.writeheader()
+        for i in chosen:
+            turn = Rotation.from_matrix(X_OB[i, :3, :3]).as_quat(scalar_first=True)
+            pose = dict(
+                zip(("x", "y", "z", "qw", "qx", "qy", "qz"), [*X_OB[i, :3, 3], *turn], strict=True)
+            )
+            table.writerow(
+                {**rows[i], **pose, "preshape": hand.preshape_names[samples["preshape"][i]]}
+            )
+
+    # On the rows of the dataset, and on the mesh that was exported, of whose unit nothing is said.
+    rules = [word for rule in (*RULES, *OBJECTS) for word in ("--set", rule)]
+    onto = ("--object", folder / f"{NAME}.obj", "--config", "fast", *rules)
+    for where in (("--dataset", out / OTO, "--split", "train"), onto):
+        found = verified(tmp_path / "palms.csv", *where, "--link", hand.palm_link)
+        assert [v["outcome"] for v in found] == ["success"] * len(chosen)
+        np.testing.assert_allclose([v["slip"] for v in found], samples["slip"][chosen], rtol=0.1)

@@ -1,0 +1,85 @@
+"""Meshes for a network of others: the objects of a dataset in {O} [m], and tables of its rows.
+
+In: a dataset. Out: `<object>.obj` for each object, `objects.yaml` with what the triangles do not
+say, so that `build --objects` makes the same objects of the folder, and `rows_<split>.csv` with a
+line per sample. A pose that a network gives in the frame of such a file is in {O}: `score` reads it
+with `--frame object`, `verify --object` with any frame. The columns of the tables have the names
+that files of postures have, so that a table with the columns of a pose is one.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.paths import DATA_FILES, model_path
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.exchange.dexgraspbench import pose_vector
+from drakegrasp.frames import unpack_pose
+from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.objects.model import load_object
+from drakegrasp.objects.sources import MANIFEST_NAME
+from drakegrasp.runtime.progress import Report
+from drakegrasp.simulation.attempts import CONDITIONS
+
+#: What `drakegrasp export --help` says of the format.
+HELP = "the objects [m] and tables of the rows, for a network of others"
+#: Columns of the object's pose on the table, X_TO: position [m] and quaternion.
+PLACE = tuple(f"object_{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
+
+
+def write_meshes(out: Path, folder: Path, progress: Report) -> int:
+    """Write the objects of a dataset and return the number of its rows; see `export_dataset`."""
+    manifest = read_manifest(out)
+    said = {}
+    for done, entry in enumerate(manifest.objects, start=1):
+        model = load_object(model_path(out, entry.name))
+        text = obj_text(model.visual_vertices, model.visual_faces, normals=False)
+        (folder / f"{entry.name}.obj").write_text(text, encoding="utf-8")
+        said[entry.name] = {
+            "class": entry.class_name,
+            "mass": entry.mass,
+            **({} if entry.friction is None else {"friction": entry.friction}),
+            **({} if entry.licence is None else {"licence": entry.licence}),
+            **({} if entry.mesh_name == entry.name else {"group": entry.mesh_name}),
+            **({} if entry.group is None else {"group": entry.group}),
+        }
+        progress(done, len(manifest.objects))
+    text = yaml.safe_dump({"units": "m", "objects": said}, sort_keys=False)
+    (folder / MANIFEST_NAME).write_text(text, encoding="utf-8")
+
+    # A table of each split that has rows.
+    scale_of = {entry.name: entry.scale for entry in manifest.objects}
+    trials, count = Trials(out), 0
+    for split in SPLITS:
+        data = GraspDataset(out / DATA_FILES["oto"], split=split, fewer_fingers=True)
+        if len(data):
+            _write_rows(folder / f"rows_{split}.csv", trials[data.column("trial_id")], scale_of)
+        count += len(data)
+    return count
+
+
+def _write_rows(path: Path, samples: Trials, scale_of: Mapping[str, float]) -> None:
+    """Write the table of the rows of a split, whose attempts are given in their order."""
+    names = samples["object_name"].tolist()
+    places = np.array([pose_vector(X_TO) for X_TO in unpack_pose(samples["X_TO"])])
+    columns: dict[str, Sequence[Any]] = {
+        "row": range(len(names)),
+        "object": names,
+        "file": [f"{name}.obj" for name in names],
+        "class": samples["class_name"].tolist(),
+        "resting": samples["resting"].tolist(),
+        **dict(zip(PLACE, places.T.tolist(), strict=True)),
+        **{name: samples[name].tolist() for name in CONDITIONS},
+        "source_scale": [scale_of[name] for name in names],
+    }
+    with path.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file).writerows([columns, *zip(*columns.values(), strict=True)])
