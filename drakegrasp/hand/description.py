@@ -1,13 +1,14 @@
-"""A hand, from a YAML file and the model that it names.
+"""A hand, read from a YAML file and the model that the YAML file names.
 
 In: a YAML file and its SDFormat or URDF file. Out: a `Hand`, of any kind and with any number of
-fingers. `load_hand` reads the YAML, lets Drake parse the model once, checks one against the other,
-and stores the joints of each finger as constants, which is all that `kinematics` needs.
+fingers. `load_hand` reads the YAML file, lets Drake parse the model once, and checks the two
+against each other. It stores the joints of each finger as constants; `kinematics` needs no more.
 
-The coordinates of a hand with k fingers are c = (spread [rad], closing of finger 1..k [rad, or m
-where it slides]). Its m motors are those of the fingers that no other finger drives: closing
-positions are `closing_ratio` times those of these fingers. Frames: B palm link, G palm, Fi distal
-(fingertip) link of finger i, P a point on it, J a joint.
+The coordinates of a hand with k fingers are c = (spread [rad], closing of fingers 1..k [rad, or m
+for a sliding closing joint]). The m motors are those of the fingers that no other finger drives.
+The closing positions of all fingers are `closing_ratio` times the closing positions of these m
+fingers. Frames: B palm link, G palm, Fi distal (fingertip) link of finger i, P a point on it,
+J a joint.
 """
 
 from __future__ import annotations
@@ -55,14 +56,14 @@ from drakegrasp.hand.parsing import (
 )
 from drakegrasp.hand.shapes import pad_surfaces
 
-#: Where one threshold serves closing joints of both kinds, a slide by so much counts as a turn by
-#: one radian [m/rad]: the length of a finger.
+#: Sliding distance that is treated as equal to a turn of one radian [m/rad], if one threshold
+#: serves closing joints of both kinds. It is about the length of a finger.
 SLIDE = 0.1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hand:
-    """A hand with k fingers; made by `load_hand`."""
+    """A hand with k fingers, built by `load_hand`."""
 
     name: str
     model: ModelFile
@@ -70,23 +71,23 @@ class Hand:
     X_BG: Array  # (4, 4), palm frame, +Gz out of the palm
     frames: dict[str, Array]  # X_BA (4, 4), frames of other tools by their names
     fingers: tuple[Finger, ...]  # in grasp order
-    drive: Drive  # of the closing joints
+    drive: Drive  # what keeps the closing joints from being pushed open
     spread: Spread
-    preshape: dict[str, float]  # position of each joint that keeps one [rad or m]
-    closing_speed: Array  # (k,), of the closing joints [rad/s or m/s]
+    preshape: dict[str, float]  # position of each joint that is fixed in an attempt [rad or m]
+    closing_speed: Array  # (k,), speeds of the closing joints [rad/s or m/s]
     standoffs: tuple[float, ...]  # usual distances of the palm from the object [m]
-    spreads_deg: tuple[float, ...]  # usual angles of the spread
+    spreads_deg: tuple[float, ...]  # usual spread angles
     payload: float | None  # largest mass that the hand is made for [kg]
-    rated_load: float | None  # largest force of a fingertip that its maker allows [N]
+    rated_load: float | None  # largest fingertip force that the manufacturer allows [N]
     joint_names: tuple[str, ...]  # the n joints that turn or slide
-    joint_slides: npt.NDArray[np.bool_]  # (n,), whether each slides
+    joint_slides: npt.NDArray[np.bool_]  # (n,), whether each joint slides
     joint_gain: Array  # (n, 1 + k), positions per coordinate; at most one non-zero in each row
     joint_offset: Array  # (n,), positions at zero coordinates [rad or m]
-    joint_limits: Array  # (n, 2), lower and upper [rad or m]
+    joint_limits: Array  # (n, 2), lower and upper limits [rad or m]
     chains: tuple[Chain, ...]  # one per finger, to its fingertip
-    link_chains: dict[str, Chain]  # one per link that the palm carries, including the palm
-    lift_chance: LiftChance | None  # of a sample, when it has closed; most hands have none
-    #: The hand in each of its preshapes, with the fingers that close in it alone.
+    link_chains: dict[str, Chain]  # one per link of the palm's tree, including the palm
+    lift_chance: LiftChance | None  # predicts samples from the closed hand; most hands have none
+    #: The hand in each of its preshapes; each of these hands has only the fingers that close in it.
     preshapes: tuple[Hand, ...] = ()
     preshape_names: tuple[str, ...] = ()
 
@@ -96,13 +97,14 @@ class Hand:
         return len(self.fingers)
 
     def palm_in(self, link: str) -> Array:
-        """Return the pose X_AG (4, 4) of the palm frame in frame A: the palm link, or a tool's.
+        """Return the pose X_AG (4, 4) of the palm frame in a frame A of the hand.
 
         Args:
-            link: Name of the palm link or of one of `frames`; empty for the palm frame itself.
+            link: Name of frame A: the palm link, one of `frames`, or empty for the palm frame
+                itself.
 
         Raises:
-            HandError: If it is none of these.
+            HandError: If the hand has no frame of this name.
         """
         if not link:
             return np.eye(4)
@@ -114,11 +116,11 @@ class Hand:
         return multiply(invert_pose(self.frames[link]), self.X_BG)
 
     def at(self, preshape: int | None) -> Hand:
-        """Return the hand in a preshape of the given index; this one if None or if it has none."""
+        """Return the hand in the preshape of an index; this hand if None or without preshapes."""
         return self.preshapes[preshape] if self.preshapes and preshape is not None else self
 
     def unused_in(self, preshape: int | None) -> int:
-        """Return the fingers that a preshape leaves out, as bits: 1 for the first finger."""
+        """Return the fingers that a preshape leaves out, as bits; bit 0 is the first finger."""
         used = {finger.name for finger in self.at(preshape).fingers}
         return sum(1 << i for i, finger in enumerate(self.fingers) if finger.name not in used)
 
@@ -134,17 +136,17 @@ class Hand:
 
     @property
     def motor_fingers(self) -> list[int]:
-        """(m,), the fingers that have a motor of their own."""
+        """(m,), indices of the fingers that have their own motor."""
         return [i for i, finger in enumerate(self.fingers) if finger.driven_by is None]
 
     @property
     def motor_of(self) -> npt.NDArray[np.int64]:
-        """(k,), the motor that moves each finger."""
+        """(k,), index of the motor that moves each finger."""
         return np.argmax(self.closing_ratio > 0.0, axis=1)
 
     @property
     def closing_ratio(self) -> Array:
-        """(k, m), closing of each finger per closing of each finger that has a motor."""
+        """(k, m), closing position of each finger per closing position of each motor's finger."""
         names = [self.fingers[i].name for i in self.motor_fingers]
         ratio = np.zeros((self.num_fingers, len(names)))
         for i, finger in enumerate(self.fingers):
@@ -153,7 +155,7 @@ class Hand:
         return ratio
 
     def followers(self, finger: int) -> list[Coupling]:
-        """Return the joints that follow the closing joint of a finger that has a motor."""
+        """Return the joints that follow the closing joint of a finger with its own motor."""
         own = self.fingers[finger]
         found = list(own.coupled)
         for other in self.fingers:
@@ -165,10 +167,10 @@ class Hand:
 
     @property
     def own_motors(self) -> dict[str, int]:
-        """The joints that move where each has a motor of its own, and the finger of each.
+        """The joints that move if each joint has its own motor, with the finger of each joint.
 
-        They are those from the palm to a fingertip, but for the spread, and for one that slides
-        where its finger's closing joint turns, or turns where it slides.
+        They are the joints between the palm and a fingertip. Spread joints are left out, and so are
+        joints that slide if the finger's closing joint turns, or turn if it slides.
         """
         found: dict[str, int] = {}
         for i, (finger, chain) in enumerate(zip(self.fingers, self.chains, strict=True)):
@@ -179,9 +181,9 @@ class Hand:
 
     @property
     def closing_unit(self) -> Array:
-        """(k,), how far each closing joint moves for what counts as a radian [rad or m].
+        """(k,), closing distance that is treated as equal to one radian [rad or m].
 
-        Of a finger that another drives: by its ratio of what counts for that one.
+        For a finger driven by another finger, it is the driver's distance times the ratio.
         """
         units = [SLIDE if self.fingers[i].slides else 1.0 for i in self.motor_fingers]
         return multiply(self.closing_ratio, np.array(units))
@@ -199,19 +201,19 @@ class Hand:
 
 
 def load_hand(source: HandSource = "barrett") -> Hand:
-    """Return a hand that comes with the package, the hand of a YAML file, or that of a dataset.
+    """Return a hand of the package, the hand of a YAML file, or the hand of a dataset.
 
     Args:
-        source: One of `files.hand_names()`, or the path of a YAML file with the keys of
-            `file_format.HandFile`; its `model` is a path relative to the YAML file. That of a
-            dataset is `Config.hand_source` of its configuration.
+        source: One of `files.hand_names()`, the path of a YAML file with the keys of
+            `file_format.HandFile`, whose `model` is a path relative to the YAML file, or
+            `Config.hand_source` of a dataset's configuration for the dataset's hand.
 
     Raises:
-        HandError: If there is no such hand, a key or value of the YAML cannot be used,
-            the model lacks a link or joint that the YAML names, or the files of a dataset's hand
-            have changed.
+        HandError: If there is no such hand, a key or value of the YAML file is invalid, the model
+            lacks a link or joint that the YAML file names, or the files of a dataset's hand have
+            changed.
     """
-    # Use a hand that was loaded before, if its files did not change.
+    # Use a cached hand if its files did not change.
     path = hand_file(source)
     key = source if isinstance(source, CarriedHand) else path.absolute()
     known = _loaded.pop(key, None)
@@ -253,14 +255,14 @@ def load_hand(source: HandSource = "barrett") -> Hand:
 
 
 def load_plain_hand(source: HandSource, where: str) -> Hand:
-    """Return a hand for callers that support a single preshape only.
+    """Return a hand for callers that do not support preshapes.
 
     Args:
         source: See `load_hand`.
-        where: What that is, in words.
+        where: Description of the caller, for the message.
 
     Raises:
-        HandError: If it has preshapes, or see `load_hand`.
+        HandError: If the hand has preshapes, or as `load_hand`.
     """
     hand = load_hand(source)
     if hand.preshapes:
@@ -268,7 +270,7 @@ def load_plain_hand(source: HandSource, where: str) -> Hand:
     return hand
 
 
-#: Loaded hands with their files, the last used at the end: parsing takes 40 ms.
+#: Loaded hands with their files, the most recently used last: parsing takes 40 ms.
 _loaded: dict[Path | CarriedHand, tuple[Hand, Collection[Path]]] = {}
 
 
@@ -279,7 +281,8 @@ def _stamp(files: Collection[Path]) -> tuple[int, ...]:
 
 
 def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
-    # Parse the model, without shapes and not finalized: that would add a joint for the palm.
+    # Parse the model without shapes. Do not finalize the plant: that would add a joint for the
+    # palm.
     plant = MultibodyPlant(0.0)
     instance = add_model(plant, model)
     palm = described.palm
@@ -301,7 +304,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
                 f"got {position:g}"
             )
 
-    # The chain from the palm to each fingertip; the finger's own closing joint must be in it.
+    # Find the chain from the palm to each fingertip; it must contain the finger's closing joint.
     bodies = {body.name(): body for body in map(plant.get_body, plant.GetBodyIndices(instance))}
     base = _body(bodies, palm.link, "palm.link")
     carried, chains = make_chains(joints, base, drives, invert_pose(X_BG)), []
@@ -355,7 +358,7 @@ def _pose(rpy_deg: Sequence[float], p: Sequence[float]) -> Array:
 
 
 def _refuse_other_kinds(described: HandFile, joints: dict[str, Any]) -> None:
-    """Refuse a closing joint that slides without a force limit, or turns without a torque limit."""
+    """Reject a closing joint that slides without a force limit or turns without a torque limit."""
     for i, finger in enumerate(described.driven_fingers()):
         slides = joint_slides(joints[finger.closing_joint])
         if slides != finger.slides and finger.driven_by is not None:
@@ -376,7 +379,7 @@ def _refuse_other_kinds(described: HandFile, joints: dict[str, Any]) -> None:
 
 
 def _refuse_empty_pads(hand: Hand) -> None:
-    """Refuse a pad region that holds nothing of its fingertip's surface: nothing could touch."""
+    """Reject a pad region that contains no part of its fingertip's surface: it could not touch."""
     if not any(finger.pad_region for finger in hand.fingers):
         return
     for i, (finger, triangles) in enumerate(

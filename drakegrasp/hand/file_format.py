@@ -1,9 +1,10 @@
 """The keys of a hand file, version 1. Does not import Drake.
 
-In: a YAML file. Out: a `HandFile`, in which every value is possible by itself; `description` checks
-it against the model. docs/how-to/add-a-hand.md lists the keys.
+In: a YAML file. Out: a `HandFile` whose values are valid by themselves; `description` checks them
+against the model. docs/how-to/add-a-hand.md lists the keys.
 
-A joint turns, and its positions are angles [rad], or it slides, and they are lengths [m].
+A joint either turns or slides. Positions of turning joints are angles [rad], positions of sliding
+joints are lengths [m].
 """
 
 from __future__ import annotations
@@ -43,13 +44,14 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1)]
 Vector = tuple[Finite, Finite, Finite]
-#: Normal and offset (nx, ny, nz, d) of the points p with n.p >= d; the normal need not be unit.
+#: Normal and offset (nx, ny, nz, d) of the points p with n.p >= d; the normal can have any length.
 HalfSpace = tuple[Finite, Finite, Finite, Finite]
 #: What a closing joint does when it is pushed open; see docs/explanation/physics.md, "Drive".
 Drive = Literal["worm", "torque", "locked"]
-#: Contact this far outside a pad region counts as the pad's [m]. Shapes are polyhedra, MuJoCo's
-#: contacts are at their corners, and a border is drawn along an edge: that of the Barrett Hand
-#: misses the corners of the tip by 0.9 mm. A patch is nine times as wide.
+#: A contact at most this far outside a pad region is a contact of the pad [m]. Shapes are polyhedra
+#: and MuJoCo's contacts are at their corners, while the border of a region is drawn along an edge:
+#: the border of the Barrett Hand misses the corners of the tip by 0.9 mm. A patch is nine times as
+#: wide.
 PAD_BAND = 0.001
 _STRICT = ConfigDict(frozen=True, extra="forbid")
 
@@ -69,14 +71,14 @@ class Coupling:
 
 
 class DrivenBy(BaseModel):
-    """Whose motor moves a finger: its closing position is ratio times that of the other finger."""
+    """The finger that drives another finger: closing = ratio times the closing of `finger`."""
 
     model_config = _STRICT
     finger: Name
     ratio: Positive = 1.0
 
 
-#: Keys of a motor, with their values where a finger has none of its own.
+#: Keys of a motor, with their values for a finger without its own motor.
 _OF_MOTOR = {
     "torque_limit": None,
     "force_limit": None,
@@ -92,9 +94,10 @@ _OF_MOTOR = {
 class Finger:
     """A finger; its kinematics is its `parsing.Chain`.
 
-    A finger with a `torque_limit` closes by turning, one with a `force_limit` by sliding. One that
-    another finger's motor drives has neither in the file; in a `Hand` its limits are what that
-    motor gives, and its worm holds, where this finger alone is loaded.
+    A finger with a `torque_limit` closes by turning, a finger with a `force_limit` by sliding. A
+    finger driven by another finger has neither limit in the file. In a `Hand`, its limits are what
+    the driver's motor can apply at this finger, and what the driver's worm can hold if only this
+    finger is loaded.
     """
 
     name: Name
@@ -104,11 +107,11 @@ class Finger:
     force_limit: Positive | None = None  # of the motor, at a sliding closing joint [N]
     rotor_inertia: NonNegative = 0.0  # of the motor [kg m^2]
     gear_ratio: Positive = 1.0  # motor angle / closing position [-, or rad/m]
-    holding_torque: Positive | None = None  # what a stalled worm holds, turning [N m]
-    holding_force: Positive | None = None  # what it holds, sliding [N]
+    holding_torque: Positive | None = None  # largest load of a stalled worm, turning joint [N m]
+    holding_force: Positive | None = None  # largest load of a stalled worm, sliding joint [N]
     coupled: tuple[Coupling, ...] = ()
-    driven_by: DrivenBy | None = None  # None: by a motor of its own
-    pad_region: tuple[HalfSpace, ...] = ()  # in Fi [m]; elsewhere contact is another link's
+    driven_by: DrivenBy | None = None  # None: the finger has its own motor
+    pad_region: tuple[HalfSpace, ...] = ()  # in Fi [m]; contact outside it is not the fingertip's
     pad_point: Vector  # usual contact point, in Fi [m]
     required: bool = True  # whether a grasp needs this fingertip on the object
 
@@ -117,8 +120,8 @@ class Finger:
             raise ValueError(fault)
 
     def _faults(self) -> Iterator[str]:
-        """Yield what is wrong with it by itself."""
-        # A finger either turns or slides; one that another drives does as that one.
+        """Yield the faults of the finger that need no other part of the file to be seen."""
+        # A finger either turns or slides; a driven finger does what its driver does.
         limits = self.torque_limit, self.force_limit
         if limits.count(None) != 1 and not (self.driven_by and limits.count(None) == 2):
             yield (
@@ -126,7 +129,7 @@ class Finger:
                 f"got {'none' if self.torque_limit is None else 'both'}"
             )
 
-        # Its worm is one of the same kind of joint, and no weaker than its motor.
+        # The worm's key fits the kind of joint, and the worm is no weaker than the motor.
         key, wrong = ("force", "torque") if self.slides else ("torque", "force")
         if getattr(self, f"holding_{wrong}") is not None:
             yield f"holding_{wrong} must be holding_{key} beside {key}_limit"
@@ -172,16 +175,16 @@ class Finger:
         return np.array(self.pad_point)
 
     def on_pad(self, p_FiQ: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Return (...,) whether contact at (..., 3) of the fingertip link [m] is the pad's.
+        """Return (...,) whether contact at points (..., 3) of the fingertip link [m] is on the pad.
 
-        It is in the pad region, or at most `PAD_BAND` outside it.
+        A point is on the pad if it is in the pad region or at most `PAD_BAND` outside it.
         """
         return np.asarray(self.beside_pad(p_FiQ) <= PAD_BAND)
 
     def beside_pad(self, p_FiQ: npt.ArrayLike) -> Array:
         """Return (...,) how far points (..., 3) of the fingertip link are outside the region [m].
 
-        It is the distance from the farthest of the region's planes, negative within.
+        It is the largest of the distances outside the region's planes, negative inside the region.
         """
         points = np.asarray(p_FiQ, dtype=float)
         beside = np.full(points.shape[:-1], -np.inf)
@@ -192,19 +195,19 @@ class Finger:
 
 
 class Spread(BaseModel):
-    """The joints that keep the spread angle during an attempt; a hand may have none."""
+    """The joints that keep the spread angle during an attempt; a hand may have no such joints."""
 
     model_config = _STRICT
     joints: tuple[Name, ...] = ()
 
 
 class Preshape(BaseModel):
-    """A way to grasp: which fingers close, and where the other joints stand."""
+    """A grasp type: which fingers close, and the positions of the other joints."""
 
     model_config = _STRICT
     name: Name
     fingers: Annotated[tuple[Name, ...], Field(min_length=1)]
-    joints: dict[Name, Finite] = {}  # joints that keep one position in it [rad or m]
+    joints: dict[Name, Finite] = {}  # fixed joint positions in this preshape [rad or m]
 
 
 class Palm(BaseModel):
@@ -217,7 +220,7 @@ class Palm(BaseModel):
 
 
 class ForeignFrame(BaseModel):
-    """The frame A in which another tool says where the hand is, in the palm link's frame B."""
+    """The frame A in which another tool gives the hand's pose, in the palm link's frame B."""
 
     model_config = _STRICT
     p_BA: Vector = (0.0, 0.0, 0.0)  # [m]
@@ -225,7 +228,7 @@ class ForeignFrame(BaseModel):
 
 
 class HandFile(BaseModel):
-    """The YAML file."""
+    """The contents of the YAML file."""
 
     model_config = _STRICT
     version: int
@@ -235,8 +238,8 @@ class HandFile(BaseModel):
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1)]
     drive: Literal["worm", "torque"] = "torque"
     spread: Spread = Spread()
-    preshape: dict[Name, Finite] = {}  # joints that keep one position [rad or m]
-    preshapes: tuple[Preshape, ...] = ()  # one is drawn per attempt; none: all fingers close
+    preshape: dict[Name, Finite] = {}  # fixed joint positions [rad or m]
+    preshapes: tuple[Preshape, ...] = ()  # one is drawn per attempt; empty: all fingers close
     closing_speed_deg: Positive | None = None  # of turning closing joints [deg/s]
     closing_speed: Positive | None = None  # of sliding closing joints [m/s]
     standoffs: Standoffs  # palm to surface [m]
@@ -244,8 +247,8 @@ class HandFile(BaseModel):
         tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(min_length=1)
     ] = (0.0,)
     payload: Positive | None = None  # largest mass that the hand is made for [kg]
-    rated_load: Positive | None = None  # largest force of a fingertip that its maker allows [N]
-    frames: dict[Name, ForeignFrame] = {}  # of other tools, by their names
+    rated_load: Positive | None = None  # largest fingertip force that the manufacturer allows [N]
+    frames: dict[Name, ForeignFrame] = {}  # frames of other tools by their names
 
     @model_validator(mode="after")
     def _check(self) -> HandFile:
@@ -254,13 +257,13 @@ class HandFile(BaseModel):
         return self
 
     def _faults_of_fingers(self) -> Iterator[str]:
-        """Yield what is wrong with names and motors: a finger has its own, or another drives it."""
-        # Tables and figures tell fingers apart by their names.
+        """Yield faults of names and of motors: each finger has a motor or is driven by another."""
+        # Tables and figures identify fingers by their names.
         names = [finger.name for finger in self.fingers]
         if len(set(names)) < len(names):
             yield f"fingers must have a name each, got {', '.join(names)}"
 
-        # Preshapes have a name each, and fingers of the hand with their motors.
+        # Each preshape needs its own name, and with each finger also the finger that drives it.
         drivers = {f.name: f.driven_by.finger if f.driven_by else f.name for f in self.fingers}
         named = [preshape.name for preshape in self.preshapes]
         if len(set(named)) < len(named):
@@ -275,7 +278,7 @@ class HandFile(BaseModel):
                         f"drives {finger!r}"
                     )
 
-        # A finger that is driven by another has no motor, and that one has one.
+        # A driven finger must not have a motor, and its driver must have one.
         motors = [finger.name for finger in self.fingers if finger.driven_by is None]
         for i, driver in enumerate(drivers.values()):
             if self.fingers[i].driven_by is None:
@@ -293,7 +296,7 @@ class HandFile(BaseModel):
                     )
 
     def _faults(self) -> Iterator[str]:
-        """Yield what is wrong with the drive and the spread."""
+        """Yield faults of the drive, the closing speeds, the frames and the spread."""
         # Worms of unknown strength.
         own = [(i, f) for i, f in enumerate(self.fingers) if f.driven_by is None]
         for i, finger in own:
@@ -301,7 +304,7 @@ class HandFile(BaseModel):
                 key = "holding_force" if finger.slides else "holding_torque"
                 yield f"fingers.{i}.{key} must be given where drive is worm, got none"
 
-        # The speed of each kind of closing joint, and no other.
+        # Each kind of closing joint needs its speed; the other speed must be left out.
         for key, slides, how in (
             ("closing_speed_deg", False, "turns"),
             ("closing_speed", True, "slides"),
@@ -312,19 +315,19 @@ class HandFile(BaseModel):
             if given and not used:
                 yield f"{key} must be left out: no closing joint {how}"
 
-        # Names that files already give the palm frame and the palm link.
+        # Names that files already use for the palm frame and the palm link.
         for name in {"palm", self.palm.link} & set(self.frames):
             yield f"frames.{name} must have another name, got that of the palm"
 
-        # Angles of a spread that the hand does not have.
+        # Spread angles of a hand without spread joints.
         if not self.spread.joints and set(self.spreads_deg) != {0.0}:
             yield f"spreads_deg must be [0] without spread.joints, got {list(self.spreads_deg)}"
 
     def in_preshape(self, preshape: Preshape) -> HandFile:
-        """Return the file of a hand that has the fingers of a preshape alone.
+        """Return the file of a hand that has only the fingers of a preshape.
 
-        Joints of the other fingers keep the positions that the preshape gives, else those of the
-        open hand.
+        Joints of the other fingers keep the positions that the preshape specifies, or else the
+        positions of the open hand.
         """
         still, fingers = dict(self.preshape), list[Finger]()
         for finger in self.fingers:
@@ -338,11 +341,11 @@ class HandFile(BaseModel):
         return self.model_copy(update=changes)
 
     def driven_fingers(self) -> tuple[Finger, ...]:
-        """Return the fingers; one that another drives with the limits of that one's motor."""
+        """Return the fingers; a driven finger gets its limits from the motor of its driver."""
         named, found = {finger.name: finger for finger in self.fingers}, []
         for finger in self.fingers:
             if (by := finger.driven_by) is not None:
-                # By virtual work a torque T at the driver is T / ratio at the finger.
+                # By virtual work, a torque T at the driver is T / ratio at the finger.
                 driver = named[by.finger]
                 limit, holding = driver.effort_limit / by.ratio, driver.holding_effort
                 holding = None if holding is None else holding / by.ratio
@@ -361,11 +364,12 @@ class HandFile(BaseModel):
 
 
 def rated_load(described: HandFile) -> float | None:
-    """Return the largest force of a fingertip that the maker of a hand allows [N]; None if unknown.
+    """Return the largest fingertip force that the manufacturer allows [N]; None if unknown.
 
     Args:
-        described: The hand's file. That of a hand of the package says nothing of it, and is told
-            by its contents: a user's hand may have any name.
+        described: The hand's file. Files of the package's hands do not contain the force. Such a
+            hand is recognized by the contents of its file, because a user-defined hand may have any
+            name.
     """
     of_package = (load for other, load in _rated_loads() if other == described)
     return described.rated_load or next(of_package, None)
@@ -378,7 +382,7 @@ def _rated_loads() -> list[tuple[HandFile, float]]:
 
 
 def foreign_frames(described: HandFile) -> dict[str, ForeignFrame]:
-    """Return the frames of other tools by their names; of a package's hand as `rated_load` does."""
+    """Return frames of other tools by name; hands of the package are found as in `rated_load`."""
     of_package = (frames for other, frames in _foreign_frames() if other == described)
     return described.frames or next(of_package, {})
 
@@ -396,12 +400,12 @@ def _foreign_frames() -> list[tuple[HandFile, dict[str, ForeignFrame]]]:
 
 
 def with_efforts(finger: Finger, limit: float, holding: float | None, *, slides: bool) -> Finger:
-    """Return a finger with another effort limit and holding effort, of a joint that slides or not.
+    """Return a finger with another effort limit and holding effort.
 
     Args:
         finger: The finger.
-        limit: Torque [N m] or force [N] of its motor.
-        holding: What its worm holds; None if it is not known.
+        limit: Largest torque [N m] or force [N] of its motor.
+        holding: Largest torque or force that its worm holds; None if unknown.
         slides: Whether its closing joint slides.
     """
     if slides:
@@ -413,14 +417,14 @@ def read_hand_file(path: Path) -> HandFile:
     """Return the contents of a hand file.
 
     Raises:
-        HandError: If a key or a value cannot be used, in one line.
+        HandError: If a key or a value is invalid; the message has one line.
     """
     try:
         tree: Any = parse_yaml_once(read_text(path))
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise HandError(f"{path}: must be YAML, got text that is not ({one_line(error)})") from None
 
-    # Another version may have other keys: its mistake is the version alone.
+    # Another version may have other keys, so report only the version as the mistake.
     version = tree.get("version", VERSION) if isinstance(tree, dict) else VERSION
     if type(version) is not int or version != VERSION:
         raise HandError(
@@ -429,7 +433,7 @@ def read_hand_file(path: Path) -> HandFile:
     try:
         return HandFile.model_validate(tree)
     except ValidationError as error:
-        # A bad item of a list also makes the list too short: leave out what follows from it.
+        # A bad item of a list also makes the list too short: do not report what follows from it.
         mistakes = error.errors()
         below = {m["loc"][:n] for m in mistakes for n in range(1, len(m["loc"]))}
         lines = [

@@ -1,4 +1,4 @@
-"""Locates the files of a hand, and what they name. Does not import Drake."""
+"""Locates the files of a hand and the files that they name. Does not import Drake."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from drakegrasp.config import CarriedHand, HandSource
 from drakegrasp.errors import HandError
 from drakegrasp.foreign_files import parse_json
 
-#: Folder of the table and of the hands that come with the package, as `<name>_hand.yaml`.
+#: Folder of the package's hand files `<name>_hand.yaml`, their models and the table's model.
 MODELS = Path(__file__).resolve().parent.parent / "models"
 
 
 def hand_names() -> list[str]:
-    """Return the names of the hands that come with the package, and of those of others."""
+    """Return the names of the package's hands and of the hands that plugins register."""
     ours = (path.name.removesuffix("_hand.yaml") for path in MODELS.glob("*_hand.yaml"))
     return sorted({*ours, *registry.names("hands")})
 
 
 def hand_file(source: HandSource) -> Path:
-    """Return the YAML file of a hand that comes with the package, or the one that is given.
+    """Return the YAML file of a registered hand, of a dataset's hand, or the given file.
 
     Raises:
-        HandError: If there is no such file, or that of a dataset is elsewhere.
+        HandError: If there is no such file, or the path of a dataset's hand leads elsewhere.
     """
     if isinstance(source, CarriedHand):
         refuse_outside(source.path, source.path.parent)
@@ -44,10 +44,10 @@ def hand_file(source: HandSource) -> Path:
 
 
 def refuse_outside(path: Path, folder: Path) -> None:
-    """Refuse what is no plain file of a folder, which may be a stranger's.
+    """Reject a path that is not a plain file of a folder; the folder may be a stranger's.
 
     Raises:
-        HandError: If it is missing or something else, or it or the folder is a link.
+        HandError: If the path is missing or no file, or if it or the folder is a link.
     """
     try:
         found, real = path.resolve(strict=True), folder.parent.resolve() / folder.name
@@ -58,9 +58,9 @@ def refuse_outside(path: Path, folder: Path) -> None:
 
 
 def chance_file(source: HandSource) -> Path:
-    """Return the file of the weights by which lifts are chosen, which few hands have.
+    """Return the path of the weights by which lifts are chosen; few hands have this file.
 
-    It lies next to the hand file: `<name>_chance.yaml` of `<name>_hand.yaml`.
+    It lies next to the hand file: `<name>_chance.yaml` next to `<name>_hand.yaml`.
 
     Raises:
         HandError: If there is no such hand.
@@ -72,13 +72,13 @@ def chance_file(source: HandSource) -> Path:
 def find_packages(folder: Path, model: str, packages: Mapping[str, str]) -> dict[str, Path]:
     """Return the folder of each package whose files a hand's model may name.
 
-    Those are the packages that the hand file names, and those in which the model lies: the folders
-    above it with a `package.xml`, by the name that this file gives.
+    These are the packages that the hand file names and the packages that contain the model. The
+    latter are the folders above the model with a `package.xml`, under the name given in that file.
 
     Args:
-        folder: Of the hand file.
-        model: Path of the model, relative to it.
-        packages: Folders by name, relative to it.
+        folder: Folder of the hand file.
+        model: Path of the model, relative to `folder`.
+        packages: Package folders by name, relative to `folder`.
 
     Raises:
         HandError: If a package is not a folder.
@@ -96,7 +96,7 @@ def find_packages(folder: Path, model: str, packages: Mapping[str, str]) -> dict
 
 
 def _package_name(manifest: Path) -> str:
-    """Return the name that a package.xml gives; its folder's name if it gives none."""
+    """Return the package name in a package.xml; the name of its folder if it gives no name."""
     try:
         name = ElementTree.parse(manifest).findtext("name")
     except ElementTree.ParseError:
@@ -104,22 +104,22 @@ def _package_name(manifest: Path) -> str:
     return (name or manifest.parent.name).strip()
 
 
-#: Suffixes of models, which a model may include.
+#: Suffixes of models and of files that a model may include.
 MODEL_SUFFIXES = (".sdf", ".urdf", ".xml")
 PACKAGE = "package://"
-#: What a model names: meshes and models in SDFormat, meshes in URDF; then textures.
+#: References in a model: meshes and models in SDFormat, meshes in URDF, then textures.
 _NAMED = re.compile(
     rb"<uri>\s*(?P<uri>.*?)\s*</uri>|<mesh\b[^>]*\bfilename\s*=\s*[\"'](?P<mesh>.*?)[\"']"
     rb"|<texture\b[^>]*\bfilename\s*=\s*[\"'](?P<texture>.*?)[\"']"
     rb"|<drake:diffuse_map>\s*(?P<map>.*?)\s*</drake:diffuse_map>"
 )
-#: What Wavefront files name: materials, and their textures at the end of a line.
+#: References in Wavefront files: materials, and their textures at the end of a line.
 _MATERIALS = re.compile(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t\r]*$", re.MULTILINE)
 _TEXTURES = re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|norm)[ \t](?:.*[ \t])?(\S+)[ \t\r]*$", re.M)
 
 
 def model_references(model: bytes) -> Iterator[tuple[str, bool]]:
-    """Yield what a model names, and whether it is geometry: the rest is textures."""
+    """Yield each reference in a model and whether it is geometry; other references are textures."""
     for match in _NAMED.finditer(model):
         kind = str(match.lastgroup)
         yield unescape(match[kind].decode(errors="surrogateescape")), kind in ("uri", "mesh")
@@ -130,8 +130,8 @@ def rewritten(model: bytes, place: Callable[[str, bool], str]) -> bytes:
 
     Args:
         model: The text.
-        place: Returns what to write in place of a reference; called with it and with whether it is
-            geometry. Bytes stay where that is the same.
+        place: Returns the replacement of a reference. Its arguments are the reference and whether
+            it is geometry. If the replacement equals the reference, the bytes do not change.
     """
 
     def replaced(match: re.Match[bytes]) -> bytes:
@@ -148,7 +148,7 @@ def rewritten(model: bytes, place: Callable[[str, bool], str]) -> bytes:
 
 
 def mesh_references(path: Path) -> Iterator[tuple[str, bool]]:
-    """Yield what a mesh or a material names, and whether it is geometry."""
+    """Yield each reference in a mesh or a material file and whether it is geometry."""
     suffix = path.suffix.lower()
     if suffix in (".obj", ".mtl"):
         for name in (_MATERIALS if suffix == ".obj" else _TEXTURES).findall(path.read_bytes()):
@@ -159,17 +159,17 @@ def mesh_references(path: Path) -> Iterator[tuple[str, bool]]:
             named = [(part["uri"], key == "buffers") for key in ("buffers", "images")
                      for part in tree.get(key, ()) if "uri" in part]  # fmt: skip
         except (ValueError, TypeError, AttributeError):
-            return  # Drake refuses it
+            return  # Drake rejects it
         yield from ((str(uri), counts) for uri, counts in named if not str(uri).startswith("data:"))
 
 
 def file_of(uri: str, folder: Path, packages: Mapping[str, Path]) -> Path:
-    """Return the file of a reference in a model, which may not exist.
+    """Return the file of a reference in a model; the file may not exist.
 
     Args:
         uri: The reference.
-        folder: Of the model.
-        packages: Folders of `package://` URIs by name.
+        folder: Folder of the model.
+        packages: Folders of `package://` URIs by package name.
     """
     if not uri.startswith(PACKAGE):
         return folder / uri.removeprefix("file://")

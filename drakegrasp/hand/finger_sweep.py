@@ -1,12 +1,14 @@
-"""Paths of points on a hand's surface while its fingers close, at one angle of the spread.
+"""Paths of points on a hand's surface while its fingers close at one spread angle.
 
-In: a `Hand` and a spread. Out: `HandPaths`, in the palm frame: points of the links that closing
-does not move, and for each finger the points of the links that it moves, at closing positions half
-a degree (or 0.9 mm, of a joint that slides) apart, from the open hand to the limit. This is
-geometry only, without a simulation. Closing angles are lengths where the closing joint slides.
+In: a `Hand` and a spread. Out: `HandPaths` in the palm frame. It has the points of the links that
+closing does not move. For each finger it has the points of the links that the finger moves, at
+closing positions from the open hand to the limit. The positions are half a degree apart (0.9 mm
+for a sliding joint). This is geometry only, without a simulation. "Closing angle" also means the
+position [m] of a closing joint that slides.
 
-Also how the fingertips close on something between them: the `Opposition` of a hand, two groups of
-fingers that close against each other, and the `Pinch` in which they hold something of a width.
+The module also computes how the fingertips close on something between them: the `Opposition` of a
+hand, two groups of fingers that close against each other, and the `Pinch` in which the groups hold
+something of a given width.
 """
 
 from __future__ import annotations
@@ -36,16 +38,16 @@ from drakegrasp.mesh.surfaces import cover_triangles
 
 Points = npt.NDArray[np.float32]
 
-#: Step between two closing angles of a path, in `Hand.closing_unit`; a fingertip moves by about
-#: 1 mm.
+#: Step between two closing angles of a path, in units of `Hand.closing_unit`; it moves a fingertip
+#: by about 1 mm.
 ANGLE_STEP = np.deg2rad(0.5)
-#: Approximate spacing of the points of a fingertip link, and of another link [m].
+#: Approximate spacing of points on a fingertip link, and on another link [m].
 TIP_SPACING, LINK_SPACING = 0.003, 0.005
-#: A point that moves by less than this per step is on the joint's axis and left out [m].
+#: A point that moves by less than this per step is on the joint's axis and is left out [m].
 STILL = 5e-5
-#: The gap between fingertips is computed at every so many-th angle of a path.
+#: The gap between fingertips is computed at every `GAP_STRIDE`-th closing angle of a path.
 GAP_STRIDE = 5
-#: Number of hands and spreads whose paths a process keeps.
+#: Number of pairs of hand and spread whose paths a process caches.
 KEPT = 16
 
 
@@ -55,11 +57,11 @@ class FingerPath:
 
     Attributes:
         angles: (m,), closing angles from 0 to the limit [rad or m].
-        points: (m, n, 3), points of the links in {G} [m]; those of the fingertip's pad come first,
-            then those of the rest of the fingertip.
+        points: (m, n, 3), points of the links in {G} [m]: first the points of the fingertip's pad,
+            then the rest of the fingertip, then the other links.
         pad: Number of points of the pad.
-        tip: Number of points of the fingertip, the pad included.
-        travel: (n,), largest distance that each moves from one angle to the next [m].
+        tip: Number of points of the fingertip, including the pad.
+        travel: (n,), largest distance that each point moves between two successive angles [m].
         required: Whether a grasp needs this fingertip on the object.
     """
 
@@ -73,13 +75,13 @@ class FingerPath:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HandPaths:
-    """A hand of k fingers at one spread.
+    """The paths of a hand with k fingers at one spread.
 
     Attributes:
         still: (s, 3), points of the links that closing does not move, in {G} [m].
         fingers: One path per finger.
-        gaps: For each pair of fingers (a, b) the distance between their fingertips at each
-            `GAP_STRIDE`-th angle of a, and of b [m].
+        gaps: For each pair of fingers (a, b), the distance between their fingertips [m]. Rows are
+            every `GAP_STRIDE`-th angle of a, columns every `GAP_STRIDE`-th angle of b.
     """
 
     still: Points
@@ -91,10 +93,10 @@ class HandPaths:
 def hand_paths(hand: Hand, spread: float) -> HandPaths | None:
     """Return the paths of a hand's fingers at a spread [rad].
 
-    They are None for a hand in which several fingers move one link, or a finger's closing has no
-    limit: all its attempts are simulated.
+    The result is None if several fingers move one link or a finger's closing has no limit. All
+    attempts of such a hand are simulated.
     """
-    # Which fingers move each link.
+    # Find the fingers that move each link.
     closing_gain = {link: chain.gain[:, 1:] for link, chain in hand.link_chains.items()}
     movers = {link: np.flatnonzero(gain.any(axis=0)) for link, gain in closing_gain.items()}
     limits = coordinate_limits(hand)[1:, 1]
@@ -125,7 +127,16 @@ def hand_paths(hand: Hand, spread: float) -> HandPaths | None:
 def _finger_path(
     hand: Hand, i: int, rest: list[str], spread: float, limit: float, surfaces: dict[str, Array]
 ) -> FingerPath:
-    """Return the path of finger i, from its fingertip and the rest of its links."""
+    """Return the path of finger i.
+
+    Args:
+        hand: The hand.
+        i: Index of the finger.
+        rest: Links that the finger moves, without its fingertip.
+        spread: Spread angle [rad].
+        limit: Closing position at the limit [rad or m].
+        surfaces: Points of each link, see `link_points`.
+    """
     step = ANGLE_STEP * hand.closing_unit[i]
     angles = np.linspace(0.0, limit, int(np.ceil(limit / step)) + 1)
     closing = np.zeros((len(angles), hand.num_fingers))
@@ -135,7 +146,7 @@ def _finger_path(
         X_GL = link_poses(hand, link, spread=spread, closing=closing)
         return _place(X_GL, surfaces[link])
 
-    # Points of all links, the fingertip first, and of it the pad.
+    # Points of all links: first the fingertip, and of the fingertip first the pad.
     fingertip = hand.fingers[i].fingertip
     on_pad = _near_pad(hand.fingers[i], surfaces[fingertip])
     order = np.argsort(~on_pad, kind="stable")
@@ -156,7 +167,7 @@ def _finger_path(
 
 
 def _place(X_GL: Array, p_LQ: Array) -> Points:
-    """Return points (..., n, 3) in {G} of points (n, 3) of links with poses (..., 4, 4)."""
+    """Return points (n, 3) of a link with poses X_GL (..., 4, 4) as points (..., n, 3) in {G}."""
     moved = multiply(p_LQ, np.swapaxes(X_GL[..., :3, :3], -1, -2))
     return np.asarray(moved + X_GL[..., None, :3, 3], dtype=np.float32)
 
@@ -164,7 +175,7 @@ def _place(X_GL: Array, p_LQ: Array) -> Points:
 def _gaps(
     hand: Hand, fingers: list[FingerPath], spread: float
 ) -> dict[tuple[int, int], npt.NDArray[np.float32]]:
-    """Return `HandPaths.gaps`: look up points of finger a in the distance field of fingertip b."""
+    """Return `HandPaths.gaps`: look up points of finger a in the distance field of finger b."""
     fields, gaps = _tip_fields(hand), {}
     for b, other in enumerate(fingers):
         # Poses of fingertip b at its angles.
@@ -173,7 +184,7 @@ def _gaps(
         tip = hand.fingers[b].fingertip
         X_FbG = invert_pose(link_poses(hand, tip, spread=spread, closing=closing))
 
-        # Least distance of fingertip a from it, angle by angle.
+        # Smallest distance of fingertip a from fingertip b, angle by angle.
         for a in range(b):
             points = fingers[a].points[::GAP_STRIDE, : fingers[a].tip]
             gaps[a, b] = np.column_stack([_gap(fields[b], X, points) for X in X_FbG])
@@ -181,7 +192,7 @@ def _gaps(
 
 
 def _gap(field: DistanceField, X_FbG: Array, p_GQ: Points) -> npt.NDArray[np.float32]:
-    """Return the least distance (m,) of points (m, n, 3) from a fingertip, given its pose."""
+    """Return the smallest distance (m,) of points (m, n, 3) from a fingertip with a given pose."""
     X = X_FbG.astype(np.float32)
     x, y, z = (dot(p_GQ, X[axis, :3]).astype(np.float32) + X[axis, 3] for axis in range(3))
     return np.asarray(field.nearest(x, y, z).min(axis=1))
@@ -200,7 +211,7 @@ def _tip_fields(hand: Hand) -> tuple[DistanceField, ...]:
 
 @lru_cache(maxsize=KEPT_HANDS)
 def link_points(hand: Hand) -> dict[str, Array]:
-    """Return points on the surface of each link (n, 3) in its own frame [m]."""
+    """Return points (n, 3) on the surface of each link, in the link's frame [m]."""
     points = {}
     for link, shapes in link_shapes(hand.model).items():
         spacing = TIP_SPACING if link in hand.fingertip_links else LINK_SPACING
@@ -211,7 +222,7 @@ def link_points(hand: Hand) -> dict[str, Array]:
 
 @lru_cache(maxsize=KEPT_HANDS)
 def pad_points(hand: Hand) -> tuple[Array, ...]:
-    """Return points on the pad of each fingertip (n, 3) in the fingertip link's frame [m]."""
+    """Return points (n, 3) on the pad of each fingertip, in the fingertip link's frame [m]."""
     points = link_points(hand)
     return tuple(
         points[finger.fingertip][_near_pad(finger, points[finger.fingertip])]
@@ -220,8 +231,8 @@ def pad_points(hand: Hand) -> tuple[Array, ...]:
 
 
 def _near_pad(finger: Finger, p_FiQ: Array) -> npt.NDArray[np.bool_]:
-    """Return which points (n, 3) [m] of a fingertip are on its pad, or next to one that may be."""
-    # The points are samples of the surface: one beside the pad stands for some within.
+    """Return which points (n, 3) [m] of a fingertip are on its pad or next to it."""
+    # The points sample the surface: a point just outside the pad also represents points inside.
     return np.asarray(finger.beside_pad(p_FiQ) <= PAD_BAND + TIP_SPACING)
 
 
@@ -236,28 +247,28 @@ def _triangles(corners: Array) -> Array:
 
 
 def even_points(corners: Array, spacing: float) -> Array:
-    """Return the corners (n, 3) of a convex shape and evenly spread points of its surface [m]."""
+    """Return points (n, 3) of a convex shape [m]: its corners, and evenly spread surface points."""
     points, owner = cover_triangles(_triangles(corners), spacing / 2.0)
     dense = np.concatenate([corners, points[np.argsort(owner, kind="stable")]])
 
-    # One point stays in each cell of a grid; corners come first, so they are the ones that stay.
+    # Keep one point per cell of a grid, the first; corners come first and are all kept.
     cells = np.floor(dense / spacing).astype(np.int64)
     _, first = np.unique(cells, axis=0, return_index=True)
     return dense[np.union1d(np.arange(len(corners)), first)]
 
 
-#: Postures of each group of fingers that are tried.
+#: Number of postures that are tried for each group of fingers.
 STEPS = 60
-#: What it costs if one group has closed fully and the other not at all [rad].
+#: Cost of a pinch in which one group has closed fully and the other group not at all [rad].
 UNEVEN = 1.0
-#: Points this close behind the foremost one are as far in front [m].
+#: Points at most this far behind the foremost point are treated as equally far in front [m].
 FLAT = 2e-4
-#: Largest difference between the width of a pinch and the one that is asked for [m].
+#: Largest allowed difference between the width of a pinch and the requested width [m].
 WIDTH_ERROR = 0.004
 
 
-#: Two groups of fingers that close against each other: the unit axis (3,) across Gz along which
-#: those of the first move, the others against it; and whether each finger (k,) is of the first.
+#: Two groups of fingers that close against each other. The array (3,) is a unit axis across Gz: the
+#: first group moves along it, the second group against it. The mask (k,) selects the first group.
 Opposition: TypeAlias = tuple[Array, npt.NDArray[np.bool_]]
 
 
@@ -268,7 +279,7 @@ class Pinch:
     Attributes:
         closing: (k,), closing positions [rad or m].
         p_GQ: (k, 3), the foremost points of the pads along the opposition [m].
-        p_GM: (3,), the middle between the two groups [m].
+        p_GM: (3,), the centre between the two groups [m].
         width: Distance between the two groups along the opposition [m].
         tilt: Angle between the line from one group to the other and the opposition [rad].
     """
@@ -281,8 +292,8 @@ class Pinch:
 
 
 def find_opposition(hand: Hand) -> Opposition:
-    """Return along which line the fingers close, from the motion of their pad points."""
-    # Velocity of each pad point across Gz, on its way from the open hand to the limits.
+    """Return the line along which the fingers close, from the motion of their pad points."""
+    # Motion of each pad point across Gz, from the open hand to the limits.
     paths = _pad_point_paths(hand)
     motion = np.diff(paths, axis=0)[:, :, :2].reshape(-1, 2)
     _, vectors = np.linalg.eigh(motion.T @ motion)
@@ -296,14 +307,14 @@ def find_opposition(hand: Hand) -> Opposition:
 
 
 def find_pinch(hand: Hand, width: float) -> Pinch | None:
-    """Return the straightest pinch of a width [m]; None if the fingers have none."""
+    """Return the straightest pinch of a width [m]; None if the fingers have no such pinch."""
     # The foremost point of each pad along the opposition, at each posture.
     axis, group = find_opposition(hand)
     if group.all() or not group.any():
         return None
     closing, front = pad_fronts(hand, (axis, group))
 
-    # All pairs of a posture of the first group and one of the second.
+    # Combine each posture of the first group with each posture of the second group.
     first, second = front[:, group], front[:, ~group]
     along_first = (first @ axis).max(axis=1)
     along_second = (second @ axis).min(axis=1)
@@ -313,8 +324,8 @@ def find_pinch(hand: Hand, width: float) -> Pinch | None:
     across = np.linalg.norm(line - along[..., None] * axis, axis=-1)
     tilt = np.arctan2(across, np.maximum(along, 1e-6))
 
-    # Of those with the width, in front of the palm, the straightest in which all fingers have
-    # closed by about the same.
+    # Among the pinches of this width in front of the palm, choose the straightest one in which all
+    # fingers have closed by about the same fraction.
     share = np.linspace(0.0, 1.0, STEPS)
     cost = tilt + UNEVEN * np.abs(share[:, None] - share)
     cost[np.abs(gap - width) > WIDTH_ERROR] = np.inf
@@ -341,7 +352,7 @@ def find_pinch(hand: Hand, width: float) -> Pinch | None:
 
 
 def reach(hand: Hand, direction: Array) -> float:
-    """Return how far the closing hand reaches along a direction (3,) in {G} from its origin [m]."""
+    """Return the largest coordinate of the closing hand along a direction (3,) in {G} [m]."""
     surfaces, closing, farthest = link_points(hand), closing_path(hand, STEPS), -np.inf
     for link in hand.link_chains:
         if not len(surfaces[link]):
@@ -373,9 +384,9 @@ def _pad_point_paths(hand: Hand) -> Array:
 
 
 def pad_fronts(hand: Hand, opposition: Opposition) -> tuple[Array, Array]:
-    """Return closing positions (n, k), and the foremost point of each pad there (n, k, 3) [m].
+    """Return closing positions (n, k) and the foremost point of each pad there (n, k, 3) [m].
 
-    The positions go from the open hand to the limits; foremost is along the opposition, in {G}.
+    The positions run from the open hand to the limits. "Foremost" is along the opposition, in {G}.
     """
     closing, (axis, group) = closing_path(hand, STEPS), opposition
     X_GF = fingertip_poses(hand, spread=0.0, closing=closing)
@@ -385,7 +396,7 @@ def pad_fronts(hand: Hand, opposition: Opposition) -> tuple[Array, Array]:
         for n, X in enumerate(X_GF[:, i]):
             p_GQ = transform_points(X, points)
             along = sign * p_GQ @ axis
-            # A flat pad has many foremost points: their middle counts.
+            # A flat pad has many foremost points: use their mean.
             front[n, i] = p_GQ[along >= along.max() - FLAT].mean(axis=0)
     return closing, front
 

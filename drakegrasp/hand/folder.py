@@ -1,11 +1,13 @@
-"""The files of a hand as a folder that holds all of them, and a digest of its content.
+"""A folder that holds all files of a hand, and a digest of its content.
 
-In: a hand. Out: what such a folder holds: hand file, model, weights, meshes with the files that
-they name, licences. Files below the hand file keep their places and bytes. The hand file or the
-model is rewritten only where it names something else: an absolute path, one that leads out of the
-folder, or a `package://` URI. The hand in such a folder has the same folder and digest again. A
-dataset carries such a folder, `carry_hand`: copied at the start of a build, read there from then
-on, so that workers and later commands need no other file of the hand. Does not import Drake.
+In: a hand. Out: the content of such a folder: hand file, model, weights, licences, and meshes with
+the files that they name. Files below the hand file keep their places and bytes. The hand file and
+the model are rewritten only where they name something outside the folder or by an absolute path or
+a `package://` URI. The hand in such a folder produces the same folder and digest again.
+
+A dataset contains such a folder, see `carry_hand`. It is copied at the start of a build and read
+from then on, so that workers and later commands need no other file of the hand. Does not import
+Drake.
 """
 
 from __future__ import annotations
@@ -40,13 +42,13 @@ from drakegrasp.hand.files import (
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
 from drakegrasp.yaml_text import parse_yaml, parse_yaml_once
 
-#: Limits of a hand's files, in all [byte] and their number: a dataset may be a stranger's.
+#: Limits of a hand's files: total size [byte], YAML size [byte], number. A stranger may write them.
 LARGEST, LARGEST_YAML, MOST_FILES = 2**29, 2**18, 1000
-#: Files of licences next to a hand file or its model; files of which lines are about licences.
+#: Names of licence files next to a hand file or its model; files whose lines may mention a licence.
 _LICENCE = re.compile(r"(LICEN[CS]E|COPYING|NOTICE)([._ -].*)?", re.IGNORECASE)
 _README = re.compile(r"(README(\..*)?|package\.xml)", re.IGNORECASE)
 _MENTION = re.compile(r"licen[cs]e|copyright", re.IGNORECASE)
-#: File of these lines.
+#: File of the lines that mention a licence.
 MENTIONS = "LICENSE-mentioned.txt"
 #: The keys of a hand file that name other files.
 _MODEL_LINE = re.compile(r"^model:.*$", re.MULTILINE)
@@ -56,8 +58,8 @@ _PACKAGES_LINES = re.compile(r"^packages:.*\n(?:[ \t]+\S.*\n)*", re.MULTILINE)
 def hand_digest(source: HandSource) -> str:
     """Return a hash (16 hex digits) of a hand's files, see `HandFolder.digest`.
 
-    It distinguishes two hands of the same name. A missing file counts as empty; refusing it is
-    left to `description.load_hand`.
+    Two hands of the same name differ in it. A missing file has the hash of an empty file;
+    `description.load_hand` rejects missing files.
 
     Raises:
         HandError: As `hand_folder`.
@@ -66,9 +68,9 @@ def hand_digest(source: HandSource) -> str:
 
 
 def is_hand(source: HandSource, digest: str | None) -> bool:
-    """Return whether a digest is that of the files of a hand.
+    """Return whether a digest is the digest of a hand's files.
 
-    Version 0.2 took the digest of the model and the hand file before they are rewritten.
+    Version 0.2 computed the digest from the model and the hand file before they are rewritten.
 
     Raises:
         HandError: As `hand_folder`.
@@ -78,17 +80,17 @@ def is_hand(source: HandSource, digest: str | None) -> bool:
 
 
 def hand_folder(source: HandSource, name: str | None = None) -> HandFolder:
-    """Return what a folder with all files of a hand holds.
+    """Return the content of a folder with all files of a hand.
 
     Args:
         source: The hand.
-        name: Of its hand file in the folder; the name that it has if None.
+        name: Name of the hand file in the folder; None keeps its name.
 
     Raises:
         HandError: If there is no such hand, its files are too large, or a dataset's hand names
-            files elsewhere.
+            files outside its folder.
     """
-    # The hand file; a model elsewhere is put beside it.
+    # The hand file; a model outside its folder is put beside it.
     path = hand_file(source)
     found = HandFolder(within=path.parent if isinstance(source, CarriedHand) else None)
     found.has(path)
@@ -99,7 +101,7 @@ def hand_folder(source: HandSource, name: str | None = None) -> HandFolder:
     moved = place != posixpath.normpath(model)
     found.texts[name] = _with_model(path, place) if moved or packages else path.read_bytes()
 
-    # The model, the weights that few hands have, and licences.
+    # The model, the weights (few hands have them), and licences.
     if found.has(path.parent / model):
         found.add_model(place, path.parent / model, packages, found.uris)
     chance = f"{Path(name).stem.removesuffix('_hand')}_chance.yaml"
@@ -113,18 +115,19 @@ def hand_folder(source: HandSource, name: str | None = None) -> HandFolder:
 
 @dataclass(kw_only=True)
 class HandFolder:
-    """What a folder with the files of a hand holds, by places in it.
+    """The content of a folder with the files of a hand. A place is a path in the folder.
 
     Attributes:
-        within: Folder that nothing may leave: that of a dataset's hand; None for another hand.
-        texts: Hand file, models and lines about licences, as they are there.
-        files: The other files, where they are now.
-        counted: Places of what the digest is of, in its order; some may be of no file.
+        within: Folder that no file may leave, for a dataset's hand; None for another hand.
+        texts: Bytes of hand file, models and lines about licences, by their places.
+        files: Present paths of all other files, by their places.
+        counted: Places of the files in the digest, in their order; some of the files may be
+            missing.
         licences: Places of the licences.
-        uris: Places of what the model names, by its references, in the folder's model.
-        parts: Places of geometry that other files name, by themselves.
-        sources: Whether each file that was looked for is there.
-        size: Of the files [byte].
+        uris: Places of the geometry that the model names, by the references in the rewritten model.
+        parts: Places of the geometry that other files name; each key is its value.
+        sources: Whether each requested file exists.
+        size: Total size of the files [byte].
     """
 
     within: Path | None
@@ -138,21 +141,21 @@ class HandFolder:
     size: int = 0
 
     def content(self, place: str) -> bytes:
-        """Return the bytes of a file; none of one that is not there."""
+        """Return the bytes of a file; empty if it does not exist."""
         if place in self.texts:
             return self.texts[place]
         return self.files[place].read_bytes() if place in self.files else b""
 
     @property
     def digest(self) -> str:
-        """A hash (16 hex digits) of hand file, model, weights and meshes; no path is in it."""
+        """A hash (16 hex digits) of hand file, model, weights and meshes, independent of paths."""
         return _digest(map(self.content, self.counted))
 
     def place_of(self, reference: str, base: str) -> str | None:
-        """Return the place of what a file in the folder `base` names; None if it is elsewhere.
+        """Return the place of what a file in the folder `base` names; None if outside the folder.
 
         Raises:
-            HandError: If it is elsewhere, and the hand is a dataset's.
+            HandError: If it is outside, and the hand is a dataset's.
         """
         place = posixpath.normpath(posixpath.join(base, reference))
         is_relative = "://" not in reference and not reference.startswith("/")
@@ -163,13 +166,13 @@ class HandFolder:
         return None
 
     def has(self, path: Path) -> bool:
-        """Note a file, and return whether it is there.
+        """Record a file, and return whether it exists.
 
         Raises:
-            HandError: If it is elsewhere, and the hand is a dataset's, it is a pipe or a device, or
-                the files are too large.
+            HandError: If the file is outside the folder of a dataset's hand, is a pipe or a device,
+                or makes the files too large.
         """
-        # A file counts once; that of a dataset must be in its folder.
+        # Count a file once; a file of a dataset's hand must be in its folder.
         if path in self.sources:
             return self.sources[path]
         if "\0" in str(path):
@@ -182,7 +185,7 @@ class HandFolder:
                 raise HandError(f"{path}: must be a file, got a pipe, a socket or a device")
             return False
 
-        # A stranger's files must not fill the memory, and YAML takes many times its bytes.
+        # A stranger's files must not fill the memory, and parsed YAML takes many times its size.
         size = path.stat().st_size
         self.size += size
         long = path.suffix.lower() in (".yaml", ".yml") and size > LARGEST_YAML
@@ -197,7 +200,7 @@ class HandFolder:
         """Return the folders of the packages that a hand file or its model names.
 
         Raises:
-            HandError: If a hand file of a dataset names one.
+            HandError: If the hand file of a dataset names packages.
         """
         if self.within is None:
             return _packages(path)
@@ -206,7 +209,7 @@ class HandFolder:
         return {}
 
     def add(self, place: str, path: Path) -> None:
-        """Add a file and those that it names, unless it is missing or there already."""
+        """Add a file and the files that it names, unless it is missing or already added."""
         if place in self.files or place in self.texts or not self.has(path):
             return
         if path.suffix.lower() in MODEL_SUFFIXES:
@@ -216,7 +219,7 @@ class HandFolder:
         for reference, is_geometry in mesh_references(path):
             inner = self.place_of(reference, posixpath.dirname(place))
             if inner is None:
-                continue  # it is drawn without
+                continue  # the mesh is drawn without it
             if is_geometry:
                 self.parts[inner] = inner
             self.add(inner, path.parent / reference)
@@ -224,13 +227,13 @@ class HandFolder:
     def add_model(
         self, place: str, path: Path, packages: Mapping[str, Path], counted: dict[str, str]
     ) -> None:
-        """Add a model that is there, and the files that it names, by references to their places.
+        """Add an existing model and the files that it names; rewrite references to outside files.
 
         Args:
-            place: Of the model.
-            path: Where it is now.
-            packages: Folders of `package://` URIs by name.
-            counted: Gets the places of geometry by their references.
+            place: Place of the model.
+            path: Present path of the model.
+            packages: Folders of `package://` URIs by package name.
+            counted: Receives the places of geometry by their references.
         """
         base = posixpath.dirname(place)
 
@@ -244,15 +247,16 @@ class HandFolder:
             self.add(inner, named)
             return uri
 
-        self.texts[place] = b""  # of one that includes itself
+        self.texts[place] = b""  # for a model that includes itself
         self.texts[place] = rewritten(path.read_bytes(), add_named)
 
     def add_licences(self, folders: list[Path], hand: str) -> tuple[str, ...]:
-        """Add the licences in some folders, and lines about them; return their places."""
+        """Add the licences in some folders and lines that mention them; return their places."""
         places, lines = list[str](), list[str]()
         for folder in folders:
             for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-                # Where there are files of several hands a licence may have the name of its hand.
+                # In a folder with several hands, the name of a licence may begin with the hand's
+                # name.
                 name = path.name.removeprefix(f"{hand}_")
                 if _LICENCE.fullmatch(name):
                     place = name if name not in self.files else f"{name}-{len(places)}"
@@ -274,13 +278,13 @@ def _elsewhere(path: Path, there: bool) -> str:
 
 
 def _mentions(path: Path) -> list[str]:
-    """Return the lines of a file that are about licences."""
+    """Return the lines of a file that mention a licence."""
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     return [f"{path.name}: {line.strip()}" for line in lines if _MENTION.search(line)]
 
 
 def _described(path: Path) -> Mapping[str, Any]:
-    """Return the keys of a hand file; none if it is not one."""
+    """Return the keys of a hand file; empty if the file is not a YAML mapping."""
     try:
         tree = parse_yaml_once(path.read_bytes())
     except (yaml.YAMLError, UnicodeDecodeError):
@@ -300,11 +304,11 @@ def _packages(path: Path) -> dict[str, Path]:
 
 
 def _with_model(path: Path, place: str) -> bytes:
-    """Return the text of a hand file with the model at another place, and without packages."""
+    """Return the text of a hand file with the model at another place and without packages."""
     keys = {**_described(path), "model": place}
     keys.pop("packages", None)
 
-    # Comments stay, unless the keys are written in an unusual way.
+    # Keep comments, unless the keys are written in an unusual way.
     try:
         text = path.read_text(encoding="utf-8")
         text = _MODEL_LINE.sub(lambda match: yaml.safe_dump({"model": place}).strip(), text)
@@ -316,7 +320,7 @@ def _with_model(path: Path, place: str) -> bytes:
 
 
 def _plain_digest(path: Path) -> str:
-    """Return the digest of a hand's files as version 0.2 took it, see `is_hand`."""
+    """Return the digest of a hand's files as version 0.2 computed it, see `is_hand`."""
     described, packages = _described(path), _packages(path)
     model = path.parent / str(described.get("model", ""))
     text = model.read_bytes() if model.is_file() else b""
@@ -327,7 +331,7 @@ def _plain_digest(path: Path) -> str:
 
 
 def _digest(contents: Iterable[bytes]) -> str:
-    """Return a hash (16 hex digits) of contents one after the other."""
+    """Return a hash (16 hex digits) of concatenated contents."""
     digest = hashlib.sha256()
     for content in contents:
         digest.update(content)
@@ -339,12 +343,12 @@ HAND_FOLDER = "hand"
 
 
 def carried_hand(out: Path, hand: str, digest: str) -> CarriedHand | None:
-    """Return the hand in a dataset's directory; None for a dataset that carries none.
+    """Return the hand in a dataset's directory; None if the dataset does not contain its hand.
 
     Args:
         out: Directory of the dataset.
-        hand: What the dataset's configuration names.
-        digest: What the dataset says of the hand's files.
+        hand: Hand that the dataset's configuration names.
+        digest: Digest of the hand's files that the dataset stores.
     """
     path = out.absolute() / HAND_FOLDER / _file_name(hand)
     own = hand == f"{HAND_FOLDER}/{path.name}"
@@ -353,20 +357,20 @@ def carried_hand(out: Path, hand: str, digest: str) -> CarriedHand | None:
 
 
 def carry_hand(out: Path, config: Config, known: str | None = None) -> Config:
-    """Copy the files of a hand into a dataset's directory, unless they are there.
+    """Copy the files of a hand into a dataset's directory, unless they are already there.
 
     Args:
-        out: The directory, which the caller holds.
+        out: The directory, locked by the caller.
         config: The configuration.
-        known: What the dataset in the directory names, whose hand is the same; None for a new one.
+        known: Hand that the dataset in the directory names, the same hand; None for a new dataset.
 
     Returns:
         The configuration with the hand in the directory.
 
     Raises:
         HandError: If the hand's files cannot be read, or are too large.
-        DataError: If the directory is a new dataset's, and has files of somebody in that place.
-        DiskFullError: If there is no room for them.
+        DataError: If the directory is for a new dataset and contains other files in that place.
+        DiskFullError: If the disk has no room for the files.
     """
     # A hand of the package keeps its name; the name of a hand file is in the hash of every shard.
     name = known or config.hand
@@ -384,12 +388,12 @@ def carry_hand(out: Path, config: Config, known: str | None = None) -> Config:
 
 
 def _file_name(hand: str) -> str:
-    """Return the name of the hand file in a dataset, of a hand of the package or a hand file."""
+    """Return the file name in a dataset of a hand, given by the name of the hand or its file."""
     return PurePath(hand).name if "/" in hand or hand.endswith(".yaml") else f"{hand}_hand.yaml"
 
 
 def _is_there(carried: CarriedHand) -> bool:
-    """Return whether a directory holds a hand already."""
+    """Return whether a directory already contains a hand."""
     try:
         return hand_digest(carried) == carried.digest
     except HandError:
@@ -397,10 +401,10 @@ def _is_there(carried: CarriedHand) -> bool:
 
 
 def _refuse_other_files(content: HandFolder, folder: Path) -> None:
-    """Refuse a folder with files of the user: a build replaces and removes what is in it.
+    """Reject a folder with files of the user: a build replaces and removes its content.
 
     Raises:
-        DataError: If it is there, and no copy of the hand that a build left when it was killed.
+        DataError: If the folder exists and is not a copy of the hand from a build that was killed.
     """
     if not os.path.lexists(folder):
         return
@@ -415,7 +419,7 @@ def _refuse_other_files(content: HandFolder, folder: Path) -> None:
 
 
 def _write(content: HandFolder, folder: Path) -> None:
-    """Write the files of a hand; remove what a build has left there of another one."""
+    """Write the files of a hand, and remove files of another hand that a build left there."""
     shutil.rmtree(folder, ignore_errors=True)
     with atomic_folder(folder) as temporary:
         for place in (*content.texts, *content.files):

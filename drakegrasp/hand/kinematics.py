@@ -1,8 +1,8 @@
 """Forward kinematics of a hand.
 
 In: a `Hand` and its coordinates, the spread and the closing of each finger. Out: positions of the
-joints, poses of the links, limits of the coordinates. NumPy only. Positions of joints that turn are
-angles [rad], those of joints that slide are lengths [m].
+joints, poses of the links, limits of the coordinates. Uses NumPy only. Positions of turning joints
+are angles [rad], positions of sliding joints are lengths [m].
 """
 
 from __future__ import annotations
@@ -31,30 +31,30 @@ REACH_STEPS = 41
 def coordinate_limits(hand: Hand) -> Array:
     """Return the lower and upper limit of each coordinate, (1 + k, 2) [rad or m].
 
-    Row 0 is the spread, row 1 + i the closing of finger i. A coordinate keeps the limits of all
-    joints that it drives, coupled joints included, and of all fingers that its motor drives.
-    Without spread joints row 0 is 0, 0.
+    Row 0 is the spread, row 1 + i the closing of finger i. The limits of a coordinate keep all
+    joints that it drives within their limits, including coupled joints and the joints of all
+    fingers that share the motor. Without spread joints, row 0 is 0, 0.
     """
     limits = np.tile([-np.inf, np.inf], (1 + hand.num_fingers, 1))
     joints = zip(hand.joint_gain, hand.joint_offset, hand.joint_limits, strict=True)
     for gain, offset, joint_limits in joints:
-        # A joint of the preshape is driven by none.
+        # No coordinate drives a joint of the preshape.
         for column in np.flatnonzero(gain):
             lower, upper = np.sort((joint_limits - offset) / gain[column])
             limits[column] = max(limits[column, 0], lower), min(limits[column, 1], upper)
     if not hand.spread.joints:
         limits[0] = 0.0
 
-    # Fingers of one motor stop together.
+    # Fingers that share a motor stop together.
     limits[1:, 0] = -open_together(hand, -limits[1:, 0])
     limits[1:, 1] = open_together(hand, limits[1:, 1])
     return limits
 
 
 def open_together(hand: Hand, closing: npt.ArrayLike) -> Array:
-    """Return closing positions (k,) [rad or m] in which fingers of one motor have closed alike.
+    """Return closing positions (k,) [rad or m] in which fingers that share a motor agree.
 
-    They are as open as the most open one of them.
+    Each finger is opened until it agrees with the most open finger of its motor.
     """
     positions, ratio = np.array(closing, dtype=float), hand.closing_ratio
     for motor in range(ratio.shape[1]):
@@ -66,16 +66,16 @@ def open_together(hand: Hand, closing: npt.ArrayLike) -> Array:
 
 
 def closed_positions(hand: Hand) -> Array:
-    """Return each finger's closing position in the closed hand, (k,) [rad or m]; 0 without a limit.
+    """Return the closing positions (k,) of the closed hand [rad or m]; 0 if without a limit.
 
-    Closing positions on the way there are shares of it.
+    Closing positions between open and closed hand are given as fractions of these.
     """
     limits = coordinate_limits(hand)[1:, 1]
     return np.where(np.isfinite(limits), np.maximum(limits, 0.0), 0.0)
 
 
 def still_links(hand: Hand) -> list[str]:
-    """Return the links that neither spread nor closing moves: the palm and what is fixed to it."""
+    """Return the links that neither spread nor closing moves: the palm and links fixed to it."""
     return [link for link, chain in hand.link_chains.items() if not chain.gain.any()]
 
 
@@ -108,7 +108,7 @@ def fingertip_poses(hand: Hand, *, spread: npt.ArrayLike, closing: npt.ArrayLike
 
 
 def link_poses(hand: Hand, link: str, *, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:
-    """Return the poses X_GL (..., 4, 4) of a link that the palm carries, in the palm frame.
+    """Return the poses X_GL (..., 4, 4) of a link of the palm's tree, in the palm frame.
 
     Args:
         hand: The hand.
@@ -123,13 +123,13 @@ def link_poses(hand: Hand, link: str, *, spread: npt.ArrayLike, closing: npt.Arr
 
 
 def posed_links(hand: Hand, positions: Mapping[str, Array]) -> dict[str, Array]:
-    """Return the poses X_GL (..., 4, 4) of all links that the palm carries, in the palm frame.
+    """Return the poses X_GL (..., 4, 4) of all links of the palm's tree, in the palm frame.
 
     Args:
         hand: The hand.
-        positions: Of each of its joints (...,) [rad or m], whatever the couplings say.
+        positions: Position (...,) of each of its joints [rad or m]; couplings are ignored.
     """
-    # Links of a finger share the joints next to the palm.
+    # Links of a finger share the joints next to the palm, so cache poses by their joints.
     (shape,) = {np.shape(q) for q in positions.values()}
     posed: dict[tuple[str, ...], Array] = {(): np.broadcast_to(np.eye(4), (*shape, 4, 4))}
     for chain in sorted(hand.link_chains.values(), key=lambda chain: len(chain.joints)):
@@ -146,7 +146,7 @@ def posed_links(hand: Hand, positions: Mapping[str, Array]) -> dict[str, Array]:
 def opening(hand: Hand) -> float:
     """Return the largest distance [m] between the pads of two fingers, over spread and closing.
 
-    The postures are `OPENING_STEPS` of each coordinate, from limit to limit.
+    Each coordinate takes `OPENING_STEPS` positions from limit to limit.
 
     Raises:
         HandError: See `hand.shapes.link_shapes`.
@@ -169,11 +169,12 @@ def opening(hand: Hand) -> float:
 
 
 def flat_limits(hand: Hand) -> tuple[float, float]:
-    """Return the height [m] that flat objects need for a hand that faces the table, to what width.
+    """Return the height [m] that objects up to a width [m] need, if the hand faces the table.
 
-    While they close the fingertips come ahead of the palm by its reach: at a smaller stand-off
-    below the object's top by the difference, where the table may not be yet. At a larger one they
-    close above the object. An object wider than the width [m] is met before they are there.
+    While the fingers close, the fingertips move ahead of the palm, by the reach of the hand. At a
+    stand-off below this reach, the fingertips arrive below the top of the object by the difference;
+    an object of that height keeps them above the table. At a larger stand-off they close above the
+    object. An object that is wider than the width [m] is touched before the fingertips get there.
 
     Raises:
         HandError: See `hand.shapes.link_shapes`.
@@ -187,12 +188,12 @@ def flat_limits(hand: Hand) -> tuple[float, float]:
 
 
 def _reach(hand: Hand) -> tuple[float, float, Array]:
-    """Return how far ahead of the palm a hand comes while it closes [m], and where it is then.
+    """Return how far ahead of the palm a hand reaches while it closes, and in which posture.
 
-    The postures are `REACH_STEPS` of all fingers together, at the ends of the spread.
+    All fingers close together in `REACH_STEPS` postures, at both limits of the spread.
 
     Returns:
-        The distance along +Gz, the spread [rad] and the closing positions (k,) [rad or m].
+        The distance along +Gz [m], the spread [rad] and the closing positions (k,) [rad or m].
     """
     closing = np.linspace(0.0, closed_positions(hand), REACH_STEPS)
     corners = {link: parts for link, parts in link_shapes(hand.model).items() if parts}
@@ -225,10 +226,10 @@ def _chain_pose(chain: Chain, c: Array) -> Array:
 
 
 def _chain_frames(chain: Chain, c: Array) -> tuple[list[Array], Array]:
-    """Return the poses (..., 4, 4) of a chain's joints, before they move, and of its link in {G}.
+    """Return the poses (..., 4, 4) in {G} of a chain's joints before they move, and of its link.
 
     Args:
-        chain: Of m joints.
+        chain: A chain of m joints.
         c: (..., 1 + k), coordinates.
     """
     q = multiply(c[..., None, :], chain.gain.T)[..., 0, :] + chain.offset
@@ -240,7 +241,7 @@ def _chain_frames(chain: Chain, c: Array) -> tuple[list[Array], Array]:
 
 
 def _motion(chain: Chain, j: int, position: Array) -> Array:
-    """Return the poses (..., 4, 4) by which joint j of a chain moves at positions (...,)."""
+    """Return the poses (..., 4, 4) of joint j's motion at positions (...,)."""
     X = np.zeros((*np.shape(position), 4, 4))
     X[..., 3, 3] = 1.0
     if chain.slides[j]:
@@ -252,30 +253,32 @@ def _motion(chain: Chain, j: int, position: Array) -> Array:
 
 
 def fingertip_forces(hand: Hand, drive: Drive) -> Array:
-    """Return the largest force that each fingertip carries at its pad point, (k,) [N].
+    """Return the largest force that each fingertip supports at its pad point, (k,) [N].
 
-    It is the torque (or force, of a joint that slides) that the finger carries at its closing joint
-    over the lever of the pad point, `closing_levers`, in the middle of the closing joint's range.
-    At the ends of the range the Barrett Hand's differs by -10 and +19 %.
+    It is the torque (or force, for a sliding joint) that the finger supports at its closing joint,
+    divided by the lever of the pad point. The lever is that of `closing_levers` at the centre of
+    the closing joint's range. At the ends of the range, the Barrett Hand's force differs by -10 and
+    +19 %.
 
-    Only motors press. What a worm carries beyond its own motor's torque comes from the motors of
-    the other fingers, which press on it through the object: so a finger carries at most what they
-    give together, and never more than its `holding_effort`. With the efforts τ_i of the motors and
-    the levers l_i:
+    Only motors press. A load on a worm beyond its own motor's torque comes from the motors of the
+    other fingers, which press through the object. So a finger supports at most the sum of their
+    forces, and never more than its `holding_effort`. With the efforts τ_i of the motors and the
+    levers l_i:
 
         N_i = τ_i / l_i                                                     (torque)
         N_i = min(max(τ_i / l_i, Σ_{j≠i} τ_j / l_j), `holding_effort` / l_i)   (worm, locked)
 
-    Fingers that share a motor share its effort: then τ_i is the motor's, and l_i the sum of
-    `Hand.closing_ratio` times the levers of all of them, as if they pressed equally.
+    Fingers that share a motor share its effort, as if they pressed equally. Then τ_i is the effort
+    of the motor, and l_i the sum of the levers of all its fingers, each times its
+    `Hand.closing_ratio`.
 
     Args:
-        hand: Of k fingers.
-        drive: What keeps the closing joints from being pushed open. A motor alone carries its
-            `effort_limit`. A locked joint carries what a worm does, without a `holding_effort` any
-            load by the others.
+        hand: A hand with k fingers.
+        drive: What keeps the closing joints from being pushed open. A motor alone ("torque")
+            supports its `effort_limit`. A locked joint supports what a worm does; without a
+            `holding_effort` it supports any load from the other fingers.
     """
-    # A joint without a limit counts as limited by 0, the open hand.
+    # A joint without a limit is treated as limited to 0, the open hand.
     limits = coordinate_limits(hand)[1:]
     middle = np.where(np.isfinite(limits), limits, 0.0).mean(axis=1)
     levers = multiply(hand.closing_ratio.T, closing_levers(hand, middle))[hand.motor_of]
@@ -284,17 +287,17 @@ def fingertip_forces(hand: Hand, drive: Drive) -> Array:
     if drive == "torque":
         return motors
 
-    # The other motors' forces, up to what the finger can hold.
+    # The forces of the other motors, up to what the finger can hold.
     strongest = [np.inf if f.holding_effort is None else f.holding_effort for f in own]
     return np.minimum(np.maximum(motors, motors.sum() - motors), np.array(strongest) / levers)
 
 
 def within_load(hand: Hand, load: float | None) -> Hand:
-    """Return a hand whose motors are all weaker by one factor, so that it presses less.
+    """Return a hand whose motors are all weakened by one factor, so that it presses less.
 
-    Its strongest fingertip then carries at most `load` [N] at its pad point, by `fingertip_forces`.
-    The hand is as it was where it is no stronger, or `load` is None. Worms hold what they did: what
-    loads them comes from the motors.
+    Its strongest fingertip then supports at most `load` [N] at its pad point, see
+    `fingertip_forces`. The hand is unchanged if it is no stronger than that or `load` is None.
+    Worms keep their holding efforts, because their load comes from the motors.
     """
     if load is None:
         return hand
@@ -309,17 +312,17 @@ def within_load(hand: Hand, load: float | None) -> Hand:
 
 
 def closing_levers(hand: Hand, closing: npt.ArrayLike) -> Array:
-    """Return how far each pad point moves with its closing joint, (k,) [m/rad, or m/m].
+    """Return how far each pad point moves per motion of its closing joint, (k,) [m/rad, or m/m].
 
     With the pad point P, and the axes a_j, origins o_j and ratios r_j of the finger's joints,
 
         l = |Σ_j r_j a_j × (P − o_j)|,   where a joint that slides along a_j adds r_j a_j instead.
 
-    By virtual work this is the lever of a force along that motion, coupled joints included: the
-    same torque that `simulation.drive.opening_torques` measures, over the force.
+    By virtual work, this is the lever of a force along that motion, with coupled joints included:
+    the torque that `simulation.drive.opening_torques` measures, divided by the force.
 
     Args:
-        hand: Of k fingers.
+        hand: A hand with k fingers.
         closing: (k,), closing positions [rad or m]. The spread does not matter.
 
     Raises:
@@ -327,7 +330,7 @@ def closing_levers(hand: Hand, closing: npt.ArrayLike) -> Array:
     """
     c, levers = _coordinates(hand, 0.0, closing), []
     for i, (finger, chain) in enumerate(zip(hand.fingers, hand.chains, strict=True)):
-        # Each joint turns the pad point about its axis or slides it along, by its gain.
+        # By its gain, each joint turns the pad point about its axis or moves it along the axis.
         frames, X_GF = _chain_frames(chain, c)
         X_GJ, p_GP = np.array(frames), transform_points(X_GF, finger.p_FiP[None])[0]
         axes = multiply(X_GJ[:, :3, :3], chain.axis[:, :, None])[..., 0]

@@ -1,8 +1,9 @@
-"""The chance that a lift gives a sample, by what is known when the hand has closed.
+"""The chance that a lift yields a sample, predicted when the hand has closed.
 
-In: the contacts of closed hands, and the weights in a small file next to the hand's. Out: chances,
-by a logistic model (docs/explanation/sampling.md). Its features are normals, forces, distances and
-moments; none depends on which object it is. Does not import Drake.
+In: the contacts of closed hands, and the weights in a small file next to the hand file. Out:
+chances from a logistic model (docs/explanation/sampling.md). Its features are computed from
+normals, forces, distances and moments, and from nothing that identifies the object. Does not
+import Drake.
 """
 
 from __future__ import annotations
@@ -23,23 +24,24 @@ from drakegrasp.foreign_files import read_text
 from drakegrasp.hand.files import chance_file
 from drakegrasp.yaml_text import parse_yaml_once
 
-#: Chances are multiples of this: the last bits of an exponential depend on the machine.
+#: Chances are rounded to multiples of this, because the last bits of an exponential depend on the
+#: machine.
 GRID = 2.0**-20
-#: The search for forces that balance: steps, and the share of the friction that they may use. Few
-#: steps: forces that are hard to find are also hard to reach by closing.
+#: The search for forces that balance: number of steps, and fraction of the friction that the forces
+#: may use. The steps are few because forces that are hard to find are hard to reach by closing.
 STEPS, SHARE = 20, 0.7
-#: Divisors are at least this, far below the forces [N] and lengths [m] of contacts.
+#: Smallest divisor, far below the forces [N] and lengths [m] of contacts.
 LEAST = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ClosedGrasp:
-    """Closed hands of k fingers about objects that are held in their places, with leading axes.
+    """Hands with k fingers, closed on objects that are held in place; arrays have leading axes.
 
     Attributes:
         touching: (..., k), whether each fingertip touches the object.
         p_OQ, nhat_Q_O, f_Q_O: (..., k, 3), contact points [m], unit normals out of the object, and
-            forces on it [N]; NaN or 0 where not touching.
+            forces on the object [N]; NaN or 0 for fingertips that do not touch.
         X_TO: (..., 4, 4), pose of the object.
         p_OOcm: (3,), its centre of mass [m].
         friction_hand: (...,), coefficient of friction between hand and object.
@@ -60,11 +62,11 @@ GRASP_CONTACTS = ("touching", "p_OQ", "nhat_Q_O", "f_Q_O")
 
 @dataclass(frozen=True)
 class LiftChance:
-    """A logistic model of the chance that a lift gives a sample.
+    """A logistic model of the chance that a lift yields a sample.
 
     Attributes:
-        bias: Its logarithm of the odds where all features are 0.
-        weights: What each feature adds, per unit, by the names of `features`.
+        bias: Log-odds if all features are 0.
+        weights: Change of the log-odds per unit of each feature, by the names of `features`.
     """
 
     bias: float
@@ -80,10 +82,10 @@ class LiftChance:
 
 
 def read_lift_chance(source: HandSource) -> LiftChance | None:
-    """Return the model of a hand; None if it has none.
+    """Return the model of a hand; None if the hand has no model.
 
     Raises:
-        HandError: If there is no such hand, or its file of weights cannot be used.
+        HandError: If there is no such hand, or its file of weights is invalid.
     """
     path = chance_file(source)
     if not path.is_file():
@@ -105,8 +107,8 @@ def read_lift_chance(source: HandSource) -> LiftChance | None:
 
 
 def features(grasp: ClosedGrasp) -> dict[str, Array]:
-    """Return what the chance follows from, (...,) each, by the names of `FEATURES`."""
-    # Contacts; where nothing touches all is 0.
+    """Return the features of closed grasps, (...,) each, by the names of `FEATURES`."""
+    # Contacts; all values of a fingertip that does not touch are 0.
     on = grasp.touching[..., None]
     p_OQ, nhat, f_Q = (np.where(on, v, 0.0) for v in (grasp.p_OQ, grasp.nhat_Q_O, grasp.f_Q_O))
     count = np.maximum(_total(grasp.touching), 1.0)
@@ -114,7 +116,7 @@ def features(grasp: ClosedGrasp) -> dict[str, Array]:
     p_PQ = np.where(on, p_OQ - p_OP[..., None, :], 0.0)
     radius = np.sqrt(_total(dot(p_PQ, p_PQ)) / count)
 
-    # The forces as they are, and the centre of mass beside the contacts.
+    # The forces, and the offset of the centre of mass from the contacts.
     force = norm(f_Q)
     least = np.where(grasp.touching, force, np.inf).min(axis=-1)
     p_CmQ = np.where(on, p_OQ - grasp.p_OOcm, 0.0)
@@ -122,7 +124,7 @@ def features(grasp: ClosedGrasp) -> dict[str, Array]:
     p_PCm, up = grasp.p_OOcm - p_OP, grasp.X_TO[..., 2, :3]
     across = p_PCm - dot(p_PCm, up)[..., None] * up
 
-    # Cosines of the angles between the normals of each two contacts.
+    # Cosines of the angles between the normals of each pair of contacts.
     pairs = list(combinations(range(nhat.shape[-2]), 2))
     cosines = np.stack([dot(nhat[..., i, :], nhat[..., j, :]) for i, j in pairs], axis=-1)
     rest = _unbalanced(on, p_PQ / np.maximum(radius, LEAST)[..., None, None], nhat, grasp)
@@ -138,10 +140,10 @@ def features(grasp: ClosedGrasp) -> dict[str, Array]:
     return dict(zip(FEATURES, values, strict=True))
 
 
-#: The features: length of the mean normal; largest cosine between two normals; what is left of the
-#: wrench of a unit of normal force, see `_unbalanced`, and its root; moment of the forces about the
-#: centre of mass, over their sum and the contacts' radius; smallest force over largest; horizontal
-#: distance of the centre of mass from the contacts' centre [m].
+#: The features, in order: length of the mean normal; largest cosine between two normals; residual
+#: of the wrench for a total normal force of 1, see `_unbalanced`; its square root; moment of the
+#: forces about the centre of mass, divided by their sum and the contacts' radius; smallest force
+#: divided by largest; horizontal distance of the centre of mass from the contacts' centre [m].
 FEATURES = (
     *("normal_sum", "least_opposed", "unbalanced", "root_unbalanced", "moment", "evenness"),
     "across",
@@ -149,18 +151,19 @@ FEATURES = (
 
 
 def _unbalanced(on: npt.NDArray[np.bool_], p_PQ: Array, nhat: Array, grasp: ClosedGrasp) -> Array:
-    """Return how far forces of a unit of normal force in all are from balance, (...,).
+    """Return how far forces with a total normal force of 1 are from balance, (...,).
 
-    A few steps of projected gradient descent look for forces in the friction cones, from equal
-    ones along the normals, whose sum and moment vanish.
+    A few steps of projected gradient descent search for forces in the friction cones whose sum and
+    moment vanish. They start from equal forces along the normals.
 
     Args:
         on: (..., k, 1), whether each fingertip touches.
-        p_PQ: (..., k, 3), contacts about their centre, of root mean square length 1.
-        nhat: (..., k, 3), unit normals, 0 where nothing touches.
-        grasp: Says how much friction there is.
+        p_PQ: (..., k, 3), contacts relative to their centre, of root mean square length 1.
+        nhat: (..., k, 3), unit normals, 0 for fingertips that do not touch.
+        grasp: The closed grasps; only their friction is used.
     """
-    # Sum, moment and normal force of forces (3k,) are A f; the first six are to be 0, the last 1.
+    # Sum, moment and normal force of forces f (3k,) are A f. The goal is 0 for the first six, 1 for
+    # the last.
     lead, k = nhat.shape[:-2], nhat.shape[-2]
     x, y, z = np.moveaxis(p_PQ, -1, 0)
     o = np.zeros_like(x)
@@ -169,7 +172,7 @@ def _unbalanced(on: npt.NDArray[np.bool_], p_PQ: Array, nhat: Array, grasp: Clos
     blocks = np.concatenate([ones, arms, -nhat[..., None, :]], axis=-2)
     A = np.moveaxis(blocks, -3, -2).reshape(*lead, 7, 3 * k)
 
-    # A step is against the gradient of half the squared rest, whose Hessian is below 3 k.
+    # Each step goes against the gradient of half the squared residual; its Hessian is below 3 k.
     size, goal = 1.0 / (3.0 * k), np.eye(7)[:, -1:]
     gain = np.swapaxes(A, -1, -2) * size
     keep, push = np.eye(3 * k) - multiply(gain, A), multiply(gain, goal)
@@ -179,7 +182,7 @@ def _unbalanced(on: npt.NDArray[np.bool_], p_PQ: Array, nhat: Array, grasp: Clos
     for _ in range(STEPS):
         f = (multiply(keep, f.reshape(*lead, -1, 1)) + push).reshape(nhat.shape)
 
-        # To the nearest force in the cone.
+        # Project onto the friction cone.
         normal = -dot(f, nhat)[..., None]
         tangential = f + normal * nhat
         length = np.maximum(norm(tangential)[..., None], LEAST)
@@ -190,6 +193,6 @@ def _unbalanced(on: npt.NDArray[np.bool_], p_PQ: Array, nhat: Array, grasp: Clos
 
 
 def _total(values: npt.NDArray[Any], axis: int = -1) -> Array:
-    """Return sums over an axis, in its order."""
+    """Return sums over an axis, added in the order of the axis."""
     along = np.moveaxis(np.asarray(values, dtype=float), axis, -1)
     return dot(along, np.ones(along.shape[-1]))

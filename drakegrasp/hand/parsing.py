@@ -1,13 +1,17 @@
-"""The model of a hand: what Drake parses of it, what its text says, and its joints as constants.
+"""The model of a hand: what Drake parses, what its text declares, and its joints as constants.
 
-In: an SDFormat or URDF file, and the hand file. Out: links and joints in a plant, and nothing else
-of it, as motors and couplings come from the hand file; its own figures of masses, efforts and
-mimics, which Drake does not tell: it replaces a mass of zero by one of its own, and couples joints
-by constraints or not at all; and a `Chain` per link, which is all that `kinematics` needs.
+In: an SDFormat or URDF file, and the hand file. Out:
 
-The coordinates of a hand with k fingers are c = (spread, closing of finger 1..k). At most one of
-them drives each joint, whose position is `gain @ c + offset`: an angle [rad] where the joint turns,
-a length [m] where it slides.
+- the model's links and joints in a plant. Its motors and couplings are left out, because they come
+  from the hand file;
+- the masses, efforts and mimic joints that the text of the model declares. Drake does not report
+  them: it replaces a mass of zero by its own value, and it couples joints by constraints or not at
+  all;
+- a `Chain` per link, which is all that `kinematics` needs.
+
+The coordinates of a hand with k fingers are c = (spread, closing of fingers 1..k). At most one of
+them drives each joint. The position of the joint is `gain @ c + offset`: an angle [rad] if the
+joint turns, a length [m] if it slides.
 """
 
 from __future__ import annotations
@@ -39,15 +43,15 @@ from drakegrasp.frames import Array, invert_pose
 from drakegrasp.hand.file_format import HandFile
 from drakegrasp.runtime.environment import allow_network
 
-#: Hands of which a process keeps what it has computed: a build has one, in some preshapes.
+#: Number of hands whose results a process caches; a build has one hand, in some preshapes.
 KEPT_HANDS = 32
-#: How the coordinates move a joint: gain (1 + k,), of which at most one is not zero, and offset;
-#: its position is gain @ c + offset [rad or m].
+#: How the coordinates move a joint: gain (1 + k,), of which at most one is not zero, and offset.
+#: The position of the joint is gain @ c + offset [rad or m].
 JointDrive = tuple[Array, float]
 
 
 def _is_no_twin(record: logging.LogRecord) -> bool:
-    """Return whether no exception repeats a message of Drake."""
+    """Return whether a message of Drake is not repeated by an exception."""
     return not record.getMessage().startswith("SDFormat Error")
 
 
@@ -61,7 +65,7 @@ class ModelFile:
     Attributes:
         path: The SDFormat or URDF file.
         packages: Name and folder of each package of a package:// URI.
-        stamp: Sizes and times of the hand's files: a model that has changed is another one.
+        stamp: Sizes and times of the hand's files; a model with changed files is not equal.
     """
 
     path: Path
@@ -72,7 +76,7 @@ class ModelFile:
 def make_parser(plant: MultibodyPlant) -> Parser:
     """Return a parser for a plant that also works under `DRAKE_ALLOW_NETWORK=none`.
 
-    A Drake parser registers a remote package, which raises under that setting even though our
+    A Drake parser registers a remote package, which raises an error under that setting although our
     models do not use the package. Nothing is downloaded.
     """
     with allow_network("package_map"):
@@ -82,16 +86,16 @@ def make_parser(plant: MultibodyPlant) -> Parser:
 def add_model(plant: MultibodyPlant, model: ModelFile) -> ModelInstanceIndex:
     """Add the links and joints of a hand's model to a plant; return its model instance.
 
-    Motors and couplings (`<mimic>`) of the file are left out: those of the hand file replace them.
+    Motors and couplings (`<mimic>`) of the file are left out: the hand file replaces them.
 
     Args:
-        plant: Not finalized. Shapes are added if it is a source of a scene graph.
+        plant: Plant that is not finalized. Shapes are added if it is a source of a scene graph.
         model: The file.
 
     Raises:
-        HandError: If the file cannot be read, e.g. as a mesh is missing.
+        HandError: If the file cannot be read, for example because a mesh is missing.
     """
-    # Read the file; package:// URIs are resolved in the packages that are known.
+    # Read the file; package:// URIs are resolved in the known packages.
     if not model.path.is_file():
         raise HandError(f"model: must be an SDFormat or URDF file, got {str(model.path)!r}")
     parser = make_parser(plant)
@@ -101,10 +105,10 @@ def add_model(plant: MultibodyPlant, model: ModelFile) -> ModelInstanceIndex:
     constraints = set(plant.GetConstraintIds())
     try:
         (instance,) = parser.AddModels(model.path)
-    except (RuntimeError, ValueError, SystemExit) as error:  # of a failed assertion within Drake
+    except (RuntimeError, ValueError, SystemExit) as error:  # SystemExit: failed assertion in Drake
         raise HandError(f"model: must be a file of one model, got {first_line(error)}") from None
 
-    # Leave out its motors and couplings.
+    # Remove the model's motors and couplings.
     for index in set(plant.GetJointActuatorIndices()) - actuators:
         plant.RemoveJointActuator(plant.get_joint_actuator(index))
     for constraint in set(plant.GetConstraintIds()) - constraints:
@@ -114,14 +118,14 @@ def add_model(plant: MultibodyPlant, model: ModelFile) -> ModelInstanceIndex:
 
 @lru_cache(maxsize=KEPT_HANDS)
 def position_order(model: ModelFile, palm_link: str) -> tuple[str, ...]:
-    """Return the names of a model's joints in the order of its positions, that of every `q`.
+    """Return the names of a model's joints in the order of its positions, as in every `q`.
 
-    It is that of the tree of links whose root is the palm, which need not be that of the file: a
-    wrist of the model hangs from its palm.
+    This is the order of the tree of links whose root is the palm. It can differ from the order of
+    the file: in this tree a wrist of the model is below the palm.
 
     Args:
         model: The file.
-        palm_link: The link by which the hand is held.
+        palm_link: The root link.
 
     Raises:
         HandError: As `add_model`.
@@ -133,7 +137,7 @@ def position_order(model: ModelFile, palm_link: str) -> tuple[str, ...]:
     return tuple(plant.GetPositionNames(instance, False, False))
 
 
-#: Moments and products of inertia that URDF and SDFormat have where a model gives none.
+#: Default moments and products of inertia of URDF and SDFormat.
 _MOMENTS = [
     dict.fromkeys(("xx", "yy", "zz", "xy", "xz", "yz"), "0"),
     {"xx": "1", "yy": "1", "zz": "1", "xy": "0", "xz": "0", "yz": "0"},
@@ -156,12 +160,12 @@ def read_xml(path: Path) -> Element:
 
 
 def declared_masses(root: Element) -> dict[str, float]:
-    """Return the mass [kg] of each link of a model in URDF or SDFormat; 0 where it gives none."""
+    """Return the mass [kg] of each link of a URDF or SDFormat model; 0 if the model gives none."""
     masses = {}
     for link in root.iter("link"):
         name = link.get("name")
         if name is None:
-            continue  # URDF's <child link="..."/> has other tags, so this is no link
+            continue  # URDF's <child link="..."/> has another tag: this one is not a link
         found = link.find("inertial/mass")
         text = None if found is None else found.get("value", found.text)
         masses[name] = _number(text or "0", f"mass of link {name!r}")
@@ -169,9 +173,9 @@ def declared_masses(root: Element) -> dict[str, float]:
 
 
 def impossible_inertias(root: Element) -> dict[str, str]:
-    """Return the links with a mass whose inertia no body can have, with what is wrong.
+    """Return each link with a mass and a physically impossible inertia, with the reason.
 
-    Drake replaces such an inertia by one of its own.
+    Drake replaces such an inertia by its own value.
     """
     masses, found = declared_masses(root), {}
     for link in root.iter("link"):
@@ -193,7 +197,7 @@ def impossible_inertias(root: Element) -> dict[str, str]:
 
 
 def declared_efforts(root: Element) -> dict[str, float]:
-    """Return the largest effort [N m or N] of each joint that the <limit>s of a model give one."""
+    """Return the largest effort [N m or N] of each joint whose <limit> in the model gives one."""
     efforts = {}
     for joint in root.iter("joint"):
         for limit in joint.iter("limit"):
@@ -203,14 +207,14 @@ def declared_efforts(root: Element) -> dict[str, float]:
 
 
 def declared_mimics(root: Element) -> list[Mimic]:
-    """Return the joints of a model in URDF or SDFormat that follow others."""
-    # URDF, SDFormat and Drake each have their own way to write it.
+    """Return the joints of a URDF or SDFormat model that follow other joints."""
+    # URDF, SDFormat and Drake each write a mimic joint differently.
     found = []
     for joint in root.iter("joint"):
         for tag in joint.iter():
             if tag.tag.rpartition("}")[2].rpartition(":")[2] != "mimic":
                 continue
-            # Attributes in URDF and Drake, elements with a reference in SDFormat.
+            # URDF and Drake use attributes; SDFormat uses elements and has a reference.
             ratio = _number(_value(tag, "multiplier", "1"), "multiplier of a mimic")
             reference = _number(_value(tag, "reference", "0"), "reference of a mimic")
             offset = _number(_value(tag, "offset", "0"), "offset of a mimic") - ratio * reference
@@ -221,7 +225,7 @@ def declared_mimics(root: Element) -> list[Mimic]:
 
 
 def refuse_impossible(root: Element) -> None:
-    """Refuse limits and mimics of URDF or SDFormat of which a parser says where in it they fail.
+    """Reject impossible limits and mimics of URDF or SDFormat: a parser's error lacks the reason.
 
     Raises:
         HandError: If a lower limit is above its upper one, or a joint follows one that does not
@@ -243,10 +247,10 @@ def refuse_impossible(root: Element) -> None:
 
 
 def refuse_limits(name: str, lower: float, upper: float) -> None:
-    """Refuse a joint whose lower limit is above its upper one.
+    """Reject a joint whose lower limit is above its upper limit.
 
     Raises:
-        HandError: If it is.
+        HandError: If it is above.
     """
     if not lower <= upper:
         raise HandError(
@@ -268,17 +272,17 @@ def _number(text: str, what: str) -> float:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Chain:
-    """The m joints that turn or slide, from the palm to one link, as constants.
+    """The m joints that turn or slide between the palm and one link, as constants.
 
     With positions q = gain @ c + offset, the pose of the link in the palm frame is
-    X_GFi = X_PJ[0] X(axis[0], q[0]) X_PJ[1] X(axis[1], q[1]) ... X_JFi, where X(axis, q) turns
-    about the axis by an angle, or slides along it.
+    X_GFi = X_PJ[0] X(axis[0], q[0]) X_PJ[1] X(axis[1], q[1]) ... X_JFi. Here X(axis, q) is a turn
+    about the axis by an angle, or a slide along the axis.
     """
 
-    joints: tuple[str, ...]  # (m,), their names
-    X_PJ: Array  # (m, 4, 4), each joint in the moving frame of the joint before; the first in G
+    joints: tuple[str, ...]  # (m,), names of the joints
+    X_PJ: Array  # (m, 4, 4), joint in the moving frame of the previous joint; the first one in G
     axis: Array  # (m, 3), unit, in the joint's frame J
-    slides: npt.NDArray[np.bool_]  # (m,)
+    slides: npt.NDArray[np.bool_]  # (m,), whether each joint slides
     gain: Array  # (m, 1 + k), positions per coordinate
     offset: Array  # (m,), positions at zero coordinates [rad or m]
     X_JFi: Array  # (4, 4), the link in the moving frame of the last joint
@@ -290,7 +294,7 @@ def moving_joint(joint: Any) -> bool:
 
 
 def refuse_other_joint(joint: Any) -> None:
-    """Refuse a joint that neither turns nor slides nor is fixed."""
+    """Reject a joint that is not revolute, prismatic or fixed."""
     if not (moving_joint(joint) or isinstance(joint, WeldJoint)):
         raise HandError(
             f"model: joint {joint.name()!r} must be revolute, prismatic or fixed, "
@@ -310,10 +314,10 @@ def joint_axis(joint: Any) -> Array:
 
 
 def find_joints(plant: MultibodyPlant, instance: ModelInstanceIndex) -> list[Any]:
-    """Return the joints of a hand's model, in the order of its file.
+    """Return the joints of a hand's model in the order of its file.
 
     Raises:
-        HandError: If one neither turns nor slides nor is fixed, or fixes a link to the world.
+        HandError: If a joint is not revolute, prismatic or fixed, or has the world as its parent.
     """
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
     for joint in joints:
@@ -326,16 +330,16 @@ def find_joints(plant: MultibodyPlant, instance: ModelInstanceIndex) -> list[Any
 
 
 def find_drives(described: HandFile, joints: Sequence[str]) -> dict[str, JointDrive]:
-    """Return what drives each joint that turns or slides, by its name.
+    """Return what drives each joint that turns or slides, by the joint's name.
 
     Args:
         described: The hand file.
         joints: Names of these joints.
 
     Raises:
-        HandError: If a key names another joint, or a joint is driven twice or by nothing.
+        HandError: If a key names another joint, or a joint is driven twice or not at all.
     """
-    # List what the file says of each joint, with the key that says so.
+    # List what the file specifies for each joint, with the key of the specification.
     found = [(f"spread.joints.{n}", j, 0, 1.0, 0.0) for n, j in enumerate(described.spread.joints)]
     found += [(f"preshape.{j}", j, 0, 0.0, at) for j, at in described.preshape.items()]
     for i, finger in enumerate(described.fingers):
@@ -343,7 +347,7 @@ def find_drives(described: HandFile, joints: Sequence[str]) -> dict[str, JointDr
         for n, c in enumerate(finger.coupled):
             found.append((f"fingers.{i}.coupled.{n}.joint", c.joint, 1 + i, c.ratio, c.offset))
 
-    # Each joint must be driven once, and only once.
+    # Each joint must be driven exactly once.
     drives: dict[str, JointDrive] = {}
     for key, joint, column, ratio, offset in found:
         if joint not in joints:
@@ -366,9 +370,9 @@ def find_drives(described: HandFile, joints: Sequence[str]) -> dict[str, JointDr
 def make_chains(
     joints: Sequence[Any], base: RigidBody, drives: Mapping[str, JointDrive], X_GB: Array
 ) -> dict[str, Chain]:
-    """Return the chain of joints from the palm to each link that it carries, the palm included.
+    """Return the chain of joints from the palm to each link of its tree, including the palm.
 
-    A palm that a wrist carries begins its own: what carries it is left out.
+    If a wrist supports the palm, the chains begin at the palm and leave out the wrist.
     """
     k = len(next(iter(drives.values()))[0])
     chains = {
@@ -382,7 +386,7 @@ def make_chains(
             X_JFi=X_GB,
         )
     }
-    # Each link has one joint that carries it, so no link is met twice.
+    # Each link has one joint to its parent, so no link is found twice.
     carriers = {joint.child_body().name(): joint for joint in joints}
     carriers.pop(base.name(), None)
     links = [base.name()]
@@ -395,9 +399,9 @@ def make_chains(
 
 
 def _extended(chain: Chain, joint: Any, drives: Mapping[str, JointDrive]) -> Chain:
-    """Return the chain to the link that a joint carries, from that to the link before.
+    """Return the chain to a joint's child link, given the chain to its parent link.
 
-    The constant poses between two joints that move are multiplied into one.
+    The constant poses between two moving joints are multiplied into one pose.
     """
     X_JF = multiply(chain.X_JFi, joint.frame_on_parent().GetFixedPoseInBodyFrame().GetAsMatrix4())
     X_MC = invert_pose(joint.frame_on_child().GetFixedPoseInBodyFrame().GetAsMatrix4())
@@ -416,10 +420,10 @@ def _extended(chain: Chain, joint: Any, drives: Mapping[str, JointDrive]) -> Cha
 
 
 def refuse_joints_of_others(described: HandFile, chains: Sequence[Chain]) -> None:
-    """Refuse a finger that moves a joint of another one; joints outside all fingers may follow.
+    """Reject a finger that moves a joint of another finger; it may move joints outside all fingers.
 
     Raises:
-        HandError: If one does.
+        HandError: If a finger moves a joint of another finger.
     """
     owners = {
         joint: finger.name

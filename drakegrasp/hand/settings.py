@@ -1,7 +1,7 @@
-"""Loads a configuration: what it leaves open, the hand's file says. Does not import Drake.
+"""Loads a configuration and fills its open values from the hand's file. Does not import Drake.
 
-In: a preset or a YAML file, and what overrides it. Out: a complete `Config`, whose stand-offs and
-spreads are numbers.
+In: a preset or a YAML file, and overrides. Out: a complete `Config`, whose stand-offs and spreads
+are numbers.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file, hand_names
 from drakegrasp.registry import read_class
 
-#: Keys of `candidates` that are the hand's own where they are not given, or null.
+#: Keys of `candidates` that are taken from the hand's file if they are missing or null.
 HAND_KEYS = ("standoffs", "spreads_deg")
-#: Sections and keys that may name classes of the user's own.
+#: Sections and keys that may name user-defined classes.
 CLASS_KEYS = (("candidates", "method"), ("filters", "own"))
 
 
@@ -38,18 +38,18 @@ def load_config(
 ) -> Config:
     """Return the configuration of a preset or YAML file, with overrides applied.
 
-    Stand-offs and spreads that nobody gives are those of the hand's file. Classes of the user's
-    own, `file.py:Name`, are imported: that runs the file.
+    Missing stand-offs and spreads are taken from the hand's file. User-defined classes, given as
+    `file.py:Name`, are imported, which runs the file.
 
     Args:
-        source: A preset's name, or a path to a YAML file; None: the defaults.
-        overrides: `"a.b=c"` strings, c read as YAML; later ones win.
+        source: Name of a preset, or path of a YAML file; None for the defaults.
+        overrides: Strings `"a.b=c"`, with c read as YAML; later ones win.
         values: Top-level fields, e.g. `seed=1`; they win over the overrides.
 
     Raises:
-        ConfigError: If a key is unknown, or a value is of the wrong type or impossible;
-            one line with the key's path, what it must be, and what it was. Also if a class of the
-            user's own cannot be imported.
+        ConfigError: If a key is unknown, a value has the wrong type or is impossible, or a
+            user-defined class cannot be imported. The message is one line with the key's path, what
+            the value must be, and what it was.
         HandError: If the hand's file is needed and cannot be read.
     """
     tree = {} if source is None else read_settings(source)
@@ -73,12 +73,12 @@ def override_config(config: Config, overrides: Sequence[str], **values: Any) -> 
     """Return a configuration with overrides applied, see `load_config`.
 
     Another hand brings its own stand-offs and spreads, unless they are overridden. The hand of a
-    dataset is the one that the dataset carries, unless another is named.
+    dataset is the hand that the dataset contains, unless another hand is named.
 
     Raises:
         ConfigError, HandError: See `load_config`.
     """
-    # All keys: what `to_dict` leaves out would become the default.
+    # Use all keys: a key that `to_dict` leaves out would become the default.
     tree, known = config.model_dump(mode="json"), config.to_dict()
     for text in overrides:
         apply_override(tree, text)
@@ -99,9 +99,9 @@ def override_config(config: Config, overrides: Sequence[str], **values: Any) -> 
 
 
 def _with_absolute_hand(tree: dict[str, Any]) -> dict[str, Any]:
-    """Return a tree of values whose hand, if it is a file, is an absolute path.
+    """Return a tree of values in which the path of a hand file is absolute.
 
-    What is stored must name the same file in whatever directory it is read.
+    A stored path must name the same file in every working directory.
     """
     hand = tree.get("hand")
     if isinstance(hand, str) and hand and hand not in hand_names() and Path(hand).is_file():
@@ -110,10 +110,10 @@ def _with_absolute_hand(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read_classes(tree: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Replace each `path/file.py:Name` of a tree by name and digest; return the files' texts too.
+    """Replace each `path/file.py:Name` in a tree by name and digest; also return the files' texts.
 
     Raises:
-        ConfigError: If one cannot be imported, with its key.
+        ConfigError: If a class cannot be imported; the message names its key.
     """
     code: dict[str, str] = {}
 
@@ -142,20 +142,20 @@ def _completed(
     known: Mapping[str, str] | None = None,
     source: HandSource | None = None,
 ) -> Config:
-    """Return the configuration of a tree of values, where those of the hand may be missing.
+    """Return the configuration of a tree of values; missing values of the hand are filled in.
 
     Args:
         tree: The values.
-        known: Text of the files of classes that the tree names with their digests.
-        source: The hand, if it is not found by the name that the tree has.
+        known: Texts of the files of classes that the tree names with their digests.
+        source: The hand, if the tree's name does not find it.
     """
     tree, code = _read_classes(tree)
     hand, candidates = tree.get("hand", DEFAULT_HAND), tree.get("candidates", {})
     if not isinstance(candidates, dict):
-        return parse_config(tree)  # which refuses it
+        return parse_config(tree)  # which rejects it
     missing = [key for key in HAND_KEYS if candidates.get(key) is None]
     if missing:
-        # A hand that is no text is refused by `parse_config` as well.
+        # `parse_config` rejects a hand that is not a string.
         source = source or (hand if isinstance(hand, str) else DEFAULT_HAND)
         described = read_hand_file(hand_file(source))
         filled = {key: getattr(described, key) for key in missing}

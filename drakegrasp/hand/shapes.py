@@ -1,7 +1,7 @@
 """The collision shapes of a hand's links, as convex sets of points.
 
 In: a hand's model. Out: for each link the corners of its collision shapes, in the link's frame.
-Every shape of a hand is convex (`models/README.md`), so its corners describe it fully.
+Every shape of a hand is convex (`models/README.md`), so its corners describe it completely.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.file_format import Finger, HalfSpace
 from drakegrasp.hand.parsing import KEPT_HANDS, ModelFile, add_model
 
-#: Corners of the polygon that replaces a circle and encloses it.
+#: Number of corners of the polygon that replaces a circle and encloses it.
 CIRCLE = 16
-#: A plane whose normal has less of a line's direction than this is parallel to it.
+#: A plane is parallel to a line if the component of its normal along the line is below this.
 PARALLEL = 1e-9
-#: Shapes do not reach farther from their link [m]: in metres, no hand's do.
+#: Largest allowed reach of a shape from its link's origin [m]; a larger shape has wrong units.
 FARTHEST = 3.0
-#: Twice the area of a triangle that counts as a line [m^2].
+#: Triangles with less than this twice-area are treated as lines [m^2].
 SLIVER = 1e-12
 
 
@@ -44,7 +44,8 @@ def link_shapes(model: ModelFile) -> dict[str, tuple[Array, ...]]:
     """Return the corners (n, 3) [m] of each collision shape of each link, in the link's frame.
 
     Raises:
-        HandError: If a shape is not a box, cylinder, capsule, sphere or convex mesh, or too large.
+        HandError: If a shape is not a box, cylinder, capsule, sphere or convex mesh, or is too
+            large.
     """
     shapes = {}
     for link, inspector, geometries in _links(model):
@@ -61,10 +62,11 @@ def link_shapes(model: ModelFile) -> dict[str, tuple[Array, ...]]:
 
 @lru_cache(maxsize=KEPT_HANDS)
 def link_rims(model: ModelFile) -> dict[str, Array]:
-    """Return what a link's collision shapes are the convex hulls of, exactly, in the link's frame.
+    """Return points, balls and discs whose convex hulls are exactly a link's collision shapes.
 
-    A row (p, a, r) of the result (n, 7) is the corner p [m] if the radius r is 0 [m], a ball about
-    p if the axis a is zero, and else the disc about p across the unit axis a.
+    They are in the link's frame. A row (p, a, r) of the result (n, 7) is the corner p [m] if the
+    radius r is 0 [m], a ball about p if the axis a is zero, and otherwise the disc about p across
+    the unit axis a.
     """
     return {
         link: np.concatenate([np.zeros((0, 7)), *[_rims(inspector, g) for g in geometries]])
@@ -75,7 +77,7 @@ def link_rims(model: ModelFile) -> dict[str, Array]:
 def _links(
     model: ModelFile,
 ) -> Iterator[tuple[str, SceneGraphInspector, Sequence[GeometryId]]]:
-    """Yield the links of a model, each with what describes shapes, and its collision shapes."""
+    """Yield each link of a model, with the inspector of its shapes, and its collision shapes."""
     plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     instance = add_model(plant, model)
@@ -100,9 +102,9 @@ def _rims(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
 def pad_surfaces(model: ModelFile, fingers: Sequence[Finger]) -> tuple[Array, ...]:
     """Return the surface (t, 3, 3) [m] of each fingertip's pad as triangles, in its link's frame.
 
-    The surface is that of the convex hull of the link's shapes, as far as it is in the hand file's
-    pad region. The planes of the region are no surface, so it is open there. A fingertip without
-    shapes has no triangles.
+    The surface is the part of the surface of the convex hull of the link's shapes that is in the
+    hand file's pad region. It is open at the planes of the region. A fingertip without shapes has
+    no triangles.
 
     Raises:
         HandError: See `link_shapes`.
@@ -128,9 +130,10 @@ def ray_span(corners: Array, start: Array, direction: Array) -> tuple[float, flo
     Args:
         corners: (n, 3) [m].
         start: (3,), a point of the line [m].
-        direction: (3,), its unit of length; before the start, positions are negative.
+        direction: (3,), direction of the line; positions on the line are multiples of it, negative
+            before the start.
     """
-    # On the line p = start + t direction each plane n.p + d <= 0 of the hull is a limit of t.
+    # On the line p = start + t direction, each plane n.p + d <= 0 of the hull limits t.
     planes = hull_planes(corners)
     slope, offset = planes[:, :3] @ direction, planes[:, :3] @ start + planes[:, 3]
     if (offset[np.abs(slope) < PARALLEL] > 0.0).any():
@@ -147,7 +150,7 @@ def hull_triangles(corners: Array) -> Array:
 
 
 def _clip(triangles: Array, half_space: HalfSpace) -> Array:
-    """Return the triangles (s, 3, 3) [m] of what is in a half-space of triangles (t, 3, 3) [m]."""
+    """Return the part of triangles (t, 3, 3) [m] in a half-space, as triangles (s, 3, 3) [m]."""
     normal, offset = np.array(half_space[:3]), half_space[3]
     kept = []
     for triangle, heights in zip(triangles, dot(triangles, normal) - offset, strict=True):
@@ -162,7 +165,7 @@ def _clip(triangles: Array, half_space: HalfSpace) -> Array:
         kept += [(corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1)]
     found = np.reshape(kept, (-1, 3, 3))
 
-    # Edges on the plane leave triangles without an area.
+    # Edges on the plane leave triangles without area.
     sides = found[:, 1:] - found[:, :1]
     return found[norm(np.cross(sides[:, 0], sides[:, 1])) > SLIVER]
 
@@ -191,7 +194,7 @@ def _corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
 
 
 def primitive_corners(shape: Shape) -> Array | None:
-    """Return points (n, 3) around a shape, in its frame [m]; None if it is no primitive."""
+    """Return points (n, 3) around a primitive shape, in its frame [m]; None for another shape."""
     if isinstance(shape, Box):
         return _box(shape.size() / 2.0)
     if isinstance(shape, Cylinder):
@@ -217,7 +220,7 @@ def _prism(radius: float, half_length: float) -> Array:
 
 def ball_corners(radius: float, count: int = CIRCLE**2) -> Array:
     """Return points (count, 3) on a sphere about the origin [m]."""
-    # A Fibonacci lattice: even spacing without poles.
+    # A Fibonacci lattice has even spacing without poles.
     i = np.arange(count) + 0.5
     z, turn = 1.0 - 2.0 * i / count, np.pi * (1.0 + np.sqrt(5.0)) * i
     across = np.sqrt(1.0 - z**2)
