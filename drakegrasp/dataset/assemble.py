@@ -1,10 +1,10 @@
-"""From shards to trials.hdf5, grasping_oto.hdf5 and grasping_otm.hdf5, and their data card.
+"""From shards to trials.hdf5, grasping_oto.hdf5, grasping_otm.hdf5 and their data card.
 
-In: a directory whose work units are all done. Out: the three files, all or none, and their card.
-The work is done in tasks, by an `Executor`: `assembly.survey` reads the shards of an object,
-`assembly.pack` makes the compressed chunks of some rows. This process decides which successes are
-samples, and puts the chunks into the files. It keeps a few numbers per success, whatever the
-number of attempts. Imports no Drake.
+In: a directory whose work units are all done. Out: the three files, all or none, and their card. An
+`Executor` runs the work in tasks: `assembly.survey` reads the shards of an object, `assembly.pack`
+compresses the chunks of a range of rows. This process decides which successes become samples, and
+writes the chunks to the files. It keeps a few numbers per success, whatever the number of attempts.
+It does not import Drake.
 """
 
 from __future__ import annotations
@@ -64,13 +64,14 @@ from drakegrasp.runtime.progress import Report, silent
 
 @dataclass(frozen=True, kw_only=True)
 class Assembly:
-    """What the files of a dataset hold.
+    """Numbers of rows in the files of a dataset.
 
     Attributes:
         trials: Number of attempts.
         grasps: Number of successes.
-        removed: Number of successes by reason of removal; `Removal.KEPT` are the samples.
-        samples: Number of samples by split.
+        removed: Number of successes for each reason of removal; the key `Removal.KEPT` counts the
+            samples.
+        samples: Number of samples in each split.
     """
 
     trials: int
@@ -92,17 +93,18 @@ def assemble(
     Args:
         out: Directory of the dataset.
         overrides: `key=value` texts that change the filters or the split of the dataset.
-        rejected: Trials that an inspection rejects, by id or identity; they become no samples.
-        execute: Does the work; the files do not depend on it.
-        progress: Called with the number of tasks that are done and to do.
+        rejected: Trials that an inspection rejects, as ids or identities; they do not become
+            samples.
+        execute: Executor of the tasks; the files do not depend on it.
+        progress: Called with the number of finished tasks and the number of all tasks.
 
     Raises:
         ConfigError: If an override cannot be used; nothing is changed.
-        DataError: If a shard is missing or damaged, what is rejected is no success, or another
-            process builds in the directory; the old files and filters stay.
-        DiskFullError: If there is no room; the old files and filters stay.
+        DataError: If a shard is missing or damaged, if a rejected trial is not a success, or if
+            another process builds in the directory; the old files and filters stay.
+        DiskFullError: If the disk has no room; the old files and filters stay.
     """
-    # The lock would make a missing directory.
+    # The lock would create a missing directory.
     if not out.is_dir():
         read_manifest(out)
     with build_lock(out):
@@ -123,24 +125,24 @@ def assemble_locked(
 
     Args:
         out: Directory of the dataset.
-        manifest: Of the dataset; it may have other filters or another split than the one there.
-        rejected: As for `assemble`; those of the manifest if None, as far as they are successes.
+        manifest: Manifest of the dataset; its filters and split may differ from those on disk.
+        rejected: As for `assemble`; if None, the rejections of the manifest that are successes.
         execute: As for `assemble`.
         progress: As for `assemble`.
     """
     sweep_temporary(out)
     with disk_full_named(out), replaced_together(out) as new:
-        # Survey the shards: how many rows, and of each success what the filters need.
+        # Survey the shards: the number of rows, and what the filters need of each success.
         shards = number_rows(_survey_all(out, manifest, execute, progress), manifest)
 
-        # Decide which successes are samples, and in which split.
+        # Decide which successes become samples, and in which split.
         if rejected is not None:
             known = keys_of(manifest, shards.successes)
             manifest = replace(manifest, rejected=find_keys(rejected, known, out))
         decisions = decide(manifest, shards)
         certified = manifest.config.certified
 
-        # Write what is small, and room for all rows.
+        # Write the small tables, and allocate all rows.
         paths = {camera: new(name) for camera, name in {"": TRIALS_FILE, **DATA_FILES}.items()}
         with ExitStack() as stack:
             files = {c: stack.enter_context(new_hdf5(path)) for c, path in paths.items()}
@@ -155,7 +157,7 @@ def assemble_locked(
             _write_table(files[""], "objects", OBJECT_FIELDS, object_columns(manifest))
             _write_table(files[""], "successes", SUCCESS_FIELDS, decisions.columns())
 
-            # Rows are packed in any order, and put into the files in theirs.
+            # Rows are packed in any order, and each chunk is written at its own position.
             tasks = list(pack_tasks(out, decisions, certified=certified))
             texts = sample_texts(manifest)
             surveyed = len({piece.object for piece in shards.slices})
@@ -163,8 +165,8 @@ def assemble_locked(
                 unpack_rows(task, files, texts)
                 progress(surveyed + done, surveyed + len(tasks))
 
-        # What the files hold, in words and numbers. Filters, split and rejections change with the
-        # files that they made.
+        # The card describes the files in words and numbers. The manifest, with filters, split and
+        # rejections, changes together with the files.
         content = content_of(manifest, paths[""], paths["oto"])
         for name, text in card_files(content).items():
             new(name).write_bytes(text)
@@ -173,10 +175,10 @@ def assemble_locked(
 
 
 def _survey_all(out: Path, manifest: Manifest, execute: Executor, progress: Report) -> list[Survey]:
-    """Return the surveys of all objects with a palm pose, by their rows of /objects.
+    """Return the surveys of all objects with a palm pose, in the order of /objects.
 
     Raises:
-        DataError: If a shard is missing or damaged, or there is none.
+        DataError: If a shard is missing or damaged, or no object has a palm pose.
     """
     surveys = []
     for survey in in_order(execute)(survey_object, survey_tasks(out, manifest)):
@@ -188,9 +190,9 @@ def _survey_all(out: Path, manifest: Manifest, execute: Executor, progress: Repo
 
 
 def _packed(execute: Executor, tasks: Sequence[PackTask]) -> Iterator[PackTask]:
-    """Yield the tasks whose parts are written, in order; remove those that are left at the end."""
+    """Yield the tasks whose parts are written, in order; remove the remaining parts at the end."""
     try:
-        # When this generator is closed, that of the tasks is, first: none writes any more.
+        # Closing this generator first closes the one of the tasks, so no task writes any more.
         yield from in_order(execute)(pack_rows, tasks)
     finally:
         for task in tasks:
@@ -198,10 +200,10 @@ def _packed(execute: Executor, tasks: Sequence[PackTask]) -> Iterator[PackTask]:
 
 
 def summarise(out: Path) -> Assembly:
-    """Return what the files of a dataset hold.
+    """Return the numbers of rows in the files of a dataset.
 
     Raises:
-        DataError: If they are missing or damaged.
+        DataError: If the files are missing or damaged.
     """
     with open_trials(out / TRIALS_FILE) as trials, open_samples(out / DATA_FILES["oto"]) as data:
         removal = read_codes(trials["successes/removal"], list(Removal))
@@ -217,7 +219,7 @@ def summarise(out: Path) -> Assembly:
 def _write_table(
     file: h5py.File, name: str, fields: Sequence[Field], columns: Mapping[str, AnyArray]
 ) -> None:
-    """Write a group whose rows are all known."""
+    """Write a group all of whose rows are known."""
     group = file.create_group(name)
     for field in fields:
         write_field(group, field, columns[field.name])

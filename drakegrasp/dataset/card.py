@@ -1,8 +1,8 @@
-"""The data card: what a dataset is, how it was made, how much it holds, and what it cannot.
+"""The data card: what a dataset is, how it was made, how much it holds, and what it cannot do.
 
-In: the directory of a dataset. Out: its content, a dictionary of JSON types, and two files of it,
-`DATACARD.json` for programs and `DATACARD.md` for people. It has no time and no machine in it: the
-same files give the same card.
+In: the directory of a dataset. Out: the content of its card, a dictionary of JSON types, and two
+files with this content, `DATACARD.json` for programs and `DATACARD.md` for people. The card
+contains no time and no machine: the same files produce the same card.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ from drakegrasp.hand.folder import HandFolder, hand_folder
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.files import write_atomic
 
-#: What the licence is called of meshes for which none is stated.
+#: Licence shown for meshes without a stated one.
 NOT_STATED = "not stated"
-#: The licence of a hand that comes with the package and has none of its own.
+#: Licence of a hand that comes with the package and has no licence file of its own.
 OWN_LICENCE = "BSD-3-Clause, that of drakegrasp"
-#: Signs of a licence's first line.
+#: Maximum number of characters shown of a licence's first line.
 LONGEST_LINE = 100
-#: Known limits, and the page of drakegrasp's docs that says more.
+#: Known limits, each with the page of drakegrasp's docs that says more.
 LIMITS = (
     ("Everything is simulated: no grasp was tried on a real robot.", "explanation/physics.md"),
     (
@@ -78,13 +78,13 @@ LIMITS = (
 )
 
 
-#: The settings that a reader asks for first.
+#: The settings that a reader needs first.
 SETTINGS = (
     *("candidates.method", "candidates.max", "candidates.standoffs", "physics.friction_hand"),
     *("physics.friction_table", "objects.mass", "lift.drive", "filters.require"),
     *("filters.max_slip", "filters.max_turn_deg", "camera.size"),
 )
-#: What is known of a hand whose files are there: its file, and the folder of all of them.
+#: A hand whose files were found: its hand file, and the folder of all its files.
 KnownHand = tuple[HandFile, HandFolder]
 #: The files of a dataset that a reader needs, in words.
 FILES = {
@@ -97,7 +97,7 @@ FILES = {
 
 
 def card_content(out: Path) -> dict[str, Any]:
-    """Return what the card of a dataset says, as JSON types.
+    """Return the content of a dataset's card, as JSON types.
 
     Args:
         out: Directory of the dataset.
@@ -124,28 +124,28 @@ def card_counts(out: Path) -> dict[str, Any]:
 
 
 def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
-    """Return what the card says of a manifest and of files that may not have their names yet.
+    """Return the card's content for a manifest and for files that may still have temporary names.
 
     Args:
-        manifest: Of the dataset.
-        trials: Its trials.hdf5.
-        data: One of its data files.
+        manifest: Manifest of the dataset.
+        trials: Path of its trials.hdf5.
+        data: Path of one of its data files.
 
     Raises:
         DataError: If one of the files is missing or damaged.
     """
-    # The manifest has more objects than the files while a build goes on that adds some.
+    # While a build that adds objects runs, the manifest has more objects than the files.
     attempts, config = Trials(trials, any_name=True), manifest.config
     funnel, holding, hand = funnel_of(attempts), holding_of(attempts), _known_hand(config)
     entries = [entry for entry in manifest.objects if entry.name in funnel.names]
     with open_samples(data) as file:
         rule, counts = str(file.attrs.get("split_by", "class")), _counts(file, funnel)
-        # Entries of the card that most datasets lack.
+        # Optional entries of the card, which most datasets lack.
         more = {"fingertip_loads": _loads(file, hand and rated_load(hand[0]))}
     if holding is not None:
         more["p_hold"] = {"in_words": holding_lines(holding), **asdict(holding)}
 
-    # The known limits, and one that follows from the counts.
+    # The known limits, and one limit that follows from the counts.
     limits = [*LIMITS]
     if note := held_note(funnel):
         limits.append((f"{note[0].upper()}{note[1:]}.", "reference/outcomes.md"))
@@ -174,7 +174,7 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
 
 
 def _count_scenes(out: Path) -> dict[str, dict[str, int]] | None:
-    """Return the counts of scenes.hdf5; None if there is none, or a damaged or older one."""
+    """Return the counts of scenes.hdf5; None if it is missing, damaged or outdated."""
     path = out / SCENES_FILE
     if not path.is_file():
         return None
@@ -186,7 +186,7 @@ def _count_scenes(out: Path) -> dict[str, dict[str, int]] | None:
 
 
 def licences(entries: Iterable[ObjectEntry]) -> dict[str, list[str]]:
-    """Return the objects' names by the licence of their meshes, in the order of the names."""
+    """Return the names of the objects for each licence of their meshes, sorted by licence."""
     found: dict[str, list[str]] = {}
     for entry in entries:
         found.setdefault(entry.licence or NOT_STATED, []).append(entry.name)
@@ -194,17 +194,17 @@ def licences(entries: Iterable[ObjectEntry]) -> dict[str, list[str]]:
 
 
 def _settings(config: Config, hand: KnownHand | None) -> dict[str, Any]:
-    """Return the settings that a reader asks for first; the manifest has all of them."""
+    """Return the settings that a reader needs first; the manifest has all settings."""
     tree = config.to_dict()
     settings = {key: tree[room][name] for key in SETTINGS for room, name in [key.split(".")]}
-    # Labels depend on the drive. The file of an older dataset's hand may be elsewhere now.
+    # Labels depend on the drive. The file of an older dataset's hand may have moved.
     if config.lift.drive is None:
         settings["lift.drive"] = hand[0].drive if hand else "that of the hand file"
     return settings
 
 
 def _known_hand(config: Config) -> KnownHand | None:
-    """Return the hand of the dataset or the package; None if it is neither's, or has changed."""
+    """Return the hand if it is in the dataset or the package and unchanged, or else None."""
     source = config.hand_source
     if not isinstance(source, CarriedHand) and config.hand not in hand_names():
         return None
@@ -218,12 +218,12 @@ def _known_hand(config: Config) -> KnownHand | None:
 
 
 def _hand_licences(config: Config, hand: KnownHand | None) -> dict[str, str]:
-    """Return the first line of each licence of a hand, by the name of its file."""
+    """Return the first line of each licence of a hand, by the name of the licence file."""
     if hand is None:
         return {}
     found = {}
     for place in hand[1].licences:
-        # The first line of the text that says something, shortened.
+        # The first line of the text that is not empty, shortened.
         text = hand[1].content(place).decode(errors="replace")
         lines = (printable(line.strip()) for line in text.splitlines())
         found[place] = next(filter(None, lines), "")[:LONGEST_LINE]
@@ -233,7 +233,7 @@ def _hand_licences(config: Config, hand: KnownHand | None) -> dict[str, str]:
 def _loads(file: h5py.File, rated: float | None) -> dict[str, Any] | None:
     """Return how the samples' forces compare with the hand's rated load, if it is known.
 
-    A fingertip's force is the larger one of after closing and after the lift.
+    The force of a fingertip is the larger of its forces after closing and after the lift.
     """
     if rated is None:
         return None
@@ -241,7 +241,7 @@ def _loads(file: h5py.File, rated: float | None) -> dict[str, Any] | None:
         np.maximum(*(norm(file[split][f"grasp_props/f_Q_C{when}"][:]) for when in ("", "_held")))
         for split in SPLITS
     ]
-    # A finger that a preshape leaves out has none.
+    # A finger that a preshape leaves out has no force.
     largest = np.nan_to_num(np.concatenate(forces)).max(axis=1, initial=0.0)
     loads = {"rated_N": rated, "above": int((largest > rated).sum()), "samples": len(largest)}
     if len(largest):
@@ -250,7 +250,7 @@ def _loads(file: h5py.File, rated: float | None) -> dict[str, Any] | None:
 
 
 def _counts(file: h5py.File, funnel: Funnel) -> dict[str, Any]:
-    """Return the numbers of attempts, grasps and samples: of all, by class, object and split."""
+    """Return the numbers of attempts, grasps and samples: in total, by class, object and split."""
     samples = {
         split: Counter(read_names(file[split]["object_props/object_name"])) for split in SPLITS
     }
@@ -288,7 +288,7 @@ def _counts(file: h5py.File, funnel: Funnel) -> dict[str, Any]:
 def _row(
     funnel: Funnel, samples: Mapping[str, Counter[str]], objects: Sequence[int]
 ) -> dict[str, int]:
-    """Return the counts of some objects together."""
+    """Return the summed counts of several objects."""
     counts = {
         "attempts": funnel.outcomes,
         "held": funnel.outcomes[:, Outcome.SUCCESS],
@@ -307,10 +307,10 @@ def _row(
 
 
 def write_card(out: Path) -> None:
-    """Write both files of the card, each whole or not at all.
+    """Write both files of the card, each completely or not at all.
 
     Args:
-        out: Directory of the dataset, whose three files are there.
+        out: Directory of the dataset, in which the three files exist.
 
     Raises:
         DataError: If a file of the dataset is missing or damaged.
@@ -321,10 +321,10 @@ def write_card(out: Path) -> None:
 
 
 def card_files(content: dict[str, Any]) -> dict[str, bytes]:
-    """Return the bytes of both files by their names.
+    """Return the bytes of both files, by their names.
 
     Args:
-        content: Of the card, see `card_content`.
+        content: Content of the card, see `card_content`.
     """
     text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
     return dict(zip(CARD_FILES, (text.encode(), card_text(content).encode()), strict=True))
@@ -334,8 +334,8 @@ def card_text(content: Mapping[str, Any]) -> str:
     """Return a card as Markdown.
 
     Args:
-        content: As `card_content` gives it; that of an export also has the samples by camera, the
-            camera, the columns, and those of scenes (`exchange.hub.folder`).
+        content: Content as `card_content` returns it; the content of an export also has the samples
+            by camera, the camera, the columns, and the columns of scenes (`exchange.hub.folder`).
     """
     sections = [section(content) for key, section in SECTIONS if key in content]
     text = "\n\n".join(filter(None, sections))
@@ -467,7 +467,7 @@ def _limits(content: Mapping[str, Any]) -> str:
 
 
 def _cameras(content: Mapping[str, Any]) -> str:
-    """Return how many samples each camera has, and how a pixel of a depth image is a point."""
+    """Return the numbers of samples by camera, and the formula from depth pixels to points."""
     cameras, unit = content["samples_by_camera"], content["depth_unit"]
     rows = [(split, *(counts[split] for counts in cameras.values())) for split in SPLITS]
     (fx, _, cx), (_, fy, cy) = content["camera"]["K"][:2]
@@ -494,7 +494,7 @@ def _columns(content: Mapping[str, Any]) -> str:
     )
 
 
-#: The sections of the card in order, each with the key that content must have for it.
+#: The sections of the card in order, each with the key of the content that it needs.
 SECTIONS: tuple[tuple[str, Callable[[Mapping[str, Any]], str]], ...] = (
     ("conventions", _what),
     ("files", _files),
@@ -511,7 +511,7 @@ SECTIONS: tuple[tuple[str, Callable[[Mapping[str, Any]], str]], ...] = (
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return a Markdown table; numbers are on the right."""
+    """Return a Markdown table; columns of integers are aligned to the right."""
     rows = list(rows)
     sides = ["--:" if all(type(r[k]) is int for r in rows) else "---" for k in range(len(heads))]
     lines = [heads, sides, *([_cell(value) for value in row] for row in rows)]
@@ -525,7 +525,7 @@ def _cell(value: object) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a text whose signs mean nothing to Markdown tables and HTML."""
+    """Return a text without characters that are special in Markdown tables and HTML."""
     signs = {"&": "&amp;", "<": "&lt;", ">": "&gt;", "\\": "\\\\", "|": "\\|"}
     for sign, written in signs.items():
         text = text.replace(sign, written)

@@ -1,7 +1,7 @@
-"""HDF5 files of a dataset: opening one to read, writing a field, reading rows of images fast.
+"""HDF5 files of a dataset: opening a file, writing a field, reading rows of images fast.
 
-HDF5 spends most of the time of reading an image on inflating it. libdeflate does that four times
-as fast; it is used where the package `deflate` is installed, with the same result.
+HDF5 spends most of the time of reading an image on decompression. libdeflate is four times as fast,
+with the same result; it is used if the package `deflate` is installed.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ except ModuleNotFoundError:
     deflate = None
 
 AnyArray = npt.NDArray[Any]
-#: How many bytes the compression of HDF5 packs into one at most (zlib: 1,032 to 1).
+#: Largest number of bytes that the compression of HDF5 packs into one byte (zlib: 1,032 to 1).
 MOST_PACKED = 1_032
-#: Level of compression: higher ones save a tenth of the bytes for twice the time.
+#: Level of compression: higher levels save a tenth of the bytes for twice the time.
 GZIP_LEVEL = 1
-#: Rows in a chunk of a column of small values.
+#: Number of rows in a chunk of a column of small values.
 COLUMN_CHUNK = 2048
 
 
 def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
-    """Open a file of a dataset to read it; close it after use.
+    """Open a file of a dataset for reading; the caller closes it.
 
-    An untrusted file may use links or external storage, or claim rows that it does not hold; our
-    files never do, so such a file is refused.
+    An untrusted file may use links or external storage, or claim rows that it does not hold. Our
+    files never do, so such a file is rejected.
 
     Args:
-        path: Of the file.
-        again: Whether the same work has opened the file before: then nothing is looked for.
+        path: Path of the file.
+        again: Whether the same work has opened the file before; then it is not searched for these.
 
     Raises:
-        OSError: If it cannot be read.
-        DataError: If a process died while it replaced the files beside it, or it has links, values
-            that lie elsewhere, or more rows than it can hold.
+        OSError: If the file cannot be read.
+        DataError: If a process died while it replaced the files beside it, or if the file has
+            links, values stored outside of it, or more rows than it can hold.
     """
     refuse_half_replaced(path.parent)
     refuse_irregular(path)
@@ -70,7 +70,7 @@ def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
 def says_damage(error: BaseException) -> bool:
     """Return whether an error says that an HDF5 file is damaged.
 
-    h5py raises errors of many kinds then, even a KeyError or a TypeError, but always itself.
+    h5py then raises errors of many kinds, even a KeyError or a TypeError, but always from its code.
     """
     if isinstance(error, OSError | UnicodeDecodeError | MemoryError):
         return True
@@ -91,7 +91,7 @@ def _find_elsewhere(file: h5py.File) -> str | None:
             if group.links.get_info(key).type != h5py.h5l.TYPE_HARD:
                 return f"a link at {name}"
 
-            # An object may have several names, and a group may be within itself.
+            # An object may have several names, and a group may contain itself.
             item = h5py.h5o.open(group, key)
             address = h5py.h5o.get_info(item).addr
             if isinstance(item, h5py.h5g.GroupID) and address not in seen:
@@ -108,10 +108,10 @@ def _find_elsewhere(file: h5py.File) -> str | None:
 
 
 def read_texts(dataset: h5py.Dataset) -> tuple[str, ...]:
-    """Return the texts of a dataset, to be shown: none steers a terminal.
+    """Return the texts of a dataset for display: all are printable, so none controls a terminal.
 
     Raises:
-        DataError: If one of them is no text or cannot be printed.
+        DataError: If one of them is not text or cannot be printed.
     """
     path = dataset.file.filename
     try:
@@ -125,10 +125,10 @@ def read_texts(dataset: h5py.Dataset) -> tuple[str, ...]:
 
 
 def read_names(dataset: h5py.Dataset) -> tuple[str, ...]:
-    """Return the names of objects in a dataset of texts, which may become names of files.
+    """Return the names of objects in a dataset of texts; they may become names of files.
 
     Raises:
-        DataError: If one of them is none.
+        DataError: If one of them is not a valid name.
     """
     names = read_texts(dataset)
     for name in names:
@@ -138,10 +138,10 @@ def read_names(dataset: h5py.Dataset) -> tuple[str, ...]:
 
 
 def read_column(group: h5py.Group, name: str) -> AnyArray:
-    """Return a column of numbers, whole: a third of the time that `group[name][:]` takes.
+    """Return a whole column of numbers, in a third of the time that `group[name][:]` takes.
 
     Raises:
-        OSError: If it is missing or cannot be read.
+        OSError: If the column is missing or cannot be read.
     """
     try:
         column = h5py.h5d.open(group.id, name.encode())
@@ -162,17 +162,17 @@ def read_rows(
     rows: slice = slice(None),
     fields: Iterable[Field] = (),
 ) -> AnyArray:
-    """Return rows (n, ...) of a field; one that an older file lacks is derived, or has no value.
+    """Return rows (n, ...) of a field; a field missing in an older file is derived or empty.
 
     Args:
         group: The group of the field.
         field: The field.
         rows: The rows.
-        fields: Of the group: the shapes of those that are there say what the letters in the shape
-            of a field without a value stand for.
+        fields: Fields of the group; the shapes of existing ones define the lengths of the letters
+            in the shape of a field without values.
 
     Raises:
-        DataError: If the field must be there, and is not.
+        DataError: If the field is required and missing.
     """
     if field.name in group:
         dataset = group[field.name]
@@ -187,7 +187,7 @@ def read_rows(
 
 
 def sizes_in(group: h5py.Group, fields: Iterable[Field]) -> dict[str, int]:
-    """Return the lengths of the letters in the shapes of those fields that a group has."""
+    """Return the lengths of the letters in the shapes of the fields that a group has."""
     found: dict[str, int] = {}
     for field in fields:
         if field.name in group:
@@ -199,13 +199,13 @@ def sizes_in(group: h5py.Group, fields: Iterable[Field]) -> dict[str, int]:
 def create_field(
     group: h5py.Group, field: Field, shape: tuple[int, ...], rows: int = 0
 ) -> h5py.Dataset:
-    """Create the dataset of a field, with room for some rows; it can be resized.
+    """Create the resizable dataset of a field, with a number of rows.
 
-    Unit, frame and meaning become attributes. An image is one chunk, because loaders read single
-    samples in random order.
+    Unit, frame and meaning become attributes. Each image is a chunk of its own, because loaders
+    read single samples in random order.
 
     Args:
-        group: Where to create it.
+        group: Group of the dataset.
         field: The field.
         shape: Shape of one row.
         rows: Number of rows.
@@ -237,15 +237,15 @@ def write_field(group: h5py.Group, field: Field, values: AnyArray) -> h5py.Datas
 
 
 def packed_chunk(values: AnyArray, rows: int) -> bytes:
-    """Return what HDF5 stores of a chunk of a column, as `create_field` packs it.
+    """Return the bytes that HDF5 stores for a chunk of a column, as `create_field` packs it.
 
     Args:
         values: (n, ...), rows of the chunk.
-        rows: Number of rows of the chunk, at least n; what is beyond the end of a column is zero.
+        rows: Number of rows of the chunk, at least n; rows beyond the end of a column are zero.
     """
     whole = np.zeros((rows, *values.shape[1:]), dtype=values.dtype)
     whole[: len(values)] = values
-    # The first bytes of all numbers come first, then the second ones.
+    # The first bytes of all numbers are stored first, then the second bytes, and so on.
     planes = whole.reshape(-1).view(np.uint8).reshape(-1, values.dtype.itemsize).T
     return zlib.compress(planes.tobytes(), GZIP_LEVEL)
 
@@ -254,8 +254,8 @@ def unpacked_chunk(chunk: bytes, skipped: int, like: h5py.Dataset) -> AnyArray:
     """Return the row (1, ...) of a chunk that `create_field` or `write_fixed` packed.
 
     Args:
-        chunk: What HDF5 stores.
-        skipped: The filters that it skipped: 1 the order of bytes, 2 the compression.
+        chunk: The stored bytes.
+        skipped: Mask of the filters that HDF5 skipped: 1 the order of bytes, 2 the compression.
         like: A dataset of the same type, with rows of the same shape.
     """
     content = chunk if skipped & 2 else zlib.decompress(chunk)
@@ -266,10 +266,10 @@ def unpacked_chunk(chunk: bytes, skipped: int, like: h5py.Dataset) -> AnyArray:
 
 
 def write_fixed(group: h5py.Group, field: Field, values: AnyArray) -> None:
-    """Create the dataset of a field that no row is added to, from all of its rows (n, ...).
+    """Create the dataset of a field from all of its rows (n, ...); no row can be added later.
 
-    It is one chunk, or one for each image, and has no attributes: less than half of the bytes that
-    HDF5 spends on the dataset of `write_field`.
+    It is one chunk, or one for each image, and has no attributes, so HDF5 spends less than half of
+    the bytes that it needs for the dataset of `write_field`.
     """
     if not len(values):
         group.create_dataset(field.name, data=values, dtype=field.dtype)
@@ -286,7 +286,7 @@ def write_fixed(group: h5py.Group, field: Field, values: AnyArray) -> None:
 
 
 class ImageRows:
-    """The rows of a field of images, each a chunk of its own.
+    """The rows of a field of images, each of which is a chunk of its own.
 
     Args:
         dataset: The field in an open file.
@@ -298,7 +298,7 @@ class ImageRows:
         self._origin = (0,) * len(self._shape)
         self._bytes = dataset.dtype.itemsize * int(np.prod(self._shape))
 
-        # What `create_field` writes. A file that was packed otherwise is left to HDF5.
+        # The filters of `create_field`. A file that was packed in another way is left to HDF5.
         pipeline = dataset.id.get_create_plist()
         filters = [pipeline.get_filter(k)[0] for k in range(pipeline.get_nfilters())]
         self._inflated_here = (
@@ -309,7 +309,7 @@ class ImageRows:
         )
 
     def __getitem__(self, row: int) -> AnyArray:
-        """Return the image of a row, an array of its own.
+        """Return the image of a row as a new array.
 
         Raises:
             OSError: If the chunk is damaged.
@@ -322,7 +322,7 @@ class ImageRows:
         """Read the image of a row.
 
         Args:
-            row: Of the field.
+            row: Row of the field.
             image: Contiguous array of an image's shape and type; it is overwritten.
 
         Raises:
@@ -335,7 +335,7 @@ class ImageRows:
             _unshuffle(self._inflate(chunk, row), image)
 
     def _chunk(self, row: int) -> bytes | None:
-        """Return what is stored of a row; None if no filter was applied, or nothing is."""
+        """Return the stored bytes of a row; None if a filter was skipped, or nothing is stored."""
         try:
             skipped, chunk = self._dataset.id.read_direct_chunk((row, *self._origin))
         except RuntimeError:
@@ -353,7 +353,7 @@ class ImageRows:
 
 
 def _unshuffle(content: bytearray, image: AnyArray) -> None:
-    """Write the numbers whose first bytes come first in a buffer, then the second ones."""
+    """Write numbers from a buffer with the first bytes of all numbers first, then the second."""
     *planes, highest = np.frombuffer(content, dtype=np.uint8).reshape(image.itemsize, -1)
     numbers = image.view(f"<u{image.itemsize}").reshape(-1)
     numbers[:] = highest

@@ -1,4 +1,4 @@
-"""Reads the JSON files of a dataset as typed data: what is of another type is refused.
+"""Reads the JSON files of a dataset as typed data and rejects values of another type.
 
 In: a file and a pydantic model. Out: the model, or a `DataError` that names the file and the key.
 """
@@ -22,7 +22,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def _refuse_no_name(text: str) -> str:
-    """Refuse what would lead out of the directory as a file's name, or steer a terminal."""
+    """Raise an error if a name, used as a file's name, could leave the directory."""
     if not is_name(text):
         raise ValueError(f"a name must be {NAME_RULE}, got {text!r}")
     return text
@@ -33,7 +33,7 @@ Name = Annotated[str, AfterValidator(_refuse_no_name)]
 
 
 def stated(entry: DataclassInstance) -> dict[str, Any]:
-    """Return a dataclass as JSON types, without the values that are those of its defaults."""
+    """Return a dataclass as JSON types, without the values that equal their defaults."""
     values = asdict(entry)
     return {f.name: values[f.name] for f in fields(entry) if values[f.name] != f.default}
 
@@ -42,12 +42,12 @@ def read_mapping(path: Path, what: str) -> tuple[dict[str, Any], bytes]:
     """Return the content of a JSON file that must be a mapping, and its bytes.
 
     Args:
-        path: Of the file.
-        what: What it must be, in words.
+        path: Path of the file.
+        what: Description of a valid file, for the message.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        DataError: If it cannot be read, or is something else.
+        DataError: If the file cannot be read, or is not a JSON mapping.
     """
     try:
         content = read_content(path, LARGEST_TEXT)
@@ -63,12 +63,12 @@ def read_mapping(path: Path, what: str) -> tuple[dict[str, Any], bytes]:
 
 
 def validated(path: Path, content: bytes, model: type[M]) -> M:
-    """Return JSON text as a model; every value has exactly its type.
+    """Return JSON text as a model; every value must have exactly the type of its field.
 
     Args:
-        path: Of its file, for the message.
+        path: Path of the file, for the message.
         content: The text, which `read_mapping` has read.
-        model: The model.
+        model: Class of the model.
 
     Raises:
         DataError: If a key is missing, unknown or of another type.

@@ -1,21 +1,21 @@
-"""The lock of a dataset's directory, one build at a time, and the log of its builds.
+"""The lock of a dataset's directory, which allows one build at a time, and the log of its builds.
 
-`build.lock` in the directory is a line of JSON that names the process that builds there. The
-process holds the kernel's lock (flock) on the file and removes it at the end of the build. A
-second build is refused and names the first. The kernel frees the lock of a process that dies: the
-next build takes the file over and names the dead one.
+`build.lock` in the directory holds one line of JSON that names the process that builds there. The
+process holds the kernel's lock (flock) on the file and removes the file at the end of the build. A
+second build is rejected with a message that names the first. The kernel frees the lock of a process
+that dies: the next build takes over the file and names the dead process.
 
-Between machines the lock is as good as the file system's: NFS and Lustre (mounted with `flock`)
-lock for all machines. On a file system without locks the line of JSON decides: if its process ran
-on this machine and is gone, the next build takes over. A process of another machine counts as
-alive; the message says which file to remove if it is dead.
+Between machines the lock is as good as that of the file system: NFS and Lustre (mounted with
+`flock`) lock files for all machines. On a file system without locks the line of JSON decides: if
+its process ran on this machine and has ended, the next build takes over the file. A process of
+another machine counts as alive; the message says which file to remove if that process is dead.
 
-The library filelock is no substitute: its flock names no holder, so a refusal could not say who
-builds, and a build could not report whose lock it took over.
+The library filelock cannot replace this module: its flock does not name the holder, so the message
+of a rejected build could not say who builds, and a build could not report whose lock it took over.
 
-`log.jsonl` has the events of the builds with their times, a line of JSON each. People, their tools
-and the estimate of the remaining time read it. No data come from it, and it is the only file of a
-dataset that depends on the clock.
+`log.jsonl` lists the events of the builds with their times, one line of JSON each. People, their
+tools and the estimate of the remaining time read it. No data are derived from it, and it is the
+only file of a dataset that depends on the clock.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ from drakegrasp.runtime.files import (
 )
 
 LOCK_FILE = "build.lock"
-#: Folders that a build makes in the directory.
+#: Folders that a build creates in the directory.
 FOLDERS = ("builtin", "hand", "objects", "shards")
-#: Directories that a thread of this process holds, and the lock of this set.
+#: Directories that a thread of this process holds, and the lock that guards this set.
 _held: set[str] = set()
 _claiming = threading.Lock()
 
@@ -58,8 +58,8 @@ class Holder:
 
     Attributes:
         process: The process.
-        since: When it took the lock, in ISO 8601.
-        command: Its command line.
+        since: Time at which the process took the lock, in ISO 8601.
+        command: Command line of the process.
     """
 
     process: Process
@@ -74,16 +74,17 @@ class Holder:
 def build_lock(out: Path) -> Iterator[Holder | None]:
     """Hold a directory while the block runs.
 
-    Yields the dead holder from whom the lock was taken over, or None. Files that it was replacing
-    are all new then. One function of a command takes the lock, and what it calls relies on it.
+    Yields the dead holder whose lock was taken over, or None. Files that the dead holder was
+    replacing are then all new. One function of each command takes the lock, and the functions that
+    it calls rely on it.
 
     Args:
-        out: The directory; made if it is missing, and removed again if it stays empty.
+        out: The directory; created if it is missing, and removed again if it stays empty.
 
     Raises:
         DataError: If another process builds in the directory, or it cannot be written.
     """
-    # A directory that is made here goes again if it stays empty.
+    # A directory that is created here is removed again if it stays empty.
     try:
         made = not out.exists()
         out.mkdir(parents=True, exist_ok=True)
@@ -111,12 +112,12 @@ def build_lock(out: Path) -> Iterator[Holder | None]:
 
 
 def _claim(out: Path) -> str:
-    """Take a directory for one thread of this process; return by what `_held` names it.
+    """Take a directory for one thread of this process; return the key that `_held` has for it.
 
-    On network file systems the kernel's lock belongs to a process, with all its threads.
+    On network file systems the kernel's lock belongs to a process with all its threads.
 
     Raises:
-        DataError: If a thread of this process has it already.
+        DataError: If a thread of this process already holds the directory.
     """
     key = os.path.realpath(out)
     with _claiming:
@@ -129,10 +130,10 @@ def _claim(out: Path) -> str:
 
 
 def tidy(out: Path) -> None:
-    """Put in order what a process that died left in a directory, if somebody did.
+    """Finish or remove what a dead process left unfinished in a directory.
 
-    For commands that only read. Nothing happens where a process builds, or where this one may not
-    write.
+    For commands that only read. Nothing happens if a process builds in the directory, or if this
+    process may not write there.
     """
     leftovers = (out / LOCK_FILE, out / LIST_NAME)
     if any(map(os.path.lexists, leftovers)) or any(stale_temporary(out)):
@@ -141,10 +142,12 @@ def tidy(out: Path) -> None:
 
 
 def _refuse_linked_folders(out: Path) -> None:
-    """Refuse a dataset whose subfolders are symbolic links: nothing is written outside of it.
+    """Raise an error if a subfolder of the dataset is a symbolic link.
+
+    A build therefore never writes outside of the dataset.
 
     Raises:
-        DataError: If one is a link.
+        DataError: If a subfolder is a link.
     """
     inner = out / "shards"
     folders = [out / name for name in FOLDERS]
@@ -157,15 +160,15 @@ def _refuse_linked_folders(out: Path) -> None:
 
 
 def unwritable(out: Path, error: OSError) -> DataError:
-    """Return the refusal of a directory that cannot be written."""
+    """Return the error for a directory that cannot be written."""
     return DataError(f"{out}: must be a directory that can be written, got: {error.strerror}")
 
 
 def _take(path: Path) -> tuple[FileIO, Holder | None]:
-    """Return the open lock file, which is ours now, and its dead holder, if there was one.
+    """Return the open lock file, which this process now holds, and its dead holder or None.
 
     Raises:
-        DataError: If another process holds it, or it cannot be written.
+        DataError: If another process holds the file, or it cannot be written.
     """
     while True:
         try:
@@ -173,7 +176,7 @@ def _take(path: Path) -> tuple[FileIO, Holder | None]:
         except OSError as error:
             raise unwritable(path.parent, error) from None
         try:
-            # The kernel decides, or on a file system without locks (None) the file's content.
+            # The kernel decides; on a file system without locks (None) the file's content does.
             locked = lock_file(file)
             before = _read(file)
             alive = before is not None and before.process.runs() is not False
@@ -185,11 +188,11 @@ def _take(path: Path) -> tuple[FileIO, Holder | None]:
         except BaseException:
             file.close()
             raise
-        file.close()  # its holder removed it after we opened it: try again
+        file.close()  # its holder removed it after this process opened it: try again
 
 
 def _is_at(path: Path, file: FileIO) -> bool:
-    """Return whether an open file is still the one at a path."""
+    """Return whether an open file is still the file at a path."""
     try:
         return os.path.samestat(path.stat(), os.fstat(file.fileno()))
     except FileNotFoundError:
@@ -197,7 +200,7 @@ def _is_at(path: Path, file: FileIO) -> bool:
 
 
 def _read(file: FileIO) -> Holder | None:
-    """Return the holder that a lock file names, or None if it names none."""
+    """Return the holder that a lock file names, or None if it names nobody."""
     try:
         content = json.loads(os.pread(file.fileno(), 1 << 16, 0))
         return Holder(
@@ -241,20 +244,20 @@ class BuildLog:
         self._path = out / LOG_FILE
 
     def __call__(self, event: str, **facts: Any) -> None:
-        """Append an event in one write, so that a crash leaves whole lines.
+        """Append an event in a single write, so that a crash leaves only whole lines.
 
         Args:
             event: Name of the event, e.g. "unit done".
-            facts: Its details, as JSON types.
+            facts: Details of the event, as JSON types.
 
         Raises:
             OSError: If the file cannot be written.
-            DataError: If it is a link.
+            DataError: If the file is a link.
         """
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
         line = json.dumps({"time": now, "event": event, **facts}, ensure_ascii=False)
 
-        # Other alphabets stay readable; what would steer a terminal becomes its code.
+        # Letters of other alphabets stay readable; control characters become escape codes.
         line = "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in line) + "\n"
         descriptor = open_own(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
         try:
@@ -264,9 +267,9 @@ class BuildLog:
 
 
 def read_log(out: Path) -> Iterator[dict[str, Any]]:
-    """Yield the events of a directory's builds, oldest first; none if there is no log.
+    """Yield the events of a directory's builds, oldest first; nothing if there is no log.
 
-    A line that is no event is skipped, such as one that a full disk has cut off.
+    A line that is not an event is skipped, for example one that a full disk has cut off.
     """
     try:
         refuse_irregular(out / LOG_FILE)

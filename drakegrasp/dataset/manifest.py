@@ -1,8 +1,8 @@
 """`manifest.json`: the configuration, the objects and the versions of a dataset.
 
-A build writes it before the first work unit. A directory without a readable manifest holds no
-dataset; a directory with the manifest of another configuration is refused. It has no time, no
-machine and no number of workers in it: the same command gives the same bytes.
+A build writes it before the first work unit. A directory without a readable manifest contains no
+dataset, and a build rejects a directory with the manifest of another configuration. The manifest
+contains no time, no machine and no number of workers: the same command produces the same bytes.
 """
 
 from __future__ import annotations
@@ -56,16 +56,16 @@ from drakegrasp.runtime.files import probe_folder, refuse_half_replaced, write_a
 
 #: Packages whose versions may change a result.
 VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "h5py")
-#: Versions that must not change within a dataset, nor between a client and its workers. A dataset
-#: may be of another version of drakegrasp, if that gives the same results.
+#: Versions that must not change within a dataset, nor differ between a client and its workers. The
+#: version of drakegrasp may differ if both versions produce the same results.
 REQUIRED_VERSIONS = ("drakegrasp", "drake", "hand")
-#: The oldest version of drakegrasp whose results are equal to those of this one. A change by which
-#: the same settings give other values sets it to the version in which it is released.
+#: The oldest version of drakegrasp whose results equal those of this one. A change after which the
+#: same settings produce other values sets it to the version in which the change is released.
 RESULTS_SINCE = "0.2.0"
 
 
 def _refuse_no_pose(packed: tuple[float, ...]) -> tuple[float, ...]:
-    """Refuse numbers that are no rigid motion."""
+    """Raise an error if the numbers are not a rigid motion."""
     try:
         read_pose(unpack_pose(np.array(packed)), "it")
     except GraspError as error:
@@ -74,15 +74,16 @@ def _refuse_no_pose(packed: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _refuse_unprintable(text: str) -> str:
-    """Refuse what would steer a terminal."""
+    """Raise an error if a text is not printable, since it could control a terminal."""
     if not text.isprintable():
         raise ValueError(f"it must be printable, got {text!r}")
     return text
 
 
 #: Key of the hash of all other keys.
+#: Key of the hash of all other keys.
 DIGEST = "sha256"
-#: Types of what a manifest holds; they are checked when one is read.
+#: Types of the values in a manifest; they are checked when a manifest is read.
 Axis = Annotated[str, Field(pattern=r"^[+-][xyz]$")]
 Hex = Annotated[str, Field(pattern="^[0-9a-f]+$")]
 Text = Annotated[str, AfterValidator(_refuse_unprintable)]
@@ -92,8 +93,8 @@ Pose = Annotated[
 ]
 
 
-#: Stands for section `verify` in every signature. No row depends on that section, and its first
-#: defaults keep the signatures of datasets that were made with them.
+#: Replaces the section `verify` in every signature. No row depends on that section, and its first
+#: defaults keep the signatures of datasets that were built with them.
 VERIFY_BEFORE = {
     "max_surface_distance": 0.01,
     "max_residual": 0.008,
@@ -113,7 +114,7 @@ class RestingEntry:
 
     Attributes:
         X_TO: The pose, (12,): the first three rows of the 4x4 matrix [m, -].
-        probability: Share of the drops that ended in it.
+        probability: Fraction of the drops that ended in the pose.
         rolled: Whether the object would have rolled on and was stopped.
     """
 
@@ -125,29 +126,31 @@ class RestingEntry:
 @with_config(ConfigDict(extra="forbid"))
 @dataclass(frozen=True, kw_only=True)
 class ObjectEntry:
-    """An object that was prepared, in the manifest.
+    """A prepared object, in the manifest.
 
     Attributes:
-        name, class_name: Of the object.
-        mesh_sha256: Hash of the mesh file and of what `objects.yaml` says of it, hexadecimal.
+        name, class_name: Names of the object and of its class.
+        mesh_sha256: Hash of the mesh file and of its entry in `objects.yaml`, hexadecimal.
         scale: Metres per unit of length of the mesh file.
         up: Axis of the mesh file that is +z of {O}.
         mass: Mass [kg].
         density: Mass over volume [kg/m^3].
-        friction: Its own coefficient with hand and table; None: the configuration's.
+        friction: The object's own coefficient of friction with hand and table; None: those of the
+            configuration.
         collision_error: Largest distance between mesh and collision surface [m].
-        resting: Its resting poses.
+        resting: Resting poses of the object.
         candidates: Number of palm poses to try, drawn from the distinct ones.
         combinations: Number of combinations of rotations that were considered.
         valid: Number of those above the table whose palm ray meets the bounding box.
         distinct: Number of different palm poses among the valid ones.
         notes: What was repaired in the mesh.
         licence: Identifier of the mesh's licence; None: not stated.
-        tried: Number of palm poses up to which a target of samples was met; None: all.
-        group: What it shares with others of the same mesh, which stay in one split; None: its name.
-        seed: Of its draws, in a merged dataset; None: that of the configuration.
-        drawn_as: Name in its files, where a merged dataset has the mesh under several seeds; None:
-            its name.
+        tried: Number of palm poses after which a target of samples was met; None: all.
+        group: Name shared by objects of the same mesh, which stay in one split; None: the object's
+            name.
+        seed: Seed of the object's draws, in a merged dataset; None: that of the configuration.
+        drawn_as: Name of the object in its files, if a merged dataset has the mesh under several
+            seeds; None: the object's name.
     """
 
     name: Name
@@ -173,11 +176,11 @@ class ObjectEntry:
 
     @property
     def mesh_name(self) -> str:
-        """Name of its mesh: under several seeds it is one object of the split."""
+        """Name of the mesh; a mesh under several seeds is one object of the split."""
         return self.drawn_as or self.name
 
     def config_in(self, config: Config) -> Config:
-        """Return the configuration of the object in a dataset's: with the seed of its draws."""
+        """Return a dataset's configuration with the seed of this object's draws."""
         return config if self.seed is None else config.model_copy(update={"seed": self.seed})
 
     def to_json(self) -> dict[str, Any]:
@@ -191,10 +194,10 @@ class RefusedMesh:
     """A mesh that cannot be simulated, in the manifest.
 
     Attributes:
-        name: Of the object.
-        mesh_sha256: Hash of the mesh file and of what `objects.yaml` says of it, hexadecimal.
-        reason: Why it was refused, in words.
-        again: Whether the machine may be at fault, so that the next build tries it again.
+        name: Name of the object.
+        mesh_sha256: Hash of the mesh file and of its entry in `objects.yaml`, hexadecimal.
+        reason: Why the mesh was rejected, in words.
+        again: Whether the machine may be the cause, so that the next build tries the mesh again.
     """
 
     name: Name
@@ -210,11 +213,11 @@ class Manifest:
     Attributes:
         config: Resolved configuration, with the seed.
         objects: The objects, in the order of the dataset's rows.
-        refused: The meshes that were refused.
-        rejected: Attempts that an inspection rejects: successes that are no samples.
-        versions: Versions of the packages that made the dataset, and a hash of the hand's files.
-        fingers: Name of each finger in grasp order, and whether a grasp needs its fingertip.
-        joints: Names of the hand's joints in the order of the fields `q`; older datasets have none.
+        refused: The meshes that were rejected.
+        rejected: Attempts that an inspection rejects: successes that are not samples.
+        versions: Versions of the packages that built the dataset, and a hash of the hand's files.
+        fingers: Names of the fingers in grasp order, each with whether a grasp needs its fingertip.
+        joints: Names of the hand's joints in the order of the fields `q`; empty in older datasets.
         schema_version: Version of the schema of the dataset's files.
     """
 
@@ -246,7 +249,7 @@ class Manifest:
                 )
 
     def config_of(self, name: str) -> Config:
-        """Return the configuration of an object by its name, see `ObjectEntry.config_in`."""
+        """Return the configuration of the object of a name, see `ObjectEntry.config_in`."""
         own = (entry.config_in(self.config) for entry in self.objects if entry.name == name)
         return next(own, self.config)
 
@@ -262,18 +265,18 @@ class Manifest:
 
     @property
     def split_rule(self) -> Rule:
-        """What `split.by` of the configuration stands for with these objects."""
+        """The rule that `split.by` of the configuration selects for these objects."""
         classes = [entry.class_name for entry in self.objects]
         return split_rule(self.config.split, classes, self.groups)
 
     def pose_numbers(self) -> list[npt.NDArray[np.int64]]:
-        """Return a number (r,) of each resting pose of each object, see `number_poses`."""
+        """Return a number for each resting pose (r,) of each object, see `number_poses`."""
         # The third row of X_TO is the table's normal in {O}, and the height.
         up = [[pose.X_TO[8:11] for pose in entry.resting] for entry in self.objects]
         return number_poses([entry.mesh_name for entry in self.objects], up)
 
     def signature(self) -> str:
-        """Return a hash of all in it that decides a row of the dataset, hexadecimal."""
+        """Return a hash of everything that determines a row of the dataset, hexadecimal."""
         unlicensed = tuple(replace(entry, licence=None) for entry in self.objects)
         content = _content(replace(self, objects=unlicensed, refused=()))
         content["config"]["verify"] = VERIFY_BEFORE
@@ -281,13 +284,13 @@ class Manifest:
 
 
 def finger_names(config: Config) -> dict[str, bool]:
-    """Return the name of each finger in grasp order, and whether a grasp needs its fingertip."""
+    """Return the names of the fingers in grasp order, each with whether a grasp needs its tip."""
     fingers = read_hand_file(hand_file(config.hand_source)).fingers
     return {finger.name: finger.required for finger in fingers}
 
 
 def installed_versions(config: Config) -> dict[str, str]:
-    """Return the versions of all that may change a result: packages, and the hand's files."""
+    """Return all versions that may change a result: those of packages, and the hand's hash."""
     packages = {name: metadata.version(name) for name in VERSIONED}
     return {**packages, "hand": hand_digest(config.hand_source)}
 
@@ -299,7 +302,7 @@ def other_version(then: Mapping[str, str], now: Mapping[str, str]) -> str | None
 
 
 def same_results(name: str, *versions: str) -> bool:
-    """Return whether two versions of one package are equal, or both of ours give equal results."""
+    """Return whether versions of a package are equal, or are ours and produce equal results."""
     since, *numbers = (
         [int(number) for number in re.findall(r"\d+", text)[:3]]
         for text in (RESULTS_SINCE, *versions, metadata.version("drakegrasp"))
@@ -338,7 +341,7 @@ def manifest_text(manifest: Manifest) -> bytes:
 
 
 def _digest(content: Mapping[str, Any]) -> str:
-    """Return the hash of all that a manifest says beside it, however it is laid out."""
+    """Return the hash of all other keys of a manifest, whatever its layout."""
     said = {key: value for key, value in content.items() if key != DIGEST}
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
@@ -356,7 +359,7 @@ def _content(manifest: Manifest) -> dict[str, Any]:
         "objects": [entry.to_json() for entry in manifest.objects],
         "refused": [stated(entry) for entry in manifest.refused],
     }
-    # Most datasets have none.
+    # Most datasets have no rejections.
     if manifest.rejected:
         content["rejected"] = [stated(key) for key in manifest.rejected]
     return content
@@ -366,12 +369,12 @@ def read_manifest(out: Path) -> Manifest:
     """Return the manifest of a dataset's directory.
 
     Raises:
-        DataError: If there is none, it cannot be read, it is of another schema, or a process died
-            while it replaced the files.
+        DataError: If the manifest is missing, cannot be read or has another schema, or if a process
+            died while it replaced the files.
     """
     path = out / FILE_NAME
     refuse_half_replaced(out)
-    # A missing file is another mistake than a broken one.
+    # A missing file gets another message than a broken one.
     try:
         tree, content = read_mapping(path, "a readable manifest")
     except FileNotFoundError:
@@ -379,7 +382,7 @@ def read_manifest(out: Path) -> Manifest:
             f"{out.absolute()}: must be the directory of a dataset, got one without {FILE_NAME}"
         ) from None
 
-    # The version first: another schema may have other keys.
+    # Check the version first: another schema may have other keys.
     refuse_other_schema(path, tree.get("schema_version"))
     stored = validated(path, content, _Stored)
     try:
@@ -387,7 +390,7 @@ def read_manifest(out: Path) -> Manifest:
     except ConfigError as error:
         raise DataError(f"{path}: {error}") from None
 
-    # A dataset that was passed on has its hand with it.
+    # A dataset that was passed on contains its hand.
     carried = carried_hand(out, config.hand, stored.versions.get("hand", ""))
     manifest = Manifest(
         config=config.with_hand(config.hand, carried),
@@ -395,7 +398,7 @@ def read_manifest(out: Path) -> Manifest:
     )
     if (mistake := next(_contradictions(stored, manifest), None)) is not None:
         raise DataError(f"{path}: {mistake}")
-    # What is left is a value that may be, but is another one. Older manifests have no digest.
+    # What remains is a valid value that was changed. Older manifests have no digest.
     if stored.sha256 not in (None, _digest(tree)):
         raise DataError(
             f"{path}: must be as it was written, got one with another {DIGEST}: it is damaged, or "
@@ -422,7 +425,7 @@ class _Stored(BaseModel):
 
 
 def _contradictions(stored: _Stored, manifest: Manifest) -> Iterator[str]:
-    """Yield where a manifest contradicts itself, in words."""
+    """Yield the contradictions within a manifest, in words."""
     config = manifest.config
     for key, said, must in (
         ("config_hash", stored.config_hash, config.simulation_hash()),
@@ -452,33 +455,33 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
     """Return the manifest of the dataset that a build with this configuration continues.
 
     Args:
-        out: The directory; made if it is missing.
+        out: The directory; created if it is missing.
         config: Configuration of the build.
 
     Returns:
         The manifest in the directory, or None if the directory is empty or new.
 
     Raises:
-        DataError: If the directory holds other files, the dataset of another configuration, or
+        DataError: If the directory holds other files or the dataset of another configuration, or
             cannot be written; nothing in it is changed.
     """
-    # The directory must be writable: better to fail now than after the first work unit.
+    # The directory must be writable: it is better to fail now than after the first work unit.
     try:
         out.mkdir(parents=True, exist_ok=True)
         probe_folder(out)
     except OSError as error:
         raise unwritable(out, error) from None
 
-    # Without a manifest it must be empty, but for what an interrupted build may leave.
+    # Without a manifest, it may only contain what an interrupted build leaves.
     if not (out / FILE_NAME).exists():
         _refuse_other_files(out)
         return None
 
-    # With a manifest it must continue the same dataset.
+    # With a manifest, the build must continue the same dataset.
     manifest = read_manifest(out)
     installed = installed_versions(config)
     same_hand = is_hand(config.hand_source, manifest.versions.get("hand"))
-    if same_hand:  # wherever its files are
+    if same_hand:  # wherever the hand's files are
         config = config.with_hand(manifest.config.hand)
     config = continued(config, manifest.config)
     if manifest.config.simulation_hash() != config.simulation_hash():
@@ -491,7 +494,7 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
             f"{out}: must be of one seed to be built on, got a merged dataset of several; build on "
             "those that it was merged of"
         )
-    if same_hand:  # version 0.2 had another digest of the same files
+    if same_hand:  # version 0.2 had another digest for the same files
         installed["hand"] = manifest.versions["hand"]
     if (name := other_version(manifest.versions, installed)) is not None:
         raise DataError(
@@ -502,10 +505,10 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
 
 
 def _refuse_other_files(out: Path) -> None:
-    """Refuse a directory with files that no build of ours writes.
+    """Raise an error if a directory has files that none of our builds writes.
 
     Raises:
-        DataError: If there is one.
+        DataError: If there is such a file.
     """
     own = (*FOLDERS, LOCK_FILE, LOG_FILE)
     names = (path.name for path in out.iterdir())
@@ -518,12 +521,12 @@ def _refuse_other_files(out: Path) -> None:
 
 
 def release_directory(out: Path) -> None:
-    """Remove the files of a build that made nothing, and the directory if it is then empty."""
+    """Remove the files of a build that produced nothing, and the directory if it is then empty."""
     for name in (FILE_NAME, LOG_FILE):
         (out / name).unlink(missing_ok=True)
     if not (out / HAND_FOLDER).is_symlink():
         shutil.rmtree(out / HAND_FOLDER, ignore_errors=True)
-    # A directory with anything else in it was there before.
+    # A directory with any other content existed before.
     for folder in (*(out / name for name in FOLDERS), out):
         with suppress(OSError):
             folder.rmdir()
@@ -533,7 +536,7 @@ def with_postprocessing(manifest: Manifest, overrides: Sequence[str]) -> Manifes
     """Return a manifest with other values of the filters or the split.
 
     Args:
-        manifest: Of the dataset.
+        manifest: Manifest of the dataset.
         overrides: `key=value` texts, e.g. "split.valid_fraction=0.2".
 
     Raises:
@@ -551,7 +554,7 @@ def with_postprocessing(manifest: Manifest, overrides: Sequence[str]) -> Manifes
 def differences(
     theirs: Config, ours: Config, ignored: Collection[str] = POSTPROCESSING_KEYS
 ) -> str:
-    """Return the values that differ, in words; by default those that change the simulation."""
+    """Return the differing values in words; by default only those that change the simulation."""
     a, b = _flatten(theirs.to_dict()), _flatten(ours.to_dict())
     keys = [k for k in a | b if a.get(k) != b.get(k) and k.partition(".")[0] not in ignored]
     return ", ".join(f"{k} ({a.get(k)} there, {b.get(k)} here)" for k in keys)

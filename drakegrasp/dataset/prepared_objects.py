@@ -1,7 +1,7 @@
-"""Objects at rest with their palm poses, and their files.
+"""Objects at rest with their palm poses, and the files that hold them.
 
-In: an object that `generation.prepare` made. Out: `objects/<name>.npz` with the object and
-`objects/<name>.plan.h5` with its resting pose and palm poses, in the dataset's directory. Work
+In: an object that `generation.prepare` has prepared. Out: `objects/<name>.npz` with the object and
+`objects/<name>.plan.h5` with its resting poses and palm poses, in the dataset's directory. Work
 units, `check` and `replay` read these two files and do not need the mesh file.
 """
 
@@ -36,11 +36,12 @@ from drakegrasp.runtime.files import atomic_hdf5
 from drakegrasp.simulation.candidates import Candidates
 from drakegrasp.table import Table
 
-#: What an object's entry in the manifest has of its model, and of its palm poses.
+#: Fields of an object's entry in the manifest that come from its model.
 _OF_MODEL = (
     *("name", "class_name", "mesh_sha256", "scale", "up", "mass", "density", "friction"),
     *("collision_error", "notes"),
 )
+#: Fields of the entry that come from the object's candidates.
 _COUNTS = ("combinations", "valid", "distinct")
 
 
@@ -50,9 +51,9 @@ class PreparedObject:
 
     Attributes:
         model: Meshes and mass properties.
-        resting_poses: (r, 4, 4), resting poses X_TO; the first is the paper's.
-        probability: (r,), share of the drops that ended in each.
-        table_force: (r,), upward force of the table at rest [N].
+        resting_poses: (r, 4, 4), resting poses X_TO; the first is the one of the paper.
+        probability: (r,), fraction of the drops that ended in each resting pose.
+        table_force: (r,), upward force of the table on the object at rest [N].
         stopped: (r,) bool, whether the object would have rolled on and was stopped, see
             `settle.settle`.
         candidates: Palm poses and their rays.
@@ -78,7 +79,7 @@ class PreparedObject:
             for X_TO, share, rolled in zip(*columns, strict=True)
         )
 
-        # What is known of the object, its poses at rest, and how many palm poses there are.
+        # Facts of the object, its resting poses, and the number of palm poses.
         return ObjectEntry(
             **{name: getattr(self.model, name) for name in _OF_MODEL},
             resting=resting,
@@ -88,7 +89,7 @@ class PreparedObject:
 
 
 def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
-    """Write both files of an object; the plan comes last, with the hash of the other file.
+    """Write both files of an object; the plan is written last, with the hash of the other file.
 
     Args:
         prepared: The object.
@@ -112,7 +113,7 @@ def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
 
 
 def _save_postures(postures: Table, file: h5py.File) -> None:
-    """Write the arrays of postures; texts are JSON."""
+    """Write the columns of the postures; texts are stored as JSON."""
     for field in (*POSTURE_FIELDS, *POSTURE_TEXTS):
         data = postures[field.name]
         if field.optional and not any(data.tolist()):
@@ -123,16 +124,16 @@ def _save_postures(postures: Table, file: h5py.File) -> None:
 
 
 def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
-    """Return an object as `save_prepared` wrote it.
+    """Return an object that `save_prepared` wrote.
 
     Raises:
-        DataError: If its files are missing, damaged, of another configuration or of another
-            number of palm poses.
-        MeshError: If the file of its meshes is of another version.
+        DataError: If its files are missing or damaged, or belong to another configuration or
+            another number of palm poses.
+        MeshError: If the file of its meshes has another version.
     """
     path = plan_path(out, name)
 
-    # Both files must be as they were written, and of this configuration.
+    # Both files must be unchanged, and belong to this configuration.
     refuse_changed_model(out, name, recorded_model(out, name))
     with opened(path, "the plan of an object") as file:
         attributes = dict(file.attrs)

@@ -1,23 +1,25 @@
-"""How good grasps are: how implausible they look, and how much disturbance they tolerate.
+"""Quality of grasps: how implausible they look, and how much disturbance they tolerate.
 
-In: columns of trials.hdf5. Out: a score of suspicion with its parts; of the lifts that were
-repeated with disturbances (`simulation.robustness`) the shares that end well, with intervals, and
-how well numbers of the first lift rank the grasps. No such number ever fills a column of p_hold.
+In: columns of trials.hdf5. Out: a score of suspicion with its parts; for lifts that were repeated
+with disturbances (`simulation.robustness`), the fractions of repeats that end well, with intervals,
+and how well numbers of the first lift rank the grasps. Such a number never fills a column of
+p_hold.
 
-The score of suspicion says which grasps a person should look at first. By itself it removes
-nothing; a limit in the configuration (`filters.max_suspicion`) can. Each part is a quantity that a
-firm grasp keeps small, divided by the value from which on the part alone is reason enough to look,
+The score of suspicion tells which grasps a person should look at first. By itself it removes
+nothing; a limit in the configuration (`filters.max_suspicion`) can. Each part is a quantity that is
+small for a firm grasp, divided by the value above which this part alone is reason enough to look,
 see `PARTS`:
 
-* `normal_angle`, `surface_distance`: patches on both sides of an edge give a mean normal and a
+* `normal_angle`, `surface_distance`: a patch on both sides of an edge has a mean normal and a
   centre that no surface has.
-* `imbalance`: after the lift the fingertips' forces and the weight should cancel. What is left is
-  carried by something else, or accelerates the object.
-* `normal_sum`: length of the sum of the unit normals after closing. Opposed fingers cancel; where
-  all push the same way the object escapes. On 1,023 lifts of 29 objects it tells failed lifts
-  from held ones with an area under the ROC curve of 0.83.
+* `imbalance`: after the lift, the fingertips' forces and the weight should cancel. The rest is
+  supported by something else, or accelerates the object.
+* `normal_sum`: length of the sum of the unit normals after closing. Normals of opposed fingers
+  cancel; if all fingers push in the same direction, the object escapes. On 1,023 lifts of 29
+  objects it separates failed lifts from held ones with an area under the ROC curve of 0.83.
 
-Epsilon, the Ferrari-Canny measure, is no part: as a threshold it loses half of the true grasps.
+Epsilon, the Ferrari-Canny measure, is not a part: as a threshold it would remove half of the true
+grasps.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ from drakegrasp.outcomes import Outcome, Stage
 
 #: Drake's gravity [m/s^2], as in `simulation.settle`, which loads Drake.
 GRAVITY = 9.81
-#: A part counts at most this often: one wild number must not hide what the others say.
+#: Largest value of a part: one extreme number must not hide the others.
 CAP = 3.0
 
 
@@ -50,11 +52,12 @@ class Part:
     """One reason to doubt a grasp.
 
     Attributes:
-        name: Of the part.
-        scale: Value from which on it alone is reason enough to look; own choices, see below.
-        shown: How people read it.
-        meaning: What it is, in words.
-        stage: First stage at which it has a value.
+        name: Name of the part.
+        scale: Value from which on the part alone is reason enough to look; our own choices, see
+            below.
+        shown: How people read the part.
+        meaning: Description of the part, in words.
+        stage: First stage at which the part has a value.
     """
 
     name: str
@@ -71,9 +74,9 @@ def _shown(name: str) -> Shown:
     return shown
 
 
-#: The scales are the limits of `filters` in the preset `paper` where there is one. The others are
-#: values that 5 % of the stable grasps on 29 objects exceed (penetration, sum of normals: for
-#: three fingers 1.6), or none of them does (imbalance).
+#: The scales are the limits of `filters` in the preset `paper`, if it has a limit. The others are
+#: values that 5 % of the stable grasps on 29 objects exceed (penetration; the sum of normals: 1.6
+#: for three fingers), or that none of them exceeds (imbalance).
 PARTS = (
     Part(
         "penetration",
@@ -148,11 +151,11 @@ class Suspicion:
     """How implausible n attempts look.
 
     Attributes:
-        score: (n,), root of the sum of the squared shares; NaN if nothing was simulated.
-        values: By the names of PARTS, (n,), the quantity itself in its unit; NaN where the attempt
-            did not get so far, or where contacts have no normal.
-        shares: By the names of PARTS, (n,), value divided by scale, at most CAP; NaN where the
-            attempt did not get so far.
+        score: (n,), root of the sum of the squared parts; NaN if nothing was simulated.
+        values: By the names of PARTS, (n,), the quantity itself in its unit; NaN if the attempt
+            ended before its stage, or if a contact has no normal.
+        shares: By the names of PARTS, (n,), value divided by scale, at most CAP; NaN if the attempt
+            ended before its stage.
     """
 
     score: Array
@@ -163,18 +166,18 @@ class Suspicion:
 def suspicion(columns: Mapping[str, npt.NDArray[Any]]) -> Suspicion:
     """Return how implausible attempts look, and why.
 
-    An attempt that ended before the lift is judged by what it has. A contact without a normal
-    (patches that face each other) counts as the largest share; a fingertip that does not touch
-    has no contact.
+    An attempt that ended before the lift is judged by the parts that it has. A contact without a
+    normal (its patches face each other) counts with the largest part, CAP; a fingertip that does
+    not touch has no contact.
 
     Args:
         columns: Rows of `/trials` by the names of COLUMNS.
     """
-    # How far each attempt got: the times have values from their stage on.
+    # How far each attempt got: each time has a value from its stage on.
     closed, lifted = np.isfinite(columns["time_close"]), np.isfinite(columns["time_lift"])
     reached = {Stage.CLOSED: closed, Stage.LIFTED: closed & lifted}
 
-    # Each part's value, and its share of the scale.
+    # The value of each part, and the value divided by its scale.
     values = _values(columns)
     shares = {}
     for part in PARTS:
@@ -190,8 +193,8 @@ def suspicion(columns: Mapping[str, npt.NDArray[Any]]) -> Suspicion:
 
 
 def _values(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, Array]:
-    """Return the values (n,) of all parts, whatever the attempts' stage."""
-    # The deepest of both instants; a finger that does not touch has none.
+    """Return the values (n,) of all parts, whatever the stage of the attempts."""
+    # The largest depth of both instants; a finger that does not touch has none.
     depths = np.stack([columns["closed_penetration"], columns["lifted_penetration"]])
     depths = np.nan_to_num(depths).max(axis=(0, -1), initial=0.0)
 
@@ -202,7 +205,7 @@ def _values(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, Array]:
     rest_T = multiply(R_TO, f_O[..., None])[..., 0]
     rest_T[:, 2] -= weight
 
-    # A finger that does not touch has no contact; a finger of a failure may lack the normal, too.
+    # A finger that does not touch has no contact; in a failed attempt a normal may be missing.
     touching = np.asarray(columns["closed_touching"], dtype=bool)
     fits = {
         name: np.where(touching, columns[name], 0.0).max(axis=1, initial=0.0)
@@ -225,9 +228,9 @@ def _values(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, Array]:
     }
 
 
-#: Probability that the true share lies in an interval.
+#: Probability that the true fraction is in an interval.
 CONFIDENCE = 0.95
-#: A grasp is robust if at least this share of its repeats are samples.
+#: A grasp is robust if at least this fraction of its repeats are samples.
 MUCH = 0.5
 #: Columns of `/trials` from which the predictors follow.
 PREDICTED_BY = (
@@ -239,14 +242,14 @@ PREDICTED_BY = (
 def wilson_interval(
     hits: float, count: float, confidence: float = CONFIDENCE
 ) -> tuple[float, float]:
-    """Return the interval of a share, from hits among independent trials (Wilson, 1927).
+    """Return the interval of a fraction, from hits among independent trials (Wilson, 1927).
 
-    Unlike the normal approximation it is right near 0 and 1, where these shares lie.
+    Unlike the normal approximation it is valid near 0 and 1, where these fractions are.
 
     Args:
         hits: Number of hits.
         count: Number of trials, positive.
-        confidence: Probability that the true share lies within.
+        confidence: Probability that the true fraction is in the interval.
     """
     z = NormalDist().inv_cdf(0.5 + confidence / 2.0)
     share, weight = hits / count, z * z / count
@@ -256,7 +259,7 @@ def wilson_interval(
 
 
 def share_text(hits: int, count: int) -> str:
-    """Return k of n with its interval as text."""
+    """Return the text "k of n" with the interval of the fraction."""
     if not count:
         return "nothing conclusive"
     low, high = wilson_interval(hits, count)
@@ -265,14 +268,14 @@ def share_text(hits: int, count: int) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Bearing:
-    """How much the grasps of a group bear.
+    """How much disturbance the grasps of a group tolerate.
 
     Attributes:
-        drawn: Number of grasps that were repeated, with a verdict at least once.
-        much: Those of which `MUCH` of the repeats or more are samples.
-        samples, held: Mean share of the repeats that are samples, and that hold; each grasp counts
-            for the inverse of its probability to be drawn.
-        low, high: Interval of `samples`: the grasps are independent, not their repeats.
+        drawn: Number of grasps that were repeated, with at least one verdict.
+        much: Number of these of whose repeats at least the fraction `MUCH` are samples.
+        samples, held: Mean fractions of the repeats that are samples, and that hold; each grasp has
+            the inverse of its probability to be drawn as weight.
+        low, high: Interval of `samples`; the grasps are independent, their repeats are not.
     """
 
     drawn: int
@@ -284,7 +287,7 @@ class Bearing:
 
 
 def bearing(columns: Mapping[str, npt.NDArray[Any]]) -> Bearing | None:
-    """Return how much grasps bear that were repeated; None if none was.
+    """Return how much disturbance the repeated grasps tolerate; None if none was repeated.
 
     Args:
         columns: Rows of `/trials`, by the names of HOLD_FIELDS.
@@ -297,8 +300,8 @@ def bearing(columns: Mapping[str, npt.NDArray[Any]]) -> Bearing | None:
     weight = 1.0 / columns["p_hold_probability"][there]
     weight = weight / weight.sum()
     mean = float(weight @ share)
-    # Of a weighted mean the grasps count as so many; Wilson's interval of as many lifts is wider
-    # than that of shares, never narrower.
+    # The effective number of grasps of a weighted mean. Wilson's interval for as many lifts is
+    # never narrower than that of the mean of fractions.
     effective = 1.0 / float(weight @ weight)
     low, high = wilson_interval(mean * effective, effective)
     return Bearing(
@@ -312,7 +315,7 @@ def bearing(columns: Mapping[str, npt.NDArray[Any]]) -> Bearing | None:
 
 
 def predictors(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, Array]:
-    """Return what of a lift may predict its p_hold: (n,) each, larger for a larger one.
+    """Return numbers of a lift that may predict its p_hold: (n,) each, larger for a larger one.
 
     Args:
         columns: Rows of `/trials`, by the names of PREDICTED_BY.
@@ -320,8 +323,8 @@ def predictors(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, Array]:
     doubts = suspicion(columns)
     forces, normals = columns["lifted_f_Q_O"], columns["lifted_nhat_Q_O"]
     pressed, size = -dot(forces, normals), norm(forces)
-    # Of friction's cone: 1 along the normal, 0 at its border. A fingertip that does not touch has
-    # none.
+    # Margin to the friction cone: 1 for a force along the normal, 0 at the cone's border; undefined
+    # for a fingertip that does not touch.
     across = np.sqrt(np.maximum(size**2 - pressed**2, 0.0))
     with np.errstate(invalid="ignore", divide="ignore"):
         margin = 1.0 - across / (columns["friction_hand"][:, None] * pressed)
@@ -341,7 +344,7 @@ def predictors(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, Array]:
 
 
 def _least(values: npt.NDArray[Any], there: npt.NDArray[np.bool_]) -> Array:
-    """Return the least value (n,) of the fingers (n, k) that are there; NaN if none is."""
+    """Return the smallest value (n,) of the fingers (n, k) in `there`; NaN if there is none."""
     least = np.where(there, values, np.inf).min(axis=1, initial=np.inf)
     return np.where(np.isfinite(least), least, np.nan)
 
@@ -350,11 +353,11 @@ def area_under_roc(scores: Array, positive: npt.NDArray[np.bool_]) -> float:
     """Return how often a positive has a higher score than a negative, ties counting half.
 
     Args:
-        scores: (n,); those that are NaN are left out.
-        positive: (n,).
+        scores: (n,); NaN values are left out.
+        positive: (n,), which scores belong to positives.
 
     Returns:
-        0.5 for scores that tell nothing; NaN if there are no positives or no negatives.
+        0.5 for scores without information; NaN if there are no positives or no negatives.
     """
     good, bad = (np.sort(scores[np.isfinite(scores) & own]) for own in (positive, ~positive))
     if not len(good) or not len(bad):
@@ -365,13 +368,13 @@ def area_under_roc(scores: Array, positive: npt.NDArray[np.bool_]) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Holding:
-    """How much the grasps of a dataset bear.
+    """How much disturbance the grasps of a dataset tolerate.
 
     Attributes:
-        groups: `samples`, and `others` that were lifted; those of which none was repeated are left
+        groups: `samples`, and `others` that were lifted; a group without repeated grasps is left
             out.
-        predictor: What ranks the samples best among what is stored of their first lift, and its
-            area under the ROC curve for `MUCH`; None if that cannot be told.
+        predictor: Stored number of the first lift that ranks the samples best, and its area under
+            the ROC curve for `MUCH`; None if it cannot be computed.
     """
 
     groups: dict[str, Bearing]
@@ -379,7 +382,7 @@ class Holding:
 
 
 def holding_lines(holding: Holding) -> list[str]:
-    """Return how much the grasps of a dataset bear, in sentences without a full stop."""
+    """Return how much disturbance the grasps tolerate, in sentences without a full stop."""
     lines = [
         f"p_hold of {name}: {100 * each.samples:.0f} % of the disturbed repeats would be samples "
         f"({100 * each.low:.0f} to {100 * each.high:.0f} %), {100 * each.held:.0f} % hold; "
@@ -395,7 +398,7 @@ def holding_lines(holding: Holding) -> list[str]:
 
 
 def holding_of(trials: Trials) -> Holding | None:
-    """Return how much the grasps of a dataset bear; None if none was repeated."""
+    """Return how much disturbance the grasps of a dataset tolerate; None if none was repeated."""
     names = [*(field.name for field in HOLD_FIELDS), "removal"]
     blocks = list(trials.blocks(names))
     columns = {name: np.concatenate([block[name] for block in blocks]) for name in names}

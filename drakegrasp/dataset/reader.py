@@ -1,4 +1,4 @@
-"""Reading a dataset. Imports h5py and NumPy, but no Drake, no trimesh, no Dask and no torch.
+"""Reading a dataset. Imports h5py and NumPy, but not Drake, trimesh, Dask or torch.
 
 >>> data = GraspDataset("OUT/grasping_oto.hdf5", split="train")   # doctest: +SKIP
 >>> data[0].image.shape, data[0].grasp.shape                      # doctest: +SKIP
@@ -44,14 +44,14 @@ class Sample:
         mask: (S, S) uint8, 1 where the object is seen.
         grasp: (6k,) float32, contact points [m], then outward unit normals, in the camera frame,
             after closing.
-        grasp_held: (6k,) float32, the same where the fingertips hold the object after the lift, on
-            the object in its resting pose.
-        fingers: (k,) bool, those that the grasp uses; contacts of others are NaN.
+        grasp_held: (6k,) float32, the same for the contacts that hold the object after the lift,
+            placed on the object in its resting pose.
+        fingers: (k,) bool, fingers that the grasp uses; contacts of other fingers are NaN.
         trial_id: Row of /trials in trials.hdf5.
         grasp_props: Fields of `grasp_props` by name: how well it holds, forces, palm, joints.
         props: Fields of `object_props` by name: names, mass properties, frames.
         conditions: Fields of `conditions` by name: friction, colours, light, camera, noise.
-        dataset, row: Where it is from: the dataset and the row of its split. Copies and pickles
+        dataset, row: Origin of the sample: the dataset and the row of its split. Copies and pickles
             keep both.
     """
 
@@ -84,28 +84,28 @@ class Sample:
 class GraspDataset:
     """One split of a data file as a sequence of samples.
 
-    Any number of processes may read, forked or spawned: each opens the file when it first reads
-    from it, and a pickle holds no open file. A file that was written anew in the meantime is
-    refused, because its rows may be others. `to_torch` gives tensors for torch's DataLoader.
+    Any number of forked or spawned processes may read: each opens the file when it first reads from
+    it, and a pickle holds no open file. A file that was rewritten in the meantime is rejected,
+    because its rows may differ. `to_torch` returns tensors for torch's DataLoader.
 
     Args:
         path: `grasping_oto.hdf5` or `grasping_otm.hdf5`.
         split: `train`, `valid` or `test`.
         fewer_fingers: Whether to read a split in which some grasps leave fingers out. The contacts
-            of these are NaN, which must not come into training unnoticed: without this such a
-            split is refused. `Sample.fingers` says which are there.
+            of these fingers are NaN and must not enter training unnoticed, so such a split is
+            rejected by default. `Sample.fingers` tells which fingers a grasp uses.
 
     Attributes:
-        path: Of the file, absolute: the working directory may change.
-        split: As given.
+        path: Absolute path of the file, since the working directory may change.
+        split: The split.
         camera: Camera of the images and of the grasps' frame, `oto` or `otm`.
         K: Camera matrix (3, 3) [px].
         image_size: Edge of the square images [px].
-        content: Hash that says which samples the split holds, and of which dataset.
+        content: Hash that identifies the samples of the split and their dataset.
 
     Raises:
-        DataError: If the file is missing, damaged or differs from the schema, the split is
-            unknown, or it has grasps of fewer fingers that were not asked for.
+        DataError: If the file is missing, damaged or differs from the schema, if the split is
+            unknown, or if it has grasps with fewer fingers and `fewer_fingers` is false.
     """
 
     #: Whether some samples leave fingers out.
@@ -121,7 +121,7 @@ class GraspDataset:
         self._fields: dict[str, h5py.Dataset | ImageRows | npt.NDArray[Any]] = {}
         self._process = -1
 
-        # What the file says of the split.
+        # Facts about the split in the file.
         with open_samples(self.path) as file:
             self._length = len(file[split]["grasps"])
             self.image_size = int(file[split]["images"].shape[-1])
@@ -131,7 +131,7 @@ class GraspDataset:
             unused = file[split].get("grasp_props/unused")
             fewer = 0 if unused is None else np.count_nonzero(unused[:])
 
-        # NaN must be asked for.
+        # Contacts with NaN must be requested.
         self.has_fewer_fingers = bool(fewer)
         if fewer and not fewer_fingers:
             raise DataError(
@@ -155,7 +155,7 @@ class GraspDataset:
     def __getitem__(
         self, index: int | np.integer | slice | Sequence[int] | npt.NDArray[np.integer]
     ) -> Sample | list[Sample]:
-        """Return the sample of an index, or a list of those of a slice or a list of indices."""
+        """Return the sample at an index, or a list of samples for a slice or a list of indices."""
         if isinstance(index, slice):
             return [self[i] for i in range(len(self))[index]]
         if np.ndim(index) == 1 and not isinstance(index, tuple):  # type: ignore[arg-type]
@@ -203,15 +203,15 @@ class GraspDataset:
             raise self._as_damage(error) from None
 
     def read_images(self, name: str, rows: Sequence[int], images: npt.NDArray[Any]) -> None:
-        """Read images of some rows into an array, without a copy on the way.
+        """Read images of some rows directly into an array.
 
         Args:
-            name: Of the field, `images` or `masks`.
-            rows: n of them, in any order.
+            name: Name of the field, `images` or `masks`.
+            rows: n rows, in any order.
             images: Contiguous array (n, ...) of the field's type; it is overwritten.
 
         Raises:
-            DataError: If the field has no images.
+            DataError: If the field is not a field of images.
         """
         field = self._field(name)
         if not isinstance(field, ImageRows):
@@ -231,7 +231,7 @@ class GraspDataset:
         return self.rows(name, 0, len(self))
 
     def rows(self, name: str, start: int, stop: int) -> npt.NDArray[Any]:
-        """Return the rows `start` to `stop` - 1 of a field, fewer where the split ends.
+        """Return the rows `start` to `stop` - 1 of a field; fewer if the split ends before.
 
         Raises:
             DataError: If there is no such field.
@@ -267,7 +267,7 @@ class GraspDataset:
         return f"GraspDataset({str(self.path)!r}, split={self.split!r}): {len(self)} grasps"
 
     def _field(self, name: str) -> h5py.Dataset | ImageRows | npt.NDArray[Any]:
-        """Return a field in the file of this process, which is kept open with it."""
+        """Return a field of the file that this process has opened; the field is cached."""
         group = self._open()[self.split]
         if name not in self._fields:
             field = group.get(name)
@@ -277,12 +277,12 @@ class GraspDataset:
         return self._fields[name]
 
     def _open(self) -> h5py.File:
-        """Return the file, as this process opened it."""
+        """Return the file, opened by this process."""
         if self._process == os.getpid():
             return self._file
 
-        # An open HDF5 file must not cross a fork. All that the parent had open is closed first:
-        # HDF5 would go on with one of its handles instead of opening the file again.
+        # An open HDF5 file must not cross a fork. All files that the parent had open are closed
+        # first, since HDF5 would reuse one of their handles instead of opening the file again.
         for reader in {self, *_open_readers}:
             if reader._process != os.getpid():
                 reader._close()
@@ -313,12 +313,12 @@ class GraspDataset:
         self._file, self._fields, self._process = None, {}, -1
 
 
-#: Those that have an open file, here or in the process from which this one was forked.
+#: Readers with an open file, opened here or in the process from which this one was forked.
 _open_readers: WeakSet[GraspDataset] = WeakSet()
 
 
 def _content(file: h5py.File, split: str) -> str:
-    """Return a hash that says which samples a split holds, and of which dataset."""
+    """Return a hash that identifies the samples of a split and their dataset."""
     digest = hashlib.sha256(str(file.attrs.get("signature")).encode())
     digest.update(file[split]["trial_id"][:].tobytes())
     return digest.hexdigest()
@@ -331,7 +331,7 @@ def _refuse_other_fields(names: Sequence[str]) -> None:
 
 
 def _lines_of(sample: Sample) -> Iterator[tuple[str, str]]:
-    """Yield names and texts that say what a sample holds: shapes and main values."""
+    """Yield names and texts that describe a sample: shapes and main values."""
     depth = sample.image[3]
     yield "image", f"{sample.image.shape} float32, depth {depth.min():.3f} to {depth.max():.3f} m"
     yield "mask", f"{sample.mask.shape} uint8, {np.count_nonzero(sample.mask):,} px of the object"
@@ -343,7 +343,7 @@ def _lines_of(sample: Sample) -> Iterator[tuple[str, str]]:
         yield "", "  ".join(" ".join(f"{x:7.4f}" for x in vector) for vector in (point, normal))
     yield "grasp_held", f"{sample.grasp_held.shape} float32, the same after the lift"
 
-    # Of groups, single numbers and texts by their values, arrays by their shapes.
+    # In groups, single numbers and texts are shown by value, arrays by shape.
     for name in ("grasp_props", "props", "conditions"):
         values = sorted(getattr(sample, name).items(), key=lambda item: np.ndim(item[1]) > 0)
         yield name, ", ".join(_said(key, value) for key, value in values)
@@ -356,26 +356,26 @@ def _said(key: str, value: Any) -> str:
 
 
 def _group(values: dict[str, Any], prefix: str) -> dict[str, Any]:
-    """Return the values whose names begin with a prefix, without it."""
+    """Return the values whose names begin with a prefix, without the prefix."""
     return {k.removeprefix(prefix): v for k, v in values.items() if k.startswith(prefix)}
 
 
-#: Group of a file of results, beside that of the verdicts.
+#: Group of a file of results, beside the group of the verdicts.
 ROWS_GROUP = "rows"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PredictedRows:
-    """The row of a dataset for each of n predictions, as a file of results holds them.
+    """The dataset row of each of n predictions, as a file of results holds them.
 
-    Trial ids tell the rows whatever the filters and the split of the dataset become; they hold as
-    long as it has the same shards.
+    Trial ids identify the rows even if the filters or the split of the dataset change; they are
+    valid as long as the dataset has the same shards.
 
     Attributes:
-        split, camera: Of the data file.
-        shards: Hash of what the dataset was assembled from, as its files have it.
-        row: (n,) int64, in the split.
-        trial_id: (n,) int64, row of trials.hdf5.
+        split, camera: Split and camera of the data file.
+        shards: Hash of the shards that the dataset was assembled from, as its files have it.
+        row: (n,) int64, rows of the split.
+        trial_id: (n,) int64, rows of trials.hdf5.
     """
 
     split: str
@@ -404,7 +404,7 @@ class PredictedRows:
 
 
 def read_predicted_rows(file: h5py.File) -> PredictedRows | None:
-    """Return the rows that a file of results is about; None if it does not say so."""
+    """Return the rows that a file of results belongs to; None if the file does not state them."""
     group, said = file.get(ROWS_GROUP), dict[str, Any]()
     try:
         said |= {name: str(group.attrs[name]) for name in ("split", "camera", "shards")}

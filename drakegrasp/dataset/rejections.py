@@ -1,9 +1,9 @@
-"""Decisions of an inspection: `reject.json`, and text lists of trials.
+"""Decisions of an inspection: `reject.json`, and text files that list trials.
 
 `drakegrasp inspect` writes `reject.json` into a dataset's directory, a new file for every decision;
-`drakegrasp assemble --reject` reads it. An attempt is named by its object, palm pose and stand-off,
-which hold while a build still runs and after other attempts were added. A text list names trials by
-their id, which is known once the dataset is assembled.
+`drakegrasp assemble --reject` reads it. The file identifies an attempt by its object, palm pose and
+stand-off, which stay valid while a build runs and after other attempts were added. A text file
+identifies trials by their ids, which are known once the dataset is assembled.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from drakegrasp.runtime.files import write_atomic
 FILE_NAME = "reject.json"
 #: Version of the file's layout.
 VERSION = 1
-#: Rejections without effect that are named.
+#: Maximum number of rejections without effect that a message names.
 NAMED = 5
-#: An id of a trial is shorter.
+#: Number of digits that the id of a trial stays below.
 _MOST_DIGITS = 19
 
 
@@ -40,7 +40,7 @@ class AttemptKey:
         object: Name of its object.
         candidate: Index of its palm pose among the object's candidates.
         standoff_index: Index into the configuration's stand-offs.
-        child: Number in the family of that first-round attempt, which is 0 itself.
+        child: Number in the family of that first-round attempt, which itself has number 0.
     """
 
     object: Name
@@ -61,21 +61,21 @@ class Decisions:
 
     Attributes:
         rejected: Attempts that must not become samples.
-        kept: Attempts that were looked at and found good; they are listed for people only.
+        kept: Attempts that a person looked at and found good; they only inform people.
     """
 
     rejected: frozenset[AttemptKey] = field(default_factory=frozenset)
     kept: frozenset[AttemptKey] = field(default_factory=frozenset)
 
     def of(self, key: AttemptKey) -> str:
-        """Return `rejected`, `kept`, or an empty text if nothing was decided."""
+        """Return `rejected`, `kept`, or an empty text if there is no decision."""
         return "rejected" if key in self.rejected else "kept" if key in self.kept else ""
 
     def with_decision(self, key: AttemptKey, decision: str) -> Decisions:
-        """Return the decisions with another one for an attempt; empty text withdraws it.
+        """Return the decisions with a new one for an attempt; an empty text withdraws the old one.
 
         Raises:
-            ValueError: If it is not a decision.
+            ValueError: If the text is not a decision.
         """
         if decision not in ("rejected", "kept", ""):
             raise ValueError(f"decision must be rejected, kept or empty, got {decision!r}")
@@ -88,10 +88,10 @@ class Decisions:
 
 
 def read_decisions(path: Path) -> Decisions:
-    """Return the decisions in a `reject.json`; none if there is no such file.
+    """Return the decisions in a `reject.json`; no decisions if there is no such file.
 
     Raises:
-        DataError: If the file is something else.
+        DataError: If the file is not a list of rejections of this version.
     """
     try:
         tree, content = read_mapping(path, "a list of rejections of drakegrasp inspect")
@@ -117,7 +117,7 @@ class _Stored(BaseModel):
 
 
 def write_decisions(path: Path, decisions: Decisions) -> None:
-    """Write a `reject.json`, atomically; equal decisions give equal bytes."""
+    """Write a `reject.json` atomically; equal decisions produce equal bytes."""
     content = {
         "version": VERSION,
         "rejected": [stated(key) for key in sorted(decisions.rejected)],
@@ -127,10 +127,10 @@ def write_decisions(path: Path, decisions: Decisions) -> None:
 
 
 def read_rejected(path: Path) -> list[int] | list[AttemptKey]:
-    """Return what a file rejects: `reject.json`, or a text of trial ids.
+    """Return the trials that a file rejects: a `reject.json`, or a text file of trial ids.
 
-    Text has an id per line; # starts a comment. A file whose name ends in `.json` is a
-    `reject.json`.
+    The text file has an id per line; # starts a comment. A file whose name ends in `.json` is read
+    as a `reject.json`.
 
     Raises:
         DataError: If the file is neither.
@@ -155,18 +155,19 @@ def read_rejected(path: Path) -> list[int] | list[AttemptKey]:
 def find_keys(
     rejected: Sequence[int | AttemptKey], ids: Mapping[AttemptKey, int], out: Path
 ) -> tuple[AttemptKey, ...]:
-    """Return the identities of what is rejected, in order and each once.
+    """Return the identities of the rejected attempts, sorted and each once.
 
-    A key that is no success of the dataset is left out: its object may be gone, or `max_grasps` may
-    end before it. An id must be one, since it is of these files.
+    A key that is not a success of the dataset is left out: its object may have been removed, or
+    `max_grasps` may end before it. An id must be that of a success, since ids belong to these
+    files.
 
     Args:
         rejected: Ids of trials, or keys of attempts.
-        ids: Of all successes.
+        ids: Ids of all successes.
         out: Directory of the dataset, for the message.
 
     Raises:
-        DataError: If an id is that of no success.
+        DataError: If an id is not that of a success.
     """
     keys = {number: key for key, number in ids.items()}
     used = {entry for entry in rejected if isinstance(entry, AttemptKey) and entry in ids}
@@ -181,14 +182,14 @@ def find_keys(
 def unused_rejections(
     out: Path, given: Sequence[int | AttemptKey], used: Sequence[AttemptKey]
 ) -> list[str]:
-    """Return what a person must know of rejections that had no effect, a sentence for each case.
+    """Return what a person must know of rejections without effect, one sentence for each case.
 
     Args:
         out: Directory of the dataset.
-        given: What was to be rejected.
-        used: Attempts that are rejected now.
+        given: Requested rejections.
+        used: Attempts that are now rejected.
     """
-    # What was asked for and is no success here.
+    # Requested rejections that are not successes of the dataset.
     keys = {key for key in given if isinstance(key, AttemptKey)}
     skipped = sorted(keys - set(used))
     if skipped:
@@ -199,7 +200,7 @@ def unused_rejections(
             f"dataset: {named}{more}"
         ]
 
-    # What an inspection rejected and nobody asked for.
+    # Rejections of an inspection that were not requested.
     path = out / FILE_NAME
     try:
         forgotten = read_decisions(path).rejected - set(used)

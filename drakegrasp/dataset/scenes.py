@@ -1,6 +1,7 @@
-"""Scenes to train on, as point clouds or images with grasps; their views as rows of a data file.
+"""Scenes for training, as point clouds or images with grasps; their views as dataset rows.
 
-Predictions for such rows are verified and scored as those for samples. Imports h5py and NumPy only.
+Predictions for such rows are verified and scored like those for samples. Imports only h5py and
+NumPy.
 
 >>> data = SceneDataset("OUT/scenes.hdf5", points=2048)   # doctest: +SKIP
 >>> item = data[0]                                        # doctest: +SKIP
@@ -35,29 +36,30 @@ from drakegrasp.seeding import Stream
 from drakegrasp.vision.depth_sensor import DepthSensor, spoil_depth
 
 Frame = Literal["table", "camera"]
-#: Which grasps that do not hold are drawn: hands that were lifted and lost the object; these, and
-#: hands that closed without all fingertips on it; none.
+#: Which failed grasps are drawn: `tested`, hands that were lifted and lost the object; `closed`,
+#: these and hands that closed without all fingertips on the object; `none`.
 Negatives = Literal["tested", "closed", "none"]
-#: What a grasp must be to count as one to learn: a sample, or held at all.
+#: Which grasps are drawn as good ones: samples, or all that held.
 Positives = Literal["sample", "held"]
-#: Whether each object comes as often, or each view.
+#: Whether each object is drawn equally often, or each view.
 Balance = Literal["object", "view"]
-#: How many times the points of an item are kept of each view.
+#: Number of points cached for each view, as a multiple of the points of an item.
 POOL = 2
-#: Of so many times the pixels that are wanted, they are drawn one by one: few come twice.
+#: If there are more pixels than this multiple of the wanted number, each is drawn independently,
+#: since few are then drawn twice.
 MANY = 8
-#: What grasps are counted by.
+#: Labels by which grasps are counted.
 LABELS = ("tested", "held", "sample")
-#: Streams of what is kept of a view, of what is drawn for an item, and of orders.
+#: Streams of the pixels cached for a view, of the draws for an item, and of two kinds of orders.
 _VIEW, _ITEM, _ORDER, _ROUND = 0, 1, 2, 3
 
 
 class SceneDataset:
     """Views of one split with grasps, as a sequence of items: dictionaries of NumPy arrays.
 
-    An item is a view, and some grasps of its scene that are drawn for it: good ones and bad ones in
-    turns, good ones by their weights. The frame A is {T}, the table's, or {C}, the view's camera. A
-    split without a grasp to draw has length 0.
+    An item is a view with some grasps of its scene that are drawn for it: good and bad ones
+    alternate, and good ones are drawn by their weights. The frame A is {T}, the table's, or {C},
+    the view's camera. A split without a grasp to draw has length 0.
 
     | key | shape, type | what |
     |---|---|---|
@@ -80,42 +82,42 @@ class SceneDataset:
     | `mass`, `friction_hand`, `friction_table` | () float32 | of the object [kg], coefficients |
     | `view`, `scene`, `object` | () int64 | rows of /views, /scenes, /objects |
 
-    With `points=None` there are images in place of the points: `rgb` (h, w, 3) uint8, `depth`
-    (h, w) float32 [m], 0 where there is none, `mask` (h, w) uint8, 1 + index of the object, and the
-    camera matrix `K` (3, 3) float32 [px]. What was not lifted is NaN in all that ends in `_held`,
-    and so are contacts of fingers that do not touch.
+    With `points=None` an item has images instead of points: `rgb` (h, w, 3) uint8, `depth` (h, w)
+    float32 [m], 0 for pixels without a depth, `mask` (h, w) uint8, 1 + index of the object, and the
+    camera matrix `K` (3, 3) float32 [px]. Values that end in `_held` are NaN for hands that were
+    not lifted, and contacts are NaN for fingers that do not touch.
 
-    Any number of processes may read, forked or spawned: none keeps the file open. Each keeps
-    points, or images, of the views that it has read. What is drawn depends on seed, epoch
-    and index alone.
+    Any number of forked or spawned processes may read; none keeps the file open. Each process
+    caches points, or images, of the views that it has read. All draws depend only on seed, epoch
+    and index.
 
     Args:
         path: OUT/scenes.hdf5.
-        points: n, of an item; None for images.
+        points: Number n of points of an item; None for images.
         frame: `table` or `camera`.
-        negatives: Bad grasps to draw: `tested`, those that were lifted and lost the object;
-            `closed`, also hands that closed without all fingertips on it; `none`.
-        balance: `object`, so that each object comes as often; `view`, so that each view does.
+        negatives: Bad grasps to draw: `tested`, hands that were lifted and lost the object;
+            `closed`, also hands that closed without all fingertips on the object; `none`.
+        balance: `object`, so that each object is drawn equally often; `view`, so that each view is.
         split: `train`, `valid` or `test`.
-        grasps: g, of an item. Where a scene has fewer, some come several times.
-        positives: Good grasps to draw: `sample`, or `held`, whatever the filters say. One that is
-            held and no sample is never a bad one.
-        on_object: Share of the points that are on the object, as far as it is in the image.
-        noise: Whether depths get the noise that was drawn for their view, if there was any.
+        grasps: Number g of grasps of an item. If a scene has fewer, some are repeated.
+        positives: Good grasps to draw: `sample`, or `held`, whatever the filters decided. A grasp
+            that is held and not a sample is never drawn as a bad one.
+        on_object: Fraction of the points that are on the object, if enough of it is in the image.
+        noise: Whether depths get the noise that was drawn for their view, if any was.
         objects: Names of the objects whose views are items; all if None.
-        seed: Of all draws.
-        cache: Memory for points or images of views, per process [byte]; others are read again.
+        seed: Seed of all draws.
+        cache: Memory for points or images of views, per process [byte]; other views are read again.
 
     Attributes:
-        path: Of the file, absolute: the working directory may change.
-        split, frame: As given.
-        names, classes: Of the objects, by their rows.
+        path: Absolute path of the file, since the working directory may change.
+        split, frame: The arguments.
+        names, classes: Names and classes of the objects, by row.
         joints, fingers: Names of the hand's joints and fingers, in the order of the arrays.
-        views: Rows of /views that items are of: those of scenes with a grasp to draw.
+        views: Rows of /views that can be items: those whose scene has a grasp to draw.
         image_size: Height and width of the images [px].
-        near, far: Planes of the cameras [m].
-        tables: Columns of /scenes, /views and /grasps by their names, all splits; no images.
-        epoch: Changes what is drawn.
+        near, far: Near and far planes of the cameras [m].
+        tables: Columns of /scenes, /views and /grasps by their names, for all splits; no images.
+        epoch: Number of the epoch, on which all draws depend.
 
     Raises:
         DataError: If the file is missing, damaged or differs from the schema, or an argument is
@@ -153,11 +155,11 @@ class SceneDataset:
         self.split, self.frame, self.epoch = split, frame, 0
         self._points, self._grasps, self._seed = points, grasps, seed
         self._on_object, self._noise, self._cache = on_object, noise, cache
-        # Of views: images, or of some pixels in random order `uv`, `depth`, `rgb` and `mask`.
+        # Cache by view: images, or the arrays `uv`, `depth`, `rgb` and `mask` of random pixels.
         self._pools: dict[int, dict[str, AnyArray]] = {}
         self._kept = 0
 
-        # All but images and surfaces is read now.
+        # Everything except images and surfaces is read now.
         self._stamp = stamp(self.path)
         with open_scenes(self.path) as file:
             self.names, self.classes = (
@@ -185,7 +187,7 @@ class SceneDataset:
         return len(self._order)
 
     def __getitem__(self, index: int | tuple[int, int]) -> dict[str, AnyArray]:
-        """Return an item by its index, or by epoch and index, as `rounds` gives them."""
+        """Return an item by its index, or by epoch and index, as `rounds` yields them."""
         epoch, index = index if isinstance(index, tuple) else (self.epoch, operator.index(index))
         if not -len(self) <= index < len(self):
             raise IndexError(f"index must be below {len(self)}, got {index}")
@@ -197,7 +199,7 @@ class SceneDataset:
         X_TC, scene = self._X_TC[view], self._scene_of[view]
         X_AT = invert_pose(X_TC) if self.frame == "camera" else np.eye(4)
 
-        # What is seen, grasps, and the object.
+        # Points or images, grasps, and the object.
         if self._points is None:
             item = {name: image.copy() for name, image in self._kept_of(view).items()}
         else:
@@ -223,40 +225,40 @@ class SceneDataset:
         return f"SceneDataset({str(self.path)!r}, split={self.split!r}): {len(self)} views"
 
     def __getstate__(self) -> dict[str, Any]:
-        # Another process keeps points of its own.
+        # Another process has its own cache.
         return {**self.__dict__, "_pools": {}, "_kept": 0}
 
     def rounds(self, seed: int = 0) -> Rounds:
-        """Return a sampler for torch's DataLoader: each round has all items in another order."""
+        """Return a sampler for torch's DataLoader: each round has all items in a new order."""
         return Rounds(self, seed)
 
     def grasps_in(self, view: int, *, frame: Frame = "table") -> dict[str, AnyArray]:
-        """Return all grasps of a view's scene, by the keys of an item; g is their number."""
+        """Return all g grasps of a view's scene, by the keys of an item."""
         _refuse_other("frame", frame, get_args(Frame))
         X_AT = invert_pose(self._X_TC[view]) if frame == "camera" else np.eye(4)
         return self._grasps_of(view, self.rows_in(self._scene_of[view]), X_AT)
 
     def grasp_of(self, view: int, stream: Stream) -> dict[str, AnyArray]:
-        """Return grasps of a view that a stream draws, in {C}, as those of an item."""
+        """Return grasps of a view drawn from a stream, in {C}, with the keys of an item."""
         rows = self._drawn(int(self._scene_of[view]), stream)
         return self._grasps_of(view, rows, invert_pose(self._X_TC[view]))
 
     def rows_in(self, scene: int) -> npt.NDArray[np.int64]:
-        """Return the rows of /grasps of a scene, which stand together."""
+        """Return the rows of /grasps of a scene, which are consecutive."""
         return np.arange(*self._bounds[scene : scene + 2])
 
     def visible_in(self, view: int) -> npt.NDArray[np.bool_]:
-        """Return which contacts (g, k) of the grasps of its scene a view sees, in their order."""
+        """Return which contacts (g, k) of its scene's grasps a view sees, in their order."""
         first, last = self._first_visible[view : view + 2]
         return self._visible[first:last]
 
     def surface(self, object: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        """Return points p_OS (4096, 3) [m] on an object, by its row, and their unit normals."""
+        """Return points p_OS (4096, 3) [m] on an object and their unit normals, by its row."""
         with self._opened() as file:
             points, normals = (file["objects"][name][object] for name in ("p_OS", "nhat_S_O"))
         return points, normals
 
-    # What there is
+    # Tables
 
     def _number(self) -> None:
         """Number the rows of /grasps by scene and of /visible by view."""
@@ -273,7 +275,7 @@ class SceneDataset:
         ):
             refuse_other_codes(self.path, name, values, codes)
 
-        # Grasps of a scene and rows of a view stand together.
+        # The grasps of a scene and the rows of a view are consecutive.
         grasps = np.bincount(self.tables["grasps"]["scene"], minlength=count)
         self._bounds = np.concatenate([[0], np.cumsum(grasps)])
         self._scene_of = views["scene"]
@@ -305,7 +307,7 @@ class SceneDataset:
     def _order_of(
         self, balance: Balance, names: Collection[str] | None
     ) -> tuple[AnyArray, AnyArray]:
-        """Return the views to draw from, and of each item the object's place, or the view."""
+        """Return the views to draw from, and for each item the index of its object or view."""
         scenes = self.tables["scenes"]
         usable = np.array([len(good) + len(bad) > 0 for good, _, bad in self._kinds], dtype=bool)
         usable &= scenes["split"] == SPLITS.index(self.split)
@@ -319,7 +321,7 @@ class SceneDataset:
         self._by_object = [views[objects == i] for i in np.unique(objects)]
         return views, np.arange(len(views)) % len(self._by_object)
 
-    # What is drawn
+    # Draws
 
     def _view_of(self, epoch: int, index: int) -> int:
         """Return the view of an item: the next one of its object in the epoch's order."""
@@ -332,7 +334,7 @@ class SceneDataset:
         return int(own[order[number]])
 
     def _drawn(self, scene: int, stream: Stream) -> npt.NDArray[np.int64]:
-        """Return rows (g,) of /grasps: good and bad ones in turns."""
+        """Return rows (g,) of /grasps: good and bad ones alternate."""
         good, until, bad = self._kinds[scene]
         u = stream.uniform(self._grasps)
         rows = np.empty(self._grasps, dtype=np.int64)
@@ -363,10 +365,10 @@ class SceneDataset:
             found[f"f_Q_A{suffix}"] = (forces @ R_TA).astype(np.float32)
         return found
 
-    # What is seen
+    # Images and points
 
     def _cloud(self, view: int, X_AT: Array, stream: Stream) -> dict[str, AnyArray]:
-        """Return the points of an item: some that follow each other in what is kept of the view."""
+        """Return the points of an item: a random run of consecutive points in the view's cache."""
         pool, n = self._kept_of(view), self._points or 0
         rows = (int(stream.integers(len(pool["uv"]), 1)[0]) + np.arange(n)) % len(pool["uv"])
         f_u, f_v, c_u, c_v = self.tables["views"]["K"][view][[0, 4, 2, 5]].astype(np.float32)
@@ -380,9 +382,9 @@ class SceneDataset:
         }
 
     def _kept_of(self, view: int) -> dict[str, AnyArray]:
-        """Return what is kept of a view, its images or some pixels; read when it is first needed.
+        """Return the cached images or pixels of a view, which are read when first needed.
 
-        The caller must not change it.
+        The caller must not change them.
         """
         if view in self._pools:
             return self._pools[view]
@@ -401,7 +403,7 @@ class SceneDataset:
     def _pixels(
         self, depth: AnyArray, mask: AnyArray, count: int, view: int
     ) -> npt.NDArray[np.int64]:
-        """Return pixels (count,) with a depth, in random order; some come twice if there are few.
+        """Return pixels (count,) with a depth, in random order, repeated if there are too few.
 
         Raises:
             DataError: If no pixel has a depth.
@@ -431,7 +433,7 @@ class SceneDataset:
         return {"rgb": rgb, "depth": depth, "mask": mask, "K": K.astype(np.float32)}
 
     def stored_images(self, view: int) -> tuple[AnyArray, AnyArray, AnyArray]:
-        """Return the images of a view as the file holds them.
+        """Return the images of a view as stored in the file.
 
         Returns:
             Colours (h, w, 3) uint8, clean depth (h, w) uint16 [DEPTH_UNIT], mask (h, w) uint8.
@@ -443,12 +445,12 @@ class SceneDataset:
         return rgb, depth, mask
 
     def _opened(self) -> Any:
-        """Open the file, which must be the one that the tables were read from."""
+        """Open the file, which must be the file that the tables were read from."""
         return reopened(self.path, self._stamp, "the scenes of a dataset")
 
 
 def count_scenes(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, int]]:
-    """Return by split how many scenes, objects, views and grasps there are.
+    """Return, for each split, the numbers of scenes, objects, views and grasps.
 
     Args:
         tables: Columns of /scenes, /views and /grasps: an open file, or `SceneDataset.tables`.
@@ -469,16 +471,16 @@ def count_scenes(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str,
 
 
 def _choice(stream: Stream, among: int, count: int) -> npt.NDArray[np.int64]:
-    """Return indices (count,) below `among`, each once if they are not very many or too few."""
+    """Return indices (count,) below `among`; distinct unless `among` is very large or too small."""
     if among > MANY * count:
         return stream.integers(among, count)
     return stream.permutation(max(count, among))[:count] % among
 
 
 class Rounds:
-    """All items of a dataset in a random order, with the epoch, which is one more each round.
+    """All items of a dataset in a random order, with the epoch, which increases with each round.
 
-    The epoch goes with the index, so it reaches workers that stay, and these keep what they read.
+    The epoch is part of the index, so it reaches persistent workers, which keep their caches.
     """
 
     def __init__(self, data: SceneDataset, seed: int) -> None:
@@ -493,7 +495,7 @@ class Rounds:
         return ((epoch, index) for index in order.tolist())
 
 
-#: Fields of /grasps that items hold as they are.
+#: Fields of /grasps that items contain unchanged.
 _AS_STORED = (
     *("q_open", "q", "q_held", "held", "sample", "precision", "stable", "tested", "outcome"),
     *("weight", "p_hold_samples", "p_hold_repeats", "trial_id"),
@@ -507,27 +509,27 @@ def _refuse_other(name: str, value: object, known: tuple[str, ...]) -> None:
 
 Columns = dict[str, AnyArray]
 
-#: Outcomes of lifts to a verdict; `table_contact` after closing is not one.
+#: Outcomes of lifts to a verdict; a `table_contact` while closing is not one of these lifts.
 LIFTED = (Outcome.SUCCESS, *LOST, Outcome.TABLE_CONTACT)
-#: Fields of /grasps that are columns of /trials, by their names here.
+#: Columns of /trials that /grasps copies, by their names in /grasps.
 _COPIED = {f.name: f.of for f in SCENE_GRASP_FIELDS if f.of} | {
     name: name for name in ("trial_id", "outcome", "precision", "stable", "preshape", "unused")
 }
-#: Columns of /trials that grasps of scenes follow from.
+#: Columns of /trials from which grasps of scenes follow.
 GRASPS_FOLLOW_FROM = (
     *dict.fromkeys(_COPIED.values()),
     *("candidate", "standoff_index", "child", "resting", "spread", "time_lift"),
     *("X_OG", "X_OG_lifted"),
     *(f"{when}_{name}" for when in ("closed", "lifted") for name in ("p_OQ", "nhat_Q_O", "f_Q_O")),
 )
-#: The camera of such rows.
+#: Name of the camera of rows of scenes.
 CAMERA = "view"
-#: First number of the place of the streams that choose own grasps.
+#: First number of the key of the streams that choose the own grasps of rows.
 _OWN = 4
 
 
 def open_rows(path: Path, *, split: str, fewer_fingers: bool = False) -> GraspDataset:
-    """Return a split of a data file, or of scenes.hdf5, by what the file holds.
+    """Return a split of a data file or of scenes.hdf5, depending on the content of the file.
 
     Args:
         path: The file.
@@ -545,12 +547,12 @@ def open_rows(path: Path, *, split: str, fewer_fingers: bool = False) -> GraspDa
 
 
 def grasps_of_trials(trials: Mapping[str, AnyArray], X_TO: Array, weights: Array) -> Columns:
-    """Return the columns of /grasps that follow from trials, put where their objects lie.
+    """Return the columns of /grasps that follow from trials, at the poses of their objects.
 
     Args:
         trials: Columns of n trials, by GRASPS_FOLLOW_FROM.
-        X_TO: Poses of their objects in the scenes, (n, 4, 4).
-        weights: (n,), of those that are samples, NaN of others.
+        X_TO: Poses of the trials' objects in the scenes, (n, 4, 4).
+        weights: (n,), weights of the trials that are samples, NaN for others.
     """
     outcome, R_OT = trials["outcome"], np.swapaxes(X_TO[:, :3, :3], 1, 2)
     columns = {name: trials[of] for name, of in _COPIED.items()}
@@ -570,12 +572,12 @@ def grasps_of_trials(trials: Mapping[str, AnyArray], X_TO: Array, weights: Array
 
 
 class SceneRows(GraspDataset):
-    """The views of a split as rows; what scoring and verification ask of `GraspDataset` is there.
+    """The views of a split as rows, with what scoring and verification need of `GraspDataset`.
 
     A row is a view of a scene that has a sample, in the order of `SceneDataset.views` with
-    `negatives="none"`. Its own grasp is one of these samples, drawn by their weights. All is in the
-    view's camera frame. Verdicts are of the object where it rested in its trials, so the camera
-    (`frame_work2cam_view`) is turned and moved back with it.
+    `negatives="none"`. The row's own grasp is one of these samples, drawn by their weights.
+    Everything is in the view's camera frame. Verdicts are for the object where it rested in its
+    trials, so the camera (`frame_work2cam_view`) is turned and moved back with the object.
 
     Args:
         path: OUT/scenes.hdf5; OUT/trials.hdf5 must be beside it.
@@ -585,8 +587,8 @@ class SceneRows(GraspDataset):
         views: (n,), rows of /views.
 
     Raises:
-        DataError: If a file is missing or damaged, they are not of one state, or a sample leaves
-            fingers out.
+        DataError: If a file is missing or damaged, if the files belong to different states of the
+            dataset, or if a sample leaves fingers out.
     """
 
     def __init__(self, path: str | Path, *, split: str = "train") -> None:
@@ -599,7 +601,7 @@ class SceneRows(GraspDataset):
         self.views = data.views
         self._length = len(self.views)
 
-        # An own grasp of each view, and its trial.
+        # The own grasp of each view, and the trial of this grasp.
         trials, ids = Trials(self.path.parent), np.zeros(self._length, dtype=np.int64)
         refuse_other_state(self.path, trials)
         grasps = []
@@ -620,7 +622,7 @@ class SceneRows(GraspDataset):
         scene = views["scene"][self.views]
         objects = data.tables["scenes"]["object"][scene, 0]
         trial = trials[ids].columns(("X_TO", "mass", "friction_hand", "friction_table"))
-        # Where the camera would be if the object had stayed where it rested.
+        # The pose that the camera would have if the object had stayed where it rested.
         X_TO = unpack_pose(trial["X_TO"])
         X_OC = multiply(
             invert_pose(unpack_pose(data.tables["scenes"]["X_TO"][scene, 0])),
@@ -640,7 +642,7 @@ class SceneRows(GraspDataset):
             "conditions/friction_table": trial["friction_table"],
         }
 
-        # All cameras have one lens.
+        # All cameras share one lens.
         self.K = views["K"][0].reshape(3, 3)
         digest = hashlib.sha256(str(trials.attributes["signature"]).encode())
         for values in (ids, self.views, views["X_TC"][self.views]):
@@ -679,10 +681,10 @@ class SceneRows(GraspDataset):
 
 
 def refuse_other_state(path: Path, trials: Trials) -> None:
-    """Refuse a scenes.hdf5 that was made of other trials.
+    """Raise an error if a scenes.hdf5 was made from other trials.
 
     Raises:
-        DataError: If it was, or it cannot be read.
+        DataError: If it was made from other trials, or cannot be read.
     """
     with opened(path, "the scenes of a dataset") as file:
         for key in ("shards", "signature"):

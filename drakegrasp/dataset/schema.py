@@ -1,7 +1,7 @@
-"""The one table of everything that the files hold, a row per field.
+"""The one table of everything that the files hold, with one row per field.
 
-Writer, reader, checker and docs/reference/dataset-format.md are made from these rows: a field
-that is not here is in no file. Imports NumPy only, so that a reader can load it anywhere.
+Writer, reader, checker and docs/reference/dataset-format.md are made from these rows: a field that
+is not listed here is in no file. Imports only NumPy, so that a reader can load it anywhere.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from drakegrasp.errors import DataError, printable
 from drakegrasp.filters import Removal
 from drakegrasp.outcomes import Outcome, Stage
 
-#: Goes up with every change of the table that an older reader cannot read.
+#: Increases with every change of the table that an older reader cannot read.
 SCHEMA_VERSION = 4
-#: What to do with a file of another version: its labels mean something else.
+#: What to do with a file of another version, whose labels have other meanings.
 OTHER_SCHEMA = "build the dataset again with this version of drakegrasp, in another directory"
 
 SPLITS = ("train", "valid", "test")
-#: Units in which people read numbers, and factors to them from SI.
+#: Units in which people read numbers, and the factors that convert SI values to them.
 SHOWN_UNITS = {"": 1.0, "s": 1.0, "N": 1.0, "kg": 1.0, "mm": 1e3, "°": float(np.rad2deg(1.0))}
 CAMERAS = ("oto", "otm")
-#: Limits of fields: what is positive, not negative, an angle, a share.
+#: Limits of fields: positive numbers, non-negative numbers, angles, fractions.
 POSITIVE = 5e-324
 ABOVE_0, FROM_0, ANGLE, SHARE = (POSITIVE, np.inf), (0.0, np.inf), (0.0, np.pi), (0.0, 1.0)
 
@@ -60,12 +60,12 @@ CONVENTIONS = {
 
 @dataclass(frozen=True)
 class Shown:
-    """A number as people read it, on pages and in figures.
+    """How people read a number, on pages and in figures.
 
     Attributes:
-        title: In words.
+        title: Title of the number, in words.
         unit: One of SHOWN_UNITS; empty for a plain number.
-        digits: After the decimal point.
+        digits: Number of digits after the decimal point.
     """
 
     title: str
@@ -74,16 +74,16 @@ class Shown:
 
     @property
     def factor(self) -> float:
-        """From SI to the unit."""
+        """Factor from SI to the unit."""
         return SHOWN_UNITS[self.unit]
 
     @property
     def label(self) -> str:
-        """The title with the unit, for an axis."""
+        """The title and the unit, for an axis."""
         return f"{self.title} [{self.unit}]" if self.unit else self.title
 
     def text(self, value: float) -> str:
-        """Return a value in SI as text with its unit; a dash if there is none.
+        """Return a value in SI as text with its unit; a dash if there is no value.
 
         Infinity means undefined: the contact has no normal.
         """
@@ -100,29 +100,32 @@ class Field:
     """One field of a file.
 
     Attributes:
-        name: Path below the group: a split, `/trials`, `/objects`, `/successes`, `/looks` or
-            `/grasps`.
-        shape: Axes of one row, separated by blanks; empty for a scalar. An axis is an integer
-            or a letter: `k` fingers, `j` joints of the hand, `6k` length of a grasp (18 for three
+        name: Path below the group, which is a split, `/trials`, `/objects`, `/successes`, `/looks`
+            or `/grasps`.
+        shape: Axes of one row, separated by blanks; empty for a scalar. An axis is an integer or a
+            letter: `k` fingers, `j` joints of the hand, `6k` length of a grasp (18 for three
             fingers), `S` size of an image [px]; in scenes.hdf5 `h` rows and `w` columns of an image
             [px], `o` objects of a scene.
-        dtype: NumPy's name, or "str" for UTF-8 text.
+        dtype: NumPy's name of the type, or "str" for UTF-8 text.
         unit: SI unit, or "-".
-        frame: Letter of the frame in which it is expressed, or "-".
-        meaning: One sentence.
-        stage: First stage at which a row has a value; before it floats are NaN, the rest 0.
-        per_finger: Whether NaN stands for a finger that does not touch.
-        sample: Whether it is an image, stored in one chunk per row.
+        frame: Letter of the frame in which the field is expressed, or "-".
+        meaning: One sentence that describes the field.
+        stage: First stage at which a row has a value; before it, floats are NaN and other types 0.
+        per_finger: Whether NaN marks a finger that does not touch.
+        sample: Whether the field is an image, stored in one chunk per row.
         some: Whether rows that reached the stage may lack a value.
-        optional: Whether files may lack it: then it reads as without a value, or is derived.
-        limits: Least and largest value, POSITIVE for what is above 0; None for any. NaN has none.
-        derive: Of a field of `/trials` that follows from others: given a table of rows with the
-            columns of `needs`, its values (n, ...). No shard stores it.
+        optional: Whether files may lack the field; it is then derived, or read as without a value.
+        limits: Smallest and largest value, POSITIVE for values above 0; None for any value. NaN is
+            always allowed.
+        derive: For a field of `/trials` that follows from other fields: a function from a table of
+            rows with the columns of `needs` to the field's values (n, ...). No shard stores the
+            field.
         needs: Names of these columns.
-        of: Where its value is measured, as a path of attributes: from a `TrialRow` of
+        of: Where the value is read, as a path of attributes: from a `TrialRow` of
             `generation.attempts` for a trial, from a `Verification` for a verdict. For a number of
-            a sample, the column of its trial that it copies. Empty if it is computed otherwise.
-        shown: How people read it; None if it is not shown by itself.
+            a sample, the column of its trial that it copies. Empty if the value is computed in
+            another way.
+        shown: How people read the field; None if it is not shown by itself.
     """
 
     name: str
@@ -144,7 +147,7 @@ class Field:
 
     @property
     def axes(self) -> tuple[int | str, ...]:
-        """Axes of a row: lengths, and letters whose length depends on the dataset."""
+        """Axes of a row: lengths, and letters whose lengths depend on the dataset."""
         return tuple(int(axis) if axis.isdecimal() else axis for axis in self.shape.split())
 
     def row_shape(self, sizes: Mapping[str, int]) -> tuple[int, ...]:
@@ -156,7 +159,7 @@ class Field:
         return tuple(sizes[axis] if isinstance(axis, str) else axis for axis in self.axes)
 
     def value_of(self, source: object) -> Any:
-        """Return the field's value of what a row is made of, or None where a stage is missing."""
+        """Return the field's value from the source of a row, or None if its stage is missing."""
         for name in self.of.split("."):
             if source is None:
                 return None
@@ -164,26 +167,26 @@ class Field:
         return source
 
     def empty(self, count: int, sizes: Mapping[str, int]) -> npt.NDArray[np.generic]:
-        """Return an array of `count` rows without a value: NaN, 0 or False."""
+        """Return an array of `count` rows without values: NaN, 0 or False."""
         fill = np.nan if np.dtype(self.dtype).kind == "f" else 0
         return np.full((count, *self.row_shape(sizes)), fill, dtype=self.dtype)
 
 
 def is_readable(version: object) -> bool:
-    """Return whether an attribute or key `schema_version` is that of a schema that can be read."""
+    """Return whether an attribute or key `schema_version` names a schema that can be read."""
     whole = isinstance(version, int | np.integer) and not isinstance(version, bool)
     return whole and version == SCHEMA_VERSION
 
 
 def refuse_other_schema(path: Path, version: object) -> None:
-    """Refuse a file of another version of the schema.
+    """Raise an error if a file has another version of the schema.
 
     Args:
-        path: Of the file, for the message.
-        version: Its attribute or key `schema_version`; None if it has none.
+        path: Path of the file, for the message.
+        version: The file's attribute or key `schema_version`; None if it has none.
 
     Raises:
-        DataError: If the version is another.
+        DataError: If the version differs.
     """
     if not is_readable(version):
         got = "none" if version is None else printable(str(version)[:40])
@@ -198,7 +201,7 @@ def sizes(*, fingers: int, joints: int, image: int) -> dict[str, int]:
 def with_derived(
     columns: Mapping[str, npt.NDArray[Any]],
 ) -> dict[str, npt.NDArray[Any]]:
-    """Return columns of `/trials` with those that follow from them."""
+    """Return columns of `/trials` together with the columns that follow from them."""
     found = dict(columns)
     for field in TRIAL_FIELDS:
         if field.derive is not None and all(name in columns for name in field.needs):
@@ -207,13 +210,13 @@ def with_derived(
 
 
 def sources_of(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the columns of a shard from which columns of `/trials` are read or derived."""
+    """Return the columns of a shard from which given columns of `/trials` are read or derived."""
     needs = {field.name: field.needs for field in TRIAL_FIELDS if field.derive is not None}
     return tuple(dict.fromkeys(chain.from_iterable(needs.get(name, (name,)) for name in names)))
 
 
 def stored_fields(fields: Sequence[Field], *, certified: bool) -> tuple[Field, ...]:
-    """Return the fields that files have: HOLD_FIELDS are in those of builds that certify alone."""
+    """Return the fields that files have; HOLD_FIELDS are only in those of builds that certify."""
     own = {field.name for field in HOLD_FIELDS}
     return tuple(f for f in fields if certified or f.name.rpartition("/")[2] not in own)
 
@@ -237,7 +240,7 @@ def _contacts(prefix: str, of: str, when: str) -> tuple[Field, ...]:
 
 
 def _measured(of: str, *fields: Field) -> tuple[Field, ...]:
-    """Return fields whose values are attributes of the same names of one thing."""
+    """Return fields whose values are attributes of the same names of one object."""
     return tuple(replace(field, of=f"{of}.{field.name}") for field in fields)
 
 
@@ -264,10 +267,10 @@ def _labels(members: Sequence[Outcome] | Sequence[Removal]) -> str:
 
 
 def _friction_use(t: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
-    """Return the share (n, k) of the friction cone that each fingertip uses after the lift.
+    """Return the fraction (n, k) of the friction cone that each fingertip uses after the lift.
 
-    |f_t| / (mu f_n), of the force's parts along the contact's mean normal and across it: 1 is the
-    border of the cone of one point; a patch that is bent may be beyond it.
+    It is |f_t| / (mu f_n), where f_n and f_t are the parts of the force along and across the
+    contact's mean normal. 1 is the border of the cone of one point; a curved patch may exceed it.
     """
     f_Q_O, nhat_Q_O = t["lifted_f_Q_O"], t["lifted_nhat_Q_O"]
     f_n = -(f_Q_O * nhat_Q_O).sum(axis=-1)  # the normal points out of the object
@@ -277,12 +280,12 @@ def _friction_use(t: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
     return np.where(t["lifted_touching"] & (f_n > 0.0), use, np.nan)
 
 
-# A row per field on at most two lines is what makes this a table.
+# One field on at most two lines makes this a table.
 # fmt: off
 
 _JOINTS = Field("q", "j", "float64", "rad or m", "-", "positions of the hand's joints", of="q")
 
-#: What `simulation.contacts.Contacts` says of one instant, by its names.
+#: What `simulation.contacts.Contacts` measures at one instant, by its names.
 _CONTACTS: tuple[Field, ...] = (
     Field("touching", "k", "bool", "-", "-", "whether the fingertip touches the object"),
     Field("p_OQ", "k 3", "float64", "m", "O", "contact points", per_finger=True),
@@ -302,14 +305,14 @@ _CONTACTS: tuple[Field, ...] = (
 
 _OF_CONTACTS = _measured("contacts", *_CONTACTS)
 
-# While the hand closes the object is fixed in its place, so nothing shows whether it stands on the
+# While the hand closes, the object is fixed in place, so nothing shows whether it stands on the
 # table.
 _CLOSED = tuple(field for field in _contacts("closed", "trial.closed", "when closing ended")
                 if field.name != "closed_object_on_table")
-# Of a lift that ends early: when it ends.
+# For a lift that ends early, the instant at which it ends.
 _LIFTED = _contacts("lifted", "trial.lift", "after the lift")
 
-# Where a palm pose comes from; an attempt's identity is object, candidate, stand-off and child.
+# Origin of a palm pose; an attempt's identity is object, candidate, stand-off and child.
 _LINEAGE = (
     Field("resting", "", "uint8", "-", "-", "index of the object's resting pose"),
     Field("source", "", "uint8", "-", "-",
@@ -327,7 +330,7 @@ _LINEAGE = (
           "m^2 of surface and rad of roll; per m^3 rad^3 about the parent's; of a posture what its "
           "file says, NaN if nothing", some=True),
 )
-#: What `preshape` says of a posture that is of none: all fingers of a hand with preshapes close.
+#: `preshape` of a posture without one, with which all fingers of a hand with preshapes close.
 NO_PRESHAPE = 255
 # Fields of several tables.
 _PRESHAPE = (
@@ -348,7 +351,7 @@ _TIME_LIFT = Field(
     "time_lift", "", "float64", "s", "-",
     "simulated time of the lift with its hold; shorter where it ended early",
     of="trial.lift.duration", shown=Shown("time of the lift", "s", 2))
-#: Files of datasets that do not measure it lack these, see `close.scrape_depth`.
+#: Missing in files of datasets that do not measure it, see `close.scrape_depth`.
 _CLEARANCE = {
     when: Field(f"clearance_{when}", "", "float64", "m", "T",
                 f"least height of the hand above the table's top {during}, negative below it; NaN "
@@ -387,7 +390,7 @@ _WORDS = (
           "whether it is a precision grasp with slip below 5 mm and turn below 5 deg"),
 )
 
-#: The conditions of an attempt, drawn or not: what `simulation.conditions` may change.
+#: The conditions of an attempt, drawn or not: everything that `simulation.conditions` may change.
 CONDITION_FIELDS: tuple[Field, ...] = (
     *_measured(
         "conditions.materials",
@@ -418,8 +421,8 @@ CONDITION_FIELDS: tuple[Field, ...] = (
           of="conditions.sensor.seed"),
 )
 
-#: How much disturbance a lifted attempt tolerates; see `drakegrasp.simulation.robustness`. Files of
-#: builds that do not certify lack these, see `stored_fields`.
+#: How much disturbance a lifted attempt tolerates; see `drakegrasp.simulation.robustness`. Missing
+#: in files of builds that do not certify, see `stored_fields`.
 HOLD_FIELDS: tuple[Field, ...] = tuple(
     replace(field, stage=Stage.LIFTED, some=True, optional=True)
     for field in (
@@ -623,8 +626,8 @@ OBJECT_FIELDS: tuple[Field, ...] = (
 )
 
 #: A row per predicted grasp, in the order of the input, in `/grasps` of the results of
-#: `drakegrasp verify`. What a method or a stage did not reach is NaN, 0, false or empty. Palm,
-#: joints, contacts and lift are those of the first wrist pose.
+#: `drakegrasp verify`. Values of a stage that was not reached, or that the method does not compute,
+#: are NaN, 0, false or empty. Palm, joints, contacts and lift are those of the first wrist pose.
 VERIFICATION_FIELDS: tuple[Field, ...] = (
     Field("object", "", "str", "-", "-", "name of the object", of="placed.model.name"),
     Field("method", "", "str", "-", "-", "how it was verified: hand, forces alone, or posture",
@@ -741,15 +744,15 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
           "method forces: angle of the predicted normals from them", of="forces.contacts.angle"),
 )
 
-#: What a view is of in `/views` of scenes.hdf5.
+#: Kinds of views in `/views` of scenes.hdf5.
 VIEW_KINDS = ("drawn", "ring", "single")
-#: Points on the surface of an object in `/objects` of scenes.hdf5.
+#: Number of points on the surface of an object in `/objects` of scenes.hdf5.
 SURFACE_POINTS = 4096
-#: What one value in a depth image of scenes.hdf5 is [m].
+#: Depth [m] of one unit in a depth image of scenes.hdf5.
 DEPTH_UNIT = 1e-4
 
 #: A row per object and resting pose, in `/scenes` of scenes.hdf5. A scene is a list of `o` objects
-#: on the table; there is one today.
+#: on the table; at present it has one object.
 SCENE_FIELDS: tuple[Field, ...] = (
     Field("split", "", "uint8", "-", "-",
           f"{', '.join(f'{i} {name}' for i, name in enumerate(SPLITS))}: by object, whatever "
@@ -783,7 +786,7 @@ VIEW_FIELDS: tuple[Field, ...] = (
                         "depth_noise", "depth_seed")),
 )
 
-#: A row per closed hand, in `/grasps` of scenes.hdf5: those of a scene stand together.
+#: A row per closed hand, in `/grasps` of scenes.hdf5; the grasps of a scene are consecutive.
 SCENE_GRASP_FIELDS: tuple[Field, ...] = (
     Field("scene", "", "int32", "-", "-", "row of /scenes"),
     Field("object", "", "uint8", "-", "-", "index in the scene of the object that is grasped"),

@@ -1,7 +1,7 @@
-"""Shards: the results of one work unit, in one immutable HDF5 file that is whole or absent.
+"""Shards: the results of one work unit, in one immutable HDF5 file that is complete or absent.
 
-The header of a shard identifies its work unit. Its seal, see `drakegrasp.runtime.files`, shows
-any change of a single bit.
+The header of a shard identifies its work unit. Its seal, see `drakegrasp.runtime.files`, reveals
+the change of any single bit.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.files import atomic_hdf5, refuse_broken_seal
 
-#: Fields of `/trials` that only the whole dataset knows; no shard has them.
+#: Fields of `/trials` that are known for the whole dataset only; shards do not have them.
 ASSEMBLED_FIELDS = ("trial_id", "object")
 _ATTRIBUTES = {
     **dict.fromkeys(("config_hash", "mesh_sha256", "object_name"), TEXT),
@@ -45,10 +45,10 @@ class ShardHeader:
 
     Attributes:
         config_hash: `Config.simulation_hash` of the dataset.
-        mesh_sha256: Hash of the object's mesh file and of what is said of it.
+        mesh_sha256: Hash of the object's mesh file and of the object's attributes.
         object_name: Name of the object.
-        start, stop: Range of its candidates.
-        drawn_as: Name of the object in the file, where it is another, see `ObjectEntry`.
+        start, stop: Range of the object's candidates.
+        drawn_as: Name of the object in the shard's file if it differs, see `ObjectEntry`.
     """
 
     config_hash: str
@@ -60,13 +60,13 @@ class ShardHeader:
 
     @property
     def stored(self) -> dict[str, str | int]:
-        """What the shard's file says of itself."""
+        """The identity as the attributes of the shard's file."""
         said = {key: value for key, value in asdict(self).items() if key != "drawn_as"}
         return {**said, "object_name": self.drawn_as or self.object_name}
 
     @property
     def label(self) -> str:
-        """The work unit in words."""
+        """The work unit in words, for messages."""
         return (
             f"{self.object_name}, palm poses {self.start} to {self.stop - 1}, "
             f"configuration {self.config_hash}, mesh {self.mesh_sha256[:12]}"
@@ -92,7 +92,8 @@ class Shard:
 
     Attributes:
         header: Identity of the unit.
-        trials: Columns by the names of `trial_columns`, a row per attempt; optional ones may lack.
+        trials: Columns by the names of `trial_columns`, a row per attempt; optional columns may be
+            missing.
         looks: Columns by the names of LOOK_FIELDS, a row per success.
     """
 
@@ -107,10 +108,10 @@ def trial_columns() -> tuple[Field, ...]:
 
 
 def read_field(trials: h5py.Group, field: Field) -> AnyArray:
-    """Return a column of a shard's `/trials`; an optional one that is missing has no value.
+    """Return a column of a shard's `/trials`; a missing optional column is filled with no-value.
 
     Raises:
-        OSError: If it is missing or cannot be read.
+        OSError: If the column is missing or cannot be read.
     """
     if field.optional and field.name not in trials:
         return field.empty(len(trials["outcome"]), sizes_in(trials, trial_columns()))
@@ -137,13 +138,14 @@ def read_shard(path: Path, header: ShardHeader | None = None, *, verify_seal: bo
     """Return a shard.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
         header: Identity that the shard must have; any if None.
-        verify_seal: Whether to hash the whole file and compare it with its seal.
+        verify_seal: Whether to hash the whole file and compare the hash with its seal.
 
     Raises:
-        DataError: If the file is missing, truncated or changed by a single bit, or of another
-            schema, configuration, mesh or range; the message names the file and the reason.
+        DataError: If the file is missing or truncated, if a single bit of it has changed, or if it
+            belongs to another schema, configuration, mesh or range; the message names the file and
+            the reason.
     """
     with open_shard(path, header, verify_seal=verify_seal) as (file, own_header):
         return Shard(
@@ -164,11 +166,11 @@ def read_trials(
     """Return some columns of a shard's `/trials`, by their names.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
         header: Identity that the shard must have.
-        names: Of the columns.
+        names: Names of the columns.
         verify_seal: Whether to verify the seal, which reads the whole file.
-        complete: Whether all other fields must be there, too.
+        complete: Whether all other fields must exist as well.
 
     Raises:
         DataError: See `read_shard`.
@@ -192,12 +194,12 @@ def open_shard(
     """Open a shard for reading, with its header, while the block runs.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
         header: Identity that the shard must have; any if None.
-        tables: Fields that must be there; if None all, with outcomes and rows that exist.
+        tables: Fields that must exist; if None, all fields must exist, and outcomes and row numbers
+            must be valid.
         verify_seal: Whether to verify the seal first, which reads the whole file.
-        again: Whether the same work has opened the shard before: then only its identity is looked
-            at.
+        again: Whether the same work has opened the shard before; then only its identity is checked.
 
     Raises:
         DataError: See `read_shard`.
@@ -207,7 +209,7 @@ def open_shard(
     with opened(path, "a complete shard", again=again) as file:
         refuse_other_attributes(path, file, _ATTRIBUTES)
 
-        # Its identity: a file may have been copied to the path of another unit.
+        # Check the identity: a file may have been copied to the path of another unit.
         own_header = ShardHeader(
             config_hash=file.attrs["config_hash"],
             mesh_sha256=file.attrs["mesh_sha256"],
@@ -220,7 +222,7 @@ def open_shard(
                 f"{path}: must be a shard of {header.label}, got one of {own_header.label}"
             )
 
-        # Its columns.
+        # Check the columns.
         if not again:
             every = {"trials": trial_columns(), "looks": LOOK_FIELDS}
             refuse_first(path, differences(file, every if tables is None else tables))

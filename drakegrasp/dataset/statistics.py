@@ -1,6 +1,6 @@
-"""Counts of a dataset: the funnel by object, and the paper's Table III; what it lacks, and why.
+"""Counts of a dataset: the funnel by object and the paper's Table III; what is missing, and why.
 
-While a build runs, or after it was stopped, the funnel is counted from the shards. Sentences say
+While a build runs, or after it was stopped, the funnel is counted from the shards. Messages say
 which objects have no sample, which part of a split is too small, and what would help.
 """
 
@@ -35,11 +35,11 @@ from drakegrasp.hand.files import hand_file
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.runtime.executor import Executor, run_here
 
-#: What stands for the name of a preshape of postures for which all fingers close.
+#: Name shown for postures without a preshape, for which all fingers close.
 NO_NAME = "-"
 #: Columns of `Funnel.refined`.
 REFINED = ("attempts", "held", "samples")
-#: Columns of attempts that a funnel counts.
+#: Columns of the attempts that a funnel counts.
 _COUNTED = (
     *("object", "outcome", "removal", "generation", "standoff_index", "audited", "slip"),
     *("precision", "stable", "preshape"),
@@ -48,24 +48,26 @@ _COUNTED = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Funnel:
-    """Numbers of candidates, outcomes and removals, by object, for m objects.
+    """Numbers of candidates, outcomes and removals of each of m objects.
 
-    Attempts and held grasps are those of the first round: palm poses about grasps that hold succeed
-    far more often. How many samples there are, refined ones included, only `samples` tells.
+    Attempts and held grasps are those of the first round, since palm poses around held grasps
+    succeed far more often. The number of all samples, including refined ones, is `samples`.
 
     Attributes:
-        names, classes: (m,), of the objects.
-        candidates: (m,), palm poses that were tried, or are to be, drawn from the distinct ones.
+        names, classes: (m,), names and classes of the objects.
+        candidates: (m,), palm poses that were tried or are to be tried, drawn from the distinct
+            ones.
         distinct: (m,), different palm poses among the valid ones.
         valid: (m,), combinations of rotations above the table whose palm ray meets the object.
         outcomes: (m, 1 + max(Outcome)), attempts by object and outcome.
-        precision, stable: (m,), successes that are precision grasps, and stable ones of these.
+        precision, stable: (m,), successes that are precision grasps, and those that are also
+            stable.
         removals: (m, 1 + max(Removal)), successes by object and reason of removal.
         refined: (m, 3), attempts, successes and samples of refined palm poses.
-        audited: (m, 4), lifts, successes, stable ones and samples among audited attempts: they say
-            how often lifts end so where others were chosen by their chance.
-        preshapes: (256, 5), by index of the preshape: attempts, successes, stable ones and samples
-            of the first round, and refined samples.
+        audited: (m, 4), lifts, successes, stable grasps and samples among audited attempts: their
+            rates are fair if other attempts were chosen for the lift by their chance.
+        preshapes: (256, 5), by index of the preshape: attempts, successes, stable grasps and
+            samples of the first round, and refined samples.
     """
 
     names: tuple[str, ...]
@@ -83,7 +85,7 @@ class Funnel:
 
     @property
     def samples(self) -> npt.NDArray[np.int64]:
-        """(m,), all samples by object, refined ones included."""
+        """(m,), all samples of each object, including refined ones."""
         return self.removals[:, Removal.KEPT] + self.refined[:, 2]
 
     @property
@@ -94,10 +96,10 @@ class Funnel:
 
 @dataclass(frozen=True)
 class PreshapeCount:
-    """Numbers of a preshape's attempts, successes and stable ones in the first round; its samples.
+    """Numbers of a preshape: attempts, successes, stable grasps of the first round; all samples.
 
-    `preshape` is its name; `NO_NAME` of postures that are of none. `refined` of the samples are
-    refined ones.
+    `preshape` is its name, or `NO_NAME` for postures without a preshape. `refined` is the number of
+    refined samples, which `samples` includes.
     """
 
     preshape: str
@@ -112,7 +114,7 @@ class PreshapeCount:
 class SplitCount:
     """A row of the paper's Table III: numbers of samples, objects and classes of a split.
 
-    `effective` is how many of the samples count where those that are alike count once, see
+    `effective` is the number of samples if near-identical ones count once, see
     `assembly.split.effective_number`.
     """
 
@@ -128,8 +130,8 @@ class Unfinished:
     """The state of a build that runs or was stopped.
 
     Attributes:
-        funnel: Counts of the work units that are done; no success is a sample yet.
-        done, total: Numbers of work units; `max_grasps` may leave some out.
+        funnel: Counts of the finished work units; no success is a sample yet.
+        done, total: Numbers of finished and of all work units; `max_grasps` may leave some out.
     """
 
     funnel: Funnel
@@ -142,11 +144,11 @@ def is_assembled(out: Path, *, verify_shards: bool = False, execute: Executor = 
 
     Args:
         out: Directory of the dataset.
-        verify_shards: Whether to compare the shards, too, which looks into each of them.
-        execute: Looks into them.
+        verify_shards: Whether to compare the shards as well, which opens each of them.
+        execute: Executor that reads the shards.
 
     Raises:
-        DataError: If a file has values that lie elsewhere, or a shard is missing.
+        DataError: If a file stores values outside of itself, or a shard is missing.
     """
     manifest = read_manifest(out)
     expected = {"signature": manifest.signature()}
@@ -163,10 +165,10 @@ def is_assembled(out: Path, *, verify_shards: bool = False, execute: Executor = 
 
 
 def _refuse_broken_files(out: Path) -> None:
-    """Refuse files that are there and cannot be read; a build would write them anew.
+    """Raise an error if an existing file cannot be read, since a build would overwrite it.
 
     Raises:
-        DataError: If there is one.
+        DataError: If there is such a file.
     """
     for name in ASSEMBLED_FILES:
         if os.path.lexists(out / name):
@@ -175,9 +177,9 @@ def _refuse_broken_files(out: Path) -> None:
 
 
 def count_unfinished(out: Path) -> Unfinished | None:
-    """Return the state of a build, or None if its files are complete or there is none.
+    """Return the state of a build; None if the files are complete or there is no build.
 
-    The seals of the shards are not verified, which would read all of them.
+    The seals of the shards are not verified, since this would read all of them.
 
     Raises:
         DataError: If the directory holds no dataset.
@@ -188,7 +190,7 @@ def count_unfinished(out: Path) -> Unfinished | None:
     if is_assembled(out):
         return None
 
-    # Count the attempts of the shards that are whole.
+    # Count the attempts of the complete shards.
     manifest = read_manifest(out)
     entries = manifest.objects
     numbers = {entry.name: number for number, entry in enumerate(entries)}
@@ -202,7 +204,7 @@ def count_unfinished(out: Path) -> Unfinished | None:
     }
     funnel = funnel_of(Trials.of_parts(out, objects, parts))
 
-    # Palm poses that are still to be tried count, too.
+    # Palm poses that are still to be tried count as well.
     planned = np.array([entry.candidates for entry in entries], dtype=np.int64)
     funnel = replace(funnel, candidates=planned)
     return Unfinished(funnel=funnel, done=len(parts), total=manifest.units)
@@ -218,7 +220,7 @@ def count_funnel(out: Path) -> Funnel:
 
 
 def funnel_of(trials: Trials) -> Funnel:
-    """Return the funnel of attempts, as `count_funnel`."""
+    """Return the funnel of attempts, see `count_funnel`."""
     objects, count = trials.objects, len(trials.objects["name"])
 
     def zeros(*shape: int) -> npt.NDArray[np.int64]:
@@ -243,7 +245,7 @@ def funnel_of(trials: Trials) -> Funnel:
         held, sample = outcome == Outcome.SUCCESS, removal == Removal.KEPT
         first, stable = block["generation"] == 0, block["stable"]
 
-        # Palm poses, outcomes, how well they hold and removals of the first round.
+        # Palm poses, outcomes, labels of the hold, and removals of the first round.
         _count(funnel.candidates, number[first & (block["standoff_index"] == 0)])
         _count(funnel.outcomes, (number[first], outcome[first]))
         _count(funnel.precision, number[first & block["precision"]])
@@ -251,7 +253,7 @@ def funnel_of(trials: Trials) -> Funnel:
         decided = first & (removal != NONE)
         _count(funnel.removals, (number[decided], removal[decided]))
 
-        # What was refined, and what became of those that were lifted in any case.
+        # Preshapes, refined palm poses, and audited attempts.
         fair, lifted = first & block["audited"], np.isfinite(block["slip"])
         for counts, of, among, chosen in (
             (funnel.preshapes, block["preshape"], first, (True, held, held & stable, sample)),
@@ -267,7 +269,7 @@ def funnel_of(trials: Trials) -> Funnel:
 def preshapes_of(funnel: Funnel, config: Config) -> list[PreshapeCount]:
     """Return the counts of each preshape of a dataset's hand, by its configuration.
 
-    There are none of a hand that has none, or whose file cannot be read any more.
+    The list is empty if the hand has no preshapes, or if its file can no longer be read.
     """
     try:
         shapes = read_hand_file(hand_file(config.hand_source)).preshapes
@@ -290,7 +292,7 @@ def _count(counts: npt.NDArray[np.int64], cells: Any) -> None:
 
 
 def held_note(funnel: Funnel) -> str:
-    """Return why there may be more held grasps than were counted; empty if there are not."""
+    """Return why there may be more held grasps than were counted; empty if there is no reason."""
     moved, left = funnel.outcomes[:, [Outcome.MOVED, Outcome.NOT_LIFTED]].sum(axis=0).tolist()
     reasons = []
     if moved:
@@ -300,7 +302,7 @@ def held_note(funnel: Funnel) -> str:
         )
     if left:
         lifts, held, stable, samples = funnel.audited.sum(axis=0).tolist()
-        # Before the files are assembled nobody knows what is a sample.
+        # Before the files are assembled, it is unknown which successes are samples.
         found = [f"{held:,} are held", f"{stable:,} stable"]
         found += [counted(samples, "sample")] if funnel.removals.any() else []
         reasons.append(
@@ -322,7 +324,7 @@ def count_splits(out: Path) -> list[SplitCount]:
 
 
 def splits_of(file: h5py.File) -> list[SplitCount]:
-    """Return what a data file tells of its splits, as `count_splits`."""
+    """Return the counts of a data file's splits, see `count_splits`."""
     return [
         SplitCount(
             split=split,
@@ -336,10 +338,10 @@ def splits_of(file: h5py.File) -> list[SplitCount]:
 
 
 def counts_as_dict(out: Path) -> dict[str, Any]:
-    """Return the counts of a dataset in types of JSON; labels without a count are left out.
+    """Return the counts of a dataset as JSON types; labels without a count are left out.
 
     Args:
-        out: Directory of the dataset; while it is built, the work units that are done count.
+        out: Directory of the dataset; during a build, only finished work units count.
 
     Raises:
         DataError: If there is no dataset, or a file cannot be read.
@@ -379,19 +381,19 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
     return {"path": str(out), "unfinished": units, **counts}
 
 
-#: A share of the samples differs much from the one asked for beyond this factor.
+#: If a split's fraction of the samples is off by more than this factor, it is reported.
 MUCH = 2.0
 
 
 class Shortfall(NamedTuple):
-    """Why an object has no sample, and what would help; each a part of a sentence."""
+    """Why an object has no sample, and what would help, as parts of a sentence."""
 
     reason: str
     advice: str
 
 
 def objects_without_samples(funnel: Funnel, config: Config) -> dict[str, Shortfall]:
-    """Return why each object that has no sample has none, by its name."""
+    """Return, for each object without a sample, why it has none, by its name."""
     return {
         funnel.names[i]: why_no_sample(funnel.outcomes[i], funnel.removals[i], config)
         for i in np.flatnonzero(funnel.samples == 0).tolist()
@@ -399,24 +401,24 @@ def objects_without_samples(funnel: Funnel, config: Config) -> dict[str, Shortfa
 
 
 def why_no_sample(outcomes: AnyArray, removals: AnyArray, config: Config) -> Shortfall:
-    """Return why the attempts at an object gave no sample.
+    """Return why the attempts at an object yielded no sample.
 
     Args:
         outcomes: (1 + max(Outcome),), attempts by outcome.
         removals: (1 + max(Removal),), successes by reason of removal.
-        config: Of the dataset, which says what was tried already.
+        config: Configuration of the dataset, which states what was already tried.
     """
     total = int(outcomes.sum())
     if not total:
         return Shortfall("nothing was tried", "more palm poses (--candidates)")
 
-    # What is nearest to a sample says more than what is most frequent, if there is any.
+    # Held grasps, if any, are closest to a sample and say more than the most frequent outcome.
     held = int(outcomes[Outcome.SUCCESS])
     if held:
         removal = Removal(int(np.argmax(removals)))
         reason = f"{held:,} held, none a sample: mostly {removal.label} ({removals[removal]:,})"
         if removal is Removal.FLAT_DEPTH:
-            # Where lifts were left out for a flat image, the filter cannot be wider than that.
+            # If lifts of flat images were left out, the filter cannot be wider than that limit.
             least = f"{config.lift.least_depth_variance:g}"
             ways = f"`drakegrasp assemble OUT --set filters.min_depth_variance={least}`"
             return Shortfall(reason, f"{ways}, which keeps flat depth images")
@@ -441,12 +443,12 @@ def why_no_sample(outcomes: AnyArray, removals: AnyArray, config: Config) -> Sho
 
 
 def split_shortfall(counts: Sequence[SplitCount], rule: str, config: SplitConfig) -> str:
-    """Return which part of a split is empty or of another share than asked for; "" if none is.
+    """Return which part of a split is empty or has another fraction than requested; "" if none is.
 
     Args:
-        counts: Of the parts.
-        rule: By what the samples are split, `class` or `object`.
-        config: The shares that were asked for.
+        counts: Counts of the parts.
+        rule: Rule of the split, `class` or `object`.
+        config: The requested fractions.
     """
     samples = {count.split: count.samples for count in counts}
     total = sum(samples.values())
@@ -460,7 +462,7 @@ def split_shortfall(counts: Sequence[SplitCount], rule: str, config: SplitConfig
     empty = [name for name, count in samples.items() if asked[name] and not count]
 
     if rule == "class":
-        # By class no share of the samples is asked for the test, and valid is drawn from the rest.
+        # By class, no fraction is requested for the test, and valid is drawn from the rest.
         if "train" in empty:
             return (
                 "no sample is for training: by class, a class trains if two of its objects have "

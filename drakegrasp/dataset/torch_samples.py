@@ -1,12 +1,13 @@
 """The samples of a split as tensors of torch, which only this module imports.
 
 In: a `GraspDataset` and the names of fields. Out: a `torch.utils.data.Dataset`, whose items torch
-collates and moves between processes by itself. The module loads without torch, too, so that every
-module of the package does; `GraspDataset.to_torch` says if torch is missing.
+itself collates and moves between processes. The module can also be imported without torch, so that
+every module of the package can; `GraspDataset.to_torch` raises an error if torch is missing.
 
-A loader asks for the samples of a batch at once. Their images are read where the batch will be:
-into one block, in a worker in memory that it shares with the training process. Read one by one,
-each image would be written three times, always into new pages, which costs as much as inflating it.
+A loader requests all samples of a batch at once. Their images are read directly into the block of
+the batch; in a worker this block is in memory that the worker shares with the training process.
+Images read one by one would be written three times each, always into new pages, which takes as long
+as decompressing them.
 """
 
 from __future__ import annotations
@@ -32,22 +33,22 @@ except ModuleNotFoundError:
 
 #: Fields of a sample by name.
 _FIELDS = {field.name: field for field in DATA_FIELDS}
-#: Fields that are read when a sample is asked for; the others fit into memory.
+#: Fields that are read when a sample is requested; all other fields fit into memory.
 _IMAGES = frozenset(name for name, field in _FIELDS.items() if field.sample)
 
 
 class TorchSamples(Dataset):
-    """Samples as dictionaries of tensors, by the names of the fields; text is a str.
+    """Samples as dictionaries from field names to tensors; a text field is a str.
 
-    Each process opens the file by itself, and keeps the fields that are no images in memory: 72
-    bytes a sample for `grasps`.
+    Each process opens the file itself, and keeps the fields that are not images in memory: 72 bytes
+    a sample for `grasps`.
 
     Args:
         data: The split.
         fields: Names of the fields, as `GraspDataset.column` takes them.
 
     Attributes:
-        data, fields: As given.
+        data, fields: The arguments.
     """
 
     def __init__(self, data: GraspDataset, fields: Sequence[str]) -> None:
@@ -62,10 +63,10 @@ class TorchSamples(Dataset):
         return {name: self._tensor(name, row) for name in self.fields}
 
     def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Any]]:
-        """Return the samples of a batch, as torch's loaders ask for them.
+        """Return the samples of a batch, as torch's loaders request them.
 
-        Each is a dictionary as `self[i]`. Their tensors are rows of one block, which the default
-        collation of torch takes as it is.
+        Each sample is a dictionary like `self[i]`. Its tensors are rows of one block, which torch's
+        default collation returns unchanged.
         """
         rows = [self.data.row_of(index) for index in indices]
         block = {name: self._tensors(name, rows) for name in self.fields}
@@ -76,19 +77,19 @@ class TorchSamples(Dataset):
         return {**self.__dict__, "_columns": {}}
 
     def _tensor(self, name: str, row: int) -> torch.Tensor | str:
-        """Return a field of a sample; a tensor of its own, which the caller may change."""
+        """Return a field of a sample; the tensor is a copy that the caller may change."""
         if name in _IMAGES:
             return torch.from_numpy(self.data.value(name, row))
         value = self._column(name)[row]
         return str(value) if isinstance(value, str) else torch.from_numpy(np.array(value))
 
     def _tensors(self, name: str, rows: Sequence[int]) -> torch.Tensor | list[str]:
-        """Return a field of some samples; tensors are new, and shared if a worker makes them."""
-        # Text is a list, as torch collates it.
+        """Return a field of several samples as a new tensor; shared memory if in a worker."""
+        # Texts form a list, as torch collates them.
         if _FIELDS[name].dtype == "str":
             return [str(text) for text in self._column(name)[rows]]
 
-        # Only a worker hands its tensors to another process.
+        # Only a worker passes its tensors to another process.
         field, size = _FIELDS[name], {"S": self.data.image_size}
         shape = field.row_shape(size) if name in _IMAGES else self._column(name).shape[1:]
         values = torch.from_numpy(np.empty((len(rows), *shape), dtype=field.dtype))
@@ -102,7 +103,7 @@ class TorchSamples(Dataset):
         return values
 
     def _column(self, name: str) -> npt.NDArray[Any]:
-        """Return all rows of a field that is no image."""
+        """Return all rows of a field that is not an image."""
         if name not in self._columns:
             self._columns[name] = self.data.column(name)
         return self._columns[name]
@@ -113,7 +114,7 @@ class _Row(dict[str, Any]):
 
     Attributes:
         block: Fields of the whole batch.
-        views: What each sample of the batch held when it was read, in their order.
+        views: Dictionaries of the batch's samples as they were read, in order.
     """
 
     def __init__(
@@ -123,12 +124,12 @@ class _Row(dict[str, Any]):
         self.block, self.views = block, views
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Become a plain dictionary in a copy and in another process."""
+        """Pickle and copy as a plain dictionary."""
         return dict, (dict(self),)
 
 
 def _collate_rows(batch: list[_Row], *, collate_fn_map: dict[Any, Any] | None = None) -> Any:
-    """Return the block of a batch; collate its samples one by one if somebody changed them."""
+    """Return the block of a batch; if a sample was changed, collate the samples one by one."""
     views = batch[0].views
     whole = len(batch) == len(views) and all(
         row.keys() == view.keys() and all(row[name] is value for name, value in view.items())
@@ -139,5 +140,5 @@ def _collate_rows(batch: list[_Row], *, collate_fn_map: dict[Any, Any] | None = 
     return collate([dict(row) for row in batch], collate_fn_map=collate_fn_map)
 
 
-# The documented way to tell torch's default collation of a type.
+# This is the documented way to register a type with torch's default collation.
 default_collate_fn_map[_Row] = _collate_rows

@@ -1,4 +1,4 @@
-"""Reading the attempts of a dataset, whatever their outcome. Imports h5py and NumPy only.
+"""Reading the attempts of a dataset, whatever their outcome. Imports only h5py and NumPy.
 
 >>> held = Trials("OUT").where(outcome="success", object_name="mug")   # doctest: +SKIP
 >>> held["slip"].max(), held.contacts(frame="T").points.shape          # doctest: +SKIP
@@ -41,27 +41,28 @@ from drakegrasp.table import Table
 if TYPE_CHECKING:
     import pandas
 
-#: Frames in which contacts can be given: object, table top, palm, world.
+#: Frames in which contacts can be returned: object, table top, palm, world.
 Frame = Literal["O", "T", "G", "W"]
-#: Number of a removal or a split that an attempt does not have.
+#: Code of a removal or a split that an attempt does not have.
 NONE = 255
-#: Rows that are read at once: 8 chunks of a column.
+#: Number of rows that are read at once: 8 chunks of a column.
 BLOCK = 16_384
-#: Columns besides those of `/trials`: names of the row's object, why a success is no sample
-#: (`removal` in the schema), and the split of a sample (index into SPLITS); NONE for all others.
+#: Columns besides those of `/trials`: name and class of the row's object, why a success is not a
+#: sample (`removal` in the schema), and the split of a sample (index into SPLITS). `removal` and
+#: `split` are NONE for all other attempts.
 DERIVED = ("object_name", "class_name", "removal", "split")
 #: The fields of `/trials` by name.
 FIELDS = {f.name: f for f in TRIAL_FIELDS}
-#: What changes when a file is replaced; None if it is not there.
+#: File status that changes when a file is replaced; None if the file does not exist.
 Stamp = tuple[int, ...] | None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrialPart:
-    """The rows of one file: all of trials.hdf5, or the first of a shard while a build runs.
+    """The rows of one file: trials.hdf5, or during a build the shard of one work unit.
 
     Attributes:
-        path: Of the file.
+        path: Path of the file.
         count: Number of rows.
         header: Identity of the shard; None for trials.hdf5.
         object: Row of the shard's object among the objects.
@@ -74,22 +75,21 @@ class TrialPart:
 
 
 class Trials:
-    """Attempts of a dataset as columns and rows; a choice of them is `Trials` again.
+    """Attempts of a dataset as columns and rows; a selection of them is again a `Trials`.
 
-    Columns are read when they are asked for, so a large dataset needs memory for those alone. A
-    file that was written anew in the meantime is refused, because its rows may be others.
+    Columns are read when they are requested, so a large dataset needs memory only for these. A file
+    that was rewritten in the meantime is rejected, because its rows may differ.
 
     Args:
         out: Directory of an assembled dataset, or its trials.hdf5.
-        any_name: Whether objects may have names that no file can have: enough to show them.
+        any_name: Whether objects may have names that are not valid names of files, which is enough
+            for display.
 
     Attributes:
-        path: The directory of the dataset, or its trials.hdf5, absolute.
+        path: The directory of the dataset, or its trials.hdf5, as an absolute path.
         objects: Columns of `/objects` by the names of the schema; texts are str.
-        attributes: What trials.hdf5 says of its dataset, e.g. `config` as JSON; nothing without it.
-
-    Raises:
-        DataError: If the file is missing, damaged or differs from the schema.
+        attributes: Attributes of trials.hdf5, e.g. `config` as JSON; empty if there is no such
+            file.
     """
 
     def __init__(self, out: str | Path, *, any_name: bool = False) -> None:
@@ -111,7 +111,7 @@ class Trials:
             self.attributes: Mapping[str, Any] = dict(file.attrs)
         self._stamp = stamp(path)
         self._count = self._parts[0].count
-        # The attempts that were chosen, and of all attempts, for every choice, what `_of_all` read.
+        # The selected rows (None: all), and what `_of_all` has read, which all selections share.
         self._rows: npt.NDArray[np.int64] | None = None
         self._known: dict[str, npt.NDArray[np.uint8]] = {}
 
@@ -119,12 +119,12 @@ class Trials:
     def of_parts(
         cls, out: Path, objects: Mapping[str, AnyArray], parts: Sequence[TrialPart]
     ) -> Trials:
-        """Return the attempts in some shards of a build that has not been assembled.
+        """Return the attempts in some shards of a build that is not assembled yet.
 
         Args:
             out: Directory of the dataset.
-            objects: Columns of its objects, `name` and `class_name` at least.
-            parts: In the order of the rows.
+            objects: Columns of its objects, at least `name` and `class_name`.
+            parts: Files of the attempts, in the order of the rows.
         """
         trials = cls.__new__(cls)
         trials.path, trials.objects, trials.attributes = out, objects, {}
@@ -133,7 +133,7 @@ class Trials:
         return trials
 
     def _chosen(self, rows: npt.NDArray[np.int64]) -> Trials:
-        """Return the attempts of some rows of all."""
+        """Return the attempts at given rows of all attempts."""
         trials = copy.copy(self)
         trials._rows = rows
         return trials
@@ -170,7 +170,7 @@ class Trials:
     def __getitem__(self, key: slice | npt.NDArray[Any] | Sequence[int]) -> Trials: ...
 
     def __getitem__(self, key: Any) -> AnyArray | dict[str, Any] | Trials:
-        """Return a column by its name, one attempt by its index, or a choice of them.
+        """Return a column by its name, one attempt by its index, or a selection of attempts.
 
         Args:
             key: Name of a column, see `columns`; an index, which counts from the end if it is
@@ -192,7 +192,7 @@ class Trials:
         return {name: values[0] for name, values in self[[index]].columns().items()}
 
     def trial(self, trial_id: int) -> dict[str, Any]:
-        """Return an attempt by its row in trials.hdf5, as `trials[index]` does.
+        """Return an attempt by its row in trials.hdf5, in the form of `trials[index]`.
 
         Raises:
             DataError: If there is no such row.
@@ -211,13 +211,13 @@ class Trials:
         refined: bool | None = None,
         sample: bool | None = None,
     ) -> Trials:
-        """Return the attempts for which all that is given holds.
+        """Return the attempts that meet all given conditions.
 
         Args:
             outcome: One or several outcomes, as `Outcome` or by their labels, e.g. "success".
             object_name: Name of the object.
             class_name: Name of the object's class.
-            refined: Whether the palm pose is a refined one, about that of a grasp that holds.
+            refined: Whether the palm pose is refined, i.e. drawn around that of a held grasp.
             sample: Whether the attempt is a sample of the dataset.
 
         Raises:
@@ -244,9 +244,9 @@ class Trials:
         """Return columns (n, ...) of the attempts by their names.
 
         Args:
-            names: Fields of `/trials`, or DERIVED ones; all but `split` if None, which is read
-                from the data files. A field that an older file lacks, or that an attempt did not
-                reach, is NaN, 0 or False.
+            names: Fields of `/trials`, or DERIVED ones; if None, all except `split`, which is read
+                from the data files. A field that an older file lacks, or whose stage an attempt did
+                not reach, is NaN, 0 or False.
 
         Raises:
             DataError: If there is no such column, or a file was replaced.
@@ -260,13 +260,13 @@ class Trials:
         return {name: np.concatenate([block[name] for block in blocks]) for name in names}
 
     def _is_rising(self) -> bool:
-        """Return whether the attempts are in the order of the file, each once."""
+        """Return whether the attempts are in the order of the file, without repetition."""
         return self._rows is None or bool((np.diff(self._rows) > 0).all())
 
     def blocks(self, names: Sequence[str]) -> Iterator[dict[str, AnyArray]]:
-        """Yield columns of some thousand attempts after the other, which must be in rising order.
+        """Yield columns of the attempts in blocks of some thousand; they must be in rising order.
 
-        There is one block at least, so that columns of no attempts have a type and a shape.
+        At least one block is yielded, so that columns without attempts have a type and a shape.
 
         Args:
             names: See `columns`.
@@ -297,15 +297,15 @@ class Trials:
     ) -> Table:
         """Return the contacts of the n attempts, of k fingers, in one frame.
 
-        Columns: `touching` (n, k) bool, whether the fingertip touches the object; `points`
-        (n, k, 3) [m], contact points, NaN for a finger that does not touch; `normals` (n, k, 3),
-        unit normals out of the object, NaN likewise; `forces` (n, k, 3) [N], of the fingertips on
-        the object.
+        Columns: `touching` (n, k) bool, whether the fingertip touches the object; `points` (n, k,
+        3) [m], contact points; `normals` (n, k, 3), unit normals out of the object; both are NaN
+        for a finger that does not touch; `forces` (n, k, 3) [N], forces of the fingertips on the
+        object.
 
         Args:
-            when: After closing, or after the lift.
+            when: `closed` for the instant after closing, `lifted` for that after the lift.
             frame: Frame of the result: `O` the object's, `T` the table top's, `G` the palm's, `W`
-                the world's; after the lift object and palm are where they are then.
+                the world's; after the lift, object and palm are at their poses of that instant.
 
         Raises:
             DataError: If there is no such moment or frame.
@@ -323,7 +323,7 @@ class Trials:
         X_TO, X_OG = (unpack_pose(columns[name]) for name in poses)
         touching, points, normals, forces = (columns[key] for key in keys)
 
-        # In the frame that is wanted.
+        # Transform them to the requested frame.
         if frame == "O":
             return Table(touching=touching, points=points, normals=normals, forces=forces)
         X_FO = {"T": X_TO, "G": invert_pose(X_OG), "W": multiply(X_WT, X_TO)}[frame]
@@ -339,9 +339,9 @@ class Trials:
         """Return a pandas data frame with a row per attempt, by trial id.
 
         Args:
-            names: See `columns`. Of all columns those with one value per attempt if None.
-                Several values of an attempt are columns of their own: `slip`, `closed_q.0`, ...;
-                outcomes and names are categories.
+            names: See `columns`; if None, all columns with one value per attempt. Several values of
+                an attempt become columns `slip`, `closed_q.0`, ...; outcomes and names are
+                categories.
 
         Raises:
             DataError: If there is no such column.
@@ -354,7 +354,7 @@ class Trials:
         if names is None:
             names = [name for name, field in FIELDS.items() if not field.shape] + [*DERIVED]
 
-        # Several values of an attempt are columns of their own.
+        # Several values of an attempt become several columns.
         series: dict[str, Any] = {}
         for name, values in self.columns(names).items():
             if values.ndim > 1:
@@ -363,7 +363,7 @@ class Trials:
             else:
                 series[name] = values
 
-        # Outcomes and splits become words.
+        # Outcomes and splits become texts.
         if "outcome" in series:
             labels = {outcome.value: outcome.label for outcome in Outcome}
             series["outcome"] = [labels[int(value)] for value in series["outcome"]]
@@ -389,7 +389,7 @@ class Trials:
 
     @contextmanager
     def _open(self, part: TrialPart) -> Iterator[h5py.File]:
-        """Open a part: the file that was looked at first, or none."""
+        """Open a part, which must be the file that was first read."""
         if part.header is not None:
             with open_shard(part.path, part.header, verify_seal=False, again=True) as (file, _):
                 yield file
@@ -400,7 +400,7 @@ class Trials:
     def _read(
         self, part: TrialPart, start: int, rows: npt.NDArray[np.int64], names: Sequence[str]
     ) -> Iterator[dict[str, AnyArray]]:
-        """Yield columns of some rows of a part, which begins with row `start` of all."""
+        """Yield columns of some rows of a part, whose first row is row `start` of all attempts."""
         with self._open(part) as file:
             for block in np.split(rows, np.flatnonzero(np.diff(rows // BLOCK)) + 1):
                 yield {name: self._column(name, file, part, start, block) for name in names}
@@ -408,11 +408,11 @@ class Trials:
     def _column(
         self, name: str, file: h5py.File, part: TrialPart, start: int, rows: npt.NDArray[np.int64]
     ) -> AnyArray:
-        """Return a column of rows of a part that lie close together."""
+        """Return a column for rows of a part that are close together."""
         if name not in (*DERIVED, *ASSEMBLED_FIELDS):
             codes = list(Outcome) if name == "outcome" else None
             return _stored(name, file["trials"], rows, codes)
-        # What only the whole dataset knows.
+        # Columns that are known for the whole dataset only.
         if name == "trial_id":
             return start + rows
         if name in ("removal", "split"):
@@ -424,7 +424,7 @@ class Trials:
         return number if name == "object" else self.objects[name.removeprefix("object_")][number]
 
     def _of_all(self, name: str) -> npt.NDArray[np.uint8]:
-        """Return `removal` or `split` of all attempts; NONE where nothing is decided."""
+        """Return `removal` or `split` of all attempts; NONE for attempts without a decision."""
         if name not in self._known:
             values = np.full(self._count, NONE, dtype=np.uint8)
             assembled = [part for part in self._parts if part.header is None]
@@ -439,7 +439,7 @@ class Trials:
         return self._known[name]
 
     def _nothing(self, names: Sequence[str]) -> dict[str, AnyArray]:
-        """Return columns of no attempts."""
+        """Return columns without any attempts."""
         sizes = {"k": 0, "j": 0}
         if self._parts:
             with self._open(self._parts[0]) as file:
@@ -466,13 +466,13 @@ def _stored(
     rows: npt.NDArray[np.int64],
     codes: int | list[Outcome] | None = None,
 ) -> AnyArray:
-    """Return a column of rows that lie close together, as it is stored.
+    """Return a stored column for rows that are close together.
 
     Args:
-        name: Of the column.
+        name: Name of the column.
         trials: The group of the part.
-        rows: In rising order.
-        codes: What its numbers may stand for, see `refuse_other_codes`; None for measured values.
+        rows: Rows in rising order.
+        codes: Valid codes of the column, see `refuse_other_codes`; None for measured values.
     """
     near = slice(int(rows[0]), int(rows[-1]) + 1)
     values = read_rows(trials, FIELDS[name], near, FIELDS.values())
@@ -485,16 +485,16 @@ def _stored(
 def shard_part(
     out: Path, header: ShardHeader, object_: int, names: Sequence[str] | None = None
 ) -> TrialPart:
-    """Return the attempts in a shard; its seal, which takes reading all of it, is not verified.
+    """Return the attempts in a shard; its seal is not verified, since this reads the whole file.
 
     Args:
         out: Directory of the dataset.
-        header: Of the shard.
+        header: Header of the shard.
         object_: Row of its object among the objects.
-        names: Columns that must be there; all that a shard has, and its images, if None.
+        names: Columns that must exist; if None, all columns and images of a shard must.
 
     Raises:
-        DataError: If it is missing, damaged, or another shard.
+        DataError: If the file is missing, damaged, or another shard.
     """
     path = header.path(out)
     stored = tuple(f for f in trial_columns() if f.name in (*(names or ()), "outcome"))
@@ -505,7 +505,7 @@ def shard_part(
 
 
 def sample_ids(out: Path) -> dict[str, npt.NDArray[np.int64]]:
-    """Return the trial ids of the samples by split, in rising order; none without data files.
+    """Return the trial ids of the samples by split, in rising order; empty without data files.
 
     Args:
         out: Directory of the dataset, or its trials.hdf5.
@@ -522,7 +522,7 @@ def sample_ids(out: Path) -> dict[str, npt.NDArray[np.int64]]:
 
 
 def stamp(path: Path) -> Stamp:
-    """Return what changes when a file is replaced; None if it is not there."""
+    """Return a file status that changes when a file is replaced; None if there is no file."""
     try:
         status = path.stat()
     except OSError:
@@ -532,10 +532,10 @@ def stamp(path: Path) -> Stamp:
 
 @contextmanager
 def reopened(path: Path, known: Stamp, what: str) -> Iterator[h5py.File]:
-    """Open a file that was read before while the block runs, see `opened`; `known` is its stamp.
+    """Open a file that was read before, while the block runs; `known` is its stamp.
 
     Raises:
-        DataError: If it is another file by now.
+        DataError: If the path now has another file.
     """
     with opened(path, what, again=True) as file:
         if stamp(path) != known:

@@ -1,9 +1,10 @@
-"""Rows of the dataset, and how they come into its files.
+"""Packs rows of the dataset and copies them into its files.
 
-A task packs some rows: what the client only has to put into the files. In: a range of rows that
-begins and ends with a chunk, and their shards. Out: a part, an HDF5 file with the compressed chunks
-of the columns of /trials, compressed images and masks of the samples among the rows, and the
-samples' other columns as records. The client copies a part, and removes it.
+A task packs a range of rows, so that the client only has to copy them into the files. In: a range
+of rows that begins and ends at chunk borders, and the shards of these rows. Out: a part, which is
+an HDF5 file with the compressed chunks of the columns of /trials, the compressed images and masks
+of the samples among the rows, and the samples' other columns as records. The client copies a part
+and removes it.
 """
 
 from __future__ import annotations
@@ -52,17 +53,18 @@ from drakegrasp.grasp import pack_grasp, transform_grasp
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.runtime.files import atomic_hdf5, disk_full_named, temporary_name
 
-#: Fields of a sample that are copied from /looks as they are stored, and their names there.
+#: Image fields of a sample, copied from /looks as they are stored, and their names there.
 IMAGES = {"images": "image", "masks": "mask"}
-#: Fields of a sample that are texts: of its object.
+#: Text fields of a sample, and the attributes of its object that they repeat.
 TEXTS = {"object_props/object_name": "name", "object_props/class_name": "class_name"}
-#: Rows of a task: some ten of the largest shards, 30 MB in memory.
+#: Rows of a task: about ten of the largest shards, 30 MB in memory.
 TASK_ROWS = 8 * COLUMN_CHUNK
 
 #: A split and a camera.
 Place = tuple[str, str]
-#: All numbers of some samples as records (n,), by the names of DATA_FIELDS, with `object`, the row
-#: of /objects; and of each field of IMAGES their stored bytes and the filters that HDF5 skipped.
+#: All numbers of the samples at a place as records (n,): the names are those of DATA_FIELDS and
+#: `object`, the row of /objects. And for each field of IMAGES the stored bytes of each sample, with
+#: the mask of the filters that HDF5 skipped.
 Records = dict[Place, AnyArray]
 Images = dict[Place, dict[str, list[tuple[bytes, int]]]]
 
@@ -74,11 +76,11 @@ class PackTask:
     Attributes:
         out: Directory of the dataset.
         part: Path of the file to write.
-        start, stop: The range, ids of trials; the start is that of a chunk.
-        slices: The shards that have rows in it, in order.
-        ids: Ids of the trials in it that are samples, in rising order, by split.
-        firsts: Row of the first of them, by split.
-        weights: Their weights.
+        start, stop: Range of trial ids; the start is the first row of a chunk.
+        slices: The shards that have rows in the range, in order.
+        ids: For each split the ids of the trials in the range that are samples, in rising order.
+        firsts: For each split the row of the first of these samples.
+        weights: For each split the weights of these samples.
         sizes: Lengths of the letters in the shapes of the fields.
         certified: Whether the files have HOLD_FIELDS.
     """
@@ -102,7 +104,7 @@ def pack_tasks(out: Path, decisions: Decisions, *, certified: bool) -> Iterator[
     weights = {split: decisions.weights[rows] for split, rows in decisions.splits.items()}
     for start in range(0, shards.count, TASK_ROWS):
         stop = min(start + TASK_ROWS, shards.count)
-        # From the shard in which the range begins to that in which it ends.
+        # From the shard in which the range begins to the shard in which it ends.
         within = slices[bisect_right(firsts, start) - 1 : bisect_left(firsts, stop)]
         bounds = {split: np.searchsorted(rows, (start, stop)) for split, rows in ids.items()}
         yield PackTask(
@@ -123,13 +125,11 @@ def pack_tasks(out: Path, decisions: Decisions, *, certified: bool) -> Iterator[
 
 
 def pack_rows(task: PackTask) -> PackTask:
-    """Write the part of a range of rows; one that is there is replaced.
-
-    Returns the task.
+    """Write the part of a range of rows, replacing an existing part; return the task.
 
     Raises:
-        DataError: If a shard is no longer there.
-        DiskFullError: If there is no room for the part.
+        DataError: If a shard no longer exists.
+        DiskFullError: If the disk has no room for the part.
     """
     columns, records, images = read_rows(task)
     with disk_full_named(Path(task.out)), atomic_hdf5(Path(task.part)) as file:
@@ -150,11 +150,11 @@ def pack_rows(task: PackTask) -> PackTask:
 def unpack_rows(
     task: PackTask, files: Mapping[str, h5py.File], texts: Mapping[str, Sequence[str]]
 ) -> None:
-    """Put the part of a task into the files, and remove it.
+    """Copy the part of a task into the files and remove the part.
 
     Args:
         task: The task.
-        files: The files by camera, that of the trials under "", with room for all rows.
+        files: The files by camera, with room for all rows; the trials are under "".
         texts: See `sample_texts`.
     """
     with h5py.File(task.part) as part:
@@ -174,19 +174,19 @@ def unpack_rows(
 
 
 def _copy_chunks(column: h5py.Dataset, target: h5py.Dataset, first: int) -> None:
-    """Copy a column as it is stored to rows that begin with a chunk."""
+    """Copy the stored chunks of a column to rows that begin at a chunk border."""
     for row in range(0, len(column), column.chunks[0]):
         skipped, chunk = column.id.read_direct_chunk((row, *_within(column)))
         target.id.write_direct_chunk((first + row, *_within(column)), chunk, skipped)
 
 
 def _within(column: h5py.Dataset) -> tuple[int, ...]:
-    """Return the place of a chunk without its row."""
+    """Return the position of a chunk without its row."""
     return (0,) * (column.ndim - 1)
 
 
 def sample_texts(manifest: Manifest) -> dict[str, list[str]]:
-    """Return by the names of TEXTS the text of each object, by row of /objects."""
+    """Return, for each name of TEXTS, the texts of all objects in the order of /objects."""
     return {
         name: [getattr(entry, attribute) for entry in manifest.objects]
         for name, attribute in TEXTS.items()
@@ -197,12 +197,12 @@ def sample_texts(manifest: Manifest) -> dict[str, list[str]]:
 
 
 def read_rows(task: PackTask) -> tuple[dict[str, AnyArray], Records, Images]:
-    """Return the rows of a range: the columns of /trials, and the samples of each split and camera.
+    """Return the rows of a range: columns of /trials, and samples of each split and camera.
 
     Raises:
-        DataError: If a shard is no longer there.
+        DataError: If a shard no longer exists.
     """
-    # The survey has verified the seals.
+    # The seals are not verified here, since the survey has verified them.
     count, places = task.stop - task.start, [(s, c) for s in task.ids for c in CAMERAS]
     columns = {
         f.name: np.empty((count, *f.row_shape(task.sizes)), f.dtype) for f in _fields_of(task)
@@ -217,8 +217,8 @@ def read_rows(task: PackTask) -> tuple[dict[str, AnyArray], Records, Images]:
     records = {place: np.zeros(len(task.ids[place[0]]), kind) for place in places}
     images: Images = {place: {name: [] for name in IMAGES} for place in places}
 
-    # Shard by shard.
-    load = lru_cache(1)(load_object)  # the shards of an object come one after the other
+    # Read shard by shard.
+    load = lru_cache(1)(load_object)  # the shards of an object follow each other
     for piece in task.slices:
         first, last = max(task.start, piece.first), min(task.stop, piece.first + piece.rows)
         path = piece.header.path(Path(task.out))
@@ -246,8 +246,8 @@ def _add_samples(
     task: PackTask,
     load: Callable[[Path], ObjectModel],
 ) -> None:
-    """Add the samples of a shard that are in the range of a task; `load` gives its object."""
-    # Most shards of a hard object have none.
+    """Add the samples of a shard that are in the range of a task; `load` loads its object."""
+    # Most shards of a difficult object have no samples.
     bounds = {
         split: np.searchsorted(ids, (piece.first, piece.first + piece.rows)).tolist()
         for split, ids in task.ids.items()
@@ -284,17 +284,17 @@ def sample_values(
 
     Args:
         model: The object.
-        trial: Values of its row of /trials.
-        look: Values of its row of /looks; images are not needed.
+        trial: Values of the trial's row of /trials.
+        look: Values of the trial's row of /looks; images are not needed.
         camera: `oto` or `otm`.
     """
-    # The poses of this sample.
+    # Poses of this sample.
     X_TO = unpack_pose(trial["X_TO"])
     X_TC = {c: unpack_pose(look[f"X_TC_{c}"]) for c in CAMERAS}
     X_CO = multiply(invert_pose(X_TC[camera]), X_TO)
 
-    # Grasp, palm and forces in the frame of the file's camera. What is held is put in place with
-    # the object: both go through its resting pose.
+    # Grasp, palm and forces in the frame of the file's camera. The held grasp is expressed with the
+    # object in its resting pose: both grasps are transformed with X_CO.
     values: dict[str, Any] = {}
     for suffix, when, X_OG in (("", "closed", "X_OG"), ("_held", "lifted", "X_OG_lifted")):
         grasp = pack_grasp(trial[f"{when}_p_OQ"], trial[f"{when}_nhat_Q_O"])
@@ -318,5 +318,5 @@ def sample_values(
     }
     values |= {f"object_props/{name}": value for name, value in properties.items()}
 
-    # All others are columns of the trial.
+    # All other fields are columns of the trial.
     return values | {field.name: trial[field.of] for field in DATA_FIELDS if field.of in trial}

@@ -1,8 +1,8 @@
-"""Postprocessing: which samples train, validate and test, by class or by object.
+"""Postprocessing: which samples are for training, validation and test, by class or by object.
 
-Pure functions of names and numbers. By class is the paper's rule (Veres et al.): of each class one
-object is tested. By object is for meshes that are each of a class of their own, of which that rule
-would test all.
+Pure functions of names and numbers. The rule by class is that of the paper (Veres et al.): one
+object of each class is for the test. The rule by object is for meshes that are each a class of
+their own; the rule by class would put all of these into the test split.
 """
 
 from __future__ import annotations
@@ -23,15 +23,16 @@ Rows = npt.NDArray[np.int64]
 
 
 def split_rule(config: SplitConfig, classes: Sequence[str], groups: Sequence[str]) -> Rule:
-    """Return the rule of the split: that of the configuration, or what `auto` stands for.
+    """Return the rule of the split: that of the configuration, or the rule that `auto` selects.
 
-    `auto` is by object where no class has objects of two groups and `train_classes` names none.
-    Objects without samples count, too, so that the rule does not depend on which grasps held.
+    `auto` selects the rule by object if no class has objects of two groups and `train_classes` is
+    not given. Objects without samples count as well, so that the rule does not depend on which
+    grasps held.
 
     Args:
-        config: Of the split.
+        config: Configuration of the split.
         classes: Classes of the objects.
-        groups: Of each object what it shares with others of the same mesh, e.g. its morphs.
+        groups: Group of each object, equal for objects of the same mesh, e.g. its morphs.
     """
     if config.by != "auto":
         return config.by
@@ -40,7 +41,7 @@ def split_rule(config: SplitConfig, classes: Sequence[str], groups: Sequence[str
 
 
 def may_train(class_name: str, count: int, config: SplitConfig) -> bool:
-    """Return whether by class samples of a class with `count` objects train or validate."""
+    """Return whether samples of a class of `count` objects may train or validate, by class."""
     if config.train_classes is None:
         return count > 1
     return class_name in config.train_classes
@@ -58,10 +59,10 @@ def split_samples(
 
     Args:
         objects: (n,), row of /objects of each sample.
-        names: Names of the objects' meshes, by row; a mesh under several seeds is one object.
+        names: Names of the objects' meshes, by row; a mesh with several seeds counts as one object.
         classes: Classes of the objects, by row.
         groups: Groups of the objects, by row, see `split_rule`.
-        config: The rule and its shares.
+        config: The rule and the fractions of the splits.
         seed: Seed of the dataset.
     """
     if split_rule(config, classes, groups) == "object":
@@ -78,11 +79,11 @@ def _split_by_class(
 ) -> dict[str, Rows]:
     """Return the indices of the samples of each split by class.
 
-    From each class one object is drawn; all its samples go to the test split. Of the samples of
-    the other objects a share goes to the validation split and the rest to the training split. A
-    class goes to the test split as a whole if only one of its objects has samples and
-    `train_classes` does not name it, or if `train_classes` leaves it out. A class with one object
-    that `train_classes` names is not tested. The draw of a class depends on its own objects alone.
+    From each class one object is drawn; all its samples are in the test split. A fraction of the
+    samples of the other objects is in the validation split and the rest in the training split. A
+    class is in the test split as a whole if only one of its objects has samples and `train_classes`
+    does not name the class, or if `train_classes` leaves it out. A class with one object that
+    `train_classes` names is not tested. The draw of a class depends only on its own objects.
     """
     # The objects that have samples, by class.
     members: dict[str, set[str]] = {}
@@ -92,9 +93,9 @@ def _split_by_class(
     splits: Mapping[str, list[Rows]] = {"train": [], "valid": [], "test": []}
     for class_name in sorted(members):
         own = sorted(members[class_name])
-        # A key of three numbers: never the stream of a candidate of an object of that name.
+        # A key of three numbers: it never equals the stream of a candidate of an object so named.
         stream = Stream(seed, object_key(class_name), 0, 1)
-        # The test object, or all of them, or none.
+        # The test objects: one, all or none.
         if not may_train(class_name, len(own), config):
             tested, others = own, []
         elif len(own) < 2:
@@ -104,7 +105,7 @@ def _split_by_class(
             others = [name for name in own if name not in tested]
         splits["test"].append(_rows_of(objects, names, tested))
 
-        # The samples of the others, shuffled.
+        # The samples of the other objects, shuffled.
         pool = _rows_of(objects, names, others)
         shuffled = pool[stream.permutation(len(pool))]
         count = round(config.valid_fraction * len(pool))
@@ -115,11 +116,11 @@ def _split_by_class(
 
 
 def rank_in_split(group: str, seed: int) -> float:
-    """Return the number in [0, 1) of a group of objects; those with the lowest are tested.
+    """Return the number in [0, 1) of a group of objects; groups with the lowest are tested.
 
-    It is uniform over seeds, so the share x of all groups has a number below x, more or less.
+    It is uniform over seeds, so about a fraction x of all groups has a number below x.
     """
-    # Another stream than that of a class: it may have the same name.
+    # Not the stream of a class, which may have the same name.
     return float(Stream(seed, object_key(group), 0, 2).uniform(1)[0])
 
 
@@ -128,10 +129,10 @@ def _split_by_object(
 ) -> dict[str, Rows]:
     """Return the indices of the samples of each split by object.
 
-    Each group of objects draws a number from the seed and its own name. In the order of these the
-    first share of the groups that have samples is tested, the last one validates, and those
-    between train. So one group more moves at most one other across each of the two borders, and
-    none from test to valid or back.
+    Each group of objects draws a number from the seed and its own name. The groups with samples are
+    ordered by this number: the first fraction is for the test, the last for validation, and those
+    between are for training. One more group therefore moves at most one other group across each of
+    the two borders, and none from test to validation or back.
     """
     # The groups that have samples, in the order of their numbers.
     present = {groups[i] for i in np.unique(objects).tolist()}
@@ -144,14 +145,15 @@ def _split_by_object(
 
 
 def _rows_of(objects: npt.NDArray[np.int32], texts: Sequence[str], chosen: Sequence[str]) -> Rows:
-    """Return the indices of the samples of the objects whose text is one of those chosen."""
+    """Return the indices of the samples whose object's text is among the chosen ones."""
     return np.flatnonzero(np.isin(objects, [i for i, text in enumerate(texts) if text in chosen]))
 
 
 def _shares(count: int, config: SplitConfig) -> tuple[int, int]:
-    """Return how many of the groups test and validate: their shares, and one at least.
+    """Return the numbers of groups for test and validation: their fractions, but at least one.
 
-    Of few groups one trains before any is tested, and one is tested before any validates.
+    If there are few groups, one is for training before any is tested, and one is tested before any
+    validates.
     """
     tested, valid = (
         max(1, round(share * count)) if share else 0
@@ -165,18 +167,18 @@ def _shares(count: int, config: SplitConfig) -> tuple[int, int]:
     return tested, valid
 
 
-#: Palms are near within this distance [m] and angle [rad].
+#: Two palms are near if their distance [m] and angle [rad] are within these limits.
 NEAR_SHIFT, NEAR_TURN = 0.010, float(np.deg2rad(15.0))
-#: Samples whose distances from all others of their group are computed together.
+#: Number of samples whose distances from all others of their group are computed together.
 BLOCK = 256
 
 
 def weigh_samples(groups: npt.ArrayLike, X_OG: Array) -> Array:
-    """Return the weight (n,) of each sample.
+    """Return the weight (n,) of each sample: 1 / the number of near samples in its group.
 
     Args:
         groups: (n,) or (n, m), equal for samples of the same object and resting pose.
-        X_OG: (n, 4, 4), poses of the palm.
+        X_OG: (n, 4, 4), palm poses.
     """
     count = np.ones(len(X_OG))
     for rows in _rows_by_group(np.asarray(groups)):
@@ -192,14 +194,14 @@ def weigh_samples(groups: npt.ArrayLike, X_OG: Array) -> Array:
 
 
 def number_poses(meshes: Sequence[str], up: Sequence[npt.ArrayLike]) -> list[npt.NDArray[np.int64]]:
-    """Return a number (r,) of each resting pose of each object.
+    """Return a number for each resting pose (r,) of each object.
 
-    It is another for each pose; but a mesh that has several seeds has drops of each, and poses of
-    these that are near count as one.
+    Each pose has a number of its own, with one exception: a mesh with several seeds has drops of
+    each seed, and near poses of different seeds share a number.
 
     Args:
         meshes: Names of the objects' meshes.
-        up: (r, 3) of each object: upward directions in {O} of its resting poses.
+        up: For each object (r, 3), the upward directions in {O} in its resting poses.
     """
     known: dict[str, tuple[Array, npt.NDArray[np.int64]]] = {}
     numbers, count = list[npt.NDArray[np.int64]](), 0
@@ -209,7 +211,7 @@ def number_poses(meshes: Sequence[str], up: Sequence[npt.ArrayLike]) -> list[npt
         if mesh not in known:
             known[mesh] = directions, own
         else:
-            # The nearest pose of another seed.
+            # Use the number of the nearest pose of another seed.
             theirs, indices = known[mesh]
             cosine = dot(directions[:, None], theirs[None])
             near = cosine.max(axis=1) >= np.cos(NEAR_TURN)
@@ -220,7 +222,7 @@ def number_poses(meshes: Sequence[str], up: Sequence[npt.ArrayLike]) -> list[npt
 
 
 def effective_number(weights: npt.ArrayLike) -> float:
-    """Return how many samples (n,) count in effect, (sum w)^2 / sum w^2 (Kish 1965)."""
+    """Return the effective number of samples, (sum w)^2 / sum w^2 (Kish 1965), of weights (n,)."""
     w = np.asarray(weights, dtype=float)
     return float(w.sum() ** 2 / (w * w).sum()) if len(w) else 0.0
 

@@ -1,10 +1,10 @@
-"""What assembling learns of the shards before it writes a row, and what it decides.
+"""What assembling reads from the shards before it writes a row, and what it decides.
 
-A task surveys the shards of one object: it verifies their seals, and says how many rows each gives
-and of each success what the filters need. From the surveys of all objects follows which successes
-are samples: by the rules of `filters`, the user's own, outliers and rejections; in which split they
-are, and what each one weighs. `assembly.pack` packs the rows accordingly, and `assemble` writes
-them; `checks` decides again and compares.
+A task surveys the shards of one object: it verifies their seals, counts the rows of each, and
+collects for each success the values that the filters need. From the surveys of all objects follows
+which successes are samples (by the rules of `filters`, user-defined filters, outliers and
+rejections), in which split each sample is, and its weight. `assembly.pack` packs the rows
+accordingly, and `assemble` writes them; `checks` decides again and compares.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ class SurveyTask:
     Attributes:
         out: Directory of the dataset.
         object: Row of the object in /objects.
-        headers: Its work units, in the order of their candidates.
-        wanted: Number of grasps after which its rows end; None for all rows.
-        camera: That sees the grasps.
+        headers: The object's work units, in the order of their candidates.
+        wanted: Number of grasps after which the object's rows end; None for all rows.
+        camera: Camera that sees the grasps.
     """
 
     out: str
@@ -75,15 +75,15 @@ class SurveyTask:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Survey:
-    """What the shards of an object hold.
+    """Row counts and successes of the shards of an object.
 
     Attributes:
         object: Row of the object in /objects.
-        rows: Number of rows that the dataset takes of each shard, from the first; a shard behind
-            the last wanted grasp is not in it.
+        rows: Number of rows that the dataset takes from each shard, counted from the first; shards
+            after the last wanted grasp are not listed.
         seals: Hash of the seals of these shards.
-        successes: Those in the rows, with the columns of `successes_of`; `trial_id` counts from the
-            object's first row.
+        successes: Successes in these rows, with the columns of `successes_of`; `trial_id` counts
+            from the object's first row.
         sizes: Lengths of the letters in the shapes of `schema`.
     """
 
@@ -120,7 +120,7 @@ def survey_object(task: SurveyTask) -> Survey:
     """Survey the shards of an object.
 
     Raises:
-        DataError: If one of them is missing or damaged.
+        DataError: If a shard is missing or damaged.
     """
     out, first, left = Path(task.out), 0, task.wanted
     rows, parts, digest = list[int](), list[Table](), hashlib.sha256()
@@ -129,8 +129,8 @@ def survey_object(task: SurveyTask) -> Survey:
         if left == 0:
             break
         with open_shard(header.path(out), header) as (file, _):
-            # The rows end with the last wanted grasp. So a dataset does not depend on how many
-            # more attempts the workers had begun when enough grasps were there.
+            # The rows end with the last wanted grasp. So a dataset does not depend on how many more
+            # attempts the workers had begun when there were enough grasps.
             outcome = read_column(file["trials"], "outcome")
             hits = np.flatnonzero(outcome == Outcome.SUCCESS)[:left]
             left = None if left is None else left - len(hits)
@@ -165,8 +165,8 @@ def shards_sha256(out: Path, manifest: Manifest, execute: Executor = run_here) -
 
     Args:
         out: Directory of the dataset.
-        manifest: Of the dataset.
-        execute: Reads the seals, a task for each object.
+        manifest: Manifest of the dataset.
+        execute: Executor that reads the seals, one task for each object.
 
     Raises:
         DataError: If a shard is missing.
@@ -176,12 +176,16 @@ def shards_sha256(out: Path, manifest: Manifest, execute: Executor = run_here) -
 
 
 def join_seals(digests: Mapping[int, bytes]) -> str:
-    """Return the hash of the hashes of all objects' seals, by their rows of /objects."""
+    """Return one hash for the seals of all objects.
+
+    Args:
+        digests: `Survey.seals` of each object, by its row of /objects.
+    """
     return hashlib.sha256(b"".join(digests[i] for i in sorted(digests))).hexdigest()
 
 
 def _read_seals(task: SurveyTask) -> tuple[int, bytes]:
-    """Return the row of an object, and what `Survey.seals` is; seals are not verified."""
+    """Return the row of an object and its `Survey.seals`; the seals are not verified."""
     out, left, digest = Path(task.out), task.wanted, hashlib.sha256()
     for header in task.headers:
         if left is not None and left <= 0:
@@ -194,7 +198,7 @@ def _read_seals(task: SurveyTask) -> tuple[int, bytes]:
 
 
 def _fingers(t: Table, camera: CameraConfig | None = None) -> tuple[AnyArray, ...]:
-    """Return which fingers the preshape leaves out, and whether all others touch both times."""
+    """Return which fingers the preshape leaves out, and whether all others touch at both times."""
     unused = unused_fingers(t["unused"], t["closed_touching"].shape[1])
     return unused, np.all(t["closed_touching"] & t["lifted_touching"] | unused, axis=1)
 
@@ -207,7 +211,7 @@ def _grasp_T(t: Table) -> Array:
 
 
 def _held_O(t: Table) -> Array:
-    """Return the contacts (n, 6k) at the end of the lift in {O}."""
+    """Return the contacts (n, 6k) in {O} at the end of the lift."""
     parts = [t[f"lifted_{name}"] for name in ("p_OQ", "nhat_Q_O")]
     return np.concatenate(parts, axis=1).reshape(t.count, 6 * parts[0].shape[1])
 
@@ -225,7 +229,7 @@ def _all_in_view(t: Table, camera: CameraConfig) -> AnyArray:
 
 
 def _in_view(K: Array, size: int, X_TC: Array, grasp_T: Array, unused: AnyArray) -> bool:
-    """Return whether all contacts of a grasp are before a camera and within its image."""
+    """Return whether all contacts of a grasp are in front of a camera and within its image."""
     p_TQ, _ = unpack_grasp(grasp_T)
     p_CQ = transform_points(invert_pose(unpack_pose(X_TC)), p_TQ[~unused])
     uv = project(K, p_CQ)
@@ -233,14 +237,14 @@ def _in_view(K: Array, size: int, X_TC: Array, grasp_T: Array, unused: AnyArray)
 
 
 def _largest(t: Table, name: str) -> AnyArray:
-    """Return the largest value (n,) of the fingers that are used."""
+    """Return the largest value (n,) among the used fingers."""
     unused, _ = _fingers(t)
     largest: AnyArray = np.where(unused, 0.0, t[name]).max(axis=1, initial=0.0)
     return largest
 
 
 def _doubts(t: Table, camera: CameraConfig) -> tuple[AnyArray, ...]:
-    """Return the suspicion score and parts of it, (n,) each."""
+    """Return the suspicion score and three of its parts, (n,) each."""
     doubts = suspicion(t)
     parts = "penetration", "imbalance", "normal_sum"
     return doubts.score, *(doubts.values[name] for name in parts)
@@ -249,12 +253,13 @@ def _doubts(t: Table, camera: CameraConfig) -> tuple[AnyArray, ...]:
 _TOUCHING = ("unused", "closed_touching", "lifted_touching")
 _IN_T = ("X_TO", "closed_p_OQ", "closed_nhat_Q_O", "closed_touching")
 _MASKS, _CAMERAS = (tuple(f"{name}_{c}" for c in CAMERAS) for name in ("mask", "X_TC"))
-#: Columns of successes that follow from those of the files: names, what they need of `/trials` and
-#: `/looks`, and what gives the columns, given these and the camera.
+#: Columns of successes that are derived from columns of the files: their names, the columns of
+#: `/trials` and `/looks` that they need, and the function that derives them from these and the
+#: camera.
 _DERIVED: tuple[tuple[tuple[str, ...], tuple[str, ...], Callable[[Table, CameraConfig], Any]], ...]
 _DERIVED = (
-    # (n, k) bool, the fingers that the preshape leaves out; and whether all others touch, after
-    # closing and after the lift.
+    # (n, k) bool, the fingers that the preshape leaves out; and (n,) bool, whether all others touch
+    # after closing and after the lift.
     (("unused", "complete"), _TOUCHING, _fingers),
     (("grasp_T",), _IN_T, lambda t, camera: [_grasp_T(t)]),
     (("held_O",), ("lifted_p_OQ", "lifted_nhat_Q_O"), lambda t, camera: [_held_O(t)]),
@@ -268,15 +273,15 @@ _DERIVED = (
         ],
     ),
     (("in_view",), (*_IN_T, *_TOUCHING, *_CAMERAS), lambda t, c: [_all_in_view(t, c)]),
-    # [m] above the table; both cameras are at the same point.
+    # Height above the table [m]; both cameras are at the same point.
     (("camera_height",), ("X_TC_otm",), lambda t, c: [unpack_pose(t["X_TC_otm"])[:, 2, 3]]),
-    # [m^2], of the otm depth image.
+    # Variance of the otm depth image [m^2].
     (
         ("depth_variance",),
         ("depth_otm",),
         lambda t, camera: [t["depth_otm"].astype(float).var(axis=(1, 2))],
     ),
-    # The largest of the contacts [m], [rad].
+    # Largest value of the contacts [m], [rad].
     *(
         ((name,), (*_TOUCHING, name), lambda t, c, name=name: [_largest(t, name)])
         for name in ("surface_distance", "normal_angle")
@@ -284,8 +289,8 @@ _DERIVED = (
     (("suspicion", "penetration", "imbalance", "normal_sum"), COLUMNS, _doubts),
     (("X_OG",), ("X_OG",), lambda t, camera: [unpack_pose(t["X_OG"])]),
 )
-#: Columns of successes as the files hold them: which attempt each one is, what rules need, and what
-#: is copied to /successes.
+#: Columns of successes that are copied from the files: the identity of the attempt, what the rules
+#: need, and what is copied to /successes.
 _COPIED = tuple(
     dict.fromkeys(
         name
@@ -299,7 +304,7 @@ LOOK_COLUMNS = (
     *_CAMERAS,
     *(field.name for field in CERTIFICATE_FIELDS),
 )
-#: Columns of `/trials` from which those of successes follow.
+#: Columns of `/trials` from which the columns of successes follow.
 TRIAL_COLUMNS = sources_of(
     name
     for name in (*_COPIED, *(name for _, needs, _ in _DERIVED for name in needs))
@@ -308,16 +313,16 @@ TRIAL_COLUMNS = sources_of(
 
 
 def successes_of(rows: Table, camera: CameraConfig, *, object: int = 0) -> Table:
-    """Return what filters and splits look at, of n successes; their `trial_id` counts from 0.
+    """Return what filters and splits need of n successes; `trial_id` counts from 0.
 
-    Columns whose sources are not there, as the images of a trial that nobody rendered, are left
-    out: the rules that need them say nothing.
+    A column whose sources are missing, e.g. the images of a trial that was not rendered, is left
+    out; rules that need it are then not applied.
 
     Args:
-        rows: Columns of their rows of `/trials` and `/looks`, by their names there; `depth_otm`
-            (n, S, S) are their otm depth images [m].
-        camera: That sees the grasps.
-        object: Row of their object in /objects.
+        rows: Columns of the successes' rows of `/trials` and `/looks`, by their names there;
+            `depth_otm` (n, S, S) are their otm depth images [m].
+        camera: Camera that sees the grasps.
+        object: Row of the successes' object in /objects.
     """
     found: dict[str, AnyArray] = {
         "trial_id": np.arange(rows.count, dtype=np.int64),
@@ -337,9 +342,9 @@ class ShardSlice:
     """The rows of a shard that the dataset takes, and their ids.
 
     Attributes:
-        header: Of the shard.
-        object: Row of its object in /objects.
-        first: Id of the trial in its first row.
+        header: Header of the shard.
+        object: Row of the shard's object in /objects.
+        first: Id of the trial in the shard's first row.
         rows: Number of rows taken, from the first.
     """
 
@@ -351,11 +356,11 @@ class ShardSlice:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shards:
-    """What the shards of a dataset hold.
+    """Rows and successes of all shards of a dataset.
 
     Attributes:
-        slices: The rows that the dataset takes of each shard, in order.
-        successes: All successes among them, with their trials' ids.
+        slices: The rows that the dataset takes from each shard, in order.
+        successes: All successes among these rows, with the ids of their trials.
         sizes: Lengths of the letters in the shapes of the fields.
         seals: Hash of the seals of the shards, hexadecimal.
     """
@@ -373,13 +378,13 @@ class Shards:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Decisions:
-    """What becomes of the n successes of a dataset.
+    """What is decided about the n successes of a dataset.
 
     Attributes:
-        shards: What its shards hold.
-        removal: (n,) uint8, the `Removal` of each.
+        shards: Rows and successes of the dataset's shards.
+        removal: (n,) uint8, the `Removal` of each success.
         splits: Indices of the samples of each split among the successes, in rising order.
-        weights: (n,), weight of each sample; NaN for a success that is not one.
+        weights: (n,), weight of each sample; NaN for a success that is not a sample.
     """
 
     shards: Shards
@@ -389,7 +394,7 @@ class Decisions:
 
     @cached_property
     def ids(self) -> dict[str, npt.NDArray[np.int64]]:
-        """Ids of the trials that are samples, in rising order, by split."""
+        """For each split the ids of the trials that are samples, in rising order."""
         return {
             split: self.shards.successes["trial_id"][rows] for split, rows in self.splits.items()
         }
@@ -407,7 +412,7 @@ def number_rows(surveys: Sequence[Survey], manifest: Manifest) -> Shards:
     for survey in surveys:
         ids = survey.successes["trial_id"] + first
         parts.append(survey.successes.with_columns(trial_id=ids))
-        # Shards behind the last wanted grasp give no rows.
+        # Shards after the last wanted grasp have no rows here.
         for header, rows in zip(headers[survey.object], survey.rows, strict=False):
             slices.append(ShardSlice(header=header, object=survey.object, first=first, rows=rows))
             first += rows
@@ -420,7 +425,7 @@ def number_rows(surveys: Sequence[Survey], manifest: Manifest) -> Shards:
 
 
 def keys_of(manifest: Manifest, successes: Table) -> dict[AttemptKey, int]:
-    """Return the trial id of each success, by its identity."""
+    """Return the trial id of each success, by the identity of its attempt."""
     names = ("object", "candidate", "standoff_index", "child", "trial_id")
     rows = zip(*(successes[name].tolist() for name in names), strict=True)
     return {AttemptKey(manifest.objects[i].name, *key): t for i, *key, t in rows}
@@ -429,26 +434,26 @@ def keys_of(manifest: Manifest, successes: Table) -> dict[AttemptKey, int]:
 def decide(
     manifest: Manifest, shards: Shards, removed_by_own: npt.NDArray[np.bool_] | None = None
 ) -> Decisions:
-    """Decide which successes are samples, in which split, and what each weighs.
+    """Decide which successes are samples, and the split and weight of each sample.
 
     Args:
-        manifest: Of the dataset: its filters and its split; what it rejects becomes no sample.
-        shards: What its shards hold.
+        manifest: Manifest of the dataset, with filters, split and rejected attempts.
+        shards: Rows and successes of the dataset's shards.
         removed_by_own: As for `judge_successes`.
     """
-    # The filters.
+    # Apply the filters.
     successes = shards.successes
     known = keys_of(manifest, successes)
     rejected = [known[key] for key in manifest.rejected if key in known]
     removal = judge_successes(successes, manifest.config.filters, rejected, removed_by_own)
 
-    # Only first-round attempts are tested: the others are drawn about held ones.
+    # Only first-round attempts are tested: refined palm poses are drawn around held ones.
     splits = _split_successes(manifest, successes, removal)
     refined = successes["child"][splits["test"]] > 0
     removal[splits["test"][refined]] = Removal.REFINED_TEST
     splits["test"] = splits["test"][~refined]
 
-    # The weights, among all samples.
+    # Weigh each sample among all samples.
     kept = np.flatnonzero(removal == Removal.KEPT)
     weights = np.full(len(removal), np.nan)
     numbers = manifest.pose_numbers()
@@ -462,7 +467,7 @@ def _split_successes(
     manifest: Manifest, successes: Table, removal: AnyArray
 ) -> dict[str, npt.NDArray[np.int64]]:
     """Return which successes are samples of each split, in rising order."""
-    # A first-round attempt and all that was refined from it go to one split.
+    # A first-round attempt and all attempts that were refined from it are in one split.
     kept = np.flatnonzero(removal == Removal.KEPT)
     names = ("object", "candidate", "standoff_index")
     keys = np.column_stack([successes[name][kept] for name in names])
@@ -495,7 +500,7 @@ def file_attributes(manifest: Manifest, seals: str, camera: str = "") -> dict[st
     """Return the attributes of a file.
 
     Args:
-        manifest: Of the dataset.
+        manifest: Manifest of the dataset.
         seals: Hash of the seals of the shards, hexadecimal.
         camera: `oto` or `otm`; empty for the trials.
     """
@@ -510,13 +515,13 @@ def file_attributes(manifest: Manifest, seals: str, camera: str = "") -> dict[st
 
 
 def lens_attributes(camera: CameraConfig) -> dict[str, Any]:
-    """Return what the attributes of a file say of the cameras."""
+    """Return the attributes of a file that describe the cameras."""
     return {"K": intrinsics(camera), "near": camera.near, "far": camera.far}
 
 
-#: The setting that names filters of the user's own.
+#: The setting that names user-defined filters.
 _OWN = "filters.own"
-#: Which successes a filter keeps, (n,) of bool if it does as it should.
+#: A filter: returns which successes it keeps, (n,) of bool if it is correct.
 _Keep: TypeAlias = Callable[[Table], Any]
 
 
@@ -532,19 +537,19 @@ def judge_successes(
         successes: The n successes, with the columns of `dataset.assembly.survey`.
         config: Limits of the filters.
         rejected: Ids of trials that an inspection rejects.
-        removed_by_own: (n,), which the user's own filters remove; None: the filters are run.
+        removed_by_own: (n,), successes that user-defined filters remove; if None, these are run.
 
     Raises:
-        ConfigError: If a filter of the user's own cannot be run, or returns something else.
+        ConfigError: If a user-defined filter cannot be run, or returns something else than bools.
     """
     if removed_by_own is None:
         removed_by_own = _removed_by_own(config, successes)
 
-    # Filters that judge a grasp alone.
+    # Filters that judge each grasp by itself.
     removal = first_removal(successes, config)
     removal[removed_by_own & (removal == Removal.KEPT)] = Removal.OWN
 
-    # Outliers among the grasps of an object that are left, with the same fingers.
+    # Outliers among the remaining grasps of an object that use the same fingers.
     kept = removal == Removal.KEPT
     if config.outlier_sigma > 0.0:
         groups = np.column_stack([successes["object"], successes["unused"]])
@@ -553,17 +558,17 @@ def judge_successes(
             outside = is_outlier(successes["grasp_T"][rows], config.outlier_sigma)
             removal[rows[outside]] = Removal.OUTLIER
 
-    # The inspection comes last: it only sees samples.
+    # The inspection comes last, since it only saw samples.
     listed = np.isin(successes["trial_id"], np.asarray(rejected, dtype=np.int64))
     removal[listed & (removal == Removal.KEPT)] = Removal.REJECTED
     return removal
 
 
 def own_filters(config: FilterConfig) -> list[_Keep]:
-    """Return the filters that the configuration names: classes of a file, rules of packages.
+    """Return the filters that the configuration names: classes in files, or rules of packages.
 
     Raises:
-        ConfigError: If one cannot be imported, or is something else.
+        ConfigError: If a filter cannot be imported, or is not a filter.
     """
     return [_own_filter(name, config) for name in config.own]
 
@@ -586,9 +591,9 @@ def _own_filter(name: str, config: FilterConfig) -> _Keep:
 
 
 def own_setting(config: FilterConfig) -> str:
-    """Return the setting `KEY=VALUE` that gives the user's own filters again; empty without any.
+    """Return the setting `KEY=VALUE` that names the user-defined filters; empty if there are none.
 
-    A dataset knows their files by name and no folder.
+    A dataset stores the names of their files without folders.
     """
     names = [name.partition("@")[0] for name in config.own]
     value = names[0] if len(names) == 1 else f"[{', '.join(names)}]"
@@ -596,7 +601,7 @@ def own_setting(config: FilterConfig) -> str:
 
 
 def _removed_by_own(config: FilterConfig, successes: Table) -> Flags:
-    """Return which successes (n,) a filter of the user's own does not keep."""
+    """Return which successes (n,) are removed by a user-defined filter."""
     due = (successes.count,)
     removed = np.zeros(due, dtype=np.bool_)
     if due == (0,):
@@ -613,7 +618,7 @@ def _removed_by_own(config: FilterConfig, successes: Table) -> Flags:
 
 
 def count_samples(out: Path, header: ShardHeader, config: Config) -> int:
-    """Return how many successes of a shard pass the filters, but for that of outliers.
+    """Return how many successes of a shard pass all filters except the one of outliers.
 
     Raises:
         DataError: If the shard is missing or damaged.

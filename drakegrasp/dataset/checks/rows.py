@@ -1,9 +1,9 @@
-"""What a check works with: files that may hold anything, rows of them, rules, and violations.
+"""What a check works with: files with any content, their rows, rules, and violations.
 
-In: an open HDF5 file. Out: what is known of it, plain data that any process can open; batches of
-its rows; violations of rules in them. A rule is given no row that broke one before: so the check
-reports a cause, and not all that follows from it. The rules here walk over the fields of a group:
-what each value must be by the schema, whatever its name.
+In: an open HDF5 file. Out: a description of the file, as plain data with which any process can open
+it; batches of its rows; violations of rules in these rows. A rule does not get rows that broke an
+earlier rule, so the check reports a cause and not everything that follows from it. The rules here
+apply to the fields of any group: they check each value against the schema.
 """
 
 from __future__ import annotations
@@ -56,21 +56,21 @@ from drakegrasp.runtime.progress import Report
 
 AnyArray = npt.NDArray[Any]
 Rows = npt.NDArray[np.int64]
-#: Rows listed per broken invariant and group; further rows are only counted.
+#: Number of rows listed per broken invariant and group; further rows are only counted.
 MAX_LISTED = 20
-#: float32 rounds points within a metre or two by 1e-7 m; this leaves room for products.
+#: float32 rounds points within one or two metres by 1e-7 m; this leaves room for products.
 POSITION_TOLERANCE = 1e-5  # [m]
 #: float32 rounds unit vectors and rotations by 2e-7; this leaves room for products.
 UNIT_TOLERANCE = 1e-5
-#: How far a number may be from the same derived again, in units in the last place of its row's
-#: largest value: a last bit may differ between machines.
+#: How far a stored number may be from the number derived again, in units in the last place of the
+#: row's largest value: the last bit may differ between machines.
 LAST_PLACES = 2
 #: K, near and far are float64 copies of the configuration's values.
 CAMERA_TOLERANCE = 1e-9
-#: Key of scenes.hdf5 among the files that are checked; "" is that of the trials.
+#: Key of scenes.hdf5 among the checked files; the key of the trials is "".
 SCENES = "scenes"
-#: Objects whose meshes, with their search trees, stay in memory during a task; samples are ordered
-#: by object.
+#: Number of objects whose meshes, with their search trees, stay in memory during a task; samples
+#: are ordered by object.
 KEPT_OBJECTS = 4
 
 
@@ -102,7 +102,7 @@ class Violation:
 
 
 def of_file(file: str, what: str, got: object, group: str = "") -> Violation:
-    """Return a violation of a file, or of a group of it, as a whole."""
+    """Return a violation of a whole file, or of a whole group of it."""
     return Violation(file=file, group=group, what=what, got=str(got))
 
 
@@ -118,7 +118,7 @@ class Findings:
         return bool(self._listed)
 
     def add(self, violations: Iterable[Violation]) -> set[int]:
-        """Collect violations; return the rows that they are in."""
+        """Collect violations; return the rows in which they are."""
         rows = set()
         for violation in violations:
             key = (violation.file, violation.group, violation.what)
@@ -133,7 +133,7 @@ class Findings:
         return rows
 
     def merge(self, other: Findings) -> None:
-        """Take over what a task found."""
+        """Add the findings of a task."""
         for listed in other._listed.values():
             self.add(listed)
         self._more.update(other._more)
@@ -141,7 +141,7 @@ class Findings:
             self.mark(file, group, rows)
 
     def mark(self, file: str, group: str, rows: Iterable[int]) -> None:
-        """Remember rows of a group that break a rule or cannot be read."""
+        """Record rows of a group that break a rule or cannot be read."""
         self._bad.setdefault((file, group), set()).update(rows)
 
     def bad(self, file: str, group: str) -> Rows:
@@ -149,13 +149,13 @@ class Findings:
         return np.array(sorted(self._bad.get((file, group), ())), dtype=np.int64)
 
     def of_rows(self, file: str, group: str, start: int, stop: int) -> Findings:
-        """Return what a task must know that judges a range of rows: those that are bad already."""
+        """Return the findings for a task that judges a range of rows: the rows already bad."""
         rows = self.bad(file, group)
         known = rows[(rows >= start) & (rows < stop)].tolist()
         return Findings(_bad={(file, group): set(known)})
 
     def violations(self) -> list[Violation]:
-        """Return the listed violations, with a line for those that were only counted."""
+        """Return the listed violations, with one line for those that were only counted."""
         result = []
         for (file, group, what), listed in self._listed.items():
             result += listed
@@ -169,17 +169,17 @@ class Findings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CheckedFile:
-    """What is known of a file that is checked: plain data, which a task takes along.
+    """Description of a checked file: plain data, which is sent with a task.
 
     Attributes:
-        path: Of the file.
-        stamp: What tells it from another file at the same path.
-        name: Its name in violations.
-        camera: `oto` or `otm`; SCENES, or empty for the trials.
-        attributes: Its attributes that break no rule of their own.
-        config: Its configuration, if it is sound.
+        path: Path of the file.
+        stamp: Stamp that distinguishes the file from another file at the same path.
+        name: Name of the file in violations.
+        camera: `oto` or `otm`; SCENES for the scenes; empty for the trials.
+        attributes: Attributes of the file that are valid by themselves.
+        config: Configuration of the file, if it is valid.
         fields: Fields of each group.
-        counts: Number of rows of each group whose layout is sound.
+        counts: Number of rows of each group whose layout is valid.
     """
 
     path: str
@@ -196,7 +196,7 @@ class CheckedFile:
         """Open the file while the block runs.
 
         Raises:
-            DataError: If it is another file by now.
+            DataError: If the path now has another file.
             OSError: If it cannot be opened.
         """
         with open_hdf5(Path(self.path), again=True) as file:
@@ -216,7 +216,7 @@ class CheckedFile:
             names: Fields to read; all if None.
 
         Raises:
-            OSError, UnicodeDecodeError: If the file is damaged there.
+            OSError, UnicodeDecodeError: If the file is damaged at these rows.
         """
         # HDF5 reads a slice far faster than the same rows as a list.
         dense = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
@@ -229,7 +229,7 @@ class CheckedFile:
                 columns[f.name] = (own[f.name].asstr() if f.dtype == "str" else own[f.name])[choice]
             else:
                 columns[f.name] = f.empty(len(rows), sizes_in(own, self.fields[group]))
-        # In files made before it a derived number of a trial is derived here.
+        # Older files lack some derived fields of a trial, which are derived here.
         for f in self.fields[group]:
             if f.derive is not None and f.name not in own and {*f.needs} <= {*columns}:
                 columns[f.name] = f.derive(columns)
@@ -244,7 +244,7 @@ class CheckedFile:
         findings: Findings,
         names: Sequence[str] | None = None,
     ) -> Iterator[Batch]:
-        """Yield rows of a group that are not bad, of `size` rows each; others become findings."""
+        """Yield the good rows of a group in batches of `size`; unreadable rows become findings."""
         place = f"/{group}"
         for first in range(0, len(rows), size):
             own = rows[first : first + size]
@@ -264,19 +264,19 @@ def look_at(name: str, file: h5py.File, camera: str, findings: Findings) -> Chec
     Args:
         name: Name of the file, for the violations.
         file: The file.
-        camera: `oto` or `otm`; SCENES, or empty for the trials.
-        findings: Where violations go.
+        camera: `oto` or `otm`; SCENES for the scenes; empty for the trials.
+        findings: Takes the violations.
     """
     kinds = {"": (ORIGIN, TRIAL_TABLES), SCENES: (OF_SCENES, SCENE_TABLES)}
     rules, fields = kinds.get(camera, (OF_CAMERA, DATA_TABLES))
     config, attributes, counts = None, dict[str, Any](), dict[str, int]()
 
-    # Another version has another layout: its version is all that is told.
+    # Another schema version has another layout, so only the version is reported.
     if not is_readable(version := file.attrs.get("schema_version", "none")):
         what = f"attribute schema_version must be {SCHEMA_VERSION}"
         findings.add([of_file(name, what, f"{version}; {OTHER_SCHEMA}")])
     else:
-        # Its attributes: those that break no rule of their own are compared.
+        # Attributes that are valid by themselves are compared with the configuration.
         mistakes = attribute_mistakes(file, rules)
         attributes = {key: value for key, value in file.attrs.items() if key not in mistakes}
         try:
@@ -289,7 +289,7 @@ def look_at(name: str, file: h5py.File, camera: str, findings: Findings) -> Chec
         findings.add(of_file(name, each.what, each.got) for each in mistakes.values())
         findings.add(_attributes(name, attributes, config, camera))
 
-        # Its layout: a group with a broken dataset is not read.
+        # The layout: a group with an invalid column is not read.
         image, broken = None if config is None else config.camera.size, set()
         for found in differences(file, fields, image=image, thorough=True):
             findings.add([of_file(name, found.what, found.got, found.path)])
@@ -312,7 +312,7 @@ def look_at(name: str, file: h5py.File, camera: str, findings: Findings) -> Chec
 def _attributes(
     name: str, attributes: Mapping[str, Any], config: Config | None, camera: str
 ) -> Iterator[Violation]:
-    """The attributes agree with the configuration; conventions are there."""
+    """The attributes agree with the configuration, and all conventions exist."""
     for key in CONVENTIONS:
         if not str(attributes.get(f"convention_{key}", "")).strip():
             yield of_file(name, f"attribute convention_{key} must be there", "none")
@@ -332,17 +332,17 @@ def _attributes(
             yield of_file(name, f"attribute {key} must be {expected}", value)
 
 
-#: Returns an object by its name, or None if its file is broken, which is a finding.
+#: Returns an object by its name, or None if its file is broken, which is already a finding.
 LoadModel = Callable[[str], ObjectModel | None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dataset:
-    """The dataset around a file that is checked.
+    """The dataset around a checked file.
 
     Attributes:
-        out: Its directory.
-        manifest: Its manifest.
+        out: Directory of the dataset.
+        manifest: Manifest of the dataset.
         readable: Names of the objects whose meshes can be read.
     """
 
@@ -351,7 +351,7 @@ class Dataset:
     readable: frozenset[str]
 
     def loader(self) -> LoadModel:
-        """Return what loads the objects, and keeps some, while a task has it."""
+        """Return a function that loads objects and caches some, for the time of a task."""
         out, readable = self.out, self.readable
 
         def load(name: str) -> ObjectModel | None:
@@ -368,7 +368,7 @@ class Batch:
     """Some rows of one group.
 
     Attributes:
-        of: The file.
+        of: The file of the rows.
         group: Name of the group, e.g. `train`.
         rows: (n,), numbers of the rows in the group.
         columns: Values by field, (n, ...) each.
@@ -387,7 +387,7 @@ class Batch:
 
     @property
     def config(self) -> Config:
-        """Configuration of the file, which is sound."""
+        """Configuration of the file, which must be valid."""
         assert self.of.config is not None
         return self.of.config
 
@@ -408,7 +408,7 @@ class Batch:
         return replace(self, rows=self.rows[keep], columns=columns)
 
     def judge(self, findings: Findings, *stages: Sequence[Rule]) -> Batch:
-        """Apply rules, in each stage to the rows that broke none before; return those left."""
+        """Apply rules in stages, each to the rows that broke none before; return what is left."""
         batch = self
         for rules in stages:
             if len(batch):
@@ -424,7 +424,8 @@ class Batch:
         Args:
             what: The invariant in words.
             bad: (n,) bool.
-            got: The values (n,) that break it, their text by index into the batch, or one text.
+            got: The values (n,) that break it, a function from an index in the batch to a text, or
+                one text.
         """
         for i in np.flatnonzero(bad).tolist():
             if isinstance(got, str):
@@ -437,18 +438,18 @@ class Batch:
     def follows(
         self, name: str, due: AnyArray, what: str, tolerance: float | None = None
     ) -> Iterator[Violation]:
-        """Yield a violation for each row of a field whose values are not those that are due.
+        """Yield a violation for each row in which a field differs from the expected values.
 
         Args:
-            name: Of the field.
-            due: (n, ...), the values derived again, NaN where there are none.
-            what: From what they follow, in words.
-            tolerance: How far a number may be off; `LAST_PLACES` of rounding if None.
+            name: Name of the field.
+            due: (n, ...), the values derived again; NaN where there is no value.
+            what: What the values follow from, in words.
+            tolerance: Maximum difference of a number; `LAST_PLACES` of rounding if None.
         """
         values = self.columns[name]
         due = np.asarray(due).astype(values.dtype, copy=False).reshape(values.shape)
         if values.dtype.kind != "O" and values.tobytes() == due.tobytes():
-            return  # mostly
+            return  # the usual case
         bad, off = ~all_per_row(values == due), np.zeros(len(self))
         if values.dtype.kind == "f":
             apart = np.where(np.isnan(values) & np.isnan(due), 0.0, np.abs(values - due))
@@ -463,7 +464,7 @@ class Batch:
         )
 
     def follow(self, columns: Mapping[str, AnyArray], what: str) -> Iterator[Violation]:
-        """Yield the violations of all fields of the batch that must have the values of a column."""
+        """Yield the violations of all fields of the batch that must equal a given column."""
         for name, due in columns.items():
             if name in self.columns:
                 yield from self.follows(name, due, what)
@@ -483,7 +484,7 @@ def all_per_row(values: AnyArray) -> AnyArray:
 def complete(
     batch: Batch, stage: AnyArray | Stage = Stage.LIFTED, **contacts: AnyArray
 ) -> Iterator[Violation]:
-    """Fields of numbers have values from their stage on, and none before.
+    """Fields of numbers have values from their stage on, and no values before it.
 
     Args:
         batch: Rows of a group.
@@ -520,7 +521,10 @@ def complete(
 
 
 def _is_not_as_due(values: AnyArray, due: AnyArray) -> AnyArray:
-    """Return where (n,) values (n, ...) are not finite that are due, or not NaN that are not."""
+    """Return (n,) whether a row of values (n, ...) lacks a due value or has an undue one.
+
+    A value is due where `due` is true: it must be finite there, and NaN elsewhere.
+    """
     if due.all():
         return ~all_per_row(np.isfinite(values))
     due = due.reshape(*due.shape, *(1,) * (values.ndim - due.ndim))
@@ -528,10 +532,10 @@ def _is_not_as_due(values: AnyArray, due: AnyArray) -> AnyArray:
 
 
 def ranges(batch: Batch) -> Iterator[Violation]:
-    """Fields are within their limits by the schema; NaN has none."""
+    """Fields are within the limits of the schema; NaN has no limits."""
     for f in batch.fields if len(batch) else ():
         if f.limits is not None:
-            # In single precision the largest turn is beyond itself.
+            # A limit is rounded as the values are: in float32, pi is above its double value.
             values = batch[f.name].reshape(len(batch), -1)
             low, high = (values.dtype.type(limit) for limit in f.limits)
             positive = f.limits[0] == POSITIVE
@@ -542,19 +546,19 @@ def ranges(batch: Batch) -> Iterator[Violation]:
 
 
 def derived(batch: Batch) -> Iterator[Violation]:
-    """Fields that follow from others by the schema have the values that it derives."""
+    """Derived fields have the values that the schema derives from other fields."""
     for f in batch.fields:
         if f.derive is not None:
             yield from batch.follows(f.name, f.derive(batch.columns), ", ".join(f.needs))
 
 
 def rigid(batch: Batch) -> Iterator[Violation]:
-    """Poses are rigid motions, and normals have length one; NaN means there is none."""
+    """Poses are rigid motions, and normals have length one; NaN means that there is no value."""
     for f in batch.fields:
         if f.axes[-1:] == (12,):
             yield from _rotation(batch, f.name)
         elif f.axes == ("6k",) or (f.axes == ("k", 3) and "nhat" in f.name):
-            # Of a grasp the normals come after the points.
+            # In a grasp the normals come after the points.
             n = batch[f.name].astype(float).reshape(len(batch), -1, 3)
             n = n[:, n.shape[1] // 2 :] if f.axes == ("6k",) else n
             for k, own in enumerate(np.linalg.norm(n, axis=2).T):
@@ -577,7 +581,7 @@ def _rotation(batch: Batch, name: str) -> Iterator[Violation]:
 
 # Tasks
 
-#: A number of rows, and what judges them, in any process.
+#: A number of rows, and a function that judges them in any process.
 Task = tuple[int, Callable[[], Findings]]
 
 
@@ -587,10 +591,10 @@ class Check:
 
     Attributes:
         execute: Runs the tasks.
-        report: Called with the number of rows and shards that are done and to do.
-        total: Number of rows and shards to do.
-        done: Number of rows and shards that are done.
-        findings: The violations.
+        execute: Executor of the tasks.
+        report: Called with the number of finished rows and shards, and the number of all.
+        total: Number of all rows and shards.
+        done: Number of finished rows and shards.
     """
 
     execute: Executor
@@ -612,7 +616,7 @@ class Check:
 
     @contextmanager
     def readable(self, file: CheckedFile) -> Iterator[None]:
-        """Let whole columns of a file be read in the block; that they cannot be is a finding."""
+        """Let the block read whole columns of a file; an unreadable column is a finding."""
         try:
             yield
         except (OSError, UnicodeDecodeError) as error:
@@ -621,6 +625,6 @@ class Check:
 
 
 def _judge(task: Task) -> tuple[int, Findings]:
-    """Do a task; return its number of rows and what it found."""
+    """Run a task; return its number of rows and its findings."""
     size, judge = task
     return size, judge()

@@ -1,13 +1,13 @@
 """`drakegrasp check`: every rule on every row of a dataset, or of one of its files.
 
-In: a dataset's directory, or grasping_oto.hdf5, grasping_otm.hdf5, trials.hdf5 or scenes.hdf5
-alone. Out: a list of violations, empty for a sound dataset. Rows are read in batches, so the memory
-is bounded, and judged in tasks, by an `Executor`. Imports no Drake.
+In: a dataset's directory, or one of the files grasping_oto.hdf5, grasping_otm.hdf5, trials.hdf5 and
+scenes.hdf5. Out: a list of violations, empty for a valid dataset. Rows are read in batches, which
+bounds the memory, and an `Executor` judges them in tasks. Does not import Drake.
 
-Of a whole dataset the files are compared first with what assembling gives again of its shards:
-samples are derived by the functions that write them, stored images are compared byte for byte. All
-other rules compare values with each other: verdicts, poses, images, meshes.
-`trials`, `samples` and `scenes` apply them in an order, see `rows`.
+The files of a whole dataset are first compared with what assembling its shards again produces:
+samples are derived by the functions that write them, and stored images are compared byte for byte.
+All other rules compare values with each other: verdicts, poses, images, meshes. `trials`, `samples`
+and `scenes` apply them in stages, see `rows`.
 """
 
 from __future__ import annotations
@@ -85,9 +85,10 @@ from drakegrasp.runtime.progress import Report, silent
 
 __all__ = ["Violation", "check_dataset"]
 
-#: Attributes that say of what a file was assembled, the cause of others first.
+#: Attributes that identify the state of a dataset that a file belongs to; a cause of other
+#: differences comes first.
 ORIGIN = ("config", "split_by", "versions", "fingers", "joints", "shards", "signature")
-#: Trials in a batch: some 10 MB.
+#: Trials in a batch: about 10 MB.
 TRIAL_ROWS = 8192
 
 
@@ -97,14 +98,14 @@ def check_dataset(
     """Return every broken invariant of a dataset or of one of its files.
 
     Args:
-        path: Directory of a dataset, or one of its HDF5 files. A file alone is checked for all
-            that needs no other file.
-        execute: Runs the tasks; the result is the same whatever runs them.
-        progress: Called with the number of rows and shards that are done and to do.
+        path: Directory of a dataset, or one of its HDF5 files. For a single file, all rules that
+            need no other file are checked.
+        execute: Executor of the tasks; the result does not depend on it.
+        progress: Called with the number of finished rows and shards, and the number of all.
 
     Raises:
-        DataError: If the path is neither, cannot be read, or is of another schema. In a directory
-            a file that cannot be read is a violation, and the others are still checked.
+        DataError: If the path is neither, cannot be read, or has another schema. In a directory, a
+            file that cannot be read is a violation, and the other files are still checked.
     """
     check = Check(execute=execute, report=progress or silent)
     if Path(path).is_dir():
@@ -115,7 +116,7 @@ def check_dataset(
 
 
 def _check_file(path: Path, check: Check) -> None:
-    """Check a file alone."""
+    """Check a single file."""
     try:
         file = open_hdf5(path)
     except OSError as error:
@@ -124,7 +125,7 @@ def _check_file(path: Path, check: Check) -> None:
             f"got one that cannot be read ({first_line(error)})"
         ) from None
 
-    # Its attributes say which of the files it is, whatever its name.
+    # The attributes tell which of the files it is, whatever its name.
     with file:
         camera = str(file.attrs.get("camera", ""))
         if "scenes" in file and "views" in file:
@@ -145,14 +146,14 @@ def _check_file(path: Path, check: Check) -> None:
 
 
 def _check_directory(out: Path, check: Check) -> None:
-    """Check the files of a dataset, each with its objects, its shards and the other files."""
+    """Check the files of a dataset against its objects, its shards and each other."""
     manifest = read_manifest(out)
     names = (*DATA_FILES.items(), ("", TRIALS_FILE))
     looked = {camera: _look_at(out, camera, name, check.findings) for camera, name in names}
     files = {camera: file for camera, file in looked.items() if file is not None}
     check.total = _rows(files) + sum(entry.candidates for entry in manifest.objects)
 
-    # The files that all others follow from.
+    # The files that all other files follow from.
     objects, surveys = set[str](), []
     shards = {task.object: task for task in survey_tasks(out, manifest)}
     tasks = ((out, entry, shards.get(i)) for i, entry in enumerate(manifest.objects))
@@ -168,7 +169,7 @@ def _check_directory(out: Path, check: Check) -> None:
     sound &= len(surveys) > 0 and len(objects) == len(manifest.objects)
     again = _assemble_again(manifest, surveys, files.get("")) if sound else None
 
-    # Files of another state are not compared row by row.
+    # Files of another state of the dataset are not compared row by row.
     current = set()
     for camera, file in files.items():
         other = [*_of_another_state(file, manifest, again)]
@@ -183,10 +184,10 @@ def _check_directory(out: Path, check: Check) -> None:
     if (out / SCENES_FILE).exists() and (
         shown := _look_at(out, SCENES, SCENES_FILE, check.findings)
     ):
-        # Grasps of broken trials are not compared.
+        # Grasps are not compared with broken trials.
         scenes.judge(shown, check, dataset if "" in current else None)
     if not check.findings:
-        _check_card(out, check.findings)  # else it would differ for the same cause
+        _check_card(out, check.findings)  # with other findings, it would differ for the same cause
 
 
 def _check_rows(
@@ -196,15 +197,16 @@ def _check_rows(
     again: Decisions | None = None,
     current: frozenset[str] = frozenset(),
 ) -> None:
-    """Judge all rows of some files, by camera: first the attempts, then what the samples show.
+    """Judge all rows of some files: first the attempts, then the samples.
 
     Args:
-        files: The files; the trials come under "".
+        files: The files by camera; the trials are under "".
         check: Runs the tasks, and takes the violations.
         dataset: The dataset around the files, if there is one.
-        again: The dataset assembled again, if its shards are sound.
-        current: Cameras of the files that are of the dataset's manifest and shards, "" for the
-            trials. They are compared with what is assembled again, or else with each other.
+        again: The dataset assembled again, if its shards are valid.
+        current: Cameras of the files that match the dataset's manifest and shards, "" for the
+            trials. These files are compared with the dataset assembled again, or else with each
+            other.
     """
     compared = frozenset() if again is None else current
     check.judge(_trials_tasks(files, dataset, again, compared))
@@ -214,7 +216,7 @@ def _check_rows(
             both = {"", camera} <= current - compared and "trials" in files[""].counts
             trials = files[""] if both else None
             check.judge(samples_tasks(file, dataset, trials, check.findings))
-        # What is compared follows from the shards; other files are judged by themselves.
+        # Compared files follow from the shards; other files are judged by themselves.
         if camera not in compared:
             with check.readable(file):
                 known = {entry.name: entry for entry in entries}
@@ -222,7 +224,7 @@ def _check_rows(
 
 
 def _look_at(out: Path, camera: str, name: str, findings: Findings) -> CheckedFile | None:
-    """Return a file of a dataset, if it can be read."""
+    """Return the description of a file of a dataset, or None if the file cannot be read."""
     try:
         with open_hdf5(out / name) as file:
             return look_at(name, file, camera, findings)
@@ -230,7 +232,7 @@ def _look_at(out: Path, camera: str, name: str, findings: Findings) -> CheckedFi
         got = first_line(error) if (out / name).exists() else "none; `drakegrasp assemble`"
         findings.add([of_file(name, "the file must be there and readable", got)])
     except DataError as error:
-        # One with values elsewhere; that some files are half replaced concerns them all.
+        # The file stores values outside of itself. If files are half replaced, this concerns all.
         refuse_half_replaced(out)
         got = first_line(error).rpartition(", got ")[2]
         findings.add([of_file(name, "the file must hold its own values", got)])
@@ -238,12 +240,12 @@ def _look_at(out: Path, camera: str, name: str, findings: Findings) -> CheckedFi
 
 
 def _check_card(out: Path, findings: Findings) -> None:
-    """The data card counts what the files hold; older datasets have no card."""
+    """The counts of the data card match the files; older datasets have no card."""
     path = out / CARD_FILES[0]
     try:
         counts = card_counts(out)
     except (DataError, ValueError, IndexError):
-        return  # a file is damaged, and found above
+        return  # a file is damaged, which is already a finding
     try:
         found = read_json(path)["counts"]
     except FileNotFoundError:
@@ -270,11 +272,12 @@ def _check_object(
     """Verify the files of an object in a dataset's directory.
 
     Args:
-        task: The directory, the object and its shards; None if it has no palm pose.
+        task: The directory, the object, and the task of its survey; None if the object has no palm
+            pose.
 
     Returns:
-        The violations, whether its meshes can be read, and the survey of its shards; None where
-        one is missing or broken, or there is none.
+        The violations; whether the object's meshes can be read; and the survey of its shards, None
+        if a shard is missing or broken, or if there is no shard.
     """
     out, entry, shards = task
     findings, survey = Findings(), None
@@ -290,10 +293,10 @@ def _check_object(
 
 
 def carried_hand_as_built(manifest: Manifest) -> Iterator[Violation]:
-    """The hand that the dataset carries is the one that built it."""
+    """The hand in the dataset's directory is the hand that the dataset was built with."""
     source, what = manifest.config.hand_source, f"the hand must be that of {FILE_NAME}"
     if not isinstance(source, CarriedHand):
-        return  # an older dataset carries none
+        return  # an older dataset does not contain its hand
     try:
         found = hand_digest(source)
     except HandError as error:
@@ -304,7 +307,7 @@ def carried_hand_as_built(manifest: Manifest) -> Iterator[Violation]:
 
 
 def _meshes(out: Path, entry: ObjectEntry) -> Iterator[Violation]:
-    """The meshes can be read, and are those of the manifest."""
+    """The meshes can be read, and match the manifest."""
     path = model_path(out, entry.name)
     name = str(path.relative_to(out))
     try:
@@ -317,7 +320,7 @@ def _meshes(out: Path, entry: ObjectEntry) -> Iterator[Violation]:
 
 
 def _as_written(out: Path, name: str) -> Iterator[Violation]:
-    """The meshes and the plan are as they were written: the plan vouches for both."""
+    """The meshes and the plan are unchanged; the plan has the hashes of both."""
     path = plan_path(out, name)
     try:
         expected = recorded_model(out, name)
@@ -330,7 +333,7 @@ def _as_written(out: Path, name: str) -> Iterator[Violation]:
 
 
 def _broken_shards(task: SurveyTask) -> Iterator[Violation]:
-    """The shards are there and whole, up to the last wanted grasp."""
+    """The shards exist and are complete, up to the last wanted grasp."""
     out, left = Path(task.out), np.inf if task.wanted is None else task.wanted
     for header in task.headers:
         if left <= 0:
@@ -352,14 +355,14 @@ def _broken_shards(task: SurveyTask) -> Iterator[Violation]:
 def _assemble_again(
     manifest: Manifest, surveys: Sequence[Survey], trials: CheckedFile | None
 ) -> Decisions:
-    """Decide again which successes are samples, given the surveys of all objects.
+    """Decide again which successes are samples, from the surveys of all objects.
 
-    Code of a dataset is never imported: what the user's own filters removed is read from
-    `trials`, if these can be read.
+    Code of a dataset is never imported: which successes user-defined filters removed is read from
+    `trials`, if it can be read.
     """
     shards, removed = number_rows(surveys, manifest), np.zeros(0, dtype=np.int64)
     if manifest.config.filters.own and trials is not None and "successes" in trials.counts:
-        # Columns that cannot be read are a finding later.
+        # Columns that cannot be read become a finding later.
         with suppress(OSError), trials.opened() as file:
             ids, reasons = (file["successes"][name][:] for name in ("trial_id", "removal"))
         removed = ids[reasons == Removal.OWN]
@@ -370,12 +373,12 @@ def _assemble_again(
 def _of_another_state(
     file: CheckedFile, manifest: Manifest, again: Decisions | None
 ) -> Iterator[Violation]:
-    """A file is of the manifest's configuration and of the shards that are there, with their rows.
+    """A file matches the manifest's configuration and the existing shards, with all their rows.
 
     Args:
         file: The file.
-        manifest: Of the dataset.
-        again: The dataset assembled again; None if its shards are not all known.
+        manifest: Manifest of the dataset.
+        again: The dataset assembled again; None if its shards are not all valid.
     """
     due = file_attributes(manifest, "" if again is None else again.shards.seals, file.camera)
     for key in ORIGIN:
@@ -386,9 +389,9 @@ def _of_another_state(
             got = "another" if key in ("config", "signature") else file.attributes[key]
             got = f"{got}; run `drakegrasp assemble` again"
             yield of_file(file.name, f"attribute {key} must be that of {of}", got)
-            return  # others follow from it
+            return  # other differences follow from this one
 
-    # The number of rows of each group.
+    # The number of rows in each group.
     if again is None:
         return
     counts = {split: len(ids) for split, ids in again.ids.items()}
@@ -404,14 +407,14 @@ def _of_another_state(
 def _objects_and_successes(
     trials: CheckedFile, manifest: Manifest, again: Decisions | None, findings: Findings
 ) -> None:
-    """Compare /objects with the manifest, and /successes with what is decided again."""
+    """Compare /objects with the manifest, and /successes with the decisions made again."""
     tables = {"objects": (object_columns(manifest), FILE_NAME)}
     if again is not None:
         tables["successes"] = again.columns(), "the shards, the filters and the split"
     with trials.opened() as file:
         for group, (columns, of) in tables.items():
             count = len(next(iter(columns.values())))
-            if trials.counts.get(group) == count:  # else a finding already, or no group
+            if trials.counts.get(group) == count:  # else already a finding, or no group
                 for batch in trials.batches(file, group, np.arange(count), count or 1, findings):
                     findings.add(batch.follow(columns, of))
 
@@ -425,21 +428,21 @@ def _trials_tasks(
     again: Decisions | None = None,
     compared: frozenset[str] = frozenset(),
 ) -> Iterator[Task]:
-    """Yield the tasks that judge all attempts, and compare what follows from the shards.
+    """Yield the tasks that judge all attempts, and compare rows that follow from the shards.
 
     Args:
-        files: The files, by camera; the trials under "", if they can be read.
-        dataset: The dataset around them, if there is one.
-        again: The dataset assembled again, if its shards are sound.
+        files: The files by camera; the trials are under "", if they can be read.
+        dataset: The dataset around the files, if there is one.
+        again: The dataset assembled again, if its shards are valid.
         compared: Cameras of the files that are compared; "" for the trials.
     """
-    # Trials need their objects: a broken layout is a finding already.
+    # Attempts need their objects: an invalid layout of either is already a finding.
     trials = files.get("")
     sound = trials is not None and {"objects", "trials"} <= set(trials.counts)
     trials = trials if sound else None
     count = 0 if trials is None else trials.counts["trials"]
 
-    # What follows from the shards comes along, range by range.
+    # Each range of attempts comes with the task that derives its rows from the shards.
     packs: Iterator[PackTask] = iter(())
     if dataset is not None and again is not None and compared:
         certified = dataset.manifest.config.certified
@@ -463,11 +466,11 @@ def _judge(
 
     Args:
         trials: trials.hdf5; None if it cannot be read.
-        rows: Of /trials, (n,).
+        rows: (n,), rows of /trials.
         dataset: The dataset around the files, if there is one.
-        pack: Derives the rows again; None where they cannot be compared.
-        compared: Whether the attempts are compared, too.
-        data: The data files that are compared, by camera.
+        pack: Task that derives the rows again; None if they cannot be compared.
+        compared: Whether the attempts are compared as well.
+        data: The compared data files, by camera.
     """
     findings = Findings()
     columns, records, images = ({}, {}, {}) if pack is None else read_rows(pack)
@@ -500,20 +503,20 @@ def _compare_samples(
     images: Mapping[str, Sequence[tuple[bytes, int]]],
     findings: Findings,
 ) -> None:
-    """Compare some samples of a data file with those that are derived again.
+    """Compare some samples of a data file with the samples derived again.
 
     Args:
         data: The file.
         split: Name of the split.
         first: Row of the first sample.
-        due: Their columns but for images.
-        images: See `assembly.pack.Images`.
+        due: Columns of the samples derived again, without images.
+        images: Stored images of these samples, see `assembly.pack.Images`.
         findings: Takes the violations.
     """
     rows = np.arange(first, first + len(due["trial_id"]))
     with data.opened() as file:
         for batch in data.batches(file, split, rows, max(len(rows), 1), findings, list(due)):
-            # A sample of another trial differs in all else.
+            # If a sample belongs to another trial, all its other fields differ as well.
             names = ["trial_id"], [name for name in due if name != "trial_id"]
             for own, of in zip(names, ("shards and manifest", "its trial"), strict=True):
                 columns = {name: due[name][batch.rows - first] for name in own}
@@ -528,23 +531,23 @@ def _compare_samples(
 
 
 def _differs(dataset: h5py.Dataset, row: int, chunk: bytes, skipped: int) -> bool:
-    """Return whether an image is another than a chunk of a shard; mostly the bytes are the same."""
+    """Return whether an image differs from a chunk of a shard; mostly the bytes are equal."""
     try:
         stored = dataset.id.read_direct_chunk((row, *(0,) * (dataset.ndim - 1)))
-    except RuntimeError:  # packed otherwise, or not there
+    except RuntimeError:  # packed in another way, or missing
         stored = None
     if stored == (skipped, chunk):
         return False
     try:
         return not np.array_equal(dataset[row : row + 1], unpacked_chunk(chunk, skipped, dataset))
     except OSError:
-        return False  # it cannot be read, as the rules of samples find
+        return False  # it cannot be read, which the rules of samples report
 
 
 def _rows_depend_on(key: str, text: str) -> str:
-    """Return an attribute without what no row depends on: the section `verify` of a configuration.
+    """Return an attribute without what rows do not depend on: the section `verify` of a config.
 
-    It acts on predicted grasps, and may be another one now.
+    That section is for predicted grasps, and may have changed since.
     """
     if key != "config":
         return text

@@ -1,8 +1,8 @@
-"""What is checked of grasping_oto.hdf5 and grasping_otm.hdf5: numbers, frames, images, splits.
+"""Rules of grasping_oto.hdf5 and grasping_otm.hdf5: numbers, frames, images, splits.
 
 In: a data file and, if there is one, the dataset around it. Out: tasks that judge its samples, each
-by itself and against its trial and the mesh; the rules of its splits; points and distances of one
-image, also for the rules of scenes. That a sample is what its shard gives is for `run`.
+by itself and against its trial and the mesh; the rules of its splits; points and distances in one
+image, which the rules of scenes also use. `run` compares each sample with its shard.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from drakegrasp.vision.depth_sensor import DepthSensor, clean_depth
 SAMPLE_ROWS = 64
 #: Samples in a task.
 TASK_ROWS = 4 * SAMPLE_ROWS
-#: How skew an inertia may be, and by how much its moments may be none of a body, for rounding.
+#: Limits for rounding: of an inertia's asymmetry, and of moments that no body could have.
 RELATIVE_TOLERANCE = 1e-5
 #: float32 rounds slip [m] and turn [rad] by 2e-7 at most.
 MOTION_TOLERANCE = 1e-6
@@ -60,8 +60,8 @@ DEPTH_TOLERANCE = 3e-4  # [m]
 #: A contact on the object's outline may be rounded to a pixel beside the mask, and the collision
 #: mesh and `filters.max_surface_distance` allow it to be off the full mesh.
 MASK_TOLERANCE = 2.0  # [px]
-#: A contact is on the visible surface or behind it. At outlines the depth image jumps, so the
-#: nearest surface within this many pixels counts. BEFORE_SURFACE is the 2 mm of
+#: A contact is on the visible surface or behind it. The depth image jumps at outlines, so the
+#: nearest surface within this many pixels counts. BEFORE_SURFACE covers the 2 mm of
 #: `filters.max_surface_distance` and the slope of the surface within those pixels.
 SILHOUETTE = 2  # [px]
 BEFORE_SURFACE = 5e-3  # [m]
@@ -77,13 +77,13 @@ P_TTABLE = np.array([0.0, 0.0, -0.05])
 def samples_tasks(
     data: CheckedFile, dataset: Dataset | None, trials: CheckedFile | None, findings: Findings
 ) -> Iterator[Task]:
-    """Yield the tasks that judge all samples of a file; none if its lens is not known.
+    """Yield the tasks that judge all samples of a file; none if its lens is unknown.
 
     Args:
         data: The file.
         dataset: The dataset around the file, if there is one.
-        trials: trials.hdf5, where the samples are to be compared with it; their shards tell more.
-        findings: Has the bad rows of both files.
+        trials: trials.hdf5, if samples are to be compared with it; their shards say more.
+        findings: Findings so far, with the bad rows of both files.
     """
     copied = list[Rule]()
     if trials is not None:
@@ -104,29 +104,29 @@ def _judge(
     copied: list[Rule],
     findings: Findings,
 ) -> Findings:
-    """Apply every rule to samples: first to numbers by themselves, then to what follows.
+    """Apply every rule to samples: first to single numbers, then to what follows from them.
 
     Args:
         data: The file.
         split: Name of the split.
-        rows: Of the split, (n,).
+        rows: (n,), rows of the split.
         dataset: See `samples_tasks`.
-        copied: The rule that they repeat their trials, if it is to be applied.
-        findings: Has the rows that are bad already.
+        copied: The rule that samples repeat their trials, if it is to be applied.
+        findings: Findings so far, with the rows that are already bad.
     """
     meshes = [] if dataset is None else [partial(on_meshes, load=dataset.loader())]
     values = [rigid, ranges, image_values, mass_properties, fixed_frames, hold]
     with data.opened() as file:
         for batch in data.batches(file, split, rows, SAMPLE_ROWS, findings):
             sound = batch.judge(findings, [finite], values, [camera_pair, image_frames], copied)
-            # What the images show, which needs right frames.
+            # Rules of the image content, which need valid frames.
             shown = without_noise(sound)
             shown.judge(findings, [contacts_in_image, table_pixels], meshes)
     return findings
 
 
 def _copies_trial(batch: Batch, trials: CheckedFile, bad: AnyArray) -> Iterator[Violation]:
-    """A sample is of a success, and repeats its numbers; trials that are bad are a finding."""
+    """A sample belongs to a success and repeats its numbers; bad trials are already findings."""
     ids = batch["trial_id"]
     unknown = (ids < 0) | (ids >= trials.counts["trials"])
     yield from batch.broken("trial_id must be a row of /trials", unknown, ids)
@@ -147,7 +147,7 @@ def _copies_trial(batch: Batch, trials: CheckedFile, bad: AnyArray) -> Iterator[
 
 
 def finite(batch: Batch) -> Iterator[Violation]:
-    """No number of a sample is NaN or infinite but the contacts of fingers that it leaves out."""
+    """All numbers of a sample are finite, except for contacts of fingers that it leaves out."""
     used = ~unused_fingers(batch["grasp_props/unused"], batch["grasps"].shape[1] // 6)
     yield from complete(batch, closed=used, lifted=used)
 
@@ -155,7 +155,7 @@ def finite(batch: Batch) -> Iterator[Violation]:
 def mass_properties(batch: Batch) -> Iterator[Violation]:
     """Inertias are symmetric and possible for a body.
 
-    The principal moments of a body are positive, and none is more than the sum of the others.
+    The principal moments of a body are positive, and none is larger than the sum of the others.
     """
     inertia = batch["object_props/work2inertia"].astype(float).reshape(-1, 3, 3)
     skew = np.abs(inertia - np.swapaxes(inertia, 1, 2)).max(axis=(1, 2))
@@ -171,7 +171,7 @@ def mass_properties(batch: Batch) -> Iterator[Violation]:
 
 
 def hold(batch: Batch) -> Iterator[Violation]:
-    """A sample keeps the limits of the hold in `filters`, and is called as it holds."""
+    """A sample is within the limits of the hold in `filters`, and its labels match its hold."""
     filters = batch.config.filters
     links, slip, turn, precision, stable = (
         batch[f"grasp_props/{name}"]
@@ -184,7 +184,7 @@ def hold(batch: Batch) -> Iterator[Violation]:
             what = f"a sample must pass the filter {rule.removal.label}"
             yield from batch.broken(what, rule.refuses(least, filters), "one that does not")
 
-    # On the limit rounding decides.
+    # At a limit, rounding decides.
     success = np.full(len(batch), Outcome.SUCCESS.value)
     bad = precision != is_precision(success, links)
     yield from batch.broken("precision must follow from other_links_held", bad, precision)
@@ -196,7 +196,7 @@ def hold(batch: Batch) -> Iterator[Violation]:
     yield from batch.broken(what, (surely & ~stable) | (stable & ~perhaps), stable)
 
 
-# The frames of a sample among each other
+# Consistency of a sample's frames
 
 
 def fixed_frames(batch: Batch) -> Iterator[Violation]:
@@ -213,7 +213,7 @@ def fixed_frames(batch: Batch) -> Iterator[Violation]:
 
 
 def camera_pair(batch: Batch) -> Iterator[Violation]:
-    """Both cameras have one place and one view direction; otm has world up at the top."""
+    """Both cameras share position and view direction; otm has world up at the top."""
     oto, otm = (batch.pose(f"object_props/frame_work2cam_{camera}") for camera in CAMERAS)
     off = np.abs(oto[:, :3, 2:] - otm[:, :3, 2:]).max(axis=(1, 2))
     what = "both cameras must have the same place and view"
@@ -237,11 +237,11 @@ def on_meshes(batch: Batch, load: LoadModel) -> Iterator[Violation]:
 
 
 def contacts_on_mesh(batch: Batch, model: ObjectModel) -> Iterator[Violation]:
-    """Contacts of samples of one object are on its mesh, and their normals point out of it.
+    """Contacts of one object's samples are on its mesh, and their normals point outward.
 
-    A normal counts as outward if it agrees with either face of `ContactFit.normal_angle`.
+    A normal counts as outward if it agrees with either of the faces of `ContactFit.normal_angle`.
     """
-    # Contacts in {O}, and how they lie there.
+    # Contacts in {O}, and how they fit the mesh.
     X_OC = invert_pose(object_in_camera(batch))
     p_CQ, n_C = contacts_of(batch)
     n_O = np.einsum("nij,nkj->nki", X_OC[:, :3, :3], n_C)
@@ -270,7 +270,7 @@ def points_of(depth: AnyArray, chosen: AnyArray, K: Array, X_AC: Array) -> Array
 
 
 def off_table(p_TQ: Array) -> float:
-    """Return how far the worst of points (m, 3) is off the surface of the table's slab [m]."""
+    """Return the largest distance [m] of points (m, 3) from the surface of the table's slab."""
     outside = np.abs(p_TQ - P_TTABLE) - TABLE_HALF
     distance = np.linalg.norm(np.maximum(outside, 0.0), axis=1)
     distance += np.abs(np.minimum(outside.max(axis=1, initial=-np.inf), 0.0))
@@ -278,26 +278,26 @@ def off_table(p_TQ: Array) -> float:
 
 
 def some_of(points: Array) -> Array:
-    """Return MEASURED_PIXELS of points (m, 3), evenly from the first to the last."""
+    """Return MEASURED_PIXELS of points (m, 3), evenly spaced from the first to the last."""
     return points[np.linspace(0, len(points) - 1, MEASURED_PIXELS).astype(int)]
 
 
 def off_mesh(chosen: list[Array], model: ObjectModel) -> Array:
-    """Return how far (n,) the worst of some points p_OQ of each of n images is off a mesh [m]."""
+    """Return for each of n images the largest distance (n,) [m] of its points p_OQ from a mesh."""
     _, distance, _ = model.visual.nearest.on_surface(np.concatenate(chosen))
     return np.asarray(distance.reshape(len(chosen), -1).max(axis=1))
 
 
 def border_of(mask: AnyArray) -> AnyArray:
-    """Return which pixels of a mask (h, w) of 0 and 1 have a neighbour outside of it."""
+    """Return which object pixels of a mask (h, w) of 0 and 1 have a neighbour outside of it."""
     return (mask == 1) & ~binary_erosion(mask, np.ones((3, 3)), border_value=1)
 
 
-# What the images of samples show
+# Content of the samples' images
 
 
 def object_in_camera(batch: Batch) -> Array:
-    """Return X_CO (n, 4, 4) of the object in the frame of the file's camera."""
+    """Return X_CO (n, 4, 4), the pose of the object in the frame of the file's camera."""
     X_CT, X_WO = (
         batch.pose(f"object_props/frame_{name}")
         for name in (f"cam2work_{batch.of.camera}", "world2obj")
@@ -312,7 +312,7 @@ def contacts_of(batch: Batch) -> tuple[Array, Array]:
 
 
 def has_depth(depth: AnyArray, config: Config) -> AnyArray:
-    """Return where depths of a sample are some; everywhere if no pixel may lose its."""
+    """Return which pixels have a depth; all of them if the configuration cannot lose depths."""
     loses = config.randomize.depth_noise is not None or config.randomize.depth_baseline > 0.0
     lost = depth >= np.float32(config.camera.far)
     return np.asarray(~lost) if loses else np.ones_like(lost)
@@ -334,7 +334,7 @@ def image_values(batch: Batch) -> Iterator[Violation]:
 
 
 def image_frames(batch: Batch) -> Iterator[Violation]:
-    """The image frame is before the camera, faces away from it, and in otm is at the centroid."""
+    """The image frame is in front of the camera, faces away, and in otm is at the centroid."""
     name = "frame_cam2img_otm"
     X_CI, K = batch.pose(f"object_props/{name}"), intrinsics(batch.config.camera)
     ahead = X_CI[:, 2, 3]
@@ -344,7 +344,7 @@ def image_frames(batch: Batch) -> Iterator[Violation]:
     what = f"{name} must have +Ix along +Cz"
     yield from batch.broken(what, turned > UNIT_TOLERANCE, got.__getitem__)
 
-    # The frame was estimated from the otm mask, so only that file can confirm its origin.
+    # The frame was estimated from the otm mask, so only the otm file can confirm its origin.
     if batch.of.camera == "otm":
         off = np.zeros(len(batch))
         for i in np.flatnonzero(ahead > 0.0):
@@ -355,7 +355,7 @@ def image_frames(batch: Batch) -> Iterator[Violation]:
 
 
 def without_noise(batch: Batch) -> Batch:
-    """Return the samples with depth images from which the noise is taken that was drawn."""
+    """Return the samples with the drawn noise removed from their depth images."""
     noise, seeds = batch["conditions/depth_noise"], batch["conditions/depth_seed"]
     if not noise.any():
         return batch
@@ -367,10 +367,10 @@ def without_noise(batch: Batch) -> Batch:
 
 
 def contacts_in_image(batch: Batch) -> Iterator[Violation]:
-    """Contacts project onto the mask, and lie on the visible surface or behind it."""
+    """Contacts project onto the mask, and are on the visible surface or behind it."""
     (p_CQ, _), K = contacts_of(batch), intrinsics(batch.config.camera)
     for finger in range(p_CQ.shape[1]):
-        # How far each contact is beside the mask [px], and before the surface there [m].
+        # Distance of each contact from the mask [px], and in front of the surface there [m].
         z = p_CQ[:, finger, 2]
         beside, before = np.zeros((2, len(batch)))
         for i in np.flatnonzero(z > 0.0):
@@ -391,9 +391,9 @@ def contacts_in_image(batch: Batch) -> Iterator[Violation]:
 
 
 def nearest_depth(depth: AnyArray, config: Config, pixel: Array) -> float:
-    """Return the least depth [m] around a pixel (2,), which is clipped into the image.
+    """Return the smallest depth [m] around a pixel (2,), which is clipped into the image.
 
-    It is infinite where no pixel around has a depth.
+    It is infinite if no pixel around has a depth.
     """
     u, v = np.clip(np.rint(pixel), 0, len(depth) - 1).astype(int)
     rows, columns = (slice(max(at - SILHOUETTE, 0), at + SILHOUETTE + 1) for at in (v, u))
@@ -402,7 +402,7 @@ def nearest_depth(depth: AnyArray, config: Config, pixel: Array) -> float:
 
 
 def table_pixels(batch: Batch) -> Iterator[Violation]:
-    """Pixels beside the mask, nearer than far, show the table."""
+    """Pixels outside of the mask that are nearer than far show the table."""
     X_TC = invert_pose(batch.pose(f"object_props/frame_cam2work_{batch.of.camera}"))
     camera, off = batch.config.camera, np.zeros(len(batch))
     K = intrinsics(camera)
@@ -419,7 +419,7 @@ def object_pixels(batch: Batch, model: ObjectModel) -> Iterator[Violation]:
     beyond, chosen = np.zeros(len(batch)), []
     for i, depth in enumerate(batch["images"][:, 3]):
         seen = (batch["masks"][i] == 1) & has_depth(depth, batch.config)
-        # A corner of the mesh stands for an image whose depths are all lost.
+        # If an image has lost all its depths, a corner of the mesh takes the place of its points.
         if not seen.any():
             chosen.append(some_of(model.visual_vertices[:1]))
             continue
@@ -428,7 +428,7 @@ def object_pixels(batch: Batch, model: ObjectModel) -> Iterator[Violation]:
         slack = np.where(border, depth / K[0, 0], 0.0)[seen]
         beyond[i] = beyond_box(p_OQ, X_OC[i][:3, 3], model.half_extents, slack)
 
-        # The mesh is measured inside the border, if there is any inside.
+        # The distance from the mesh is measured inside the border, if there are pixels inside.
         chosen.append(some_of(p_OQ[~border[seen]] if (seen & ~border).any() else p_OQ))
     off, outside = off_mesh(chosen, model), beyond > DEPTH_TOLERANCE
     for where, bad, got in (
@@ -440,19 +440,20 @@ def object_pixels(batch: Batch, model: ObjectModel) -> Iterator[Violation]:
 
 
 def beyond_box(p_OQ: Array, p_OC: Array, half_extents: Array, slack: Array) -> float:
-    """Return how far the worst point is outside of the object's box [m], 0 if none is.
+    """Return how far the worst point is outside of the object's box [m]; 0 if all are inside.
 
-    A renderer moves corners to fractions of a pixel, so a pixel whose ray just misses the object
-    can show it. Its depth is then that of a face seen nearly from its edge, continued beyond that
-    edge. So a point may be moved along its ray, but not aside, into the box and its tolerance.
+    A renderer moves corners by fractions of a pixel, so a pixel whose ray just misses the object
+    can show it. The depth of such a pixel is that of a face seen at a grazing angle, continued
+    beyond the face's edge. So a point may be moved along its ray, but not sideways, into the box
+    and its tolerance.
 
     Args:
         p_OQ: Points (m, 3) [m].
-        p_OC: The camera, (3,) [m].
-        half_extents: Of the box, (3,) [m].
-        slack: By how much each point may be moved, (m,) [m] of depth.
+        p_OC: Position of the camera, (3,) [m].
+        half_extents: Half extents of the box, (3,) [m].
+        slack: How far each point may be moved, (m,) [m] of depth.
     """
-    # Where the ray of each point enters the box and leaves it.
+    # Where the ray of each point enters and leaves the box.
     along = p_OQ - p_OC
     along = along / np.linalg.norm(along, axis=1, keepdims=True)
     along = np.where(np.abs(along) < 1e-12, 1e-12, along)
@@ -467,13 +468,13 @@ def beyond_box(p_OQ: Array, p_OC: Array, half_extents: Array, slack: Array) -> f
 
 
 def splits(data: CheckedFile, entries: Mapping[str, ObjectEntry]) -> Iterator[Violation]:
-    """A trial is one sample, and the test split has the objects that the seed draws.
+    """A trial is at most one sample, and the test split has the objects that the seed draws.
 
     Args:
         data: The data file.
-        entries: The objects by name, as far as they are known.
+        entries: Entries of the known objects, by name.
     """
-    # Each trial once; meanwhile gather the objects and their classes by split.
+    # Each trial occurs once; this loop also collects the objects and their classes by split.
     seen: dict[int, str] = {}
     objects: dict[str, dict[str, str]] = {}
     with data.opened() as file:
@@ -489,7 +490,7 @@ def splits(data: CheckedFile, entries: Mapping[str, ObjectEntry]) -> Iterator[Vi
             names, classes = (file[split][f"object_props/{key}"].asstr()[:] for key in keys)
             objects[split] = dict(zip(names.tolist(), classes.tolist(), strict=True))
 
-    # By object: no object in two splits, nor another one of its mesh.
+    # By object: neither an object nor its group, e.g. its morphs, is in two splits.
     if data.attributes.get("split_by") == "object":
         home: dict[str, str] = {}
         for split, members in objects.items():
@@ -501,7 +502,7 @@ def splits(data: CheckedFile, entries: Mapping[str, ObjectEntry]) -> Iterator[Vi
     if data.config is None or len(objects) < len(SPLITS):
         return
 
-    # By class: the draw depends on nothing but the objects, of which one or all are tested.
+    # By class: the draw depends only on the objects, of which one or all are tested.
     kinds = {name: kind for members in objects.values() for name, kind in members.items()}
     names = sorted(kinds)
     meshes = [entries[name].mesh_name if name in entries else name for name in names]
@@ -518,6 +519,6 @@ def splits(data: CheckedFile, entries: Mapping[str, ObjectEntry]) -> Iterator[Vi
 
 
 def group_of(entries: Mapping[str, ObjectEntry], name: str) -> str:
-    """Return what an object shares with others of its mesh; its name if it is unknown."""
+    """Return the group of an object, see `split_rule`; its name if the object is unknown."""
     entry = entries.get(name)
     return name if entry is None else entry.group or entry.mesh_name

@@ -1,8 +1,8 @@
-"""What is checked of scenes.hdf5: what lies on the table, what the cameras see, the closed hands.
+"""Rules of scenes.hdf5: what is on the table, what the cameras see, the closed hands.
 
-In: the file, and the dataset around it if there is one. Out: tasks that judge a scene each. Grasps
-are derived again from their trials, and which contacts a camera sees from its images, by the
-functions that make scenes; pictures are compared with the mesh and the table.
+In: the file, and the dataset around it if there is one. Out: tasks that judge one scene each.
+Grasps are derived again from their trials, and the contacts that a camera sees from its images, by
+the functions that create scenes; pictures are compared with the mesh and the table.
 """
 
 from __future__ import annotations
@@ -49,16 +49,17 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.vision.camera import visible_contacts
 
-#: Half a step of the stored depths comes on top.
+#: Half a step of the stored depths is added.
 PICTURE_TOLERANCE = DEPTH_TOLERANCE + DEPTH_UNIT / 2.0  # [m]
-#: By how much rounding may move a contact: a camera that is moved by as much, any way, may see it.
+#: How far rounding may move a contact. Visibility is tested with the camera moved this far in every
+#: direction.
 ROUNDED = 1e-5  # [m]
 
 
 def judge(data: CheckedFile, check: Check, dataset: Dataset | None) -> None:
     """Judge scenes.hdf5, with the dataset around it if there is one."""
     if len(data.counts) < len(data.fields):
-        return  # a finding already
+        return  # already a finding
     check.total += data.counts["scenes"]
     entries = dataset.manifest.objects if dataset else ()
     before = len(check.findings.violations())
@@ -72,7 +73,7 @@ def judge(data: CheckedFile, check: Check, dataset: Dataset | None) -> None:
 
 
 def _judge(data: CheckedFile, scene: int, dataset: Dataset | None) -> Findings:
-    """Apply the rules of a scene: of its place, its grasps, then of each of its views."""
+    """Apply the rules of a scene: to its objects, to its grasps, then to each of its views."""
     findings = Findings()
     with data.opened() as file:
         rows = {g: np.flatnonzero(file[g]["scene"][:] == scene) for g in ("views", "grasps")}
@@ -101,7 +102,7 @@ def _judge(data: CheckedFile, scene: int, dataset: Dataset | None) -> Findings:
 
 
 def _other_state(data: CheckedFile, out: Path) -> Iterator[Violation]:
-    """The file is of the trials that are there."""
+    """The file was made from the present trials."""
     of = Trials(out).attributes
     if any(str(data.attributes.get(key)) != str(of.get(key)) for key in ("shards", "signature")):
         differs = str(data.attributes.get("shards")) != str(of.get("shards"))
@@ -114,7 +115,7 @@ def _tables(data: CheckedFile, entries: Mapping[str, ObjectEntry]) -> Iterator[V
 
     Args:
         data: The file, with all of its groups.
-        entries: The objects by name, as far as they are known.
+        entries: Entries of the known objects, by name.
     """
     of = {("scenes", "object"): "objects", ("views", "scene"): "scenes"}
     of |= {("grasps", "scene"): "scenes"}
@@ -123,7 +124,7 @@ def _tables(data: CheckedFile, entries: Mapping[str, ObjectEntry]) -> Iterator[V
         split, names = file["scenes/split"][:], file["objects/name"].asstr()[:].tolist()
         got = np.column_stack([file["visible"][name][:] for name in ("view", "grasp")])
 
-    # Numbers of rows that exist.
+    # Row numbers must exist.
     for (group, name), counted in of.items():
         values = columns[group, name]
         if ((values < 0) | (values >= data.counts[counted])).any():
@@ -152,13 +153,13 @@ def _tables(data: CheckedFile, entries: Mapping[str, ObjectEntry]) -> Iterator[V
 
 
 def resting_scene(place: Batch, dataset: Dataset, name: str) -> Iterator[Violation]:
-    """The object rests as the manifest says, but for a turn about Tz and a place on the table."""
+    """The object has a resting pose of the manifest, turned about Tz and moved on the table."""
     entry = next(entry for entry in dataset.manifest.objects if entry.name == name)
     resting = int(place["resting"][0, 0])
     known, what = resting < len(entry.resting), "resting must be one of its object's"
     yield from place.broken(what, np.array([not known]), place["resting"][:, 0])
     if known:
-        # Upright direction and height stay.
+        # The upward direction and the height do not change.
         due = np.array(entry.resting[resting].X_TO)[8:]
         off = np.abs(place["X_TO"][:, 0, 8:] - due).max(axis=1)
         what = "X_TO must be the object's resting pose, turned about Tz and moved on the table"
@@ -189,7 +190,7 @@ def follow_trials(grasps: Batch, place: Batch, trials: Trials) -> Iterator[Viola
         return
     own = trials[grasps["trial_id"]].columns([*GRASPS_FOLLOW_FROM, "removal"])
     X_TO = np.tile(place.pose("X_TO")[0, 0], (len(grasps), 1, 1))
-    # Of a sample its weight is known from the data files alone.
+    # The weight of a sample is only in the data files.
     weights = np.where(own["removal"] == Removal.KEPT, grasps["weight"], np.nan)
     due = grasps_of_trials(own, X_TO, weights)
     yield from grasps.follow(due, "its trial and the pose of the object")
@@ -199,7 +200,7 @@ def follow_trials(grasps: Batch, place: Batch, trials: Trials) -> Iterator[Viola
 
 
 def image_values(views: Batch, objects: int) -> Iterator[Violation]:
-    """Depths are 0 or within near..far; masks name objects of the scene, and these have depths."""
+    """Depths are 0 or within near..far; masks name objects of the scene, which have depths."""
     near, far = views.config.scenes.near, views.config.scenes.far
     depth = views["depth"].reshape(len(views), -1) * DEPTH_UNIT
     mask = views["mask"].reshape(len(views), -1)
@@ -220,7 +221,7 @@ def _points(views: Batch, i: int, chosen: AnyArray) -> Array:
 
 
 def table_pixels(views: Batch) -> Iterator[Violation]:
-    """Pixels beside the mask that have a depth show the table."""
+    """Pixels outside of the mask that have a depth show the table."""
     beside = (views["mask"] == 0) & (views["depth"] > 0)
     off = np.array([off_table(_points(views, i, own)) for i, own in enumerate(beside)])
     what = f"points beside the mask must be on the table within {PICTURE_TOLERANCE:g} m"
@@ -243,11 +244,11 @@ def object_pixels(views: Batch, X_TO: Array, model: ObjectModel) -> Iterator[Vio
 
 
 def seen_contacts(views: Batch, of: Mapping[int, AnyArray], grasps: Batch) -> Iterator[Violation]:
-    """The contacts that are said to be seen are those that a camera sees, by its images.
+    """The contacts marked as visible are those that the camera sees, by its images.
 
     Args:
         views: Views of a scene.
-        of: By view whether each contact (g, k) is said to be seen.
+        of: For each view, (g, k) bool, whether each contact is marked as visible.
         grasps: All g grasps of the scene.
     """
     wrong = np.zeros(len(views), dtype=np.int64)

@@ -1,9 +1,10 @@
-"""What is checked of trials.hdf5: each attempt by itself, and what is derived of it again.
+"""Rules of trials.hdf5: each attempt by itself, and against values derived again.
 
-In: the file, with the dataset around it if there is one. Out: tasks; each judges a range of the
-attempts. What the shards give is compared first (`run`). All else a file alone shows: verdict
-and motion follow from contacts and poses, by the functions that a trial decides by; and with the
-dataset conditions, resting pose and chance, by those that a build draws and computes by.
+In: the file, with the dataset around it if there is one. Out: tasks, each of which judges a range
+of attempts. `run` first compares the attempts with their shards. The rules here also apply to a
+single file: verdict and motion follow from contacts and poses, by the functions with which a trial
+decides. With the dataset, conditions, resting pose and chance follow from the functions with which
+a build draws and computes them.
 """
 
 from __future__ import annotations
@@ -51,31 +52,31 @@ from drakegrasp.simulation.verdict import (
     scrapes,
 )
 
-#: Slip [m] and turn [rad] are as exact as the poses that they follow from; the angle of a rotation
-#: close to none is less exact than its matrix.
+#: Slip [m] and turn [rad] are as exact as the poses they follow from; the angle of a rotation close
+#: to the identity is less exact than its matrix.
 MOTION_TOLERANCE = 1e-4
-#: Largest outward force of a fingertip on the object [N]. The mean normal and the force of a patch
-#: are separate averages: where a fingertip is about to lose the object they may disagree, by no
-#: more than the force from which on a contact counts.
+#: Largest outward force [N] of a fingertip on the object. The mean normal and the force of a patch
+#: are separate averages: when a fingertip is about to lose the object, they may disagree by at most
+#: the smallest force that counts as a contact.
 PULL = 0.05
-#: With more friction a force may leave the object's side of a mean normal: a cone of 45 degrees.
+#: With more friction, a force may leave the object's side of a mean normal: a cone of 45 degrees.
 MAX_FRICTION = 1.0
 #: Chances are rounded to about a millionth.
 CHANCE_TOLERANCE = 1e-5
-#: Attempts whose successes are looked for at once.
+#: Number of attempts that are searched for successes at once.
 BLOCK = 16_384
 
 
 def trial_rules(trials: CheckedFile, dataset: Dataset | None) -> list[list[Rule]]:
     """Return the rules for a file and the dataset around it, if there is one, in stages.
 
-    The first is for any values, stages of attempts need a legal outcome, the third is for finite
-    values of known objects, the last for sound poses and contacts.
+    The first stage applies to any values; the second needs valid outcomes; the third needs finite
+    values and known objects; the last needs valid poses and contacts.
     """
     finite: list[Rule] = [verdicts, rigid, contacts]
     sound: list[Rule] = [motion, derived]
     most: AnyArray | None = None
-    # What follows from the dataset needs all of its objects.
+    # Rules that need the dataset need all of its objects.
     if dataset is not None and trials.counts["objects"] == len(dataset.manifest.objects):
         manifest, model = dataset.manifest, dataset.loader()
         most = np.array([entry.candidates for entry in manifest.objects])
@@ -87,7 +88,7 @@ def trial_rules(trials: CheckedFile, dataset: Dataset | None) -> list[list[Rule]
 
 
 def numbers(batch: Batch, candidates: AnyArray | None) -> Iterator[Violation]:
-    """The numbers of a trial are legal, and a refined palm pose has a parent.
+    """The numbers of a trial are valid, and a refined palm pose has a parent.
 
     Args:
         batch: Rows of `/trials`.
@@ -99,7 +100,7 @@ def numbers(batch: Batch, candidates: AnyArray | None) -> Iterator[Violation]:
     what = f"outcome must be one of {', '.join(map(str, known))}"
     yield from batch.broken(what, ~np.isin(outcome, known), outcome)
 
-    # Of an unknown object, which is a finding, no number is too large.
+    # An unknown object is already a finding; for it no number is too large.
     most, index = np.full(len(batch), np.inf), batch["object"]
     if candidates is not None:
         there = (index >= 0) & (index < objects)
@@ -113,8 +114,8 @@ def numbers(batch: Batch, candidates: AnyArray | None) -> Iterator[Violation]:
         bad = (batch[name] < 0) | (batch[name] >= limit)
         yield from batch.broken(f"{name} must be one of the {of}", bad, batch[name])
 
-    # The first of a family has no parent. Only of a posture from outside may the density be
-    # unknown, or the preshape be none.
+    # The first attempt of a family has no parent. Only a posture from outside may have an unknown
+    # density or no preshape.
     child, source, preshape = batch["child"], batch["source"], batch["preshape"]
     refined, given = child > 0, source == Source.POSTURES
     first = (batch["generation"] > 0) != refined
@@ -134,7 +135,7 @@ def numbers(batch: Batch, candidates: AnyArray | None) -> Iterator[Violation]:
 
 
 def complete_stages(batch: Batch) -> Iterator[Violation]:
-    """The fields of a stage have values if the attempt reached it, and none otherwise."""
+    """The fields of a stage have values if the attempt reached the stage, and none otherwise."""
     stage = _stages(batch)
     touching = {when: batch[f"{when}_touching"] for when in ("closed", "lifted")}
     yield from complete(batch, stage, **touching)
@@ -149,7 +150,7 @@ def complete_stages(batch: Batch) -> Iterator[Violation]:
 
 
 def repeats(batch: Batch) -> Iterator[Violation]:
-    """Of the repeats of an attempt some hold, and of these some are samples."""
+    """Some repeats of an attempt hold, and some of those that hold are samples."""
     drawn, half = ~np.isnan(batch["p_hold_probability"]), batch["p_hold_half_step"]
     most = batch.of.config.certify.repeats if batch.of.config else np.inf
     limit, of = np.where(drawn, most, 0), "those drawn for"
@@ -162,7 +163,7 @@ def repeats(batch: Batch) -> Iterator[Violation]:
 
 
 def verdicts(batch: Batch) -> Iterator[Violation]:
-    """The outcome is what follows from contacts, motion and chance (`simulation.verdict`)."""
+    """The outcome follows from contacts, motion and chance (`simulation.verdict`)."""
     outcome, closed = batch["outcome"], judged_closed(batch)
     due = judge_lifted(
         batch["lifted_touching"],
@@ -171,18 +172,18 @@ def verdicts(batch: Batch) -> Iterator[Violation]:
         required=required_of(batch),
         scraped=_scraped(batch, "lift"),
     )
-    # Older versions called slipped what is partly held.
+    # Older versions used the outcome `slipped` for what is now `partly held`.
     older = (outcome == Outcome.SLIPPED) & (due == Outcome.PARTLY_HELD)
     due = np.where(older, Outcome.SLIPPED.value, due)
 
-    # A lift that was ended has no verdict, but a reason; so has a closed hand that was not lifted.
+    # A lift that was ended early has a reason instead of a verdict; so has an unlifted closed hand.
     ended, left = outcome == Outcome.MOVED, outcome == Outcome.NOT_LIFTED
     must_stay = np.zeros(len(batch), dtype=np.bool_)
     if batch.of.config is not None:
         lift = batch.config.lift
         ended &= is_lost_sample(batch["slip"], batch["turn"], lift)
         must_stay = (batch["chance"] < lift.least_chance) & ~batch["audited"]
-        # Of a flat image the trial knows nothing; it has none.
+        # The trial does not store whether its image is flat, so this reason cannot be excluded.
         left &= must_stay | ((lift.least_depth_variance > 0.0) & ~batch["audited"])
     due = np.where(ended, Outcome.MOVED.value, due)
     due = np.where(left | must_stay, Outcome.NOT_LIFTED.value, due)
@@ -201,7 +202,7 @@ def verdicts(batch: Batch) -> Iterator[Violation]:
 
 
 def judged_closed(batch: Batch) -> AnyArray:
-    """Return the outcomes (n,) of closed hands, SUCCESS where the hand may lift."""
+    """Return the outcomes (n,) of closed hands, SUCCESS if the hand may lift."""
     return judge_closed(
         batch["closed_touching"],
         batch["closed_other_links"],
@@ -212,17 +213,17 @@ def judged_closed(batch: Batch) -> AnyArray:
 
 
 def required_of(batch: Batch) -> AnyArray:
-    """Return whether the grasp of each row needs each fingertip, (n, k): those of its preshape."""
+    """Return which fingertips (n, k) the grasp of each row needs: those of its preshape."""
     required = [*json.loads(batch.of.attributes.get("fingers", "{}")).values()] or [True]
     return np.asarray(required) & ~unused_fingers(batch["unused"], len(required))
 
 
 def contacts(batch: Batch) -> Iterator[Violation]:
-    """Fingertips that touch have a contact patch, and the forces on a held object point into it.
+    """Touching fingertips have a contact patch, and forces on a held object point into it.
 
-    A patch may span an edge or a thin rim: its mean normal then does not tell the direction of the
-    force. So that rule is for successes only, and only where friction turns a force by less than
-    `MAX_FRICTION` does.
+    A patch may span an edge or a thin rim; its mean normal then does not show the direction of the
+    force. So the rule of forces is only for successes, and only if the friction is at most
+    `MAX_FRICTION`, since friction turns a force away from the normal.
     """
     judged = (batch["outcome"] == Outcome.SUCCESS) & (batch["friction_hand"] <= MAX_FRICTION)
     for stage in ("closed", "lifted"):
@@ -237,7 +238,7 @@ def contacts(batch: Batch) -> Iterator[Violation]:
 
 
 def motion(batch: Batch) -> Iterator[Violation]:
-    """How the object moved in the hand follows from the palm's two poses, and the words for it."""
+    """The object's motion in the hand and its labels follow from the two poses of the palm."""
     before, after = (invert_pose(batch.pose(name)) for name in ("X_OG", "X_OG_lifted"))
     slip = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
     cosine = (np.einsum("nij,nij->n", before[:, :3, :3], after[:, :3, :3]) - 1.0) / 2.0
@@ -254,7 +255,7 @@ def motion(batch: Batch) -> Iterator[Violation]:
 
 
 def _scraped(batch: Batch, when: str) -> AnyArray:
-    """Return (n,) whether the hand came too far below the table's top; not where unknown."""
+    """Return (n,) whether the hand came too far below the table's top; False if unknown."""
     if batch.of.config is None:
         return np.zeros(len(batch), dtype=np.bool_)
     return scrapes(batch[f"clearance_{when}"], batch.config.close)
@@ -264,13 +265,13 @@ def _stages(batch: Batch) -> AnyArray:
     """Return the stage (n,) that each attempt reached."""
     table = np.zeros(max(Outcome) + 1, dtype=int)
     table[[o.value for o in Outcome]] = [o.stage.value for o in Outcome]
-    # The table can be touched by the hand as it closes, or in the lift.
+    # The hand can touch the table while it closes, or during the lift.
     by_hand = batch["closed_hand_on_table"] | _scraped(batch, "close")
     lifted = (batch["outcome"] == Outcome.TABLE_CONTACT) & ~by_hand
     return np.where(lifted, Stage.LIFTED.value, table[batch["outcome"]])
 
 
-# What an attempt has from the configuration, its object and the seed
+# What an attempt gets from the configuration, its object and the seed
 
 
 def resting_poses(batch: Batch, manifest: Manifest) -> Iterator[Violation]:
@@ -288,12 +289,12 @@ def resting_poses(batch: Batch, manifest: Manifest) -> Iterator[Violation]:
 
 
 def conditions(batch: Batch, manifest: Manifest, model: LoadModel) -> Iterator[Violation]:
-    """Friction, mass, looks, cameras and noise are what the seed gives, or the usual ones."""
+    """Friction, mass, looks, cameras and noise are those that the seed draws, or the defaults."""
     due = {f.name: np.array(batch[f.name]) for f in CONDITION_FIELDS}
     identity = ("candidate", "standoff_index", "child")
     for name, known, rows in _by_object(batch, manifest, model):
         own = manifest.config_of(name)
-        # Where nothing is drawn all attempts of an object have the same conditions.
+        # If nothing is drawn, all attempts of an object have the same conditions.
         same = own.randomize == RandomizeConfig()
         for chosen in [rows] if same else rows[:, None]:
             numbers = [0, 0, 0] if same else [int(batch[key][chosen[0]]) for key in identity]
@@ -304,7 +305,7 @@ def conditions(batch: Batch, manifest: Manifest, model: LoadModel) -> Iterator[V
 
 
 def chances(batch: Batch, manifest: Manifest, model: LoadModel) -> Iterator[Violation]:
-    """A closed hand that may lift has the chance of a sample that its sound contacts give."""
+    """A closed hand that may lift has the lift chance that its sound contacts yield."""
     # Other files of the hand may have other weights.
     try:
         if not is_hand(manifest.config.hand_source, manifest.versions.get("hand")):
@@ -318,7 +319,7 @@ def chances(batch: Batch, manifest: Manifest, model: LoadModel) -> Iterator[Viol
     lifts &= np.isfinite(batch["time_close"])
     due = np.where(lifts & (chance is not None), batch["chance"], np.nan)
     for _, known, rows in _by_object(batch, manifest, model):
-        # That of fewer fingers is of their contacts alone.
+        # The chance of a grasp with fewer fingers follows from their contacts alone.
         own = rows[lifts[rows] & (batch["unused"][rows] == 0)]
         if chance is not None and len(own):
             closed = batch.where(np.isin(np.arange(len(batch)), own))
@@ -337,7 +338,7 @@ def _by_object(
 ) -> Iterator[tuple[str, ObjectModel, AnyArray]]:
     """Yield name and model of each object that can be read, and the indices of its rows."""
     for index in np.unique(batch["object"]).tolist():
-        # Its file may have another name of it, see `ObjectEntry.drawn_as`.
+        # The object's file may have another name for it, see `ObjectEntry.drawn_as`.
         name = manifest.objects[index].name
         known = model(name)
         if known is not None:
@@ -345,7 +346,7 @@ def _by_object(
 
 
 def successes(trials: CheckedFile) -> Iterator[Violation]:
-    """Every success is in /successes, in order, with a legal reason of removal and certificate."""
+    """Every success is in /successes, in order, with a valid reason of removal and certificate."""
     if not {"trials", "successes"} <= set(trials.counts):
         return
     with trials.opened() as file:
