@@ -1,7 +1,7 @@
 """An attempt: what a trial starts from. It is plain data and needs no Drake.
 
-Samplers make attempts of palm poses (`candidates`), a posture from outside becomes one (`posture`),
-and `trial.run_attempt` tries one.
+Samplers turn palm poses into attempts (`candidates`), `posture` turns a posture from outside into
+an attempt, and `trial.run_attempt` runs the trial of an attempt.
 """
 
 from __future__ import annotations
@@ -21,43 +21,43 @@ class Source(IntEnum):
     ROTATIONS = 0
     NORMALS = 1
     REFINE = 2
-    OWN = 3  # any other: of the package, as `above`, of another one, or of the user
-    POSTURES = 4  # none: the posture comes from outside
+    OWN = 3  # any other sampler: `above`, one of another package, or a user-defined one
+    POSTURES = 4  # no sampler: the posture comes from outside
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Attempt:
-    """What a trial starts from, and how a dataset counts it.
+    """The start of a trial, and the numbers by which a dataset identifies it.
 
-    An attempt of the first round is a candidate at a stand-off. It is number 0 of its family; the
-    children of number n have the numbers n c + 1 to n c + c, where c is `refine.children`.
+    A first-round attempt is a candidate at a stand-off. It is number 0 of its family; the children
+    of number n have the numbers n c + 1 to n c + c, where c is `refine.children`.
 
     Attributes:
-        X_OG: Pose of the palm (4, 4) before the fingers close; the candidate's own where its ray
+        X_OG: Pose of the palm (4, 4) before the fingers close; the candidate's pose if its ray
             misses.
         spread: Angle of the spread joints [rad].
-        closing: Positions of the closing joints (k,) [rad or m] at the start; None is the open
+        closing: Positions (k,) of the closing joints at the start [rad or m]; None for the open
             hand.
         ray_hits: Whether the palm ray meets the object; true if no ray places the palm.
-        conditions: Friction, mass, looks and cameras; None are the usual ones.
-        audited: Whether the closed hand is lifted in any case, whatever its chance and its image.
-        path: Of a posture that spread and closing cannot say: positions (3, j) of all joints
-            [rad or m], in the plant's order: where the trial begins, where the fingers hold the
-            object, and where motors of their own go on to, and press.
-        own_motors: Whether each joint has a motor of its own; else the hand file's close the
-            fingers until they stop, and what they do not move keeps its place.
+        conditions: Friction, mass, appearance and cameras; None for the usual conditions.
+        audited: Whether the closed hand is lifted regardless of its chance and its image.
+        path: Positions (3, j) of all joints [rad or m], in the plant's order, for a posture that
+            spread and closing cannot describe: where the trial begins, where the fingers hold the
+            object, and where separate motors then move to and press.
+        own_motors: Whether each joint has its own motor. If not, the motors of the hand file close
+            the fingers until they stop, and all other joints keep their positions.
         preshape: Index of the hand's preshape; None if all fingers close.
         unused: Fingers that the preshape leaves out, see `Hand.unused_in`.
         candidate: Index of the candidate of its object.
         standoff_index: Index into `candidates.standoffs`.
-        standoff: Distance of the palm from the surface point along -Gz [m]; of the family's first
+        standoff: Distance of the palm from the surface point along -Gz [m], for the family's first
             attempt.
         seed: Seed from which `spread` was drawn.
         resting: Index of the object's resting pose.
         source: The sampler.
         log_density: Logarithm of the density of the draw, see the schema.
-        child, parent: Its number in its family, and that of its parent; 0 for the first.
-        generation: Number of parents before it.
+        child, parent: Numbers of the attempt and of its parent in the family; 0 for the first.
+        generation: Number of ancestors.
         posture_row: Row of a posture in its file; NaN for a palm pose of a sampler.
     """
 

@@ -1,9 +1,9 @@
 """Attempts from outside: many postures of several objects, and the palm poses of a build from them.
 
-In: what a file, a network or another tool says of n grasps. Out: one table, `Attempts`, in which a
-bad row keeps the reason and spoils no other. It is plain data and can be sent to another
-process. A build makes its `Candidates` and the `Attempt` of each from it, a verdict and a score put
-its rows on their objects.
+In: what a file, a network or another tool states about n grasps. Out: one table, `Attempts`. A bad
+row keeps the reason why it is bad and does not affect other rows. The table is plain data and can
+be sent to another process. A build makes its `Candidates` and the `Attempt` of each row from it.
+Verification and scoring put its rows on their objects.
 """
 
 from __future__ import annotations
@@ -38,65 +38,67 @@ from drakegrasp.simulation.posture import (
 from drakegrasp.simulation.settle import SAME_UP
 from drakegrasp.table import Table
 
-#: Frames of a table: those of a posture, and {M}, the axes and the origin of the mesh file.
+#: Frames of a table: the frames of a posture, and {M}, the axes and the origin of the mesh file.
 TableFrame = Literal["object", "table", "camera", "world", "mesh"]
 TABLE_FRAMES: tuple[str, ...] = get_args(TableFrame)
-#: No object has so many resting poses.
+#: Upper bound of the index of a resting pose; no object has so many.
 MOST_POSES = 1e6
-#: What `resting` is where nobody named a resting pose: all of the object are tried.
+#: Value of `resting` if a row names no resting pose; all resting poses of the object are tried.
 UNTOLD = -1
-#: What `preshape` is where a palm pose alone is tried in each preshape of the hand.
+#: Value of `preshape` if a row without joints is tried in each preshape of the hand.
 EACH = "each"
+#: Largest allowed difference between the length of a quaternion and one.
 #: How far the length of a quaternion may be from one.
 UNIT_TOLERANCE = 1e-3
-#: What of a table of postures decides a build. Why a row is none follows from the others, and from
-#: the meshes; a build draws its own conditions.
+#: Columns of a table of postures that decide a build. The reason why a row is bad follows from the
+#: others and from the meshes; a build draws its own conditions.
 _DECIDING = (
     *("objects", "resting", "X_TO", "X_FG", "q_grasp", "q_pregrasp", "q_squeeze", "frame", "X_TC"),
     *("scale", "log_density", "said", "preshape", "row"),
 )
-#: What a table says of all its rows together.
+#: Attributes of a table that apply to all its rows together.
 _OF_ALL = ("frame", "link", "file", "sha256")
-#: What an attempt may have drawn, in the order of `Attempts.conditions`.
+#: Conditions that an attempt may have drawn, in the order of `Attempts.conditions`.
 CONDITIONS = ("friction_hand", "friction_table", "mass")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Attempts:
-    """n postures of hands with j joints, in the plant's order; made by `make_attempts`.
+    """n postures of hands with j joints in the plant's order, built by `make_attempts`.
 
-    Or n grasps of k contacts, whose wrist and joints are not told; made by `read_grasps`.
+    Or n grasps of k contacts without wrist and joints, built by `read_grasps`.
 
     Attributes:
-        objects: (n,), name of the object of each.
-        resting: (n,), index of its resting pose; `UNTOLD` where none is named.
-        X_TO: (n, 4, 4), its pose on the table, which names the resting pose by itself; NaN: not
-            told.
+        objects: (n,), name of the object of each row.
+        resting: (n,), index of the object's resting pose; `UNTOLD` if a row names none.
+        X_TO: (n, 4, 4), pose of the object on the table, another way to name the resting pose; NaN
+            if not given.
         X_FG: (n, 4, 4), pose of the palm in the frame.
-        q_grasp: (n, j), joint positions of the grasp [rad or m]; a row of NaN: a palm pose alone,
-            which closes from the open hand.
-        q_pregrasp, q_squeeze: (n, j); a row of NaN: not given.
+        q_grasp: (n, j), joint positions of the grasp [rad or m]. A row of NaN is a palm pose alone,
+            from which the open hand closes.
+        q_pregrasp, q_squeeze: (n, j), joint positions before and beyond the grasp; a row of NaN is
+            not given.
         frame: One of `TABLE_FRAMES`.
         X_TC: (n, 4, 4), pose of the camera in {T}, for the frame "camera".
-        scale: (n,), metres per unit of length of the mesh file that the posture is for; NaN: any.
-        log_density: (n,), logarithm of the density of the draw; NaN: not known.
-        said: (n,), where it comes from, in words.
-        preshape: (n,), name of the hand's preshape; empty: all fingers close; `EACH`.
-        conditions: (n, 3), the `CONDITIONS` under which it held; NaN: not told. A verdict is
-            reached under them; a build draws its own.
+        scale: (n,), metres per unit of length of the posture's mesh file; NaN for any scale.
+        log_density: (n,), logarithm of the density of the draw; NaN if unknown.
+        said: (n,), origin of each row, in words.
+        preshape: (n,), name of the hand's preshape; empty if all fingers close; or `EACH`.
+        conditions: (n, 3), the `CONDITIONS` under which the grasp held; NaN if unknown.
+            Verification uses them; a build draws its own conditions.
         row: (n,), row in the file.
-        invalid: (n,), why a row is no posture; empty where it is one.
-        of_row: (n,), of predictions: the row of a dataset's split that each is for.
-        confidence: (n,), of predictions: greater is better.
-        link: Of what the file speaks in place of the palm frame, as is told in hints: the palm link
-            or a frame of another tool; empty: of the palm frame.
-        X_FG_xyzw: (n, 4, 4), likewise: X_FG if its quaternions were meant x, y, z, w.
-        grasps: (n, 6k), of contacts: the numbers as they were given; None of postures.
+        invalid: (n,), reason why a row is not a valid posture; empty for a valid row.
+        of_row: (n,), for predictions: row of the dataset's split that each prediction is for.
+        confidence: (n,), for predictions: greater is better.
+        link: Frame that the file gives poses of instead of the palm frame, shown in hints: the palm
+            link or a frame of another tool; empty for the palm frame.
+        X_FG_xyzw: (n, 4, 4), for hints: X_FG if the quaternions had the order x, y, z, w.
+        grasps: (n, 6k), for contacts: the numbers as they were given; None for postures.
         points, normals: (n, k, 3), contact points [m] and unit normals in the frame of the
-            caller; NaN in rows that are no grasp.
+            caller; NaN in rows without a valid grasp.
         normalised: (n,), whether a normal was not of unit length.
-        rank: (n,), of predictions for a score: 0 for the best of its row.
-        file, sha256: Where predictions for a score are from, and the hash of that.
+        rank: (n,), for predictions to score: 0 for the best prediction of its row.
+        file, sha256: Source of predictions to score, and its hash.
     """
 
     objects: tuple[str, ...]
@@ -131,13 +133,13 @@ class Attempts:
         return len(self.objects)
 
     def __iter__(self) -> Iterator[tuple[str, Any]]:
-        """Yield name and values of each column that the table has."""
+        """Yield name and values of each column of the table."""
         for f in fields(self):
             if f.name not in _OF_ALL and (value := getattr(self, f.name)) is not None:
                 yield f.name, value
 
     def of_object(self, name: str) -> Attempts:
-        """Return the rows of an object that are postures, in their order."""
+        """Return the valid rows of an object, in their order."""
         said = zip(self.objects, self.invalid, strict=True)
         return self.at([i for i, (each, reason) in enumerate(said) if each == name and not reason])
 
@@ -150,18 +152,18 @@ class Attempts:
         """Return the posture of a row.
 
         Args:
-            i: Place of the row in the table.
+            i: Index of the row in the table.
             X_TO: Pose (4, 4) of its object on the table.
             X_OM: Pose (4, 4) of the mesh file's frame in {O}, for the frame "mesh".
 
         Raises:
-            GraspError: If the frame is "mesh" and its pose is not known.
+            GraspError: If the frame is "mesh" and its pose is unknown.
         """
         X_OG = multiply(self.frame_pose(i, X_TO, X_OM), self.X_FG[i])
         return _posture(self, i, X_OG)
 
     def frame_pose(self, i: int, X_TO: Array, X_OM: Array | None) -> Array:
-        """Return the pose (4, 4) of the frame of a row in {O}; see `posture`."""
+        """Return the pose (4, 4) in {O} of the frame of a row; see `posture`."""
         if self.frame == "object":
             return np.eye(4)
         if self.frame == "mesh":
@@ -174,12 +176,12 @@ class Attempts:
         return multiply(X_OT, invert_pose(X_WT) if self.X_TC is None else self.X_TC[i])
 
     def names_pose(self, i: int) -> bool:
-        """Return whether a row names the resting pose that it is for."""
+        """Return whether a row names its resting pose."""
         return bool(np.isfinite(self.X_TO[i]).all() or self.resting[i] != UNTOLD)
 
     @property
     def nameless(self) -> str:
-        """How many rows name no resting pose, and what becomes of them; empty if none."""
+        """A message on the rows that name no resting pose; empty if there are none."""
         rows = [i for i in range(len(self)) if not (self.invalid[i] or self.names_pose(i))]
         if not rows or self.grasps is not None:
             return ""
@@ -190,7 +192,7 @@ class Attempts:
 
     @property
     def bare(self) -> str:
-        """How many rows are palm poses alone, and what becomes of them; empty if none."""
+        """A message on the rows that are palm poses alone; empty if there are none."""
         if self.grasps is not None:
             return ""
         without = np.isnan(self.q_grasp).all(axis=1)
@@ -203,13 +205,14 @@ class Attempts:
         )
 
     def shapes(self, i: int, hand: Hand) -> tuple[str, ...]:
-        """Return the preshapes in which a row is tried: the one that it names, or each."""
+        """Return the preshapes in which a row is tried: the one that it names, or each preshape."""
         return hand.preshape_names if self.preshape[i] == EACH else (self.preshape[i],)
 
     def stands(self, i: int, poses: Array) -> list[int]:
-        """Return which resting poses (r, 4, 4) of its object a row is for, as indices.
+        """Return the indices of the object's resting poses (r, 4, 4) that a row is tried in.
 
-        That is the one that it names, and all where it names none; empty if the object lacks it.
+        It is the resting pose that the row names, or all if it names none. It is empty if the
+        object lacks the named resting pose.
         """
         if np.isfinite(X_TO := self.X_TO[i]).all():
             cosines = poses[:, 2, :3] @ X_TO[2, :3]
@@ -219,7 +222,7 @@ class Attempts:
         return known if named == UNTOLD else known[named : named + 1]
 
     def numbers(self) -> Array:
-        """Return all numbers (n, m) that say what each row is, NaN where it lacks some."""
+        """Return all numbers (n, m) that describe the rows; NaN for numbers that a row lacks."""
         if self.grasps is not None:
             return self.grasps
         X = [X for X in (self.X_FG, self.X_TC) if X is not None]
@@ -227,13 +230,13 @@ class Attempts:
         return np.column_stack([*(each.reshape(len(self), 16) for each in X), *q])
 
     def refuse(self, reasons: Sequence[str]) -> Attempts:
-        """Return the table with more reasons (n,) why rows are no postures."""
+        """Return the table with additional reasons (n,) why rows are not valid."""
         both = (one or other for one, other in zip(self.invalid, reasons, strict=True))
         return replace(self, invalid=tuple(both))
 
     @property
     def refused(self) -> str:
-        """How many rows are no postures, and which, in a line; empty if all are."""
+        """A message on the rows that are not valid, with the reasons; empty if all are valid."""
         rows: dict[str, list[str]] = {}
         for row, reason in zip(self.row.tolist(), self.invalid, strict=True):
             if reason:
@@ -247,10 +250,11 @@ class Attempts:
         return f"{count:,} of {len(self):,} rows of the postures are not tried: {told}{more}"
 
     def digest(self) -> str:
-        """Return a hash (16 hex digits) of all that decides a build."""
+        """Return a hash (16 hex digits) of everything that decides a build."""
         digest = hashlib.sha256()
         for name in _DECIDING:
-            # A table without preshapes or poses is as before there were any.
+            # Leave out columns without values, so that older tables without these columns keep
+            # their hash.
             value = getattr(self, name)
             if name == "preshape" and not any(value):
                 continue
@@ -293,38 +297,39 @@ def make_attempts(
     X_FG_xyzw: Array | None = None,
     alone: npt.ArrayLike = False,
 ) -> Attempts:
-    """Return a table of postures, after checking every row by itself.
+    """Return a table of postures, after checking each row separately.
 
     Args:
         hand: The hand.
         objects: (n,), names of the objects.
         X_FG: (n, 4, 4), poses of the palm, or of the link, in the frame.
-        q_grasp: (n, m), of the joints; None: every row is a palm pose alone.
-        q_pregrasp: (n, m); rows of NaN are not given.
-        q_squeeze: (n, m); rows of NaN are not given.
-        joints: (m,), names of the joints; None: all, in the plant's order. A joint that the hand
-            file couples, or that the preshapes of all rows keep, may be missing.
-        link: Name of the palm link, or of one of the hand's `frames`, if the poses are of it; None:
-            of the palm frame.
-        resting: (n,), index of the object's resting pose; where NaN, or None, all are tried.
-        X_TO: (n, 4, 4), poses of the objects on the table, instead; rows of NaN are not given.
+        q_grasp: (n, m), joint positions; None if every row is a palm pose alone.
+        q_pregrasp: (n, m), joint positions; rows of NaN are not given.
+        q_squeeze: (n, m), joint positions; rows of NaN are not given.
+        joints: (m,), names of the joints; None for all joints in the plant's order. Joints that the
+            hand file couples, or that the preshapes of all rows keep, may be missing.
+        link: Name of the palm link, or of one of the hand's `frames`, if the poses are poses of it;
+            None for the palm frame.
+        resting: (n,), index of the object's resting pose; if NaN or None, all are tried.
+        X_TO: (n, 4, 4), poses of the objects on the table instead of indices; rows of NaN are not
+            given.
         frame: One of `TABLE_FRAMES`.
         X_TC: (n, 4, 4), with the frame "camera".
         scale: (n,), metres per unit of length of the mesh file.
-        log_density: (n,), of the draws.
-        said: (n,), where each comes from.
-        invalid: (n,), why a row is known to be no posture; empty where it may be one.
-        preshape: (n,), names of the hand's preshapes; empty: all fingers close. A palm pose alone
+        log_density: (n,), log-densities of the draws.
+        said: (n,), origin of each row, in words.
+        invalid: (n,), reason why a row is known to be invalid, or empty.
+        preshape: (n,), names of the hand's preshapes; empty if all fingers close. A palm pose alone
             may be tried in `EACH`.
-        conditions: (n, 3), `CONDITIONS`; NaN: those of the object and of the configuration.
-        of_row: (n,), of predictions.
-        confidence: (n,), of predictions.
-        X_FG_xyzw: (n, 4, 4), X_FG if its quaternions were meant x, y, z, w.
-        alone: (n,), whether a row is a palm pose alone, with no joints at any stage.
+        conditions: (n, 3), `CONDITIONS`; NaN for those of the object and of the configuration.
+        of_row: (n,), see `Attempts`.
+        confidence: (n,), see `Attempts`.
+        X_FG_xyzw: (n, 4, 4), X_FG if the quaternions had the order x, y, z, w.
+        alone: (n,), whether a row is a palm pose alone, without joints at any stage.
 
     Raises:
-        GraspError: If there is no row, the arrays differ in length, or the joints or the link are
-            none of this hand.
+        GraspError: If there is no row, the arrays differ in length, or the joints or the link do
+            not belong to the hand.
         HandError: If the hand has no such link.
     """
     # What all rows share: preshapes and joints of the hand, the palm's frame, the table's frame.
@@ -338,7 +343,7 @@ def make_attempts(
     X_AG = hand.palm_in(link or "")
     _refuse_table(count, frame, X_TC)
 
-    # Numbers that every row must have, and those that a row may lack; `bad` says why a row is none.
+    # Columns that every row must have and columns that a row may lack; `bad` has a row's fault.
     bad = [""] * count if invalid is None else list(invalid)
     stands = _resting(resting, count, bad)
     under = _conditions(conditions, count, bad)
@@ -391,7 +396,7 @@ def _resting(told: npt.ArrayLike | None, count: int, bad: list[str]) -> npt.NDAr
 
 
 def _conditions(told: npt.ArrayLike | None, count: int, bad: list[str]) -> Array:
-    """Return the `CONDITIONS` (n, 3), which are positive where they are told."""
+    """Return the `CONDITIONS` (n, 3); those that are given must be positive."""
     known = _numbers(told, (count, len(CONDITIONS)), "conditions", bad, each=True)
     for i, k in np.argwhere(known <= 0.0):
         bad[i] = bad[i] or f"{CONDITIONS[k]} must be positive, got {known[i, k]:g}"
@@ -401,7 +406,7 @@ def _conditions(told: npt.ArrayLike | None, count: int, bad: list[str]) -> Array
 def _beside_grasp(
     q: Mapping[str, Array], palms: npt.NDArray[np.bool_], size: tuple[int, int], bad: list[str]
 ) -> tuple[Array, Array]:
-    """Return pregrasp and squeeze (n, j) [rad or m], which a palm pose alone (n,) cannot have."""
+    """Return pregrasp and squeeze (n, j) [rad or m]; a palm pose alone (n,) must have neither."""
     pregrasp, squeeze = (
         _numbers(q.get(name), size, name, bad, some=True) for name in ("q_pregrasp", "q_squeeze")
     )
@@ -412,13 +417,13 @@ def _beside_grasp(
 
 
 def join_attempts(parts: Sequence[Attempts | str]) -> Attempts:
-    """Return the rows of some tables, one after the other.
+    """Return the concatenated rows of some tables.
 
     Args:
-        parts: Tables of one hand; a text says why a file is bad, and becomes one row.
+        parts: Tables of one hand. A string is the reason why a file is bad, and becomes one row.
 
     Raises:
-        GraspError: If no part is a table, or they are in different frames.
+        GraspError: If no part is a table, or the tables are in different frames.
     """
     tables = [part for part in parts if isinstance(part, Attempts)]
     if not tables:
@@ -426,7 +431,7 @@ def join_attempts(parts: Sequence[Attempts | str]) -> Attempts:
     if len(frames := {table.frame for table in tables}) > 1:
         raise GraspError(f"files must be in one frame, got {', '.join(sorted(frames))}")
 
-    # The numbers of a bad row do not matter: nobody reads them.
+    # The numbers of a bad row do not matter, because nothing reads them.
     nothing = replace(tables[0].at([0]), objects=("",), said=("",))
     whole = [p if isinstance(p, Attempts) else replace(nothing, invalid=(p,)) for p in parts]
     joined: dict[str, Any] = {}
@@ -448,9 +453,9 @@ def _in_order(
     given: Mapping[str, Any],
     kept: Sequence[Mapping[str, float] | None],
 ) -> dict[str, Array]:
-    """Return joint positions (n, j) by their stage, in the plant's order.
+    """Return joint positions (n, j) in the plant's order, by their stage.
 
-    `kept` has for each row the positions of the joints that its preshape keeps.
+    For each row, `kept` has the positions of the joints that its preshape keeps.
     """
     order = joint_order(hand)
     if unknown := [name for name in joints if name not in order]:
@@ -487,10 +492,10 @@ def _in_order(
 
 
 def _joint_rows(values: Any, shape: tuple[int, int], stage: str, turning: list[bool]) -> Array:
-    """Return joint positions as numbers (n, m), of which those that turn are in radians."""
+    """Return joint positions as numbers (n, m); turning joints must be in radians."""
     rows = _array(values, shape, f"{stage} joints")
 
-    # In degrees most rows have a joint beyond a whole turn.
+    # If the numbers were degrees, most rows would have a joint beyond a whole turn.
     angles = rows[:, turning]
     largest = np.abs(angles[np.isfinite(angles).all(axis=1)]).max(axis=1, initial=0.0)
     if len(largest) and np.median(largest) > 2.0 * np.pi:
@@ -521,9 +526,9 @@ def _numbers(
     some: bool | npt.NDArray[np.bool_] = False,
     each: bool = False,
 ) -> Array:
-    """Return an array of a shape; `bad` gets the reason for each row of it that is not finite.
+    """Return an array of a shape; `bad` gets the reason for each row that is not finite.
 
-    Where `some` (rows) are enough, a row may be all NaN; where `each` is by itself, any number may.
+    A row of the mask `some` may be all NaN. With `each`, any single number may be NaN.
     """
     if value is None:
         return np.full(shape, np.nan)
@@ -542,10 +547,10 @@ def _known_preshapes(
 ) -> tuple[list[str], list[Mapping[str, float] | None]]:
     """Return for each row why the hand lacks its preshape, and the joints that the preshape keeps.
 
-    `palms` (n,) says which rows are palm poses alone.
+    The mask `palms` (n,) selects rows with a palm pose alone.
 
     Raises:
-        GraspError: If they are of another number of rows.
+        GraspError: If `names` has another number of rows.
     """
     count = len(palms)
     if len(names) != count:
@@ -569,10 +574,10 @@ def quaternion_poses(
     """Return poses (n, 4, 4) of positions (n, 3) [m] and quaternions (n, 4) w, x, y, z.
 
     Returns:
-        The poses, NaN where there is none; and for each the reason, empty where there is one.
+        The poses, NaN for an invalid pose; and the reason for each invalid pose, else empty.
 
     Raises:
-        GraspError: If they are no numbers, or of other shapes.
+        GraspError: If the arguments are not numbers, or have other shapes.
     """
     try:
         p, wxyz = np.asarray(positions, dtype=float), np.asarray(quaternions, dtype=float)
@@ -592,7 +597,7 @@ def quaternion_poses(
         else ""
         for i, none in enumerate(bad.tolist())
     ]
-    # In single precision a quaternion is off by some 1e-7.
+    # In single precision, the length of a quaternion is off by about 1e-7.
     X = np.full((len(p), 4, 4), np.nan)
     good = np.flatnonzero(~bad)
     if good.size:
@@ -602,14 +607,14 @@ def quaternion_poses(
 
 
 def xyzw_poses(positions: npt.ArrayLike, quaternions: npt.ArrayLike) -> Array:
-    """Return the poses (n, 4, 4) of `quaternion_poses` if the numbers were meant x, y, z, w."""
+    """Return the poses (n, 4, 4) of `quaternion_poses` if the numbers had the order x, y, z, w."""
     return quaternion_poses(positions, np.roll(np.asarray(quaternions, dtype=float), 1, axis=1))[0]
 
 
 def _poses(
     value: npt.ArrayLike | None, count: int, name: str, bad: list[str], *, some: bool = False
 ) -> Array:
-    """Return poses (n, 4, 4); `bad` gets the reason for each that is not one, see `_numbers`."""
+    """Return poses (n, 4, 4); `bad` gets the reason for each invalid pose, see `_numbers`."""
     array = _numbers(value, (count, 4, 4), name, bad, some=some).copy()
     for i, X in enumerate(array):
         if bad[i] or (some and np.isnan(X).all()):
@@ -624,19 +629,19 @@ def _poses(
 
 
 def unknown_objects(table: Attempts, names: Sequence[str]) -> list[str]:
-    """Return for each row why there is no such object; empty where there is."""
+    """Return for each row the reason why its object does not exist; empty if it exists."""
     known, must = set(names), f"object must be one of {listed(list(names))}"
     return ["" if each in known else f"{must}, got {each!r}" for each in table.objects]
 
 
 def misfits(table: Attempts, name: str, scale: float, poses: Array) -> list[str]:
-    """Return for each row why it does not fit an object that it is of; empty where it does.
+    """Return for each row of an object why it does not fit the object; empty for other rows.
 
     Args:
-        table: Rows, of any objects.
-        name: The object.
-        scale: Metres per unit of length of its mesh file.
-        poses: Its resting poses, (r, 4, 4).
+        table: Rows of any objects.
+        name: Name of the object.
+        scale: Metres per unit of length of the object's mesh file.
+        poses: Resting poses of the object, (r, 4, 4).
     """
     must = f"0 to {len(poses) - 1}" if len(poses) > 1 else "0, the only one"
     found = [""] * len(table)
@@ -659,7 +664,7 @@ def misfits(table: Attempts, name: str, scale: float, poses: Array) -> list[str]
     return found
 
 
-#: What a plan has of postures, beside their palm poses.
+#: Columns of postures that a plan has beside their palm poses.
 _IN_PLAN = ("q_grasp", "q_pregrasp", "q_squeeze", "row", "said", "preshape")
 
 
@@ -672,12 +677,12 @@ def given_candidates(
 
     Args:
         model: The object.
-        X_TO: Its resting poses, (r, 4, 4).
-        table: Its rows.
-        X_OM: Pose of its mesh file's frame in {O}, (4, 4).
-        config: All the rules.
+        X_TO: Resting poses of the object, (r, 4, 4).
+        table: Rows of any objects.
+        X_OM: Pose of the mesh file's frame in {O}, (4, 4).
+        config: The configuration.
     """
-    # Its rows, in {O}; one that names no resting pose is tried in each, one of `EACH` preshape too.
+    # Rows in {O}: one per resting pose if none is named, and one per preshape if `EACH` is named.
     table = table.refuse(misfits(table, model.name, model.scale, X_TO)).of_object(model.name)
     hand = load_hand(config.hand_source)
     tried = [
@@ -706,7 +711,7 @@ def given_candidates(
 
 
 def _posture(rows: Attempts | Table, i: int, X_OG: Array) -> Posture:
-    """Return the posture of a row; NaN stands for a stage that it lacks."""
+    """Return the posture of a row; NaN means that it lacks a stage."""
     grasp, before, after = (
         None if np.isnan(q).any() else q
         for q in (rows.q_grasp[i], rows.q_pregrasp[i], rows.q_squeeze[i])
@@ -720,11 +725,11 @@ def posture_attempts(
     """Yield the attempts of a range of an object's postures; each is one row of the dataset.
 
     Args:
-        candidates: Of the object, with postures.
+        candidates: Candidates of the object, with postures.
         indices: The range.
         hand: The hand.
         name: The object's name.
-        seed: Of the dataset.
+        seed: Seed of the dataset.
     """
     given = candidates.postures
     assert given is not None

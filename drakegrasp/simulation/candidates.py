@@ -1,15 +1,16 @@
 """Stage "sample": palm poses around an object, and the attempts that follow from them.
 
 In: the object's box and mesh, and its resting poses. Out: up to `candidates.max` palm poses X_OG
-and, for each, its resting pose and the distance along its palm ray to the object. Each sampler of
-the registry gives a sequence of poses at a resting pose; resting poses and samplers take turns. The
-first n poses are the same for every `candidates.max` of at least n, so a dataset can grow. The
-paper's method (`rotations`) multiplies a first palm pose with global and local rotations; `normals`
-is the baseline of its Figure 2; a class of the user's own may be another sampler. `children` draws
-poses about that of a grasp that holds.
+and, for each, its resting pose and the distance along its palm ray to the object.
 
-Nothing here needs Drake. Poses are the same bits on every machine: sums, products and square roots
-have a stated order (`arithmetic`), limits are inclusive by more than rounding, poses are compared
+A sampler of the registry yields a sequence of poses at a resting pose. Resting poses and samplers
+take turns. The first n poses are the same for every `candidates.max` of at least n, so a dataset
+can grow. The paper's method (`rotations`) multiplies a first palm pose with global and local
+rotations. `normals` is the baseline of the paper's Figure 2. A user-defined class may be another
+sampler. `children` draws poses around the palm pose of a grasp that holds.
+
+Nothing here needs Drake. Poses are bitwise equal on every machine: sums, products and square roots
+have a fixed order (`arithmetic`), limits are inclusive by more than rounding, poses are compared
 as rounded integers, and random numbers come from `seeding`.
 """
 
@@ -45,16 +46,17 @@ from drakegrasp.simulation.samplers import (
 )
 from drakegrasp.table import Table
 
-#: Surface points that `normals` draws together; another number is another draw.
+#: Number of surface points that `normals` draws together; another number changes the draw.
 BLOCK = 1000
-#: Distance of a palm from the object from which on it must face it [m]; no hand is so large.
+#: Palms farther than this from the object must face it [m]; no hand is so large.
 FAR = 1.0
-#: Log-densities are multiples of this: the last bits of a logarithm depend on the machine.
+#: Log-densities are rounded to multiples of this: the last bits of a logarithm depend on the
+#: machine.
 _DENSITY_GRID = 2.0**-32
-#: Last numbers of the places of streams: of a sampler at a resting pose, of a child, and of the
-#: draw of whom to audit.
+#: Last numbers of the places of streams: for a sampler at a resting pose, for a child, and for the
+#: draw of audited attempts.
 _SAMPLER, _CHILD, _AUDIT = 2, 1, 3
-#: One of so many attempts is lifted in any case, whatever its chance of a sample and its image.
+#: One of this many attempts is lifted regardless of its chance of a sample and its image.
 AUDIT = 10
 
 
@@ -64,16 +66,16 @@ class Candidates:
 
     Attributes:
         X_OG: (n, 4, 4), the drawn poses, in drawing order.
-        distance: (n,), from the palm's origin along +Gz to the object's surface [m]; NaN
-            where the palm ray misses the object.
-        resting: (n,), index of the resting pose of each.
-        source: (n,), `Source` of each.
+        distance: (n,), distance from the palm's origin along +Gz to the object's surface [m]; NaN
+            if the palm ray misses the object.
+        resting: (n,), index of each pose's resting pose.
+        source: (n,), `Source` of each pose.
         log_density: (n,), logarithm of the density of each draw, see the schema.
         combinations: Number of combinations of rotations, or of surface points drawn.
-        valid: Number of those above the table whose palm ray meets the bounding box.
+        valid: Number of combinations above the table whose palm ray meets the bounding box.
         distinct: Number of different poses among the valid ones.
-        postures: Rows of `Attempts`, where they come from outside and not from samplers: `q_grasp`,
-            `q_pregrasp`, `q_squeeze`, `row`, `said` and `preshape`.
+        postures: Columns `q_grasp`, `q_pregrasp`, `q_squeeze`, `row`, `said` and `preshape` of
+            `Attempts`, if the poses come from outside; None if they come from samplers.
     """
 
     X_OG: Array
@@ -91,23 +93,23 @@ class Candidates:
 
 
 class Sampler(Protocol):
-    """A sequence of palm poses of an object at a resting pose, the same however many are taken.
+    """A sequence of palm poses of an object at a resting pose; it does not depend on its length.
 
     Attributes:
-        log_density: Of the draw of each pose, see the schema.
+        log_density: Log-density of the draw of each pose, see the schema.
     """
 
     log_density: float
 
     @property
     def limit(self) -> int | None:
-        """Number of poses that there are; None: any number."""
+        """Number of available poses; None for any number."""
 
     def poses(self, count: int) -> Array:
         """Return the first poses (count, 4, 4)."""
 
     def counts(self, count: int) -> tuple[int, int, int]:
-        """Return how many combinations, valid and distinct ones the first poses are drawn from."""
+        """Return how many combinations, valid and distinct ones the first poses were drawn from."""
 
 
 class Rotations:
@@ -133,12 +135,12 @@ class Rotations:
 
 
 class Normals:
-    """Poses that look at random surface points, see `normal_candidates`, above the table."""
+    """Poses above the table that look at random surface points, see `normal_candidates`."""
 
     def __init__(
         self, model: ObjectModel, X_TO: Array, config: CandidateConfig, stream: Stream
     ) -> None:
-        """Draw nothing yet; `config` has no say."""
+        """Draw nothing yet; `config` is not used."""
         self._model, self._X_TO, self._stream = model, X_TO, stream
         self._poses, self._numbers, self._drawn = np.zeros((0, 4, 4)), np.zeros(0, dtype=int), 0
         self.limit: int | None = None
@@ -146,7 +148,7 @@ class Normals:
 
     def poses(self, count: int) -> Array:
         """Return the first poses (count, 4, 4)."""
-        # A solid has faces that look up, and the palms above them are above the table.
+        # A solid has faces that look up, and palms above these faces are above the table.
         while len(self._poses) < count:
             poses = normal_candidates(self._model, BLOCK, self._stream)
             above = np.flatnonzero(above_table(poses[:, :3, 3], self._X_TO))
@@ -156,7 +158,7 @@ class Normals:
         return self._poses[:count]
 
     def counts(self, count: int) -> tuple[int, int, int]:
-        """Return the number of surface points up to the last pose, and twice that of the poses."""
+        """Return the number of surface points up to the last pose; number of poses, twice."""
         return int(self._numbers[count - 1]) + 1 if count else 0, count, count
 
 
@@ -167,14 +169,14 @@ def sample_candidates(
 
     Args:
         model: The object.
-        X_TO: Its resting poses in the table-top frame, (r, 4, 4), or one (4, 4).
-        config: Samplers, rotations and number.
-        seed: Of the dataset.
+        X_TO: Resting poses in the table-top frame, (r, 4, 4), or one pose (4, 4).
+        config: Samplers, rotations and number of poses.
+        seed: Seed of the dataset.
 
     Raises:
-        ConfigError: If a sampler of the user's own cannot be run, or all its poses are far away.
+        ConfigError: If a user-defined sampler cannot be run, or all its poses are far away.
     """
-    # A sampler for each method at each resting pose; they take turns.
+    # One sampler for each method at each resting pose; they take turns.
     resting = np.asarray(X_TO, dtype=float).reshape(-1, 4, 4)
     places = [(k, method) for method in config.methods for k in range(len(resting))]
     samplers = {
@@ -185,7 +187,7 @@ def sample_candidates(
     }
     turns = _turns(places, {place: s.limit for place, s in samplers.items()}, config.max)
 
-    # What each of them gives, in the order of the turns.
+    # The poses of each sampler, in the order of the turns.
     used = Counter(place for place, _ in turns)
     drawn = {place: sampler.poses(used[place]) for place, sampler in samplers.items()}
     poses = np.array([drawn[place][i] for place, i in turns]).reshape(-1, 4, 4)
@@ -208,10 +210,10 @@ def sample_candidates(
 
 
 def _refuse_far(method: str, model: ObjectModel, poses: Array, distance: Array) -> None:
-    """Refuse a sampler of the user's own whose palms are all far away and do not face the object.
+    """Reject a user-defined sampler whose palms are all far away and do not face the object.
 
     Raises:
-        ConfigError: If it is one, with the distance of the nearest.
+        ConfigError: If all palms are, with the distance of the nearest palm.
     """
     if not len(poses) or np.isfinite(distance).any():
         return
@@ -227,12 +229,13 @@ def _refuse_far(method: str, model: ObjectModel, poses: Array, distance: Array) 
 def found_sampler(
     method: str, config: CandidateConfig
 ) -> Callable[[ObjectModel, Array, CandidateConfig, Stream], Sampler]:
-    """Return the sampler of a name: one of the registry, or of the user's own.
+    """Return the sampler of a name: a registered or a user-defined sampler.
 
-    Another package may give a class such as the user's own, which takes (model, X_TO, stream).
+    Another package may register a class with the signature of user-defined samplers,
+    (model, X_TO, stream).
 
     Raises:
-        ConfigError: If it cannot be imported, or is of another signature.
+        ConfigError: If the sampler cannot be imported or has another signature.
     """
     if is_own_class(method):
         return partial(OwnPoses, method, own_sampler(method, config.code))
@@ -246,30 +249,30 @@ def found_sampler(
 
 
 def _source(method: str) -> Source:
-    """Return what is stored of a sampler."""
+    """Return the `Source` that is stored for a sampler."""
     return {"rotations": Source.ROTATIONS, "normals": Source.NORMALS}.get(method, Source.OWN)
 
 
 def _sampler_stream(name: str, seed: int, resting: int, method: str) -> Stream:
     """Return the random numbers of a sampler at a resting pose of an object."""
-    # The paper's draw has the object's own stream.
+    # The paper's method uses the object's first stream.
     if (resting, method) == (0, "rotations"):
         return Stream(seed, object_key(name))
     place = (resting, _source(method), _SAMPLER)
     if _source(method) is not Source.OWN:
         return Stream(seed, object_key(name), *place)
-    # Two samplers of the user's own do not share their numbers, and a new digest changes none.
+    # Two user-defined samplers do not share numbers, and a new digest of a file changes no numbers.
     return Stream(seed, object_key(name), *place, object_key(method.partition("@")[0]))
 
 
 def _turns(
     places: Sequence[tuple[int, str]], limits: Mapping[tuple[int, str], int | None], count: int
 ) -> list[tuple[tuple[int, str], int]]:
-    """Return whose turn each pose is, and its number there, until none has more.
+    """Return the place of each pose's sampler and the pose's index there, until none has more.
 
     Args:
-        places: Who takes turns; one that is named twice has two.
-        limits: How many poses each has; None: any number.
+        places: The places that take turns; a place that is named twice has two turns.
+        limits: Number of poses of each place; None for any number.
         count: Number of turns.
     """
     turns: list[tuple[tuple[int, str], int]] = []
@@ -289,8 +292,9 @@ def _turns(
 def normal_candidates(model: ObjectModel, count: int, stream: Stream) -> Array:
     """Return poses (n, 4, 4) that look at random surface points against their normals.
 
-    The points are uniform over the area, the roll about the normal is uniform, and the palm is two
-    half diagonals of the box away, outside of the object. Each takes four numbers of the stream.
+    The points are uniform over the surface area and the roll about the normal is uniform. The palm
+    is two half diagonals of the box away from its point, outside the object. Each pose takes four
+    numbers of the stream.
     """
     # Random points of the surface, with the outward normals of their faces.
     vertices, faces = model.visual_vertices, model.visual_faces.astype(np.int64)
@@ -311,7 +315,7 @@ def normal_candidates(model: ObjectModel, count: int, stream: Stream) -> Array:
 
 
 def palm_ray_distance(mesh: trimesh.Trimesh, X_OG: Array) -> Array:
-    """Return the distance (n,) [m] along +Gz to the mesh's surface; NaN where it is missed."""
+    """Return the distance (n,) [m] along +Gz to the mesh's surface; NaN for a ray that misses."""
     distance = first_hits(np.asarray(mesh.triangles), X_OG[:, :3, 3], X_OG[:, :3, 2])
     return np.where(np.isfinite(distance), distance, np.nan)
 
@@ -328,12 +332,12 @@ def standoff_attempts(
     """Yield the attempts of a range of an object's candidates; each is a row of the dataset.
 
     Args:
-        candidates: Of the object.
+        candidates: Candidates of the object.
         indices: The range.
         config: Stand-offs and spreads.
         name: The object's name.
-        seed: Of the dataset; with name and candidate it decides spreads and preshapes.
-        preshapes: Number of the hand's preshapes.
+        seed: Seed of the dataset; with name and candidate it decides spreads and preshapes.
+        preshapes: Number of preshapes of the hand.
     """
     spreads, standoffs = np.deg2rad(config.spreads_deg), config.standoffs
     for i in indices:
@@ -365,13 +369,13 @@ def standoff_attempts(
 
 
 def children(parent: Attempt, config: RefineConfig, *, name: str, seed: int) -> list[Attempt]:
-    """Return the attempts about the palm pose of one that holds, none in the last generation.
+    """Return the attempts around the palm pose of an attempt that holds.
 
     Args:
-        parent: The attempt.
-        config: How many, and how far away.
+        parent: The attempt that holds; if it is of the last generation, it has no children.
+        config: Number of children, and their distances.
         name: The object's name.
-        seed: Of the dataset.
+        seed: Seed of the dataset.
     """
     if parent.generation >= config.generations:
         return []
@@ -406,15 +410,15 @@ def _child(parent: Attempt, number: int, config: RefineConfig, *, name: str, see
 
 
 def is_audited(seed: int, *place: int) -> bool:
-    """Return whether an attempt is audited: object, candidate, stand-off and child decide."""
+    """Return whether an attempt is audited, given its object, candidate, stand-off and child."""
     return int(Stream(seed, *place, _AUDIT).integers(AUDIT, 1)[0]) == 0
 
 
 def palm_motion(numbers: Array, shift: float, turn: float) -> Array:
-    """Return a random pose (4, 4) of a palm in its frame before.
+    """Return a random pose (4, 4) of a palm in its frame before the motion.
 
     Args:
-        numbers: (6,), normal numbers: along the axes, then about them.
+        numbers: (6,), normal random numbers: along the axes, then about the axes.
         shift: Standard deviation along each axis [m].
         turn: Standard deviation of each component of the rotation vector [rad].
     """

@@ -1,11 +1,11 @@
 """The conditions of an attempt: what may differ between two attempts at the same palm pose.
 
-Values in use, not factors: where nothing is drawn they are the configuration's and the object's
-own. Plain data without Drake.
+The values are absolute, not factors. Values that are not drawn are those of the configuration and
+the object. This is plain data without Drake.
 
-What is drawn follows from the seed and the attempt's own numbers alone. Each attempt has a stream
-of random words, and each quantity words of its own in it: whether one quantity is drawn changes
-none of the others. All is elementary arithmetic, so it is the same on every machine
+Drawn values depend only on the seed and the attempt's numbers. Each attempt has a stream of random
+words, and each quantity has its own words in it, so drawing one quantity does not change the
+others. Only elementary arithmetic is used, so the values are the same on every machine
 (docs/explanation/determinism.md).
 """
 
@@ -27,11 +27,11 @@ from drakegrasp.vision.depth_sensor import DepthSensor
 
 @dataclass(frozen=True, kw_only=True)
 class Materials:
-    """Friction and mass: what the simulation of an attempt depends on.
+    """Friction and mass: the conditions that the simulation of an attempt depends on.
 
     Attributes:
         friction_hand, friction_table: Effective coefficients of the object with hand and table.
-        mass: Of the object [kg]; its inertia is in proportion.
+        mass: Mass of the object [kg]; its inertia scales with it.
     """
 
     friction_hand: float
@@ -46,8 +46,8 @@ class Conditions:
     Attributes:
         materials: Friction and mass.
         appearance: Colours and light.
-        X_C0C: Pose (4, 4) of the oto camera in its usual pose.
-        sensor: Errors of the depth images.
+        X_C0C: Pose (4, 4) of the oto camera relative to its usual pose.
+        sensor: Error model of the depth images.
     """
 
     materials: Materials
@@ -56,7 +56,7 @@ class Conditions:
     sensor: DepthSensor
 
     def values(self) -> dict[str, Any]:
-        """Return the values that a dataset keeps, by their names in its schema."""
+        """Return the values that a dataset stores, by their names in its schema."""
         return {
             **asdict(self.materials),
             **vars(self.appearance),
@@ -67,7 +67,7 @@ class Conditions:
 
 
 def usual_materials(model: ObjectModel, physics: PhysicsConfig) -> Materials:
-    """Return the friction and mass of an object's attempts where nothing is drawn."""
+    """Return the friction and mass of an object's attempts if nothing is drawn."""
     physics = model.own_physics(physics)
     return Materials(
         friction_hand=physics.friction_hand,
@@ -77,7 +77,7 @@ def usual_materials(model: ObjectModel, physics: PhysicsConfig) -> Materials:
 
 
 def usual_conditions(model: ObjectModel, physics: PhysicsConfig) -> Conditions:
-    """Return the conditions of an object's attempts where nothing is drawn."""
+    """Return the conditions of an object's attempts if nothing is drawn."""
     return Conditions(
         materials=usual_materials(model, physics),
         appearance=usual_appearance(model.name),
@@ -86,7 +86,7 @@ def usual_conditions(model: ObjectModel, physics: PhysicsConfig) -> Conditions:
     )
 
 
-#: The words of each quantity in an attempt's stream; their places are part of the seed's meaning.
+#: The words of each quantity in an attempt's stream. The same seed means other values if they move.
 WORDS = {
     "object_colour": slice(0, 3),
     "table_colour": slice(3, 6),
@@ -99,21 +99,21 @@ WORDS = {
     "friction_table": slice(17, 18),
     "mass": slice(18, 19),
 }
-#: Last number of the place of an attempt's stream; streams of other things have other ones.
+#: Last number of the place of an attempt's stream; other streams have other last numbers.
 _PLACE = 0
 
 
 def draw_conditions(
     model: ObjectModel, config: Config, candidate: int, standoff_index: int, child: int = 0
 ) -> Conditions:
-    """Return the conditions of an attempt; those that nothing is drawn for are the usual ones.
+    """Return the conditions of an attempt; values that are not drawn are the usual ones.
 
     Args:
-        model: The object; its own mass and colour are what factors and shares apply to.
+        model: The object; factors apply to its mass, and fractions to its colour.
         config: What is drawn, and the seed.
         candidate: Index of the attempt's candidate.
-        standoff_index: Index of its stand-off.
-        child: Its number in the family of that first-round attempt.
+        standoff_index: Index of the attempt's stand-off.
+        child: Number of the attempt in the family of that first-round attempt.
     """
     place = (candidate, standoff_index, child) if child else (candidate, standoff_index)
     stream = Stream(config.seed, object_key(model.name), *place, _PLACE)
@@ -121,7 +121,7 @@ def draw_conditions(
 
 
 def conditions_from(stream: Stream, model: ObjectModel, config: Config) -> Conditions:
-    """Return conditions that a stream gives, see `draw_conditions`."""
+    """Return the conditions that a stream yields, see `draw_conditions`."""
     usual, rules = usual_conditions(model, config.physics), config.randomize
     if rules == RandomizeConfig():
         return usual
@@ -165,12 +165,12 @@ def _appearance(usual: Appearance, rules: RandomizeConfig, drawn: dict[str, Arra
 
 
 def _between(limits: tuple[float, float] | None, number: Array, otherwise: float) -> float:
-    """Return the number (1,) in 0..1 laid over a range; `otherwise` where there is no range."""
+    """Return a number (1,) in 0..1 mapped to a range; `otherwise` if there is no range."""
     return otherwise if limits is None else limits[0] + (limits[1] - limits[0]) * float(number[0])
 
 
 def _mixed(own: Array, random: Array, share: float) -> Array:
-    """Return a colour (3,) with a share of a random one."""
+    """Return a colour (3,) mixed with a fraction of a random colour."""
     return np.asarray((1.0 - share) * own + share * random)
 
 
@@ -178,7 +178,7 @@ def _turned_light(direction: Array, angle_deg: float, numbers: Array) -> Array:
     """Return a unit vector (3,), uniform over the cap of half angle `angle_deg` about another."""
     if not angle_deg:
         return direction
-    # Two directions across; the light is never along x.
+    # Two directions across the light; the light is never along x.
     across = np.cross(direction, [1.0, 0.0, 0.0])
     across /= norm(across)
     other = np.cross(direction, across)
@@ -193,7 +193,7 @@ def _turned_light(direction: Array, angle_deg: float, numbers: Array) -> Array:
 
 
 def _camera_jitter(rules: RandomizeConfig, drawn: dict[str, Array]) -> Array:
-    """Return X_C0C (4, 4): shifts along, then turns about, the axes x, y, z of the camera."""
+    """Return X_C0C (4, 4): shifts along the camera's axes x, y, z, then turns about them."""
     shift = rules.camera_shift * (2.0 * drawn["camera_shift"] - 1.0)
     angles = np.deg2rad(rules.camera_turn_deg) * (2.0 * drawn["camera_turn"] - 1.0)
     R = np.eye(3)

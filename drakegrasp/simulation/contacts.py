@@ -1,18 +1,19 @@
 """Drake's contact results as the contacts of a grasp, in the object's frame.
 
 The contact of a fingertip is the union of all hydroelastic patches between its pad and the object.
-A patch whose pressure is mostly on the hand file's pad region is the fingertip's as a whole. One
-that is mostly beside it is split by the centroids of its faces, and its rest counts as a contact of
-another link. The contact's point is the pressure-weighted centre of the patches. Its normal is the
-pressure-weighted mean of the face normals and points out of the object. Both belong to the rigid
-object's surface, because a patch of a rigid and a compliant body is a piece of the rigid surface.
+A patch whose pressure is mostly on the hand file's pad region counts for the fingertip as a whole.
+A patch that is mostly beside the region is split by the centroids of its faces, and the part beside
+the region counts as a contact of another link. The contact's point is the pressure-weighted centre
+of the patches. Its normal is the pressure-weighted mean of the face normals and points out of the
+object. Both belong to the rigid object's surface, because a patch between a rigid and a compliant
+body is a piece of the rigid surface.
 
-`Way` tells how near the hand comes to the table: the least height of its collision shapes above the
-table's top over the way between the states in which the scene was looked at. It reads positions
-only, so the simulation is the same with and without it. Between two looks each joint moves one way,
-and a link depends on the joints of its own finger, which move in fixed ratios: a straight way from
-state to state in the space of the joints passes through all postures of each finger, whichever
-finger was faster.
+`Way` computes how close the hand comes to the table: the smallest height of its collision shapes
+above the table's top on the way between the observed states of the scene. It only reads positions,
+so the simulation is the same with and without it. Between two observations, each joint moves in one
+direction. A link depends only on the joints of its own finger, which move in fixed ratios. A
+straight line from state to state in joint space therefore passes through all postures of each
+finger, no matter which finger was faster.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from drakegrasp.simulation.scene import (
     palm_pose,
 )
 
-#: Largest share of a patch's pressure that may lie beside the pad of a fingertip's contact; own
+#: Largest fraction of a patch's pressure that may lie beside the pad of a fingertip's contact; own
 #: choice, see docs/explanation/physics.md, "Pads".
 MAX_BESIDE = 0.5
 
@@ -51,14 +52,14 @@ class Contacts:
     Attributes:
         touching: (k,) bool, whether the pad of fingertip i presses on the object with more force
             than `physics.contact_force`.
-        p_OQ: (k, 3), contact point of each fingertip in {O} [m]; NaN where not touching.
-        nhat_Q_O: (k, 3), unit normal out of the object in {O}; NaN where not touching.
-        f_Q_O: (k, 3), force of the fingertip on the object in {O} [N]; 0 where not touching.
-        area: (k,), area of the patches [m^2]; 0 where not touching.
-        penetration: (k,), largest depth of the object's surface in the fingertip [m]; 0 where not
+        p_OQ: (k, 3), contact point of each fingertip in {O} [m]; NaN if not touching.
+        nhat_Q_O: (k, 3), unit normal out of the object in {O}; NaN if not touching.
+        f_Q_O: (k, 3), force of the fingertip on the object in {O} [N]; 0 if not touching.
+        area: (k,), area of the patches [m^2]; 0 if not touching.
+        penetration: (k,), largest depth of the object's surface in the fingertip [m]; 0 if not
             touching.
-        other_links: Number of links of the hand that touch the object beside the pads; a fingertip
-            link whose patch is mostly beside its pad is one.
+        other_links: Number of links of the hand that touch the object beside the pads, including
+            fingertip links whose patch is mostly beside the pad.
         hand_on_table, object_on_table: Whether hand and object touch the table.
         table_force: (3,), force of the table on the object in {W} [N].
         point_contacts: Number of point contacts (not hydroelastic) that involve the object.
@@ -78,7 +79,7 @@ class Contacts:
 
 
 def read_contacts(scene: Scene) -> Contacts:
-    """Return the contacts of the scene now; contacts weaker than the limit do not count."""
+    """Return the present contacts of the scene; contacts weaker than the limit do not count."""
     results = scene.plant.get_contact_results_output_port().Eval(scene.context)
     reader = _Reader(scene)
     for i in range(results.num_hydroelastic_contacts()):
@@ -90,14 +91,14 @@ def read_contacts(scene: Scene) -> Contacts:
 
 
 def table_force(scene: ObjectScene) -> Array:
-    """Return the force (3,) of the table on the object now, in {W} [N]."""
+    """Return the present force (3,) of the table on the object, in {W} [N]."""
     return _forces_on_object(scene).get(scene.table.index(), np.zeros(3))
 
 
 def bodies_on_object(scene: ObjectScene) -> set[BodyIndex]:
-    """Return the bodies that touch the object now with more than `physics.contact_force`.
+    """Return the bodies that now touch the object with more than `physics.contact_force`.
 
-    These are the contacts of `read_contacts`, without points, normals and areas.
+    These are the bodies of the contacts of `read_contacts`, without points, normals and areas.
     """
     limit = scene.physics.contact_force
     forces = _forces_on_object(scene)
@@ -121,15 +122,15 @@ def _forces_on_object(scene: ObjectScene) -> dict[BodyIndex, Array]:
 def open_hand_collides(scene: Scene) -> bool:
     """Return whether a part of the hand intersects object or table, or is inside the object.
 
-    This is a geometry query without a contact solve. Where surfaces intersect, Drake returns
-    contact surfaces. A part that is wholly inside the object has none, so a point inside each part
-    is tested against the object's volume as well.
+    This is a geometry query without a contact solve. Drake returns contact surfaces if surfaces
+    intersect. A part that is completely inside the object has no contact surface, so a point inside
+    each part is also tested against the object's volume.
     """
     return bool(_meetings_of_hand(scene)) or is_inside(scene, _points_in_parts(scene))
 
 
 def open_hand_meets(scene: Scene) -> dict[str, list[str]]:
-    """Return which links of the hand intersect object or table, by "object" and "table"."""
+    """Return the links of the hand that intersect the object and the table, under these keys."""
     names = {scene.object.index(): "object", scene.table.index(): "table"}
     found: dict[str, set[str]] = {name: set() for name in names.values()}
     hand, plant = hand_bodies(scene), scene.plant
@@ -155,7 +156,7 @@ def _meetings_of_hand(scene: Scene) -> list[set[BodyIndex]]:
 
 
 def _points_in_parts(scene: Scene) -> Array:
-    """Return a point (n, 3) inside each part of the hand in {W}, one of which tells if it is in."""
+    """Return one point (n, 3) inside each part of the hand, in {W}."""
     query = scene.plant.get_geometry_query_input_port().Eval(scene.context)
     return np.array([query.GetPoseInWorld(geometry) @ p for geometry, p in scene.parts])
 
@@ -163,7 +164,7 @@ def _points_in_parts(scene: Scene) -> Array:
 def is_inside(scene: ObjectScene, p_WP: Array) -> bool:
     """Return whether any of the points (n, 3) [m] is inside the object's volume.
 
-    Drake's point distance refuses meshes with very sharp edges; winding numbers work on them.
+    Drake's point distance rejects meshes with very sharp edges; winding numbers work on them.
     """
     model = scene.model
     p_OP = transform_points(invert_pose(scene.pose(scene.object)), p_WP)
@@ -199,13 +200,13 @@ class _Reader:
         force_on_M = np.array(info.F_Ac_W().translational())
         grasped, table = scene.object.index(), scene.table.index()
 
-        # Patches without the object: only those of hand and table count.
+        # Of the patches without the object, only those of hand and table count.
         if grasped not in (M, N):
             if table in (M, N) and self._hand & {M, N}:
                 self._hand_table_force += float(norm(force_on_M))
             return
 
-        # Patches with the object: of the table, of a fingertip, or of another link.
+        # The other body of a patch is the table, a fingertip, or another link.
         other = N if grasped == M else M
         force_on_object = force_on_M if grasped == M else -force_on_M
         if other == table:
@@ -221,31 +222,32 @@ class _Reader:
     ) -> None:
         """Add a patch of fingertip i and the object, split into pad and rest of the link.
 
-        Face e of a patch has the area A, the pressure p at its centroid c and the outward normal n
-        of the object; it weighs w_e = A_e p_e. Over the faces of all patches that are the pad's,
+        Face e of a patch has the area A, the pressure p at its centroid c, and the object's outward
+        normal n; its weight is w_e = A_e p_e. Over the faces of all patches that belong to the pad,
 
             point = Σ w_e c_e / Σ w_e,   normal = Σ w_e n_e / |Σ w_e n_e|.
 
-        σ = (Σ_pad w_e) / (Σ w_e) is the pad's share of a patch with the force f on the object. From
-        σ = 1 − `MAX_BESIDE` on the whole patch is the pad's. Below, the pad's force is
+        σ = (Σ_pad w_e) / (Σ w_e) is the pad's fraction of a patch with the force f on the object.
+        If σ is at least 1 − `MAX_BESIDE`, the whole patch belongs to the pad. If not, the pad's
+        force is
 
             f_pad = − Σ_pad w_e n_e + σ (f + Σ w_e n_e):
 
-        the pressure of its own faces, and its share of what friction and damping add to all.
+        the pressure of its own faces, plus its fraction of the forces of friction and damping.
         """
         areas, centres_W, normals_W, pressures, depths = _read_faces(surface, object_is_M)
 
-        # Which faces are on the pad, and how much of the patch they carry.
+        # Find the faces on the pad, and their fraction of the patch.
         tip = self._scene.fingertips[i]
         p_FiQ = transform_points(invert_pose(self._scene.pose(tip)), centres_W)
         on_pad = self._scene.hand.fingers[i].on_pad(p_FiQ)
         weight = areas * pressures
         moment_n = weight[:, None] * normals_W
 
-        # A patch that reaches over the pad's border is the fingertip's as a whole. One that lies
-        # mostly beside the pad is split: its rest is a contact of another link. Drake tells the
-        # force of the whole patch. Its normal part belongs to the faces; friction and damping are
-        # divided as the pressure is.
+        # A patch that reaches over the pad's border belongs to the fingertip as a whole. A patch
+        # that lies mostly beside the pad is split, and its rest is a contact of another link. Drake
+        # reports only the force of the whole patch. The normal part of the force belongs to the
+        # faces, and friction and damping are divided like the pressure.
         share = weight[on_pad].sum() / weight.sum() if weight.any() else 0.0
         if share >= 1.0 - MAX_BESIDE:
             on_pad = np.ones_like(on_pad)
@@ -273,12 +275,12 @@ class _Reader:
             self._hand_on_table = True
 
     def contacts(self) -> Contacts:
-        """Return the contacts of all patches and pairs that were added."""
-        # A fingertip touches where its patches press with enough force.
+        """Return the contacts of all added patches and pairs."""
+        # A fingertip touches if its patches press with enough force.
         limit = self._scene.physics.contact_force
         touching = (norm(self._force_W) > limit) & (self._weight > 0.0)
 
-        # Pressure-weighted means; NaN where nothing touches, or where opposite normals cancel.
+        # Pressure-weighted means; NaN if nothing touches or opposite normals cancel.
         weight = np.where(touching, self._weight, np.nan)[:, None]
         length = norm(self._moment_n)[:, None]
         normal_W = self._moment_n / np.where(touching[:, None] & (length > 0), length, np.nan)
@@ -308,8 +310,8 @@ def _read_faces(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the n faces of a patch on the object.
 
-    The fingertip's pressure p is zero at its surface and grows with the depth below it, so the
-    depth of a face is p / |∇p| to first order.
+    The fingertip's pressure p is zero at its surface and grows with the depth below it. To first
+    order, the depth of a face is therefore p / |∇p|.
 
     Returns:
         Areas (n,) [m^2]; centroids (n, 3) in {W} [m]; unit normals (n, 3) out of the object in {W};
@@ -343,20 +345,20 @@ STEP = 0.02
 
 
 class Way:
-    """The states of a hand in one attempt, from look to look."""
+    """The observed states of a hand in one attempt."""
 
     def __init__(self) -> None:
         self._states: list[Array] = []
         self._scene: Scene | None = None
 
     def look(self, scene: Scene) -> None:
-        """Add the state of the scene now; all scenes are of one hand."""
+        """Add the present state of the scene; all scenes must have the same hand."""
         X_TG = multiply(invert_pose(X_WT), palm_pose(scene))
         self._states.append(np.concatenate([X_TG[2], hand_positions(scene)]))
         self._scene = scene
 
     def clearance(self) -> float:
-        """Return the least height of the hand above the table's top [m]; negative below it."""
+        """Return the smallest height of the hand above the table's top [m]; negative below it."""
         assert self._scene is not None
         states = _between(np.array(self._states))
         names = hand_joint_names(self._scene)
@@ -364,13 +366,13 @@ class Way:
 
 
 def least_height(hand: Hand, names: list[str], q: Array, up_G: Array) -> float:
-    """Return the least height of a hand above the table's top in n postures [m].
+    """Return the smallest height of a hand above the table's top in n postures [m].
 
     Args:
         hand: The hand.
-        names: Of its j joints.
-        q: Their positions (n, j) [rad or m].
-        up_G: The third rows (n, 4) of the palm's poses X_TG.
+        names: Names of its j joints.
+        q: Positions of the joints, (n, j) [rad or m].
+        up_G: Third rows (n, 4) of the palm's poses X_TG.
     """
     lowest, rims = np.inf, link_rims(hand.model)
     for link, X_GL in posed_links(hand, dict(zip(names, q.T, strict=True))).items():
@@ -378,7 +380,7 @@ def least_height(hand: Hand, names: list[str], q: Array, up_G: Array) -> float:
             continue
         up_L, (p, axis) = multiply(up_G[:, None], X_GL), (rims[link][:, :3], rims[link][:, 3:6])
         heights = dot(up_L[..., :3], p) + up_L[..., 3]
-        # The lowest point of a disc is its radius times the sine of its tilt below the centre.
+        # The lowest point of a disc is below its centre by radius times sine of the tilt.
         round_ = rims[link][:, 6] > 0.0
         if round_.any():
             cosine = dot(up_L[..., :3], axis[round_])
@@ -389,7 +391,7 @@ def least_height(hand: Hand, names: list[str], q: Array, up_G: Array) -> float:
 
 
 def _between(states: Array) -> Array:
-    """Return states (m, ...) with steps of at most `STEP` from states (n, 4 + j)."""
+    """Return states (m, ...) that connect states (n, 4 + j) in steps of at most `STEP`."""
     parts = [states[:1]]
     for a, b in pairwise(states):
         count = int(np.ceil(np.abs(b - a)[4:].max() / STEP))

@@ -1,8 +1,8 @@
 """An object at rest on the table, against which grasps are verified.
 
-In: a mesh file, a trimesh or an object that was prepared before. Out: the object and its resting
-pose. Verification simulates at `canonical_pose`, so that no verdict depends on where on the table
-the object stands and how it is turned about the vertical.
+In: a mesh file, a trimesh or a prepared object. Out: the object and its resting pose. Verification
+simulates at `canonical_pose`, so that no verdict depends on where the object stands on the table
+and how it is turned about the vertical.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Placed(Protocol):
 
     @property
     def X_TO(self) -> Array:
-        """Its pose in the table-top frame, (4, 4)."""
+        """Pose of the object in the table-top frame, (4, 4)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,9 +51,9 @@ class PlacedObject:
     Attributes:
         model: Meshes and mass properties.
         X_TO: Pose in the table-top frame, (4, 4).
-        config: The configuration with which it was prepared and dropped; default `paper`.
-        X_OM: Pose (4, 4) of the mesh file's frame in {O}, whose lengths are in metres; None: it is
-            not known, as of an object of a dataset.
+        config: The configuration with which the object was prepared and dropped; default `paper`.
+        X_OM: Pose (4, 4) of the mesh file's frame in {O}, in metres; None if unknown, as for an
+            object of a dataset.
     """
 
     model: ObjectModel
@@ -63,7 +63,7 @@ class PlacedObject:
 
     @cached_property
     def X_TO_simulated(self) -> Array:
-        """Pose (4, 4) moved to the table's centre, without yaw: verdicts depend on neither."""
+        """Pose (4, 4) moved to the table's centre, without yaw; verdicts depend on neither."""
         return canonical_pose(self.X_TO)
 
     def __repr__(self) -> str:
@@ -83,24 +83,24 @@ def place_object(
     """Return an object on the table.
 
     Args:
-        mesh: Path of a mesh file, a mesh, or an object that was placed before. The origin
-            of {O} is the centre of its bounding box, not that of the file.
+        mesh: Path of a mesh file, a mesh, or a placed object. The origin of {O} is the centre of
+            the bounding box, not the origin of the file.
         units: Unit of the mesh's lengths: m, cm or mm; metres if None. An `objects.yaml` beside
             a file wins.
-        X_TO: Pose of the object on the table; dropped as in a build if None.
-        config: Mass, friction and how it settles; that of an object that was placed before, else
-            the defaults, if None.
+        X_TO: Pose of the object on the table; if None, the object is dropped as in a build.
+        config: Mass, friction and settling; if None, the configuration of a placed object, or else
+            the defaults.
 
     Raises:
         MeshError: If the mesh cannot be simulated or does not come to rest.
-        GraspError: If X_TO is no pose or does not stand on the table.
-        ConfigError: If config is not one, or an object was placed before with other values.
+        GraspError: If X_TO is not a pose or does not put the object on the table.
+        ConfigError: If config is not a `Config`, or the object was placed with other values.
     """
     # Check the arguments that do not depend on the kind of mesh.
     config = config_for(mesh, config)
     refuse_units(units or "m")
 
-    # Prepare the object, unless that was done before.
+    # Prepare the object, unless it is already prepared.
     if isinstance(mesh, Placed):
         if units is not None:
             raise MeshError(f"units must be None for a prepared object, got {units!r}")
@@ -126,10 +126,10 @@ def place_object(
 
 
 def config_for(mesh: object, config: Config | None) -> Config:
-    """Return the given configuration, else that of a placed object, else the defaults.
+    """Return the given configuration, or else that of a placed object, or else the defaults.
 
     Raises:
-        ConfigError: If the given one is not a `Config`.
+        ConfigError: If the given configuration is not a `Config`.
     """
     if config is None:
         return mesh.config if isinstance(mesh, PlacedObject) else load_config()
@@ -138,7 +138,7 @@ def config_for(mesh: object, config: Config | None) -> Config:
 
 
 def refuse_no_config(config: object) -> None:
-    """Refuse anything but a `Config`, such as the name of a preset.
+    """Reject anything but a `Config`, such as the name of a preset.
 
     Raises:
         ConfigError: If `config` is not a `Config`.
@@ -150,10 +150,10 @@ def refuse_no_config(config: object) -> None:
 
 
 def refuse_other_objects(config: Config, known: Config, must_be: str) -> None:
-    """Refuse a configuration that prepares and drops objects differently from a known one.
+    """Reject a configuration that prepares and drops objects differently from a known one.
 
     Raises:
-        ConfigError: If its section `objects` or `settle` differs.
+        ConfigError: If the section `objects` or `settle` differs.
     """
     for name in ("objects", "settle"):
         if getattr(config, name) != getattr(known, name):
@@ -161,19 +161,20 @@ def refuse_other_objects(config: Config, known: Config, must_be: str) -> None:
 
 
 def canonical_pose(X_TO: Array) -> Array:
-    """Return the pose (4, 4) that differs from X_TO by yaw and by a shift on the table only.
+    """Return the pose (4, 4) that differs from X_TO only by yaw and by a shift on the table.
 
-    Its position is over the table's centre, and its rotation is the smallest one with the same up
-    direction in {O} as X_TO. In closed form: SciPy's `Rotation.align_vectors` calls LAPACK, whose
-    bits depend on the CPU, and has no defined answer upside down.
+    Its position is over the table's centre. Its rotation is the smallest rotation with the same up
+    direction in {O} as X_TO. It is computed in closed form, because SciPy's
+    `Rotation.align_vectors` calls LAPACK, whose bits depend on the CPU, and is not defined for an
+    upside-down pose.
     """
     up = X_TO[2, :3]
     axis = np.cross(up, [0.0, 0.0, 1.0])
     x, y, z = axis
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
-    # Rodrigues' formula R = 1 + K + K K / (1 + cos), with |axis| = sin and up_z = cos. Where cos is
-    # negative, 1 + cos = sin^2 / (1 - cos) avoids cancellation; upside down R is half a turn about
+    # Rodrigues' formula R = 1 + K + K K / (1 + cos), with |axis| = sin and up_z = cos. If cos is
+    # negative, 1 + cos = sin^2 / (1 - cos) avoids cancellation. Upside down, R is half a turn about
     # x.
     upright = 1.0 + up[2] if up[2] > 0.0 else axis @ axis / (1.0 - up[2])
     R = np.eye(3) + K + K @ K / upright if upright > 1e-20 else np.diag([1.0, -1.0, -1.0])

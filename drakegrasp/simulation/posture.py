@@ -1,10 +1,10 @@
-"""Postures: a wrist pose with the positions of all joints or alone, and the trial that follows.
+"""Postures: a wrist pose with or without the positions of all joints, and the trial of a posture.
 
-In: what a network or another tool says of a grasp. Out: a `Posture`, checked and held in {O}, from
-it the `Attempt` of a trial, and the trial of one on an object. A wrist pose alone closes from the
-open hand, as an attempt of a sampler does. Where joints follow the couplings of the hand file, the
-hand's own motors close it, as they close every attempt. Where they do not, each joint has a motor
-of its own, which goes from the pregrasp to the grasp and on to the squeeze.
+In: what a network or another tool states about a grasp. Out: a `Posture`, checked and in {O}; the
+`Attempt` of its trial; and its trial on an object. If a wrist pose has no joints, the open hand
+closes, as in an attempt of a sampler. If the joints follow the couplings of the hand file, the
+hand's own motors close the hand, as in every attempt. Otherwise each joint has its own motor, which
+moves from the pregrasp to the grasp and on to the squeeze.
 """
 
 from __future__ import annotations
@@ -32,35 +32,36 @@ from drakegrasp.simulation.trial import TrialRecord, run_attempt
 Frame = Literal["object", "table", "camera", "world"]
 FRAMES: tuple[str, ...] = get_args(Frame)
 
-#: A coupled joint this far from where the hand file has it, and a spread joint this far from
-#: another, is still as the hand file says, in the unit of its finger.
+#: A joint follows the hand file if it is at most this far from where the file has it (coupled
+#: joint) or from another spread joint, in units of its finger's closing joint.
 COUPLED = np.deg2rad(1.0)
-#: By so much fingers are opened where a posture has no pregrasp, in the unit of a closing joint.
+#: Without a pregrasp, fingers are opened by this, in units of a closing joint.
 OPENED = np.deg2rad(20.0)
-#: Where a posture has no squeeze, the joint that moved most from the pregrasp to the grasp moves
-#: on by so much, and the others in proportion; 1 rad as 0.1 m of a slide.
+#: Without a squeeze, the joint that moved most from the pregrasp to the grasp moves on by this, and
+#: the others in proportion. A slide of 0.1 m is treated as equal to 1 rad.
 SQUEEZED = np.deg2rad(20.0)
-#: A rotation that is off by less is exact but for rounding.
+#: A rotation with a smaller error is exact except for rounding.
 EXACT = 1e-12
-#: What a pregrasp or a squeeze must be.
+#: Requirement for a pregrasp or a squeeze, in messages.
 BESIDE_GRASP = "given beside q_grasp, got it alone"
-#: A closing joint this near to zero is that of the open hand [rad or m].
+#: A closing joint this close to zero is open [rad or m].
 OPEN = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """A wrist pose and joint positions of a hand of j joints, in the plant's order.
+    """A wrist pose and joint positions of a hand with j joints, in the plant's order.
 
-    The order is that of the stored `closed_q`: `joint_order` names the joints. Without joints the
+    The order is that of the stored `closed_q`; `joint_order` names the joints. Without joints, the
     hand closes from its open posture.
 
     Attributes:
         X_OG: Pose of the palm (4, 4).
-        q_grasp: (j,), when the fingers hold the object [rad or m]; None: not told.
-        q_pregrasp: (j,), where the trial begins; None: the grasp, opened by 20 degrees.
-        q_squeeze: (j,), the target of motors that press; None: beyond the grasp.
-        preshape: Name of the hand's preshape, whose fingers alone close and must touch; None: all.
+        q_grasp: (j,), positions in which the fingers hold the object [rad or m]; None if unknown.
+        q_pregrasp: (j,), start of the trial; None for the grasp, opened by 20 degrees.
+        q_squeeze: (j,), target of the motors, which press; None for a target beyond the grasp.
+        preshape: Name of the hand's preshape, whose fingers alone close and must touch; None if all
+            fingers close.
     """
 
     X_OG: Array
@@ -87,20 +88,20 @@ def make_posture(
 
     Args:
         hand: The hand.
-        X_FG: Pose of the palm (4, 4) in the frame; (3, 4) or (12,) will do.
-        q_grasp: (j,), joint positions of the grasp [rad or m]; None: the open hand closes.
-        q_pregrasp: (j,), where the trial begins.
-        q_squeeze: (j,), where the motors press to.
+        X_FG: Pose of the palm in the frame, (4, 4); (3, 4) and (12,) are also accepted.
+        q_grasp: (j,), joint positions of the grasp [rad or m]; None if the open hand closes.
+        q_pregrasp: (j,), start of the trial.
+        q_squeeze: (j,), target of the motors beyond the grasp.
         frame: "object" {O}, "table" {T}, "camera" {C} or "world" {W}.
         X_TO: Pose of the object on the table, (4, 4), for any frame but "object".
         X_TC: Pose of the camera in the table-top frame, (4, 4), for the frame "camera".
-        joints: Names of the joints in the order of the vectors; the plant's order if None.
-        preshape: Name of one of the hand's preshapes; None: all fingers close.
+        joints: Names of the joints in the order of the vectors; None for the plant's order.
+        preshape: Name of one of the hand's preshapes; None if all fingers close.
 
     Raises:
-        GraspError: If a pose is not one, a vector has another length or is not finite, a pregrasp
-            or a squeeze is without a grasp, a joint is missing, the hand has no such preshape, or
-            the frame is unknown or lacks its pose.
+        GraspError: If a pose is invalid, a vector has another length or is not finite, a pregrasp
+            or a squeeze is given without a grasp, a joint is missing, the hand has no such
+            preshape, or the frame is unknown or lacks its pose.
     """
     preshape_index(hand, preshape)
     vectors = {"q_grasp": q_grasp, "q_pregrasp": q_pregrasp, "q_squeeze": q_squeeze}
@@ -157,10 +158,10 @@ def _frame_in_object(frame: str, X_TO: npt.ArrayLike | None, X_TC: npt.ArrayLike
 
 
 def exact_pose(X: npt.ArrayLike, name: str) -> Array:
-    """Return one pose (4, 4) with an exact rotation; one that has it already keeps its bits.
+    """Return one pose (4, 4) with an exact rotation; an exact pose keeps its bits.
 
     Raises:
-        GraspError: If it is none.
+        GraspError: If X is not a pose.
     """
     pose = read_pose(X, name)
     if pose.shape != (4, 4):
@@ -175,7 +176,7 @@ def joint_order(hand: Hand) -> tuple[str, ...]:
 
 
 def _places(order: Sequence[str], joints: Sequence[str]) -> list[int]:
-    """Return where each of the hand's joints is among given names, each of which may be once."""
+    """Return the index of each of the hand's joints in given names; each must be given once."""
     given = list(joints)
     for joint in order:
         if given.count(joint) != 1:
@@ -192,10 +193,11 @@ def _places(order: Sequence[str], joints: Sequence[str]) -> list[int]:
 def start_of(posture: Posture, hand: Hand) -> Attempt:
     """Return what the trial of a posture starts from.
 
-    The rule: without joints the open hand closes, in the posture's preshape and at the hand's first
-    spread. Else the hand file's motors close the fingers if in every given vector each coupled
-    joint is where its finger's closing joint puts it, and all spread joints agree, within 1 degree.
-    Else each joint has a motor of its own. Fingers that its preshape leaves out have none.
+    The rule has three cases. Without joints, the open hand closes in the posture's preshape and at
+    the hand's first spread. Otherwise the hand file's motors close the fingers if each given vector
+    follows the hand file to within 1 degree: each coupled joint is where its finger's closing joint
+    puts it, and all spread joints agree. If not, each joint has its own motor. Fingers that the
+    preshape leaves out have no motor.
 
     Raises:
         GraspError: If the hand has no such preshape.
@@ -206,20 +208,20 @@ def start_of(posture: Posture, hand: Hand) -> Attempt:
 
 
 def _start_of(posture: Posture, hand: Hand) -> Attempt:
-    """Return what the trial of a posture starts from, of a hand all of whose fingers close."""
+    """Return what the trial of a posture starts from; all fingers of the given hand close."""
     if posture.q_grasp is None:
         return Attempt(X_OG=posture.X_OG, spread=float(np.deg2rad(hand.spreads_deg[0])))
     given = [q for q in (posture.q_pregrasp, posture.q_grasp, posture.q_squeeze) if q is not None]
     start = opened(posture.q_grasp, hand) if posture.q_pregrasp is None else posture.q_pregrasp
     own_motors = not all(follows_couplings(q, hand) for q in given)
     index = {name: i for i, name in enumerate(joint_order(hand))}
-    # Of spread joints that differ, the first.
+    # If spread joints differ, use the first one.
     spread = float(posture.q_grasp[index[hand.spread.joints[0]]]) if hand.spread.joints else 0.0
     spread = float(np.clip(spread, *coordinate_limits(hand)[0]))
     closing = np.array([start[index[finger.closing_joint]] for finger in hand.fingers])
     closing = open_together(hand, np.clip(closing, *coordinate_limits(hand)[1:].T))
 
-    # A posture that the hand file can say is an attempt like any other.
+    # A posture that the hand file can describe is an attempt like any other.
     still = [abs(posture.q_grasp[index[n]] - at) <= OPEN for n, at in hand.preshape.items()]
     if not own_motors and all(still):
         return Attempt(
@@ -228,13 +230,13 @@ def _start_of(posture: Posture, hand: Hand) -> Attempt:
             closing=None if np.abs(closing).max() <= OPEN else closing,
         )
 
-    # Joints that no motor moves are locked where the grasp has them.
+    # Joints without a motor are locked at their positions in the grasp.
     start = start.copy()
     moved = hand.own_motors
     idle = tuple(name for name in hand.joint_names if name not in moved)
     for name in idle if own_motors else hand.locked_joints:
         start[index[name]] = posture.q_grasp[index[name]]
-    # No hand is beyond its limits.
+    # No joint is beyond its limits.
     limits = dict(zip(hand.joint_names, hand.joint_limits, strict=True))
     lower, upper = np.array([limits[name] for name in index]).T
     start, grasp = np.clip(start, lower, upper), np.clip(posture.q_grasp, lower, upper)
@@ -250,7 +252,7 @@ def _start_of(posture: Posture, hand: Hand) -> Attempt:
 
 
 def follows_couplings(q: Array, hand: Hand) -> bool:
-    """Return whether joint positions (j,) are such that the hand file's motors can reach them."""
+    """Return whether the hand file's motors can reach joint positions (j,)."""
     index = {name: i for i, name in enumerate(joint_order(hand))}
     spreads = [q[index[name]] for name in hand.spread.joints]
     if spreads and np.ptp(spreads) > COUPLED:
@@ -266,7 +268,8 @@ def follows_couplings(q: Array, hand: Hand) -> bool:
 def opened(q_grasp: Array, hand: Hand) -> Array:
     """Return the joint positions (j,) of a grasp whose fingers are opened by `OPENED`.
 
-    A closing joint opens by it, coupled joints by their ratios; none beyond its limits.
+    Each closing joint opens by this and coupled joints by their ratios, but not beyond their
+    limits.
     """
     order, q = joint_order(hand), q_grasp.copy()
     least = coordinate_limits(hand)[1:, 0]
@@ -283,7 +286,7 @@ def opened(q_grasp: Array, hand: Hand) -> Array:
 
 
 def squeezed(start: Array, grasp: Array, hand: Hand) -> Array:
-    """Return the joint positions (j,) as far beyond a grasp as `SQUEEZED` says."""
+    """Return the joint positions (j,) that lie beyond a grasp by `SQUEEZED`."""
     order = joint_order(hand)
     slides = np.array([hand.joint_units[name] == "m" for name in order])
     units = np.where(slides, 0.1, 1.0)
@@ -295,17 +298,17 @@ def squeezed(start: Array, grasp: Array, hand: Hand) -> Array:
 def run_trial(placed: PlacedObject, posture: Posture, config: Config | None = None) -> TrialRecord:
     """Close a simulated hand by a posture, lift the object, and return what happened.
 
-    The object is simulated at `PlacedObject.X_TO_simulated`. A closed hand that may lift always
-    does, and until it is certain whether it holds, whatever `lift` says. Contacts are those of the
-    fingers of the posture's preshape.
+    The object is simulated at `PlacedObject.X_TO_simulated`. If the closed hand may lift, it always
+    lifts until it is certain whether it holds, regardless of the section `lift`. Contacts are those
+    of the fingers of the posture's preshape.
 
     Args:
         placed: The object on the table, see `place_object`.
         posture: Wrist and joints, see `make_posture`.
-        config: Hand, physics and lift; that of the placed object if None.
+        config: Hand, physics and lift; None for the configuration of the placed object.
 
     Raises:
-        GraspError: If the posture is not of the hand, or `placed` is no placed object.
+        GraspError: If the posture does not fit the hand, or `placed` is not a placed object.
         ConfigError: If the object was placed with other values, or the hand cannot have the drive.
         HandError: If the hand cannot be used.
     """

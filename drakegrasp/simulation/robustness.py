@@ -1,10 +1,11 @@
 """How much disturbance a grasp tolerates: repeats with noise, and with less friction.
 
-In: an attempt that was lifted. Out: how many of its repeats hold, and would be
-samples, with noise on palm pose, friction and mass; whether it would be a sample at half the time
-step; and the least friction at which it holds without noise, at half the step. Repeats have the
-trial's own step: its error is numerics, and kept separate. The stored lift is not counted.
-The noise depends on the attempt's own seed alone.
+In: an attempt that was lifted. Out: three results. First, how many repeats with noise on palm pose,
+friction and mass hold, and how many of them would be samples. Second, whether the attempt without
+noise would be a sample at half the time step. Third, the smallest friction at which it holds
+without noise, also at half the step. The repeats use the trial's own step, because the error of the
+step is numerical and reported separately. The stored lift is not counted. The noise depends only on
+the attempt's seed.
 """
 
 from __future__ import annotations
@@ -28,18 +29,18 @@ from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.screen import Prediction, centred, predict
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
-#: Finer time step over the trial's, throughout the lift: a grasp that is an artefact of the step
-#: fails.
+#: Finer time step divided by the trial's, throughout the lift; a grasp that is an artefact of the
+#: step fails at the finer one.
 STEP_RATIO = 0.5
-#: Random factors are rounded to multiples of this: the exponential of two C libraries differs by
-#: far less.
+#: Random factors are rounded to multiples of this; exponentials of two C libraries differ by far
+#: less.
 FACTOR_GRID = 2.0**-32
 #: Last number of the place of the stream that decides which attempts are certified.
 _DRAWN = 5
 
 
 def is_drawn(attempt: Attempt, probability: float) -> bool:
-    """Return whether an attempt is certified, which its own seed decides."""
+    """Return whether an attempt is certified; its own seed decides."""
     stream = Stream(attempt.seed, attempt.standoff_index, _DRAWN)
     return bool(stream.uniform(1)[0] < probability)
 
@@ -53,27 +54,29 @@ def certify(
     *,
     held: bool = True,
 ) -> dict[str, float]:
-    """Return how much an attempt bears, by the names of the schema.
+    """Return how much disturbance an attempt tolerates, by the names of the schema.
 
     * `p_hold_repeats`: number of disturbed repeats with a verdict.
     * `p_hold_held`, `p_hold_samples`: number of these that hold, and that would be samples.
-    * `p_hold_half_step`: whether it would be a sample, undisturbed, at half the step: 1 or 0; NaN
-      if that was inconclusive.
-    * `certified_friction`: least coefficient of hand and object at which it holds at half the step,
-      to within the attempt's own / 2^`certify.friction_steps`; inf if it does not hold at its own,
-      NaN if a simulation was inconclusive, or if it was not looked for.
+    * `p_hold_half_step`: 1 if the undisturbed attempt would be a sample at half the step, 0 if not;
+      NaN if the simulation was inconclusive.
+    * `certified_friction`: smallest coefficient of hand and object at which the attempt holds at
+    half
+      the step, to within the attempt's own coefficient / 2^`certify.friction_steps`. It is inf if
+      the attempt does not hold at its own coefficient, and NaN if a simulation was inconclusive or
+      the search was not made.
 
     Args:
         model: The object.
-        X_TO: Its resting pose, (4, 4).
-        attempt: One that was lifted; noise and less friction start from its own friction and mass.
+        X_TO: Resting pose of the object, (4, 4).
+        attempt: A lifted attempt; noise and less friction are relative to its friction and mass.
         config: The rules; `certify` has the number of repeats and the noise.
         is_sample: Returns whether the trial of a repeat would be a sample.
-        held: Whether the attempt holds: only then its least friction is looked for.
+        held: Whether the attempt holds; the smallest friction is searched only if it does.
     """
     # Repeat the attempt with noise; inconclusive repeats do not count.
     known = attempt.conditions or usual_conditions(model, config.physics)
-    config = with_whole_lifts(config)  # whether a grasp holds is the verdict of a whole lift
+    config = with_whole_lifts(config)  # whether a grasp holds is decided by a whole lift
     stream = Stream(attempt.seed, attempt.standoff_index)
     noisy = _noisy(stream, attempt, known, config.certify)
     repeats = [_lift(model, X_TO, each, config) for each in noisy]
@@ -88,7 +91,7 @@ def certify(
     (prediction,) = predict(model, shaped, X_TO, placed, config.screen)
     undisturbed = _lift(model, X_TO, _with_materials(attempt, known), finer, prediction)
 
-    # Search for the least friction; what geometry decides does not depend on friction.
+    # Search for the smallest friction; what geometry decides does not depend on friction.
     highest, friction = known.materials.friction_hand, np.nan
 
     def holds(friction: float) -> bool | None:
@@ -109,14 +112,14 @@ def certify(
 
 
 def least_friction(holds: Callable[[float], bool | None], highest: float, steps: int) -> float:
-    """Return the least friction that holds, by bisection.
+    """Return the smallest friction that holds, by bisection.
 
-    It assumes that a grasp that holds at one coefficient holds at every higher one.
+    It assumes that a grasp that holds at one coefficient also holds at every higher coefficient.
 
     Args:
         holds: Returns whether a grasp holds at a coefficient, None if inconclusive.
         highest: The highest coefficient.
-        steps: Number of times that the interval is halved.
+        steps: Number of bisection steps.
 
     Returns:
         The coefficient; inf if the highest does not hold, NaN if `holds` was inconclusive.
@@ -137,10 +140,10 @@ def least_friction(holds: Callable[[float], bool | None], highest: float, steps:
 def _noisy(
     stream: Stream, attempt: Attempt, known: Conditions, rules: CertifyConfig
 ) -> Iterator[Attempt]:
-    """Yield each repeat of an attempt: with noise on palm pose, friction and mass."""
+    """Yield each repeat of an attempt, with noise on palm pose, friction and mass."""
     materials = known.materials
     for _ in range(rules.repeats):
-        # The order of the draws is part of the seed's meaning: palm, friction, mass.
+        # The same seed must give the same draws, so their order is fixed: palm, friction, mass.
         X_GH = palm_motion(stream.normal(6), rules.palm_noise, np.deg2rad(rules.palm_noise_deg))
         noisy = replace(attempt, X_OG=multiply(attempt.X_OG, X_GH))
         friction = materials.friction_hand * _noise_factor(stream, rules.friction_noise)
@@ -149,13 +152,13 @@ def _noisy(
 
 
 def _with_materials(attempt: Attempt, known: Conditions, **changes: float) -> Attempt:
-    """Return an attempt with another friction or mass than the known one."""
+    """Return an attempt with known conditions, except for changes of friction or mass."""
     materials = replace(known.materials, **changes)
     return replace(attempt, conditions=replace(known, materials=materials))
 
 
 def _noise_factor(stream: Stream, deviation: float) -> float:
-    """Return exp(deviation times a normal number), a multiple of `FACTOR_GRID`."""
+    """Return exp(deviation times a normal number), rounded to a multiple of `FACTOR_GRID`."""
     return round(math.exp(deviation * stream.normal(1)[0]) / FACTOR_GRID) * FACTOR_GRID
 
 
@@ -168,8 +171,8 @@ def _lift(
 ) -> TrialRecord | None:
     """Return the record of an attempt, or None if it is inconclusive.
 
-    `prediction` is what `predict` returns for it, where the caller has it already. A scene in which
-    Drake failed is not used again.
+    `prediction` is the result of `predict` for the attempt, if the caller already has it. A scene
+    in which Drake failed is not used again.
     """
     scene = cached_scene(model, config.physics, config.hand_source, attempt.preshape)
     (attempt,) = centred(model, load_hand(config.hand_source), [attempt])

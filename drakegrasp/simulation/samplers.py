@@ -1,11 +1,12 @@
-"""Palm poses of the paper's rotations, and of a sampler of the user's own.
+"""Palm poses of the paper's rotations, and of user-defined samplers.
 
-The paper's are products of global and local rotations of a first palm pose: the distinct valid
-poses X_OG in a stated order, from the half extents of an object's box, its resting pose, and the
-angles. Relative to the size of the box they are the same for all objects, so without jitter the
-hundreds of thousands of combinations are compared once per process.
+The paper's poses are products of global and local rotations with a first palm pose. The module
+computes the distinct valid poses X_OG in a fixed order, from the half extents of an object's box,
+its resting pose, and the angles. Relative to the size of the box they are the same for all objects.
+Without jitter, the hundreds of thousands of combinations are therefore compared only once per
+process.
 
-A class that the user gives as `file.py:Name` yields poses of its own, which are checked;
+A class that the user gives as `file.py:Name` yields its own poses, which are checked;
 docs/explanation/sampling.md has an example.
 """
 
@@ -28,18 +29,19 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.registry import own_class, run_own
 from drakegrasp.seeding import Stream
 
-#: The first palm's axes in {O}: +Gz looks down onto the object, Gx = Ox.
+#: The first palm's axes in {O}: +Gz points down at the object, Gx = Ox.
 R_OG0 = np.diag([1.0, -1.0, -1.0])
-#: Poses that agree to this in every rotation entry, and in position relative to the object's size,
-#: are one pose: different Euler angles give equal rotations up to rounding.
+#: Two poses are the same if they agree to this in each rotation entry, and in position relative to
+#: the object's size. Different Euler angles give equal rotations only up to rounding.
 SAME_POSE = 1e-6
 #: A palm this far below the table, or a palm ray this far beside the bounding box, is still valid
-#: [m]: far above rounding, far below what matters.
+#: [m]. It is far above rounding errors and too small to matter.
 EDGE = 1e-6
-#: Combinations whose poses are computed together: bounds the memory. With `jitter_deg` it also
-#: decides which word of the stream jitters which angle, so another number is another draw.
+#: Number of combinations whose poses are computed together, which bounds the memory. With
+#: `jitter_deg` it also decides which word of the stream jitters which angle, so another number
+#: changes the draw.
 CHUNK = 131_072
-#: Bits of one rounded entry, -1e6 to 1e6, and how many of them go into one 64-bit integer.
+#: Bits of one rounded entry (-1e6 to 1e6), and number of entries in one 64-bit integer.
 BITS, PER_WORD = 21, 3
 
 Numbers = npt.NDArray[np.int64]
@@ -55,19 +57,19 @@ def rotation_candidates(
 ) -> tuple[Array, int, int]:
     """Return the distinct valid poses of the paper's method, and two counts.
 
-    X_OG = R_global X_OG0 R_local with R = Rx Ry Rz each, and X_OG0 on +Oz at the distance
-    of the box's corner from its centre, looking at it (Veres et al., equation 1). Valid:
-    the palm's origin is above the table and the ray along +Gz meets the box, edges included.
+    X_OG = R_global X_OG0 R_local, with R = Rx Ry Rz each. X_OG0 is on +Oz, as far from the box's
+    centre as its corner, and looks at it (Veres et al., equation 1). A pose is valid if the palm's
+    origin is above the table and the ray along +Gz meets the box, edges included.
 
     Args:
-        half_extents: (3,), of the box about the origin of {O} [m].
+        half_extents: (3,), half extents of the box about the origin of {O} [m].
         X_TO: Resting pose (4, 4).
-        config: The rotations; with `jitter_deg` each angle gets a random addition.
+        config: The rotations; with `jitter_deg`, each angle gets a random addition.
         stream: Draws the jitter.
 
     Returns:
-        Poses (n, 4, 4), sorted by their rotation's entries, row by row, and then by position,
-        as rounded integers; the number of combinations; of valid ones.
+        Poses (n, 4, 4), sorted as rounded integers by the entries of their rotations, row by row,
+        and then by position; the number of combinations; the number of valid combinations.
     """
     half, radius = np.asarray(half_extents, dtype=float), float(norm(half_extents))
     axes_global = (config.global_x_deg, config.global_y_deg, config.global_z_deg)
@@ -75,7 +77,7 @@ def rotation_candidates(
     grids = _angle_grid(axes_global), _angle_grid(axes_local)
     combinations = len(grids[0]) * len(grids[1])
 
-    # With jitter the poses are drawn: compare the valid ones, and keep the first of equal ones.
+    # With jitter, the poses are drawn: compare the valid ones and keep the first of equal ones.
     if config.jitter_deg:
         rotations, positions = [], []
         for R_global, R_local in _jittered(*grids, config.jitter_deg, stream):
@@ -89,7 +91,7 @@ def rotation_candidates(
         first, _ = _distinct(_words(R, p / radius), np.ones(len(R), dtype=np.int64))
         return make_poses(R[first], p[first]), combinations, len(R)
 
-    # Without, equal poses are valid together or not at all: test the first of each.
+    # Without jitter, equal poses are equally valid: test only the first of each set.
     numbers, members = _distinct_combinations(axes_global, axes_local)
     R_global, R_local = map(_rotation_xyz, grids)
     p_OG, R_first = radius * R_global[:, :, 2], R_global * np.diag(R_OG0)
@@ -110,20 +112,20 @@ def make_poses(R: Array, p: Array) -> Array:
 
 
 def above_table(p_OG: Array, X_TO: Array) -> npt.NDArray[np.bool_]:
-    """Return for points (n, 3) in {O} whether they lie above the table or on it."""
+    """Return whether points (n, 3) in {O} lie above the table or on it."""
     return dot(p_OG, X_TO[2, :3]) + X_TO[2, 3] > -EDGE
 
 
 def ray_meets_box(p_OG: Array, z_O: Array, half: Array) -> npt.NDArray[np.bool_]:
-    """Return for rays from (n, 3) along (n, 3) whether they meet the box of half extents (3,)."""
-    # The slab test (Kay and Kajiya 1986) needs exact zeros: they divide to infinity. Rounding may
-    # leave 1e-17 instead.
+    """Return whether rays from (n, 3) along (n, 3) meet the box of half extents (3,)."""
+    # The slab test (Kay and Kajiya 1986) needs exact zeros, because it divides by them to get
+    # infinity. Rounding may leave 1e-17 instead.
     direction = np.where(np.abs(z_O) < 1e-12, 0.0, z_O)
     wide = half + EDGE
     with np.errstate(divide="ignore", invalid="ignore"):
         t1, t2 = (-wide - p_OG) / direction, (wide - p_OG) / direction
 
-    # 0/0, a ray within a slab's face, constrains nothing: fmax and fmin skip the NaN.
+    # 0/0, from a ray within a slab's face, is no constraint: fmax and fmin skip the NaN.
     entry = np.fmax.reduce(np.minimum(t1, t2), axis=1)
     leave = np.fmin.reduce(np.maximum(t1, t2), axis=1)
     return leave >= np.maximum(entry, 0.0)
@@ -134,12 +136,12 @@ def ray_meets_box(p_OG: Array, z_O: Array, half: Array) -> npt.NDArray[np.bool_]
 
 @lru_cache(maxsize=1)
 def _distinct_combinations(global_deg: Axes, local_deg: Axes) -> tuple[Numbers, Numbers]:
-    """Return the first combination (n,) of each distinct pose, and how many (n,) give it.
+    """Return the first combination (n,) of each distinct pose, and its number of combinations (n,).
 
-    Combination i m + j is of the global rotation i and the local rotation j of m. The poses are in
-    the order of `rotation_candidates`.
+    Combination i m + j consists of the global rotation i and the local rotation j of m. The poses
+    are in the order of `rotation_candidates`.
     """
-    # Compare the poses of each chunk, so that fewer are left to compare.
+    # Compare the poses of each chunk first, so that fewer poses are left to compare.
     R_global, R_local = (_rotation_xyz(_angle_grid(axes)) for axes in (global_deg, local_deg))
     total = len(R_global) * len(R_local)
     words, numbers, counts = [], [], []
@@ -152,7 +154,7 @@ def _distinct_combinations(global_deg: Axes, local_deg: Axes) -> tuple[Numbers, 
         numbers.append(start + first)
         counts.append(count)
 
-    # Compare what is left; of equal ones the earliest is the first.
+    # Compare the poses of all chunks; the earliest of equal poses is the first.
     first, members = _distinct(np.concatenate(words), np.concatenate(counts))
     number = np.concatenate(numbers)[first]
     for array in (number, members):
@@ -161,11 +163,11 @@ def _distinct_combinations(global_deg: Axes, local_deg: Axes) -> tuple[Numbers, 
 
 
 def _words(R: Array, p: Array) -> Numbers:
-    """Return poses as integers (n, 4), which are equal and sort as their rounded entries do.
+    """Return poses as integers (n, 4) that are equal and sorted like their rounded entries.
 
     Args:
         R: Rotations (n, 3, 3).
-        p: Positions relative to the object's size (n, 3).
+        p: Positions (n, 3), relative to the object's size.
     """
     entries = np.rint(np.hstack([R.reshape(-1, 9), p]) / SAME_POSE).astype(np.int64)
     a, b, c = np.moveaxis((entries + (1 << BITS - 1)).reshape(-1, 4, 3), 2, 0)
@@ -176,8 +178,8 @@ def _distinct(words: Numbers, weights: Numbers) -> tuple[Numbers, Numbers]:
     """Return the first row (k,) of each set of equal rows, sorted, and its sum of weights (k,).
 
     Args:
-        words: (n, 4).
-        weights: (n,).
+        words: (n, 4), the rows.
+        weights: (n,), weight of each row.
     """
     order = np.lexsort(words.T[::-1])
     new = np.ones(len(order), dtype=np.bool_)
@@ -218,21 +220,21 @@ def _rotation_xyz(angles_deg: Array) -> Array:
 
 
 def own_sampler(stored: str, code: Mapping[str, str]) -> type[Any]:
-    """Return the class of a sampler of the user's own.
+    """Return the class of a user-defined sampler.
 
     Raises:
-        ConfigError: If it cannot be imported, or is of another signature.
+        ConfigError: If the class cannot be imported or has another signature.
     """
     key, arguments = "candidates.method", ("model", "X_TO", "stream")
     return own_class(stored, code, key=key, arguments=arguments, method="poses")
 
 
 class OwnPoses:
-    """The poses that a sampler of the user's own yields, one after the other.
+    """The poses that a user-defined sampler yields, in their order.
 
     Attributes:
-        log_density: The class's own; 0 if it has none.
-        limit: Number of poses that it has, up to `candidates.max`.
+        log_density: Log-density of the class; 0 if it has none.
+        limit: Number of yielded poses, up to `candidates.max`.
     """
 
     def __init__(
@@ -247,15 +249,15 @@ class OwnPoses:
         """Draw the poses.
 
         Args:
-            stored: Its name in the configuration.
+            stored: Name of the sampler in the configuration.
             found: The class.
             model: The object.
-            X_TO: Its resting pose, (4, 4).
+            X_TO: Resting pose of the object, (4, 4).
             config: Number of poses.
-            stream: Its random numbers.
+            stream: Random numbers of the sampler.
 
         Raises:
-            ConfigError: If it cannot be run, or yields something other than poses.
+            ConfigError: If the sampler cannot be run, or yields something other than poses.
         """
         name = stored.partition("@")[0]
         sampler = run_own(stored, found, model, X_TO, stream)
@@ -273,12 +275,12 @@ class OwnPoses:
         return self._poses[:count]
 
     def counts(self, count: int) -> tuple[int, int, int]:
-        """Return the number of poses three times: nothing is known of what was not yielded."""
+        """Return the number of poses three times: poses that were not yielded are unknown."""
         return count, count, count
 
 
 def _pose(name: str, X_OG: npt.ArrayLike) -> Array:
-    """Return what a sampler yielded as a pose (4, 4) with an exact rotation."""
+    """Return the yielded value as a pose (4, 4) with an exact rotation."""
     try:
         X = read_pose(X_OG, name)
     except GraspError as error:

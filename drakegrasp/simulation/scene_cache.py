@@ -1,9 +1,9 @@
-"""The scenes and renderers that a process keeps: building one costs as much as an attempt.
+"""The scenes and renderers that a process caches: building one costs as much as an attempt.
 
-In: an object, and what to simulate or draw it with. Out: its scene or its renderer, built now or
-kept from before. They are known by a digest of what they hold, so a copy of an object shares
-them. Objects under the same physics and hand also share a diagram, see `swap_object`. A scene that
-is reset gives the same bits as a new one, so earlier use changes nothing.
+In: an object, and what to simulate or draw it with. Out: its scene or its renderer, new or cached.
+The keys are digests of the content, so copies of an object share scenes and renderers. Objects
+under the same physics and hand also share a diagram, see `swap_object`. A scene that is reset gives
+the same bits as a new scene, so earlier use changes nothing.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from drakegrasp.simulation.construction import build_scene, swap_object
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.vision.rendering import Renderer, build_renderer
 
-#: How many scenes and renderers are kept: a build needs those of two objects. With those of a hand
-#: in its preshapes, which attempts take in turns, there are as many more.
+#: Number of cached scenes and renderers: a build needs those of two objects. For a hand with
+#: preshapes, between which attempts alternate, one more is cached per preshape.
 KEPT = 4
-#: How many diagrams of scenes are kept, each for one hand and one physics but for its friction; as
-#: many more for preshapes.
+#: Number of cached diagrams, each for one hand and one physics except for its friction; one more
+#: per preshape.
 DIAGRAMS, FRICTIONS = 2, ("friction_hand", "friction_table")
 
 _Kept = TypeVar("_Kept", Scene, Renderer)
 
-#: The last in order is the last used.
+#: The most recently used entry is the last.
 _kept: dict[Hashable, Scene | Renderer] = {}
 _diagrams: dict[Hashable, Scene] = {}
 _lock = threading.Lock()
@@ -53,7 +53,7 @@ def cached_scene(
         source: See `load_hand`.
         preshape: Index of a preshape, see `Hand.at`.
     """
-    # A hand whose files have changed is loaded anew, and is then another key.
+    # A hand whose files have changed is loaded again and becomes another key.
     physics, known = model.own_physics(physics), load_hand(source)
     hand, more = known.at(preshape), len(known.preshapes)
     shape = (model.collision_vertices, model.collision_faces, model.half_extents)
@@ -63,8 +63,8 @@ def cached_scene(
 
 
 def _make_scene(model: ObjectModel, physics: PhysicsConfig, hand: Hand, most: int) -> Scene:
-    """Return the scene of an object, on a diagram that is kept or on a new one of so many."""
-    # An attempt sets friction in the context, so a diagram serves any.
+    """Return the scene of an object on a cached or new diagram; keep at most `most` diagrams."""
+    # An attempt sets friction in the context, so one diagram serves any friction.
     key = physics.model_copy(update=dict.fromkeys(FRICTIONS)), hand
     known = _diagrams.pop(key, None)
     if known is not None:
@@ -76,13 +76,13 @@ def _make_scene(model: ObjectModel, physics: PhysicsConfig, hand: Hand, most: in
 
 
 def cached_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
-    """Return the renderer of an object; use it in the thread that asked for it first."""
+    """Return the renderer of an object; use it only in the thread that first requested it."""
     key = "renderer", _digest(model.name, model.visual_vertices, model.visual_faces), config
     return _cached(key, lambda: build_renderer(model, config))
 
 
 def forget_scenes() -> None:
-    """Drop every scene: one in which Drake failed must not be used again."""
+    """Drop every scene, because a scene in which Drake failed must not be used again."""
     with _lock:
         _diagrams.clear()
         _forget()
@@ -93,7 +93,7 @@ def _cached(key: Hashable, build: Callable[[], _Kept], most: int = KEPT) -> _Kep
         kept = _kept.pop(key, None)
         if kept is None:
             while len(_kept) >= most:
-                # The diagram of a scene stays, and its context goes by itself.
+                # The diagram of a scene stays, and its context is freed without help.
                 if isinstance(_kept.pop(next(iter(_kept))), Renderer):
                     gc.collect()
             kept = build()
@@ -102,16 +102,16 @@ def _cached(key: Hashable, build: Callable[[], _Kept], most: int = KEPT) -> _Kep
 
 
 def _forget(plant: MultibodyPlant | None = None) -> None:
-    """Drop the scenes of a plant, or all."""
+    """Drop the scenes of a plant, or all scenes if None."""
     for key, kept in list(_kept.items()):
         if isinstance(kept, Scene) and plant in (None, kept.plant):
             del _kept[key]
-    # Diagrams sit in reference cycles and own memory that Python does not count.
+    # Diagrams are in reference cycles and own memory that Python does not count.
     gc.collect()
 
 
 def _digest(name: str, *arrays: npt.NDArray[np.generic] | np.float64) -> str:
-    """Return a digest of an object: its name, from which its colour follows, and arrays."""
+    """Return a digest of an object: its name, which decides its colour, and arrays."""
     digest = hashlib.sha256(name.encode())
     for array in arrays:
         digest.update(array.tobytes())
@@ -122,8 +122,8 @@ def _digest(name: str, *arrays: npt.NDArray[np.generic] | np.float64) -> str:
 def _leave_renderers_to_the_system() -> None:
     """Keep the renderers from being destroyed when the process ends.
 
-    That would happen in another thread than the one that made them, which VTK answers with a
-    page of warnings. A reference that is never returned keeps them until the process is gone.
+    They would be destroyed in another thread than the one that created them, and VTK would print a
+    page of warnings. A reference that is never released keeps them until the process has ended.
     """
     for diagram in _kept.values():
         if isinstance(diagram, Renderer):

@@ -3,17 +3,18 @@
 In: attempts at an object on the table. Out: a `Prediction` for each. Points on the hand's surface
 are looked up in the object's distance field: with the hand open at the start pose, and while each
 finger closes by itself. While the hand closes, object and wrist are static and each finger has one
-degree of freedom. Geometry therefore decides which link meets the object first, and where. It errs
-by the compliance of the contact, the spacing of the grid and that of the points; the margins of
-`ScreenConfig` cover these errors.
+degree of freedom. Geometry therefore decides which link meets the object first, and where. Its
+errors come from the compliance of the contact, the spacing of the grid, and the spacing of the
+points. The margins of `ScreenConfig` cover these errors.
 
-An attempt is called lost only where it is lost by more than the margin. Every step works point by
-point, so a prediction depends on its attempt alone, not on those that are predicted with it.
+An attempt counts as lost only if it is lost by more than the margin. Every step treats each point
+separately, so a prediction depends on its attempt alone, and not on the other attempts in the call.
 
-`centred` moves palms of hands whose opposed fingers share a motor along the direction in which they
-close, so that both sides meet the object at once. Where one finger meets an object first, the other
-of a shared motor stops with it. A real gripper then pushes the object, or gives way, until both
-touch; here the object is clamped while the hand closes, so the palm is moved before.
+`centred` applies to hands in which opposed fingers share a motor. It moves the palm along the
+closing direction so that both sides meet the object at the same time. If one finger meets the
+object first, the other finger of the motor stops with it. A real gripper then pushes the object, or
+gives way, until both fingers touch. Here the object is clamped while the hand closes, so the palm
+is moved before.
 """
 
 from __future__ import annotations
@@ -37,14 +38,15 @@ from drakegrasp.simulation.attempt import Attempt, Source
 
 Counts = npt.NDArray[np.int64]
 
-#: Attempts that are evaluated together. For the open hand few, so that a CPU's cache holds their
-#: points; for closing fingers many, since attempts drop out and each call has its overhead.
+#: Number of attempts that are evaluated together. It is small for the open hand, so that their
+#: points fit a CPU's cache. It is large for closing fingers, because attempts drop out and each
+#: call has its overhead.
 START_CHUNK, SWEEP_CHUNK = 8, 128
-#: A first test of the open hand takes every so many-th point.
+#: The first test of the open hand uses every `START_STRIDE`-th point.
 START_STRIDE = 8
-#: Field blur up to which the configured margins hold as they are [m].
+#: Largest blur of a field for which the configured margins suffice without an addition [m].
 COVERED = 1.25e-3
-#: Fingertips that come nearer to each other than this may meet [m].
+#: Fingertips that come closer to each other than this may touch [m].
 FINGER_GAP = 0.01
 
 
@@ -53,11 +55,11 @@ class Prediction:
     """What geometry decides about one attempt of a hand with k fingers.
 
     Attributes:
-        outcome: `start_collision` or `screened` where the attempt is certainly lost, else None.
+        outcome: `start_collision` or `screened` if the attempt is certainly lost, else None.
         clear: Whether the open hand is farther from object and table than the margin.
-        closing: (k,), closing angles up to which the fingers meet nothing [rad, or m where they
+        closing: (k,), closing angles up to which the fingers meet nothing [rad, or m if they
             slide]; empty with an outcome.
-        last: (k,), closing angles beyond which a fingertip's pad cannot meet the object any more
+        last: (k,), closing angles beyond which a fingertip's pad can no longer meet the object
             [rad or m]; empty with an outcome.
     """
 
@@ -76,21 +78,21 @@ def predict(
 ) -> list[Prediction | None]:
     """Return what geometry decides about attempts; None for an attempt that is not screened.
 
-    Not screened are attempts whose palm ray misses or whose fingers start closed, hands that
-    `finger_sweep` cannot describe, and all attempts if `config.mode` is off.
+    Attempts are not screened if their palm ray misses, their fingers start closed, `finger_sweep`
+    cannot describe the hand, or `config.mode` is off.
 
     Args:
         model: The object.
         hand: The hand.
         X_TO: Resting pose of the object in the table-top frame, (4, 4).
-        attempts: Of the object.
+        attempts: Attempts at the object.
         config: The margins.
     """
     predictions: list[Prediction | None] = [None] * len(attempts)
     if config.mode == "off":
         return predictions
 
-    # The paths of the fingers depend on the spread: attempts of one spread are screened together.
+    # The paths of the fingers depend on the spread: screen attempts with one spread together.
     rows_by_spread: dict[float, list[int]] = {}
     for row, attempt in enumerate(attempts):
         if attempt.ray_hits and attempt.closing is None:
@@ -103,19 +105,19 @@ def predict(
         lookup = PointLookup(model.field, np.asarray(X_TO, dtype=float), X_OG)
         screened = _screen(lookup, paths, _widened(config, model.field))
         for row, found in zip(rows, screened, strict=True):
-            # Fingers of one motor start together.
+            # Fingers that share a motor start together.
             starts = open_together(hand, found.closing) if found.outcome is None else found.closing
             predictions[row] = replace(found, closing=starts)
     return predictions
 
 
 def extra_margin(field: DistanceField) -> float:
-    """Return by how much a coarse field widens each margin [m]."""
+    """Return the margin that is added to each configured margin for a coarse field [m]."""
     return max(0.0, field.blur - COVERED)
 
 
 def _widened(config: ScreenConfig, field: DistanceField) -> ScreenConfig:
-    """Return the margins that cover the errors of this field as well."""
+    """Return a configuration whose margins also cover the errors of this field."""
     extra = extra_margin(field)
     names = ("start_margin", "reach_margin", "block_margin", "clearance")
     return config.model_copy(update={name: getattr(config, name) + extra for name in names})
@@ -139,8 +141,8 @@ class PointLookup:
     def distances(self, rows: Counts, p_GQ: Points, below: float) -> Points:
         """Return the distances (a, n) [m] of points (a, n, 3) or (n, 3) from the object.
 
-        They are lower bounds, too small by at most twice the grid's error. The least of each row is
-        interpolated where it is below a limit [m].
+        They are lower bounds, too small by at most twice the grid's error. The smallest distance of
+        each row is interpolated if it is below the limit `below` [m].
         """
         # Transform the points into {O} and read the nearest grid points.
         field, X_OG = self._field, self._X_OG[rows]
@@ -149,7 +151,7 @@ class PointLookup:
         distances = field.nearest(x, y, z)
         distances -= error
 
-        # Only points that may be the nearest of a row need the exact value.
+        # Only points that may be the closest point of a row need the exact value.
         least = distances.min(axis=1)
         close = np.flatnonzero(least <= np.float32(below))
         if len(close):
@@ -173,9 +175,9 @@ def _affine(row: Points, p: Points) -> Points:
 
 
 def _screen(lookup: PointLookup, paths: HandPaths, config: ScreenConfig) -> list[Prediction]:
-    """Return the predictions for attempts of one spread."""
+    """Return the predictions for attempts with one spread."""
     # Drop attempts whose open hand is certainly in collision. A subset of the points suffices to
-    # reject: the full minimum can only be smaller.
+    # reject an attempt, because the minimum over all points can only be smaller.
     margin = config.start_margin
     opened = np.concatenate([paths.still, *(path.points[0] for path in paths.fingers)])
     distance = _open_distance(lookup, np.arange(len(lookup)), opened[::START_STRIDE], margin)
@@ -187,7 +189,7 @@ def _screen(lookup: PointLookup, paths: HandPaths, config: ScreenConfig) -> list
     )
     predictions = [collision] * len(lookup)
 
-    # Close the fingers of the others.
+    # Close the fingers of the remaining attempts.
     for rows in _chunks(alive, SWEEP_CHUNK):
         angles = _closing_angles(lookup, paths, rows, config)
         for row in rows.tolist():
@@ -207,7 +209,7 @@ _NO_ANGLES = np.zeros(0)
 def _closing_angles(
     lookup: PointLookup, paths: HandPaths, rows: Counts, config: ScreenConfig
 ) -> dict[int, tuple[Array, Array]]:
-    """Return `Prediction.closing` and `last` by attempt, where all fingertips may arrive."""
+    """Return `closing` and `last` of a `Prediction` for attempts with all fingertips in reach."""
     # One required finger that does not arrive decides, so the next finger skips these attempts.
     sweeps = []
     for path in paths.fingers:
@@ -215,7 +217,7 @@ def _closing_angles(
         if path.required:
             rows = rows[sweeps[-1].arrives]
 
-    # Collect the fingers of each attempt that is left, as indices (n, k) into their paths.
+    # Collect the fingers of each remaining attempt, as indices (n, k) into their paths.
     places = [np.searchsorted(sweep.rows, rows) for sweep in sweeps]
     pairs = list(zip(sweeps, places, strict=True))
     starts = np.stack([sweep.start[place] for sweep, place in pairs], axis=1)
@@ -246,7 +248,7 @@ def _open_distance(lookup: PointLookup, rows: Counts, opened: Points, margin: fl
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Sweep:
-    """One finger closing, for a attempts; angles are indices into those of its path.
+    """The closing of one finger in each of a attempts; angles are indices into the finger's path.
 
     Attributes:
         rows: (a,), the attempts, ascending.
@@ -267,39 +269,39 @@ def _sweep_finger(
 ) -> _Sweep:
     """Close one finger from the open hand until it is blocked or at its limit.
 
-    A point moves by at most its `travel` from one angle to the next. From its distance to a
-    threshold follows by how many angles the finger may advance before any point can cross it;
-    the angles between need no evaluation (sphere tracing; Hart 1996).
+    A point moves by at most its `travel` from one angle to the next. Its distance to a threshold
+    therefore limits how many angles the finger may advance before the point can cross the
+    threshold. The angles in between need no evaluation (sphere tracing; Hart 1996).
     """
     count, end = len(rows), len(path.angles) - 1
     start, last = np.zeros(count, dtype=np.int64), np.full(count, end)
     arrives = np.zeros(count, dtype=np.bool_)
 
-    # All attempts start from the open hand, with everything at its clearance.
+    # All attempts start from the open hand, and all points have their clearance.
     k, active = np.zeros(count, dtype=np.int64), np.arange(count)
     starting = np.ones(count, dtype=np.bool_)
     clearance, reach = np.float32(config.clearance), np.float32(config.reach_margin)
     block = np.float32(config.block_margin)
     rate, pad_rate = 1.0 / path.travel, 1.0 / path.travel[: path.pad]
     while len(active):
-        # Where the finger's points are now: from the object, and from object and table.
+        # Distances of the finger's points now: from the object, and from object and table.
         points = path.points[k[active]]
         to_object = lookup.distances(rows[active], points, config.clearance)
         to_pad = to_object[:, : path.pad]
         to_any = np.minimum(to_object, lookup.heights(rows[active], points))
         least = to_any.min(axis=1)
 
-        # As long as everything stays beyond the clearance, the simulation can start later.
+        # As long as all points are beyond the clearance, the simulation can start later.
         far = starting[active] & (least > clearance)
         start[active[far]] = k[active[far]]
         starting[active] = far
 
-        # The fingertip's pad is within reach of the object.
+        # Note attempts whose pad is within reach of the object.
         within = to_pad.min(axis=1) <= reach
         arrives[active[within]] = True
         last[active[within]] = k[active[within]]
 
-        # Advance until a point may be blocked, the pad within reach, or the start found.
+        # Advance until a point may be blocked, the pad may be within reach, or the start is found.
         room = ((to_any + block) * rate).min(axis=1)
         to_reach = np.where(within, 0, ((to_pad - reach) * pad_rate).min(axis=1))
         np.minimum(room, to_reach, out=room)
@@ -315,7 +317,7 @@ def _sweep_finger(
 
 
 def _clear_starts(paths: HandPaths, starts: Counts) -> Counts:
-    """Return start angles (n, k) cut back to before two fingertips may meet on the way.
+    """Return start angles (n, k), reduced to before two fingertips may touch on the way.
 
     All fingers close at the same speed; a finger waits at its start angle for the others.
     """
@@ -334,25 +336,25 @@ def _clear_starts(paths: HandPaths, starts: Counts) -> Counts:
     return np.minimum(starts, np.maximum(0, GAP_STRIDE * (first - 1))[:, None])
 
 
-#: Moves of the palm; after the first one sliding jaws are centred.
+#: Number of moves of the palm; sliding jaws are centred after the first move.
 MOVES = 3
-#: A finger meets the object where it is nearer than this [m], after so many steps at most.
+#: A finger meets the object if it is closer than this [m]; largest number of steps of the search.
 TOUCH, STEPS = 5e-5, 40
-#: Points this far from the object need no exact distance [m].
+#: Points farther than this from the object need no exact distance [m].
 FAR = 0.02
 
 
 def centred(model: ObjectModel, hand: Hand, attempts: Sequence[Attempt]) -> list[Attempt]:
-    """Return attempts whose fingers of one motor meet the object together, where they can.
+    """Return attempts whose fingers that share a motor meet the object together, if they can.
 
-    An attempt is as it was if its palm ray misses, its fingers start closed, one side of the
-    fingers does not meet the object, or no motor of the hand drives opposed fingers. So is one of
-    a posture, which is tried as it is given.
+    An attempt is unchanged if its palm ray misses, its fingers start closed, one side of the
+    fingers does not meet the object, or no motor of the hand drives opposed fingers. An attempt of
+    a posture is also unchanged, because it is tried as given.
 
     Args:
         model: The object.
         hand: The hand.
-        attempts: At the object.
+        attempts: Attempts at the object.
     """
     # The paths of the fingers depend on preshape and spread.
     found = list(attempts)
@@ -382,7 +384,7 @@ def centred(model: ObjectModel, hand: Hand, attempts: Sequence[Attempt]) -> list
 
 
 def _move(model: ObjectModel, X_OG: Array, paths: Sequence[FingerPath], ratio: Array) -> Array:
-    """Return by how much (n, 3) palms move in {O} [m]; 0 where one side meets nothing."""
+    """Return the motion (n, 3) of palms in {O} [m]; 0 if one side of the fingers meets nothing."""
     # Positions of the motor at which each finger meets the object, and the motion of its pad there.
     lookup = PointLookup(model.field, np.eye(4), X_OG)
     ends = [_meeting(lookup, path) for path in paths]
@@ -391,8 +393,8 @@ def _move(model: ObjectModel, X_OG: Array, paths: Sequence[FingerPath], ratio: A
     motion = np.stack([_pad_motion(path, end) for path, end in zip(paths, ends, strict=True)])
     motion *= ratio[:, None, None]
 
-    # One side is what moves with the first finger, and its first finger to touch counts.
-    # A pad that stays where it is has no direction, and nothing is on a side.
+    # The first side has the fingers that move with the first finger. On each side, the finger that
+    # touches first decides. A pad that does not move has no direction and belongs to no side.
     u = motion[0] / np.maximum(norm(motion[0]), np.finfo(float).tiny)[:, None]
     speed = dot(motion, u)
     first, rate = [], []
@@ -411,9 +413,9 @@ def _move(model: ObjectModel, X_OG: Array, paths: Sequence[FingerPath], ratio: A
 def _meeting(lookup: PointLookup, path: FingerPath) -> Array:
     """Return the place (n,) on a path, in steps, at which a finger meets the object; inf: nowhere.
 
-    It is negative for a finger that is within the object when the hand is open: as far as it would
-    have to open. No point moves by more per step than the largest `travel`, so the least distance
-    says how many steps are free (sphere tracing; Hart 1996).
+    For a finger that is within the object when the hand is open, the place is negative: how far the
+    finger would have to open. No point moves by more than the largest `travel` per step, so the
+    smallest distance limits the number of free steps (sphere tracing; Hart 1996).
     """
     rate, end = float(path.travel.max()), len(path.angles) - 1
     place, active = np.zeros(len(lookup)), np.arange(len(lookup))
@@ -428,7 +430,7 @@ def _meeting(lookup: PointLookup, path: FingerPath) -> Array:
 
 
 def points_at(path: FingerPath, place: Array) -> npt.NDArray[np.float32]:
-    """Return the points (n, p, 3) in {G} at places on a path, between its steps in proportion."""
+    """Return the points (n, p, 3) in {G} at places on a path, interpolated between its steps."""
     before = np.clip(np.floor(place).astype(np.int64), 0, len(path.points) - 2)
     share = (place - before).astype(np.float32)[:, None, None]
     points = path.points[before] * (np.float32(1.0) - share)
@@ -436,7 +438,7 @@ def points_at(path: FingerPath, place: Array) -> npt.NDArray[np.float32]:
 
 
 def _pad_motion(path: FingerPath, place: Array) -> Array:
-    """Return the motion (n, 3) of the middle of the pad per closing position, in {G}."""
+    """Return the motion (n, 3) of the pad's centre per closing position, in {G}."""
     near = np.clip(np.where(np.isfinite(place), place, 0.0), 0, len(path.points) - 2)
     before = near.astype(np.int64)
     middle = path.points[:, : path.pad].astype(float).mean(axis=1)

@@ -25,22 +25,22 @@ from drakegrasp.simulation.scene import ObjectScene, advance, reset_object
 
 #: Simulated time between two checks of the object's speed [s].
 CHECK_PERIOD = 0.05
-#: Longest edge of the surface that lands [m], and the number of faces up to which longer ones are
-#: split. A base carries to within about a quarter of the longest edge from its rim.
+#: Longest edge of the surface that lands [m], and the number of faces up to which longer edges are
+#: split. A base supports to within about a quarter of the longest edge from its rim.
 MAX_EDGE, MAX_FACES = 0.02, 12_000
 #: Drake's gravity [m/s^2], and the largest relative error of the table's force at rest.
 GRAVITY, MAX_FORCE_ERROR = 9.81, 0.01
-#: A resting pose is snapped to multiples of this, in p_TO [m] and in the quaternion of R_TO: about
+#: A resting pose is rounded to multiples of this, in p_TO [m] and in the quaternion of R_TO: about
 #: a micrometre and a microradian. Drake's last bits depend on the CPU, and the palm poses depend on
 #: the resting pose.
 POSE_GRID = 2.0**-20
-#: An object that landed deeper in the table is raised by that and set down again [m], this often.
+#: An object deeper in the table than this [m] is raised and set down again, at most this often.
 MAX_SINK, MAX_SETTINGS = 3e-4, 4
-#: A larger tilt of an object at rest is noted [rad], 5 degrees: less is how an uneven base stands.
+#: A larger tilt of an object at rest is reported [rad] (5 degrees); an uneven base tilts by less.
 NOTED_TILT = np.pi / 36.0
-#: Share of the longest time after which an object that still rolls is stopped; see `settle`.
+#: Fraction of the longest time after which an object that still rolls is stopped; see `settle`.
 STOP_FRACTION = 0.6
-#: Resting poses whose upward directions in {O} differ by less are one [rad].
+#: Resting poses whose upward directions in {O} differ by less than this are the same pose [rad].
 SAME_UP = np.pi / 18.0
 #: Time step of drops from random orientations [s].
 RANDOM_STEP = 0.008
@@ -54,11 +54,11 @@ class Resting:
 
     Attributes:
         X_TO: Pose in the table-top frame, (4, 4); p_TO = (0, 0, z).
-        seconds: Simulated time until it rested [s].
+        seconds: Simulated time until the object rested [s].
         table_force: Upward force of the table at rest [N].
-        sink: Depth of its lowest point in the table [m].
-        stopped: Whether it was stopped because it was still rolling.
-        probability: Share of the drops that ended so.
+        sink: Depth of the object's lowest point in the table [m].
+        stopped: Whether the object was stopped because it was still rolling.
+        probability: Fraction of the drops that ended in this pose.
     """
 
     X_TO: Array
@@ -75,7 +75,7 @@ class Resting:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user may not expect of how it rests, in sentences."""
+        """What a user may not expect of how the object rests, in sentences."""
         notes = []
         if self.tilt > NOTED_TILT:
             degrees = np.degrees(self.tilt)
@@ -88,18 +88,19 @@ class Resting:
 
 
 def find_resting_poses(model: ObjectModel, config: Config) -> list[Resting]:
-    """Return the different resting poses of an object; the first is that of `settle`.
+    """Return the different resting poses of an object; the first is the pose of `settle`.
 
-    Of `objects.resting_poses` drops the first has {O} aligned to {W}, and the others have random
-    orientations. A drop that does not come to rest, or ends like one before, adds no pose.
+    The number of drops is `objects.resting_poses`. In the first drop {O} is aligned to {W}, the
+    others have random orientations. A drop that does not come to rest, or ends like an earlier one,
+    adds no pose.
 
     Raises:
-        MeshError: As `settle`, of the first drop.
+        MeshError: As `settle`, for the first drop.
     """
     found, counts = [settle(model, config)], [1]
     for drop in range(1, config.objects.resting_poses):
         stream = Stream(config.seed, object_key(model.name), drop, _PLACE)
-        # The direction of four normal numbers is a uniform quaternion (Muller 1959).
+        # Four normal random numbers, normalised, are a uniform quaternion (Muller 1959).
         try:
             resting = settle(model, config, _rotation(stream.normal(4)))
         except MeshError:
@@ -122,41 +123,42 @@ def find_resting_poses(model: ObjectModel, config: Config) -> list[Resting]:
 def settle(model: ObjectModel, config: Config, R_TO: Array | None = None) -> Resting:
     """Return the resting pose of an object that is dropped.
 
-    {O} begins at `settle.drop_height` above the table (Veres et al.), the lowest point of a taller
-    object just on it, and so that of an object with an orientation of its own.
+    The origin of {O} starts at `settle.drop_height` above the table (Veres et al.). If the object
+    is taller, or has a given orientation, its lowest point starts just on the table.
 
-    Hydroelastic contact has no rolling resistance, so a round object may roll for very long. After
-    `STOP_FRACTION` of `settle.max_time` each check therefore sets the velocity of an object that
-    still moves to zero; the released code froze it.
+    Hydroelastic contact has no rolling resistance, so a round object may roll for a very long time.
+    After `STOP_FRACTION` of `settle.max_time`, each check therefore sets the velocity of an object
+    that still moves to zero. The paper's released code froze such an object.
 
     Args:
         model: The object.
-        config: How it settles.
-        R_TO: Its orientation when it is dropped, (3, 3); None: {O} is aligned to {T}.
+        config: How the object settles.
+        R_TO: Orientation of the object when it is dropped, (3, 3); None aligns {O} to {T}.
 
     Raises:
         MeshError: If the object leaves the table, never comes to rest, or Drake cannot
             simulate it.
     """
     try:
-        # The paper's drop keeps the fall, the step and the surface that decided its pose in earlier
+        # The paper's drop keeps the fall, the step and the surface that decided the pose in earlier
         # datasets.
         if R_TO is None:
             return _settle(model, config, np.eye(3), settling_surface(model))
-        # One from a random orientation has none to keep. Let go at the table, with longer steps and
-        # the surface that lifts begin on, it comes to rest at a fifth of the cost.
+        # A drop from a random orientation has no earlier pose to keep. It starts at the table, with
+        # longer steps and the surface of lifts, and comes to rest at a fifth of the cost.
         rules = config.settle.model_copy(update={"drop_height": 0.0, "time_step": RANDOM_STEP})
         eased = config.model_copy(update={"settle": rules})
         return _settle(model, eased, R_TO, model.resting_surface)
-    # A failed assertion within Drake arrives as SystemExit.
+    # A failed assertion in Drake arrives as SystemExit.
     except (RuntimeError, SystemExit) as error:
         reason = first_line(error)
         raise MeshError(f"{model.name}: Drake failed while dropping it: {reason}") from None
 
 
 def _settle(model: ObjectModel, config: Config, R_TO: Array, surface: Solid) -> Resting:
-    # Free fall does not turn it, so the simulation begins where it touches the table. From above,
-    # the first step in contact would find it millimetres deep, and throw it up and over.
+    # Free fall does not turn the object, so the simulation begins where it touches the table. If it
+    # began higher, the first step in contact would find the object millimetres deep in the table
+    # and throw it up and over.
     rules = config.settle
     physics = config.physics.model_copy(update={"time_step": rules.time_step})
     scene = build_object_scene(model, physics, resting_surface=surface)
@@ -169,7 +171,7 @@ def _settle(model: ObjectModel, config: Config, R_TO: Array, surface: Solid) -> 
     scene.simulator.Initialize()
     stopped = _wait_for_rest(scene, config)
 
-    # What landed on a tip may stick in the table like a nail: raise it and set it down.
+    # An object that landed on a tip may stick in the table like a nail: raise it and set it down.
     sink = _sink(scene)
     for _ in range(MAX_SETTINGS):
         if sink <= MAX_SINK:
@@ -178,13 +180,13 @@ def _settle(model: ObjectModel, config: Config, R_TO: Array, surface: Solid) -> 
         stopped = _wait_for_rest(scene, config) or stopped
         sink = _sink(scene)
 
-    # The pose over the table's centre, on the grid.
+    # The pose over the table's centre, rounded to the grid.
     X_TO = multiply(invert_pose(X_WT), scene.pose(scene.object))
     if X_TO[2, 3] < 0.0:
         raise MeshError(f"{model.name}: must come to rest on the table, got an object that left it")
     X_TO = snapped(X_TO)
 
-    # At rest the table carries the weight: a check of the contact itself.
+    # At rest the table supports the weight; this checks the contact itself.
     force = float(table_force(scene)[2])
     weight = model.mass * GRAVITY
     if abs(force - weight) > MAX_FORCE_ERROR * weight:
@@ -195,13 +197,13 @@ def _settle(model: ObjectModel, config: Config, R_TO: Array, surface: Solid) -> 
 
 
 def settling_surface(model: ObjectModel) -> Solid:
-    """Return the object's collision surface without long edges, which decides how it lands."""
+    """Return the object's collision surface without long edges; it decides how the object lands."""
     return subdivide(model.collision_solid, MAX_EDGE, MAX_FACES)
 
 
 def _wait_for_rest(scene: ObjectScene, config: Config) -> bool:
     """Simulate until the object has been slow for long enough; return whether it was stopped."""
-    # Refuse what takes too long.
+    # Reject an object that takes too long.
     rules, name = config.settle, scene.model.name
     resting_for, stopped, linear, angular = 0.0, False, 0.0, 0.0
     start = scene.time
@@ -212,7 +214,7 @@ def _wait_for_rest(scene: ObjectScene, config: Config) -> bool:
                 f"simulation, got {linear:.3g} m/s and {angular:.3g} rad/s"
             )
 
-        # Look at its speed a little later.
+        # Measure its speed a little later.
         advance(scene, CHECK_PERIOD)
         linear, angular = _speeds(scene)
         if not np.isfinite(linear) or linear > config.physics.max_speed:
@@ -221,7 +223,7 @@ def _wait_for_rest(scene: ObjectScene, config: Config) -> bool:
                 f"it settles, got {linear:.3g} m/s"
             )
 
-        # Count for how long it has been slow; stop it if it moves for too long.
+        # Measure how long it has been slow; stop it if it has moved for too long.
         slow = linear < rules.max_linear_speed and angular < rules.max_angular_speed
         resting_for = resting_for + CHECK_PERIOD if slow else 0.0
         if not slow and scene.time - start > STOP_FRACTION * rules.max_time:
@@ -237,7 +239,7 @@ def _sink(scene: ObjectScene) -> float:
 
 
 def _raise(scene: ObjectScene, height: float) -> None:
-    """Move the object up by a height [m], at rest."""
+    """Move the object up by a height [m] and set its velocity to zero."""
     X_WO = scene.pose(scene.object).copy()
     X_WO[2, 3] += height
     scene.plant.SetFreeBodyPose(scene.context, scene.object, RigidTransform(X_WO))
@@ -247,10 +249,10 @@ def _raise(scene: ObjectScene, height: float) -> None:
 def snapped(X_TO: Array) -> Array:
     """Return a resting pose (4, 4) with p_TO = (0, 0, z), rounded to a fine grid.
 
-    Poses that differ by rounding become the same bits, unless they lie halfway between two points
-    of the grid: with a rounding error e that happens to one pose in POSE_GRID / e.
+    Poses that differ by rounding errors become equal in every bit, unless they lie halfway between
+    two points of the grid. With a rounding error e, that happens to one pose in POSE_GRID / e.
     """
-    # A quaternion and its negative give the same bits below: each term has two of its entries.
+    # A quaternion and its negative give the same bits below, because each term has two entries.
     wxyz = np.rint(RotationMatrix(X_TO[:3, :3]).ToQuaternion().wxyz() / POSE_GRID)
     height = np.rint(X_TO[2, 3] / POSE_GRID) * POSE_GRID
     return make_pose(_rotation(wxyz), [0.0, 0.0, height])
@@ -258,7 +260,7 @@ def snapped(X_TO: Array) -> Array:
 
 def _rotation(wxyz: Array) -> Array:
     """Return the rotation (3, 3) of a quaternion (4,) of any length."""
-    # Written out, since the bits of SciPy's or Drake's conversion may depend on the CPU.
+    # Written out, because the bits of SciPy's or Drake's conversion may depend on the CPU.
     w, x, y, z = wxyz / norm(wxyz)
     return np.array(
         [

@@ -2,7 +2,7 @@
 
 `run_attempt` is the experiment; builds, verification and replays all call it. In: a scene, the
 object's resting pose and an attempt. Out: a `TrialRecord` with the outcome and all measurements.
-A failure of the physics is an outcome, not an exception, and so is an error within Drake.
+A failure of the physics is an outcome, not an exception. So is an error in Drake.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ from drakegrasp.simulation.verdict import (
     scrapes,
 )
 
-#: Far below a time step, far above the rounding of a sum of them [s].
+#: Far below a time step, and far above the rounding error of a sum of time steps [s].
 ROUNDING = 1e-9
-#: A finger that closed this far beyond the last angle at which it can meet the object has missed
-#: it, in the unit of its closing joint.
+#: A finger has missed the object if it closed this far beyond the last angle at which it can meet
+#: the object, in the unit of its closing joint.
 BEYOND = np.deg2rad(2.0)
 
 
@@ -68,8 +68,8 @@ class Closed:
         contacts: Contacts at the end.
         q: Positions of the hand's joints [rad or m], in the plant's order.
         duration: Simulated time [s].
-        clearance: Least height of the hand above the table's top from the start on [m], negative
-            below it; NaN if it is not measured.
+        clearance: Smallest height of the hand above the table's top from the start on [m],
+            negative below it; NaN if not measured.
     """
 
     contacts: Contacts
@@ -87,7 +87,7 @@ class TrialRecord:
         X_TO, X_OG: Resting pose of the object and start pose of the palm, (4, 4).
         closed: How the fingers closed.
         lift: How the lift ended.
-        chance: Of a sample, of a closed hand that may lift; NaN if nothing is known of it.
+        chance: Chance of a sample for a closed hand that may lift; NaN if unknown.
         message: First line of the error for `solver_error`, else empty.
     """
 
@@ -101,13 +101,13 @@ class TrialRecord:
 
     @property
     def precision(self) -> bool:
-        """Whether the grasp is held, and by the fingertips alone."""
+        """Whether the object is held, and only by the fingertips."""
         lift = self.lift
         return lift is not None and bool(is_precision(self.outcome, lift.contacts.other_links))
 
     @property
     def stable(self) -> bool:
-        """Whether it is a precision grasp that moved less than 5 mm and 5 degrees in the hand."""
+        """Whether it is a precision grasp that moves less than 5 mm and 5 degrees in the hand."""
         lift = self.lift
         return lift is not None and bool(
             is_stable(self.outcome, lift.contacts.other_links, lift.slip, lift.turn)
@@ -128,17 +128,17 @@ def run_attempt(
     The same scene, attempt and configuration give the same bits, whatever ran before.
 
     Args:
-        scene: Of the object and the hand.
+        scene: Scene of the object and the hand.
         X_TO: Resting pose of the object in the table-top frame, (4, 4).
-        attempt: What to try.
+        attempt: The attempt.
         config: The rules.
-        prediction: What `predict` returns for the attempt, where the caller has it already; the
-            record is the same without.
-        is_visible: Whether the images of a grasp would make a sample; asked of hands that may
-            lift, unless they are audited.
+        prediction: Result of `predict` for the attempt, if the caller already has it; the record is
+            the same without it.
+        is_visible: Returns whether the images of a grasp would make a sample; called for hands that
+            may lift, unless they are audited.
 
     Raises:
-        ConfigError: If the hand cannot have the drive that the configuration asks for.
+        ConfigError: If the hand cannot have the drive that the configuration requests.
         MachineError: If `is_visible` cannot render.
         MemoryError: If the machine runs out of memory.
         OSError: If a file of the hand cannot be read.
@@ -159,12 +159,12 @@ def run_attempt(
         if prediction is None:
             prediction = _predict(scene, X_TO, attempt, config)
         screened = None if prediction is None else prediction.outcome
-        # Where the open hand comes near to a collision, Drake decides below whether it is one.
+        # If the open hand is close to a collision, Drake decides below whether it collides.
         near = prediction is not None and not prediction.clear
         if screened is Outcome.START_COLLISION or (screened is not None and not near):
             return replace(start, outcome=screened)
 
-        # Place: object and palm stand still, the fingers are where the attempt starts them.
+        # Place: object and palm do not move, the fingers are at the start of the attempt.
         limits = start_limits(config)
         set_materials(scene, _materials(scene, attempt))
         q = None if path is None else path[0]
@@ -174,7 +174,7 @@ def run_attempt(
         if screened is not None:
             return replace(start, outcome=screened)
 
-        # Close: from just before the fingers meet something, where geometry knows that.
+        # Close: start just before the fingers meet something, if geometry has found where.
         way = Way() if config.close.scrape_depth is not None else None
         if way is not None:
             way.look(scene)
@@ -195,7 +195,7 @@ def run_attempt(
         )
         record = replace(start, closed=closed)
 
-        # Judge the closed hand: it lifts only what it holds with all fingertips and nothing else.
+        # Judge the closed hand: it lifts only an object held by all fingertips and nothing else.
         verdict = judge_closed(
             contacts.touching,
             contacts.other_links,
@@ -207,13 +207,13 @@ def run_attempt(
             return replace(record, outcome=Outcome(int(verdict)))
 
         return _lift_closed(scene, record, attempt, config, limits, is_visible)
-    # A failed assertion within Drake arrives as SystemExit, everything else as RuntimeError.
+    # A failed assertion in Drake arrives as SystemExit, everything else as RuntimeError.
     except (Exception, SystemExit) as error:
         return _failed(start, error)
 
 
 def _scene_for(scene: Scene, attempt: Attempt) -> Scene:
-    """Return the scene of the motors that an attempt has."""
+    """Return the scene with the motors of an attempt."""
     if attempt.own_motors and scene.own_motors is not None:
         return scene.own_motors()
     return scene
@@ -223,7 +223,7 @@ def has_only_scraped(record: TrialRecord) -> bool:
     """Return whether a hand would have been lifted if it had not scraped the table."""
     if record.outcome is not Outcome.TABLE_CONTACT or record.closed is None or record.lift:
         return False
-    # Of all rules of the closed hand that of the table comes last.
+    # The rule of the table is the last of the rules for closed hands.
     touched = record.closed.contacts
     return not touched.hand_on_table
 
@@ -236,16 +236,19 @@ def lift_on(
     *,
     is_visible: Callable[[], bool] = lambda: True,
 ) -> TrialRecord:
-    """Return the record of a hand that has only scraped as it would be without `scrape_depth`.
+    """Continue an attempt whose hand only scraped the table, as if `scrape_depth` were not set.
 
     The hand is still closed in the scene: nothing else may have run there since `run_attempt`.
 
     Args:
-        scene: That `run_attempt` was given.
-        record: What it returned, see `has_only_scraped`.
+        scene: The scene given to `run_attempt`.
+        record: The record returned by `run_attempt`, see `has_only_scraped`.
         attempt: See `run_attempt`.
         config: See `run_attempt`.
         is_visible: See `run_attempt`.
+
+    Returns:
+        The record with the verdict of the lift.
     """
     scene = _scene_for(scene, attempt)
     close = config.close.model_copy(update={"scrape_depth": None})
@@ -257,7 +260,7 @@ def lift_on(
 
 
 def _failed(start: TrialRecord, error: BaseException) -> TrialRecord:
-    """Return the record of an attempt whose simulation raised; raise failures of the machine."""
+    """Return the record of an attempt whose simulation failed; raise failures of the machine."""
     if isinstance(error, TrialTimeout):
         return replace(start, outcome=Outcome.TIMEOUT)
     if isinstance(error, MachineError | MemoryError | OSError):
@@ -273,9 +276,9 @@ def _lift_closed(
     limits: TrialLimits,
     is_visible: Callable[[], bool],
 ) -> TrialRecord:
-    """Return the record of an attempt whose closed hand may lift, from there to the verdict."""
+    """Run an attempt whose closed hand may lift up to its verdict, and return its record."""
     assert record.closed is not None
-    # Choose what is worth a lift, by what is known now; some are lifted all the same.
+    # Decide from what is known now whether a lift is worthwhile; audited attempts always lift.
     record = replace(record, chance=_chance(scene, record.X_TO, attempt, record.closed.contacts))
     if not attempt.audited and (record.chance < config.lift.least_chance or not is_visible()):
         return replace(record, outcome=Outcome.NOT_LIFTED)
@@ -284,8 +287,8 @@ def _lift_closed(
     end = lift(scene, limits, config)
     record = replace(record, lift=end)
 
-    # Judge the lifted object: all fingertips must still hold it, clear of the table. A lift
-    # that was ended because the object moved has no such verdict.
+    # Judge the lifted object: all fingertips must still hold it, clear of the table. A lift that
+    # ended because the object moved has no such verdict.
     if end.moved:
         return replace(record, outcome=Outcome.MOVED)
     contacts = end.contacts
@@ -300,10 +303,10 @@ def _lift_closed(
 
 
 def start_meetings(scene: Scene, X_TO: Array, attempt: Attempt) -> dict[str, list[str]]:
-    """Return which links of the hand intersect "object" or "table" where an attempt starts.
+    """Return the links that intersect "object" or "table" at an attempt's start, by these keys.
 
     Args:
-        scene: Of the object and the hand.
+        scene: Scene of the object and the hand.
         X_TO: Resting pose of the object, (4, 4).
         attempt: The attempt.
     """
@@ -319,7 +322,7 @@ def _predict(scene: Scene, X_TO: Array, attempt: Attempt, config: Config) -> Pre
 
 
 def _chance(scene: Scene, X_TO: Array, attempt: Attempt, closed: Contacts) -> float:
-    """Return the chance that lifting a closed hand gives a sample; NaN for a hand without one."""
+    """Return the chance that lifting a closed hand yields a sample; NaN without a model."""
     model = scene.hand.lift_chance
     if model is None:
         return np.nan
@@ -333,7 +336,7 @@ def _chance(scene: Scene, X_TO: Array, attempt: Attempt, closed: Contacts) -> fl
 
 
 def _materials(scene: Scene, attempt: Attempt) -> Materials:
-    """Return the friction and mass of an attempt; the scene's own where it says nothing."""
+    """Return the friction and mass of an attempt; by default those of the scene."""
     if attempt.conditions is None:
         return usual_materials(scene.model, scene.physics)
     return attempt.conditions.materials
@@ -346,16 +349,16 @@ def _close(
     prediction: Prediction | None,
     way: Way | None,
 ) -> None:
-    """Close the fingers on the static object until they stop, or one has missed it."""
-    # Closing that geometry skipped counts as time, and an angle beyond its last contact as a miss.
+    """Close the fingers on the static object until they stop or a required finger has missed it."""
+    # Closing that geometry skipped counts as time; an angle beyond the last contact is a miss.
     end, last = config.close.max_time, np.array(np.inf)
     if prediction is not None:
         hand = scene.hand
         end -= float((prediction.closing / hand.closing_speed).min())
-        # A fingertip that need not touch ends nothing by missing the object.
+        # A fingertip that is not required does not end the attempt if it misses the object.
         last = np.where(hand.required, prediction.last + BEYOND * hand.closing_unit, np.inf)
 
-    # The last check may fall short of the end by rounding, never by a step.
+    # The last check may be before the end by a rounding error, but never by a step.
     while end - scene.time > ROUNDING:
         limits.advance(scene, min(config.close.check_period, end - scene.time))
         if way is not None:
@@ -371,9 +374,9 @@ def _follow_path(
 ) -> None:
     """Move each joint by its own motor to the grasp and on to the squeeze, until all have stopped.
 
-    The joints move in step: that with the longest way moves at the hand's closing speed.
+    The joints move in synchrony: the joint with the longest path moves at the hand's closing speed.
     """
-    # The way of the driven joints, in the order of their motors.
+    # The paths of the driven joints, in the order of their motors.
     names = hand_joint_names(scene)
     moved = [names.index(joint.name()) for joint in scene.closing_joints]
     places = [q[moved] for q in path]
@@ -383,7 +386,7 @@ def _follow_path(
     times = np.cumsum([0.0, *(lasts[i] for i in stages)])
     command_joints(scene, times.tolist(), [places[0], *(places[i + 1] for i in stages)])
 
-    # They stop when they press on the object, or are at their targets.
+    # The joints stop when they press on the object or are at their targets.
     end = float(times[-1]) + config.close.max_time
     while end - scene.time > ROUNDING:
         limits.advance(scene, min(config.close.check_period, end - scene.time))

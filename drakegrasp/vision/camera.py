@@ -1,11 +1,12 @@
-"""Cameras: their lenses and poses, what they see of contacts, and how a scene looks; NumPy only.
+"""Cameras: lenses, poses, visibility of contacts, and the appearance of a scene. Uses NumPy only.
 
 Both cameras of a grasp are 0.25 m behind the palm and look along +Gz (Veres et al., "Vision
 sensors"). `oto` (one-to-one) rolls with the palm; `otm` (one-to-many) keeps world up at the top of
-the image. Cameras of a scene know no grasp: to train, viewpoints are drawn about the object; to
-test they are fixed, published poses in {T} that neither object nor seed moves, so that a grasp that
-is the same in the camera's frame is the same on the table, wherever the object lies. Camera axes
-are those of Drake and OpenCV; pixel centres have integer coordinates, as in Drake's `CameraInfo`.
+the image. Cameras of a scene do not depend on a grasp. For training, viewpoints are drawn around
+the object. For testing, they are fixed, published poses in {T} that depend neither on the object
+nor on the seed, so that equal grasps in the camera's frame are equal grasps on the table, wherever
+the object is. Camera axes are those of Drake and OpenCV. Pixel centres have integer coordinates, as
+in Drake's `CameraInfo`.
 """
 
 from __future__ import annotations
@@ -21,11 +22,12 @@ from drakegrasp.config import CameraConfig, ScenesConfig
 from drakegrasp.frames import invert_pose, make_pose, rotation_about, transform_points
 from drakegrasp.seeding import Stream, object_key
 
-#: Sine of the angle between view and vertical below which +Ty is up in the image (0.06 degrees).
+#: If the sine of the angle between view and vertical is below this, +Ty is up in the image (0.06
+#: degrees).
 LOOKS_VERTICALLY = 1e-3
-#: What is nearer than a contact by more than this hides it [m].
+#: A surface that is closer to the camera than a contact by more than this hides the contact [m].
 BEFORE = 3e-3
-#: What is farther from the object's pixels than this is not on it [px].
+#: A contact that is farther than this from the object's pixels is not on the object [px].
 BESIDE = 2.0
 #: Fixed viewpoints: azimuth and elevation [deg], distance [m] from the point `FIXED_AIM` in {T}.
 RING = tuple((azimuth, 45.0, 0.65) for azimuth in (0.0, 90.0, 180.0, 270.0))
@@ -33,20 +35,20 @@ SINGLE = (45.0, 60.0, 0.7)
 FIXED_AIM = np.array([0.0, 0.0, 0.05])
 #: Colour of the table (models/table.sdf).
 TABLE_COLOUR = (0.55, 0.50, 0.44)
-#: Way and intensity of the light from above: at a slant, because a table is black where camera and
-#: light look along it.
+#: Direction and intensity of the light from above. It is slanted, because a table is black if
+#: camera and light look along it.
 LIGHT_WAY = np.array([0.3, 0.4, -1.0])
 LIGHT_STRENGTH = 0.7
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lens:
-    """What a camera sees from its pose.
+    """The image size, camera matrix and depth range of a camera.
 
     Attributes:
-        width, height: Of its images [px].
+        width, height: Size of the images [px].
         K: Camera matrix (3, 3) [px].
-        near, far: Range of its depths [m].
+        near, far: Range of the depths [m].
     """
 
     width: int
@@ -57,7 +59,7 @@ class Lens:
 
     @classmethod
     def of(cls, config: CameraConfig | ScenesConfig) -> Lens:
-        """Return the lens of a configuration: square pixels, centre in the image's middle.
+        """Return the lens of a configuration, with square pixels and the image's centre as centre.
 
         With the vertical field of view φ and H rows, f = H / (2 tan(φ/2)).
         """
@@ -73,9 +75,9 @@ class Lens:
 
 
 def intrinsics(config: CameraConfig) -> Array:
-    """Return the camera matrix K (3, 3) [px]: square pixels, centre in the image's middle.
+    """Return the camera matrix K (3, 3) [px], for square pixels and the image's centre as centre.
 
-    For S × S pixels, whose centres have integer coordinates, and the field of view φ:
+    With S × S pixels, whose centres have integer coordinates, and the field of view φ:
 
         f = S / (2 tan(φ/2)),   c = (S − 1) / 2,   K = [[f, 0, c], [0, f, c], [0, 0, 1]]
     """
@@ -90,7 +92,7 @@ def camera_pose_oto(
     Args:
         X_TG: Pose of the palm (4, 4).
         config: The camera's distance.
-        X_C0C: Pose (4, 4) of the camera in that usual pose, if it is another.
+        X_C0C: Pose (4, 4) of the camera relative to its usual pose; None for the usual pose.
     """
     X_TC = multiply(X_TG, make_pose(np.eye(3), [0.0, 0.0, -config.distance]))
     # A product with the identity may change the sign of a zero.
@@ -102,7 +104,7 @@ def camera_pose_otm(
 ) -> Array:
     """Return X_TC (4, 4) of the camera whose image up is world up; see `camera_pose_oto`.
 
-    A camera that looks straight up or down has no such direction; its image up is +Ty.
+    If the camera looks straight up or down, its image up is +Ty instead.
     """
     X_TC = camera_pose_oto(X_TG, config, X_C0C)
     z = X_TC[:3, 2]
@@ -135,17 +137,17 @@ def unproject(K: npt.ArrayLike, pixels: npt.ArrayLike, depth: npt.ArrayLike) -> 
 
 
 def image_frame(K: npt.ArrayLike, mask: npt.ArrayLike, depth: npt.ArrayLike) -> Array:
-    """Return X_CI (4, 4), a frame of the object that follows from one image.
+    """Return X_CI (4, 4), a frame of the object that is computed from one image.
 
-    The origin is the mask's centroid, unprojected with the depth of the object pixel nearest to the
-    centroid. Iz is the first principal axis of the mask's pixels, Iy the
-    second, both unprojected at that depth, so they lie in a plane parallel to the image.
-    Signs: Iz points to the image's right (straight down if it is vertical), and Ix = Iy x Iz
-    points away from the camera (+Cz). A mask of one pixel has Iz along +Cx.
+    The origin is the mask's centroid, unprojected with the depth of the object pixel that is
+    closest to the centroid. Iz is the first principal axis of the mask's pixels, Iy the second.
+    Both are unprojected at that depth, so they lie in a plane parallel to the image. Iz points to
+    the image's right (straight down if it is vertical), and Ix = Iy x Iz points away from the
+    camera (+Cz). For a mask of one pixel, Iz is along +Cx.
 
     Args:
-        K: Camera matrix (3, 3), as `intrinsics` makes it.
-        mask: (S, S), 1 where the object is.
+        K: Camera matrix (3, 3), as returned by `intrinsics`.
+        mask: (S, S), 1 on the object.
         depth: (S, S) [m].
 
     Raises:
@@ -166,7 +168,7 @@ def image_frame(K: npt.ArrayLike, mask: npt.ArrayLike, depth: npt.ArrayLike) -> 
     if first[0] < -1e-9 or (abs(first[0]) <= 1e-9 and first[1] < 0.0):
         first = -first
 
-    # Square pixels at one depth: a direction in pixels is a direction in Cx, Cy.
+    # With square pixels at one depth, a direction in pixels is a direction in Cx, Cy.
     Iz = np.array([first[0], first[1], 0.0])
     Ix = np.array([0.0, 0.0, 1.0])
     R_CI = np.column_stack([Ix, np.cross(Iz, Ix), Iz])
@@ -176,10 +178,10 @@ def image_frame(K: npt.ArrayLike, mask: npt.ArrayLike, depth: npt.ArrayLike) -> 
 def _principal_axis(centred: Array) -> Array:
     """Return the unit direction (2,) of largest variance of points (n, 2) about their mean.
 
-    In closed form, because LAPACK's last bits depend on the CPU. With C = [[a, b], [b, d]] the
-    points' scatter matrix and h = (a − d)/2, the eigenvalues are (a + d)/2 ± √(h² + b²), and the
-    first eigenvector is parallel to (h + √(h² + b²), b), or to (b, √(h² + b²) − h). It is +u where
-    no direction is larger than others.
+    It is computed in closed form, because LAPACK's last bits depend on the CPU. With the points'
+    scatter matrix C = [[a, b], [b, d]] and h = (a − d)/2, the eigenvalues are (a + d)/2 ± √(h² +
+    b²). The first eigenvector is parallel to (h + √(h² + b²), b), or to (b, √(h² + b²) − h). It is
+    +u if the variance is the same in all directions.
     """
     (uu, vv), uv = (centred**2).sum(axis=0), (centred[:, 0] * centred[:, 1]).sum()
     half = (uu - vv) / 2.0
@@ -209,7 +211,7 @@ class Picture:
         return project(self.K, transform_points(invert_pose(self.X_WC), p_WA))
 
 
-# What is seen of contacts, where cameras of scenes stand, how a scene looks
+# Visibility of contacts, cameras of scenes, and appearance of a scene
 
 
 def visible_contacts(
@@ -222,12 +224,13 @@ def visible_contacts(
 ) -> npt.NDArray[np.bool_]:
     """Return whether (...,) a camera sees contacts; False for contacts that are NaN.
 
-    A contact is hidden if its normal points away from the camera, or if the ray from it to the
-    camera meets the object or the table first. It is the centre of a pressed patch, so it may lie a
-    little inside the object, and on a surface that is seen at a slant the depth changes by much
-    from one pixel to the next. So of the four pixels around it the farthest counts, and `BEFORE` is
-    allowed. The patch of a grasp that is no sample may span an edge: a centre that the camera sees
-    farther than `BESIDE` from the object is hidden as well, as no image shows it.
+    A contact is hidden if its normal points away from the camera, or if the ray from the contact to
+    the camera meets the object or the table first. A contact is the centre of a pressed patch, so
+    it may lie a little inside the object, and the depth of a slanted surface changes much from one
+    pixel to the next. The test therefore uses the farthest of the four pixels around the contact,
+    and allows `BEFORE`. The patch of a grasp that is not a sample may span an edge. A centre that
+    is farther than `BESIDE` from the object in the image is therefore also hidden: no image shows
+    it.
 
     Args:
         p_TQ: Contact points (..., 3) [m].
@@ -235,7 +238,7 @@ def visible_contacts(
         X_TC: Pose of the camera (4, 4).
         K: Camera matrix (3, 3) [px].
         depth: Clean depth image (h, w) [m], 0 where there is nothing.
-        mask: Mask of the objects (h, w), 0 beside them.
+        mask: Mask of the objects (h, w), 0 beside the objects.
     """
     p = p_TQ.reshape(-1, 3)
     # A comparison with NaN is false.
@@ -243,7 +246,7 @@ def visible_contacts(
     p_CQ = transform_points(invert_pose(X_TC), p[rows])
     rows, p_CQ = rows[p_CQ[:, 2] > 0.0], p_CQ[p_CQ[:, 2] > 0.0]
 
-    # The four pixels around each that is in the image.
+    # The four pixels around each contact that is in the image.
     height, width = depth.shape
     pixels = project(K, p_CQ)
     u, v = np.floor(pixels).astype(np.int64).T
@@ -252,7 +255,7 @@ def visible_contacts(
     around = depth[np.array([v, v, v + 1, v + 1]), np.array([u, u + 1, u, u + 1])]
     farthest = np.where(around == 0, np.inf, around).max(axis=0)
 
-    # Few are on no pixel of the object: those are measured.
+    # Few contacts are not on a pixel of the object; measure the distance of these.
     beside = mask[v, u] == 0
     own = np.argwhere(mask > 0)[:, ::-1]
     apart = [np.linalg.norm(own - pixel, axis=1).min(initial=np.inf) for pixel in pixels[beside]]
@@ -267,11 +270,11 @@ def look_at(p_TA: Array, distance: float, azimuth: float, sine: float, roll: flo
     """Return X_TC (4, 4) of a camera that looks at a point from above the horizon.
 
     Args:
-        p_TA: The point (3,) [m], in the middle of the image.
-        distance: Of the camera from it [m].
-        azimuth: Of the camera about the vertical, from +Tx [rad].
-        sine: Of the camera's elevation above the point.
-        roll: About the line of sight; without it the image's rows are horizontal [rad].
+        p_TA: The point (3,) [m], in the centre of the image.
+        distance: Distance of the camera from the point [m].
+        azimuth: Azimuth of the camera about the vertical, from +Tx [rad].
+        sine: Sine of the camera's elevation above the point.
+        roll: Roll about the line of sight [rad]; at 0 the image's rows are horizontal.
     """
     s, c = sin_cos(azimuth)
     cosine = np.sqrt(1.0 - sine * sine)
@@ -282,7 +285,7 @@ def look_at(p_TA: Array, distance: float, azimuth: float, sine: float, roll: flo
 
 
 def fixed_viewpoints() -> Array:
-    """Return X_TC (5, 4, 4) of the cameras of scenes to test: the ring of four, then the single."""
+    """Return X_TC (5, 4, 4) of the test cameras of scenes: the ring of four, then `SINGLE`."""
     return np.array(
         [
             look_at(FIXED_AIM, distance, np.deg2rad(azimuth), float(sin_cos_deg(elevation)[0]))
@@ -294,12 +297,12 @@ def fixed_viewpoints() -> Array:
 def draw_viewpoint(stream: Stream, p_TO: Array, config: ScenesConfig) -> Array:
     """Return X_TC (4, 4) of a camera that looks at an object from anywhere above the table.
 
-    Azimuth, distance, roll, the point that it looks at, and the sine of the elevation are uniform:
-    so are the camera's directions over the part of the sphere.
+    Azimuth, distance, roll, the point that the camera looks at, and the sine of the elevation are
+    uniform. So the camera's directions are uniform over their part of the sphere.
 
     Args:
-        stream: Gives seven numbers.
-        p_TO: Where the object is, (3,) [m].
+        stream: Stream from which seven numbers are drawn.
+        p_TO: Position of the object, (3,) [m].
         config: The ranges.
     """
     u = stream.uniform(7)
@@ -321,7 +324,7 @@ class Appearance:
     Attributes:
         object_colour, table_colour: (3,), red, green and blue in 0..1.
         light_direction: (3,), unit vector in {W} along which the light from above shines.
-        light_strength: Its intensity; that of the light at the camera never changes.
+        light_strength: Intensity of this light; the light at the camera never changes.
     """
 
     object_colour: Array
@@ -331,13 +334,13 @@ class Appearance:
 
 
 def object_colour(name: str) -> tuple[float, float, float]:
-    """Return the RGB colour of an object, 0 to 1: its hue depends on its name alone."""
+    """Return the RGB colour of an object, 0 to 1; its hue depends only on its name."""
     hue = (object_key(name) % 997) / 997.0
     return colorsys.hsv_to_rgb(hue, 0.65, 0.85)
 
 
 def usual_appearance(name: str) -> Appearance:
-    """Return how the scene of an object looks, by the object's name, where nothing is drawn."""
+    """Return the appearance of an object's scene if nothing is drawn, by the object's name."""
     return Appearance(
         object_colour=np.array(object_colour(name)),
         table_colour=np.array(TABLE_COLOUR),

@@ -1,17 +1,18 @@
 """A depth camera's errors: noise that grows with distance, and pixels without a depth.
 
-The model is that of a camera which triangulates: it sees a pattern that a projector beside it
-throws on the scene, and tells the depth z from how far the pattern is shifted, d = f b / z, with
-focal length f and baseline b.
+The model is a camera that triangulates. It sees a pattern that a projector beside it throws on the
+scene, and computes the depth z from the shift of the pattern, d = f b / z, with focal length f and
+baseline b.
 
-* **Noise.** A shift that is uncertain by a constant makes a depth that is uncertain by sigma = c
-  z^2: c = 1.425e-3 / m for a Kinect, whose shift is certain to half a pixel (Khoshelham and Oude
-  Elberink, 2012). Each pixel errs by itself, normally distributed.
-* **Shadow.** What the camera sees and the projector does not light has no depth: stripes beside
-  near edges, on the side away from the projector. Such a pixel holds what one without anything
-  before the far plane holds: `far`.
+* **Noise.** A constant uncertainty of the shift causes an uncertainty of the depth of sigma = c
+  z^2. For a Kinect, whose shift is certain to half a pixel, c = 1.425e-3 / m (Khoshelham and Oude
+  Elberink, 2012). The error of each pixel is independent and normally distributed.
+* **Shadow.** Points that the camera sees and the projector does not light have no depth. They are
+  stripes beside near edges, on the side away from the projector. Such a pixel has the value `far`,
+  like a pixel with nothing before the far plane.
 
-In: the clean depth image. Out: the image with errors, or clean depths from it again. NumPy only.
+In: the clean depth image. Out: the image with errors, or clean depths recovered from it. Uses NumPy
+only.
 """
 
 from __future__ import annotations
@@ -25,13 +26,12 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import Array
 from drakegrasp.seeding import Stream
 
-#: A pixel is in the shadow if one that is nearer covers it by more than this [px]: far above
-#: rounding.
+#: A pixel is in the shadow if a nearer pixel covers it by more than this [px]: far above rounding.
 COVERED = 1e-3
 
 
 class DepthRange(Protocol):
-    """Near and far plane of a depth image [m]: of a configuration, a lens or a file."""
+    """Near and far plane of a depth image [m], as in a configuration, a lens or a file."""
 
     @property
     def near(self) -> float: ...  # noqa: D102
@@ -42,12 +42,12 @@ class DepthRange(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class DepthSensor:
-    """The errors of one depth camera; all are zero for one without errors.
+    """The errors of one depth camera; all are zero for a camera without errors.
 
     Attributes:
-        noise: Standard deviation of a depth over its square, c [1/m].
-        baseline: From the camera to the projector along +Cx, b [m].
-        seed: Of the noise; each camera of an attempt has a stream of its own.
+        noise: Standard deviation of a depth divided by the square of the depth, c [1/m].
+        baseline: Distance from the camera to the projector along +Cx, b [m].
+        seed: Seed of the noise; each camera of an attempt uses its own random stream.
     """
 
     noise: float = 0.0
@@ -68,8 +68,8 @@ def spoil_depth(
         depth: Clean depths (S, S) [m], `near` to `far`.
         K: Camera matrix (3, 3) [px].
         sensor: The errors.
-        camera: Number of the camera among those of its attempt.
-        config: Near and far plane; a depth that the noise takes beyond `far` is lost.
+        camera: Index of the camera among the cameras of its attempt.
+        config: Near and far plane; a depth that the noise moves beyond `far` is lost.
     """
     spoilt = depth
     if sensor.noise:
@@ -86,10 +86,10 @@ def spoil_depth(
 def clean_depth(
     depth: npt.NDArray[np.float32], sensor: DepthSensor, camera: int, config: DepthRange
 ) -> npt.NDArray[np.float32]:
-    """Return a depth image (S, S) [m] without the noise of a sensor; what is lost stays lost.
+    """Return a depth image (S, S) [m] without the noise of a sensor; lost depths stay lost.
 
-    The inverse of `spoil_depth` but for rounding: z' = z + a z^2 has the solution z = 2 z' / (1 +
-    sqrt(1 + 4 a z')) that is z' where a is 0.
+    It is the inverse of `spoil_depth` except for rounding: z' = z + a z^2 has the solution
+    z = 2 z' / (1 + sqrt(1 + 4 a z')), which is z' if a is 0.
     """
     if not sensor.noise:
         return depth
@@ -100,14 +100,14 @@ def clean_depth(
 
 
 def shadow(depth: npt.NDArray[np.float32], K: Array, baseline: float) -> npt.NDArray[np.bool_]:
-    """Return where (S, S) a depth image shows what the projector at +Cx does not light.
+    """Return the pixels (S, S) of a depth image that the projector at +Cx does not light.
 
     The projector sees a point of column u and depth z in its own column u - f b / z. Along a row
-    from left to right this column rises wherever the projector sees the surface too; where a
-    pixel further right has a smaller one, something nearer is between the two.
+    from left to right, this column rises as long as the projector also sees the surface. If a pixel
+    further right has a smaller column, something nearer is between the projector and the point.
     """
     columns = np.arange(depth.shape[1]) - K[0, 0] * baseline / depth.astype(float)
-    # The least column of all pixels to the right; none is right of the last.
+    # The smallest column of all pixels to the right; the last pixel has none to its right.
     least = np.minimum.accumulate(columns[:, ::-1], axis=1)[:, ::-1]
     covered = np.zeros(depth.shape, dtype=np.bool_)
     covered[:, :-1] = least[:, 1:] < columns[:, :-1] - COVERED
@@ -115,10 +115,10 @@ def shadow(depth: npt.NDArray[np.float32], K: Array, baseline: float) -> npt.NDA
 
 
 def _measured(depth: npt.NDArray[np.float32], config: DepthRange) -> npt.NDArray[np.bool_]:
-    """Return where (S, S) there is a depth; pixels at a clipping plane hold none."""
+    """Return the pixels (S, S) that have a depth; pixels at a clipping plane have none."""
     return (depth > np.float32(config.near)) & (depth < np.float32(config.far))
 
 
 def _normal(depth: npt.NDArray[np.float32], sensor: DepthSensor, camera: int) -> Array:
-    """Return a normal number for each pixel (S, S), row by row."""
+    """Return a normal random number for each pixel (S, S), row by row."""
     return Stream(sensor.seed, camera).normal(depth.size).reshape(depth.shape)

@@ -1,7 +1,7 @@
-"""Whether this machine can render: a box, drawn by a process of its own.
+"""Tests whether this machine can render: a separate process draws a box.
 
 A broken OpenGL kills its process, and the first thread that renders in a process owns its OpenGL.
-So a child process renders, and what becomes of it is the finding.
+So a child process renders, and its exit and output are the finding.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import subprocess
 import sys
 from pathlib import Path
 
-#: Time after which the child process has failed [s].
+#: Time after which the child process is considered failed [s].
 IMAGE_SECONDS = 60.0
-#: The box's edge and its front's distance from the camera [m].
+#: The box's edge, and the distance of its front from the camera [m].
 BOX_EDGE, BOX_DISTANCE = 0.1, 0.25
-#: What the child process runs; its last line of output is `object pixels, expected pixels`.
+#: Code of the child process; its last line of output is `object pixels, expected pixels`.
 _CHILD = "from drakegrasp.vision.probe_image import render_box; print(*render_box())"
 
 
 def probe_image() -> tuple[bool, str]:
-    """Return whether a child process renders a box, and what it said."""
+    """Return whether a child process renders a box, and a message on its finding."""
     # The child imports from the same paths, but not from its working directory.
     paths = os.pathsep.join(str(Path(p).resolve()) for p in sys.path if p)
     try:
@@ -60,9 +60,9 @@ def probe_image() -> tuple[bool, str]:
 
 
 def render_box() -> tuple[int, int]:
-    """Render a box from above; return how many pixels show it, and how many should.
+    """Render a box from above; return how many pixels show it, and how many should show it.
 
-    Call it in a process of its own: it may crash.
+    Call it in a separate process, because it may crash.
     """
     import numpy as np
     import trimesh
@@ -77,7 +77,7 @@ def render_box() -> tuple[int, int]:
     name = {"name": "box", "class_name": "box", "mesh_sha256": ""}
     model = make_object(box.vertices, box.faces, ObjectConfig(), **name)
 
-    # It stands on the table, and the camera looks straight down on it.
+    # The box stands on the table, and the camera looks straight down on it.
     X_TO = make_pose(np.eye(3), [0.0, 0.0, BOX_EDGE / 2.0])
     X_TC = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, BOX_EDGE + BOX_DISTANCE])
     seen = render(build_renderer(model, config), X_TO, X_TC)

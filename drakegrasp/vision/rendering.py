@@ -3,8 +3,8 @@
 In: an object, its resting pose and a camera pose. Out: images of object and table. The hand is
 never drawn: the renderer has its own diagram, without physics and without a hand.
 
-A renderer must be made and used in one thread. Drake's first rendering thread owns the OpenGL
-context, and any other thread silently gets a blank image; a blank image is an error here.
+A renderer must be built and used in one thread. Drake's first rendering thread owns the OpenGL
+context, and any other thread silently gets a blank image. A blank image is an error here.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ BLANK = (
     "the rendered image must not be blank, got all zeros: OpenGL works in one thread of a "
     "process only, and needs EGL (run `drakegrasp doctor`)"
 )
-#: Depths of a face that is continued beyond its edge are moved by no more than this [m].
+#: A pixel's depth is corrected by at most this, if it is on a face continued beyond its edge [m].
 FARTHEST = 0.03
 #: Name of the render engine in a diagram.
 ENGINE = "vtk"
@@ -66,12 +66,12 @@ ENGINE = "vtk"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RenderedView:
-    """The images of one camera as the engine gives them.
+    """The images of one camera as the engine returns them.
 
     Attributes:
         rgb: (H, W, 3) uint8.
-        depth: (H, W) float32 [m]; 0 where something is too near, inf where nothing is near enough.
-        mask: (H, W) uint8, 1 where the object is seen.
+        depth: (H, W) float32 [m]; 0 where something is too near, inf where everything is too far.
+        mask: (H, W) uint8, 1 on the object.
         lens: The camera.
     """
 
@@ -82,7 +82,7 @@ class RenderedView:
 
     @cached_property
     def image(self) -> npt.NDArray[np.float32]:
-        """What data files hold, (4, H, W): R, G, B in 0..1 and depth [m] within near..far."""
+        """The image for data files, (4, H, W): R, G, B in 0..1 and depth [m] within near..far."""
         image = np.empty_like(self.rgb, shape=(4, *self.mask.shape), dtype=np.float32)
         image[:3] = np.moveaxis(self.rgb, 2, 0) / np.float32(255.0)
         image[3] = np.clip(self.depth, self.lens.near, self.lens.far)
@@ -97,9 +97,9 @@ class Renderer:
         diagram, context: The diagram with its one context.
         plant, scene_graph: The two systems of the diagram.
         object, table: The bodies.
-        half_extents: Of the object's box, (3,) [m].
+        half_extents: Half extents of the object's box, (3,) [m].
         config: The camera.
-        appearance: How object and table look, and in which light; `paint` changes it.
+        appearance: Colours of object and table, and the light; `paint` changes it.
     """
 
     diagram: Diagram
@@ -115,7 +115,7 @@ class Renderer:
 
 def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
     """Return a renderer of an object's full mesh on the table."""
-    # Software OpenGL would start threads of its own beside the one process per core.
+    # Software OpenGL would start its own threads beside the one process per core.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     require_render_memory()
 
@@ -143,16 +143,16 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
 
 
 def paint(renderer: Renderer, appearance: Appearance) -> None:
-    """Give a renderer the colours and the light of an attempt; nothing is done where it has them.
+    """Give a renderer the colours and the light of an attempt; does nothing if it already has them.
 
-    The lights of a render engine are fixed, so this makes a new engine. That takes as long as some
-    ten images.
+    The lights of a render engine are fixed, so this creates a new engine, which takes as long as
+    about ten images.
     """
     now = vars(renderer.appearance).items()
     if all(np.array_equal(value, getattr(appearance, name)) for name, value in now):
         return
 
-    # An engine takes the colours over when it is added.
+    # An engine takes over the colours when it is added.
     graph = renderer.scene_graph
     context = graph.GetMyMutableContextFromRoot(renderer.context)
     graph.RemoveRenderer(context, ENGINE)
@@ -177,12 +177,12 @@ def _engine_parameters(appearance: Appearance) -> RenderEngineVtkParams:
 
 
 def _set_colour(renderer: Renderer, body: RigidBody, colour: Array) -> None:
-    """Give all shapes of a body a colour (3,)."""
+    """Set the colour (3,) of all shapes of a body."""
     plant, graph = renderer.plant, renderer.scene_graph
     context, source = graph.GetMyMutableContextFromRoot(renderer.context), plant.get_source_id()
     inspector = plant.EvalSceneGraphInspector(plant.GetMyContextFromRoot(renderer.context))
     for geometry in plant.GetVisualGeometriesForBody(body):
-        # Drake replaces no properties of this role: it is removed and assigned anew.
+        # Drake cannot replace properties of this role, so remove the role and assign it again.
         properties = PerceptionProperties(inspector.GetPerceptionProperties(geometry))
         properties.UpdateProperty("phong", "diffuse", Rgba(*colour))
         graph.RemoveRole(context, source, geometry, Role.kPerception)
@@ -190,13 +190,13 @@ def _set_colour(renderer: Renderer, body: RigidBody, colour: Array) -> None:
 
 
 def add_drawn_object(plant: MultibodyPlant, model: ObjectModel) -> RigidBody:
-    """Add an object's full mesh to a plant that is drawn, not simulated; return its body.
+    """Add an object's full mesh to a plant for drawing, and return its body.
 
     Args:
-        plant: Not finalized; its shapes are drawn.
+        plant: A plant that is drawn and not simulated; not finalized.
         model: The object.
     """
-    # The mass properties are arbitrary: nothing moves by itself.
+    # The mass properties are arbitrary, because nothing moves by itself.
     body = plant.AddRigidBody("object", SpatialInertia.SolidSphereWithMass(1.0, 1.0))
     mesh = drawn_mesh(model.visual_vertices, model.visual_faces, model.name)
     colour = np.array([*object_colour(model.name), 1.0])
@@ -205,7 +205,7 @@ def add_drawn_object(plant: MultibodyPlant, model: ObjectModel) -> RigidBody:
 
 
 def drawn_mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike, name: str) -> Mesh:
-    """Return vertices (n, 3) [m] and faces (m, 3) as a named shape that is shaded smoothly."""
+    """Return vertices (n, 3) [m] and faces (m, 3) as a named shape with smooth shading."""
     text = obj_text(vertices, faces, normals=True)
     return Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", name)))
 
@@ -216,10 +216,10 @@ def render(
     """Return the images of an object at X_TO (4, 4) from a camera at X_TC (4, 4).
 
     Args:
-        renderer: From `build_renderer`.
+        renderer: Renderer from `build_renderer`.
         X_TO: Pose of the object (4, 4).
         X_TC: Pose of the camera (4, 4).
-        lens: Of the camera; that of the renderer's configuration if None.
+        lens: Lens of the camera; None for the lens of the renderer's configuration.
 
     Raises:
         BlankImageError: If the image is blank, which means that OpenGL failed.
@@ -230,7 +230,7 @@ def render(
     plant_context = plant.GetMyMutableContextFromRoot(renderer.context)
     plant.SetFreeBodyPose(plant_context, renderer.object, RigidTransform(multiply(X_WT, X_TO)))
 
-    # The camera; it is given by its pose in the world.
+    # The camera, given by its pose in the world.
     X_WC, K = RigidTransform(multiply(X_WT, X_TC)), lens.K
     core = RenderCameraCore(
         ENGINE,
@@ -263,19 +263,20 @@ def depth_in_box(
     X_OC: Array,
     half_extents: Array,
 ) -> npt.NDArray[np.float32]:
-    """Return a depth image (H, W) [m] whose object points are in its box, where rays meet it.
+    """Return a depth image (H, W) [m] whose object points are in the object's box, if possible.
 
-    A renderer gives a pixel at an edge the depth of a face that is seen nearly from its edge,
-    continued beyond that edge by up to centimetres. Such a point moves along its ray to where the
-    ray enters the box, or leaves it. It stays where the ray misses the box by a part of a pixel,
-    and where it had to move by more than `FARTHEST`: that is another fault, for `check` to name.
+    A face that is seen almost edge-on can give a pixel at its edge the depth of the face's plane
+    beyond the edge, up to centimetres away. Such a point is moved along its ray to where the ray
+    enters or leaves the box. It is not moved if the ray misses the box, which happens by a fraction
+    of a pixel, or if it would move by more than `FARTHEST`: that is another fault, which `check`
+    reports.
 
     Args:
-        depth: (H, W) [m], 0 where something is too near, inf where nothing is near enough.
-        mask: (H, W), 1 where the object is seen.
+        depth: (H, W) [m], 0 where something is too near, inf where everything is too far.
+        mask: (H, W), 1 on the object.
         K: Camera matrix (3, 3) [px].
         X_OC: Pose of the camera (4, 4).
-        half_extents: Of the box, (3,) [m].
+        half_extents: Half extents of the box, (3,) [m].
     """
     v, u = np.nonzero((mask == 1) & (depth > 0.0) & np.isfinite(depth))
     z = depth[v, u]
