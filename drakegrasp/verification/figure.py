@@ -1,8 +1,8 @@
 """Pictures of a verified grasp: a figure of its contacts on the object, and a recording.
 
-In: a verification. Out: a matplotlib figure with the object from two sides, then the last state
-that was reached, with the hand, with the verdict and a legend; or an HTML file that plays the
-trial. The pictures come from `pictures.still_scene`, so they need OpenGL and a single thread.
+In: a verification. Out: a matplotlib figure, or an HTML file that plays the trial. The figure shows
+the object from two sides, then the last state that was reached with the hand, the verdict and a
+legend. The pictures come from `pictures.still_scene`, so they need OpenGL and a single thread.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
 
 #: Lights beside the camera and above the table, without shadows: contacts are on all sides of an
-#: object, and none should be in the dark.
+#: object, and none of them should be in the dark.
 LIGHTING = Lighting(
     name="contacts",
     lights=(
@@ -80,12 +80,12 @@ LARGEST_FORCE = 0.05
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Marks:
-    """Contacts of one kind to draw: a dot and an arrow each.
+    """Contacts of one kind to draw, each with a dot and an arrow.
 
     Attributes:
         kind: Name of the kind in the ids of the figure's elements.
-        colour: Of dots and arrows.
-        size: Diameter of the dots; the arrows scale with it [points].
+        colour: Colour of dots and arrows.
+        size: Diameter of the dots [points]; the arrows scale with it.
         p_OQ: (n, 3), points in {O} [m].
         nhat_Q_O: (n, 3), outward unit normals in {O}.
         tail_O, tip_O: (n, 3), ends of the arrows in {O} [m].
@@ -105,9 +105,10 @@ View: TypeAlias = tuple[str, Picture, Array, Sequence[Marks]]
 
 
 def _views(verified: Verification) -> Iterator[View]:
-    """Yield the object from two sides, then the last state that was reached with the hand."""
-    # The predicted contacts, those after closing with their forces, and where these are after the
-    # lift on the object as it lay: an arrow is how far a fingertip slid over its surface.
+    """Yield views of the object from two sides, then of the last state reached with the hand."""
+    # Marks: the predicted contacts; the contacts after closing, with their forces; and the contacts
+    # after the lift, on the object in its first pose. An arrow there shows how far a fingertip
+    # slid.
     model, closed, lifted = verified.placed.model, verified.closed, verified.lifted
     scene = StillScene(load_hand(verified.config.hand_source), model)
     X_WO = X_WT @ verified.placed.X_TO_simulated
@@ -125,7 +126,7 @@ def _views(verified: Verification) -> Iterator[View]:
         X_WC = _camera(model, X_WO, marks, azimuth)
         yield title, scene.picture(X_WC, (PIXELS, PIXELS), LIGHTING), X_WO, marks
 
-    # The hand after the lift or closed, or its palm pose that comes closest.
+    # The hand after the lift or after closing, or else in the palm pose that comes closest.
     trial, fit = verified.trial, verified.fit
     if trial is not None and trial.lift is not None:
         X_WO, X_OG, q = X_WT @ trial.lift.X_TO, trial.lift.X_OG, trial.lift.q
@@ -146,7 +147,7 @@ def _views(verified: Verification) -> Iterator[View]:
 
 def _predicted(verified: Verification) -> Marks:
     """Return the predicted contacts, with arrows along their normals."""
-    # A row that is no grasp has none.
+    # An invalid row has no contacts.
     there = np.isfinite(verified.p_OQ).all(axis=1)
     p, n = verified.p_OQ[there], verified.nhat_Q_O[there]
     return Marks(kind="predicted", colour=PREDICTED, size=9.0, p_OQ=p, nhat_Q_O=n, tail_O=p,
@@ -156,7 +157,7 @@ def _predicted(verified: Verification) -> Marks:
 def _arriving(
     contacts: Contacts, tail_O: Array, kind: str, colour: str, *, size: float = 5.0
 ) -> Marks:
-    """Return the contacts that touch, at the tips of arrows from tail_O (k, 3), NaN for none."""
+    """Return the contacts that touch, at the tips of arrows from tail_O (k, 3); NaN: no mark."""
     there = contacts.touching & np.isfinite(tail_O).all(axis=1)
     p, n = contacts.p_OQ[there], contacts.nhat_Q_O[there]
     return Marks(kind=kind, colour=colour, size=size, p_OQ=p, nhat_Q_O=n, tail_O=tail_O[there],
@@ -164,7 +165,7 @@ def _arriving(
 
 
 def largest_force(verified: Verification) -> float:
-    """Return the largest force on a fingertip that is drawn [N]; inf if there is none."""
+    """Return the largest drawn force on a fingertip [N]; inf if there is none."""
     ends = (verified.closed, verified.lifted)
     forces = [float(np.linalg.norm(c.f_Q_O, axis=1).max()) for c in ends if c is not None]
     return max(forces, default=0.0) or np.inf
@@ -173,9 +174,9 @@ def largest_force(verified: Verification) -> float:
 def _two_sides(model: ObjectModel, X_WO: Array, marks: Sequence[Marks]) -> tuple[float, float]:
     """Return two azimuths [rad] that together show as many predicted contacts as possible.
 
-    The first shows the most; the second shows the most of those that the first does not.
+    The first azimuth shows the most contacts; the second shows the most of the remaining ones.
     """
-    # Which contacts each camera sees, and which of them face it.
+    # Find the contacts that each camera sees, and those that face the camera.
     azimuths = np.deg2rad(AZIMUTHS_DEG)
     cameras = [_camera(model, X_WO, marks, azimuth)[:3, 3] for azimuth in azimuths]
     seen = np.array([is_seen(model, X_WO, marks[0], p_WC) for p_WC in cameras])
@@ -183,11 +184,12 @@ def _two_sides(model: ObjectModel, X_WO: Array, marks: Sequence[Marks]) -> tuple
     normals = np.broadcast_to(marks[0].nhat_Q_O, towards.shape)
     facing = np.sum(towards * normals, axis=2) > FACING
 
-    # An arrow that points at the camera shows little, so one across the line of sight counts more.
+    # An arrow that points at the camera shows little, so an arrow across the line of sight has more
+    # weight.
     across = np.linalg.norm(np.cross(towards, normals), axis=2)
     worth = (seen & facing) * (1.0 + 0.5 * across)
 
-    # Among equal second views take the one opposite to the first.
+    # Among equal second views, take the view opposite to the first.
     first = int(np.argmax(worth.sum(axis=1)))
     opposite = 1e-3 * np.cos(azimuths - azimuths[first])
     second = int(np.argmax((worth * (worth[first] == 0.0)).sum(axis=1) - opposite))
@@ -210,7 +212,7 @@ def _towards(marks: Marks, X_WO: Array, p_WC: Array) -> Array:
 
 
 def is_seen(model: ObjectModel, X_WO: Array, marks: Marks, p_WC: Array) -> npt.NDArray[np.bool_]:
-    """Return (n,), whether a camera at p_WC (3,) sees each contact past the object."""
+    """Return (n,), whether the object does not hide each contact from a camera at p_WC (3,)."""
     start = marks.p_OQ + HIDDEN * marks.nhat_Q_O
     hits = first_hits(np.asarray(model.visual.triangles), start, _towards(marks, X_WO, p_WC))
     return ~np.isfinite(hits)
@@ -220,9 +222,9 @@ def is_seen(model: ObjectModel, X_WO: Array, marks: Marks, p_WC: Array) -> npt.N
 EDGE = 3.3
 #: Distance of a number from its arrow [points].
 NUMBER = 7.0
-#: Shorter arrows are not drawn [px].
+#: Length below which arrows are not drawn [px].
 SHORTEST = 8.0
-#: Colours of the verdict: success and stable, held otherwise, not held.
+#: Colours of the verdict: success and stable; held but not both; not held.
 STABLE, HELD, FAILS = "#1B7F3B", "#8A5A00", "#B3261E"
 
 
@@ -265,7 +267,7 @@ def verification_figure(verified: Verification) -> Figure:
 
 
 def _contact_line(verified: Verification) -> str:
-    """Return the line on how close the contacts are to those asked for, and on other poses."""
+    """Return the line on how close the contacts are to the requested ones, and on other poses."""
     if verified.outcome is Outcome.INVALID or verified.first is None:
         return ""
     words = []
@@ -293,14 +295,14 @@ def _lift_line(verified: Verification) -> str:
 def _draw_marks(
     axes: Axes, picture: Picture, X_WO: Array, model: ObjectModel, marks: Marks
 ) -> None:
-    """Draw contacts of one kind; the dots of those that the object hides are hollow."""
-    # Project them into the picture, and ask which are visible.
+    """Draw contacts of one kind; a contact that the object hides has a hollow dot."""
+    # Project them into the picture, and find the visible ones.
     halo = [withStroke(linewidth=3.0, foreground="white")]
     ends = (marks.p_OQ, marks.tail_O, marks.tip_O)
     pixels = [picture.pixels(transform_points(X_WO, p)) for p in ends]
     seen = is_seen(model, X_WO, marks, picture.X_WC[:3, 3])
 
-    # An arrow, the dot, and for a prediction its number beyond the arrow's tip.
+    # Draw an arrow, the dot, and for a prediction its number beyond the arrow's tip.
     for i, (dot, tail, tip, visible) in enumerate(zip(*pixels, seen, strict=True)):
         name = str(i + 1) if marks.kind == "predicted" else ""
         arrow = {"arrowstyle": "-|>", "color": marks.colour, "linewidth": 0.36 * marks.size,
@@ -322,14 +324,14 @@ def _beyond(tail: Array, tip: Array) -> tuple[float, float]:
     """Return the offset (x, y up) of an arrow's name from its tip [points]."""
     along = (tip - tail) * [1.0, -1.0]
     length = float(np.linalg.norm(along))
-    # An arrow that points at the camera looks like a dot: its name goes above that.
+    # An arrow that points at the camera looks like a dot; put its name above the dot.
     if length < NUMBER:
         return 0.0, 1.5 * NUMBER
     return float(NUMBER * along[0] / length), float(NUMBER * along[1] / length)
 
 
 def _draw_legend(figure: Figure, verified: Verification, corner: tuple[float, float]) -> None:
-    """Draw the legend below a corner, given as shares of the figure's width and height."""
+    """Draw the legend below a corner, given as fractions of the figure's width and height."""
 
     def dot(colour: str, inside: str, label: str) -> Line2D:
         return Line2D([], [], marker="o", linestyle="none", markersize=6.5, label=label,
@@ -349,9 +351,10 @@ def _draw_legend(figure: Figure, verified: Verification, corner: tuple[float, fl
 
 
 def record_verification(verified: Verification, path: Path) -> None:
-    """Write a recording of a verification, which is simulated again for it, with its explanation.
+    """Write a recording of a verification with its explanation; the trial is simulated again.
 
-    The trial is that of the first wrist pose. A row that is no grasp shows the object at rest.
+    It is the trial of the first wrist pose. For an invalid row, the recording shows the object at
+    rest.
 
     Args:
         verified: The verdict.
@@ -376,7 +379,7 @@ def record_verification(verified: Verification, path: Path) -> None:
 
 
 def _record_object(verified: Verification, path: Path) -> None:
-    """Write a recording of the object at rest, with the contacts that forces were judged at."""
+    """Write a recording of the object at rest, with the contacts at which forces were judged."""
     placed, config = verified.placed, verified.config
 
     def run(meshcat: Meshcat) -> None:

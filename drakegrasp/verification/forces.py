@@ -1,23 +1,22 @@
-"""What forces at a grasp's contacts alone can do, within the hand's strength.
+"""What forces at a grasp's contacts can do within the hand's strength, without a simulation.
 
 In: predicted points and normals, or contacts, and the wrenches of a lift. Out: the smallest forces
-within the friction cones (`ContactForces`), margins of a grasp, and a `ForceVerdict`: whether
-forces at the contacts of the surface that a prediction selects can carry the lift. Nothing is
-simulated.
+within the friction cones (`ContactForces`), margins of a grasp, and a `ForceVerdict`. The verdict
+states whether forces at the surface contacts that a prediction selects can support the lift.
 
 The forces solve a second-order cone program (M. Lobo, L. Vandenberghe, S. Boyd, H. Lebret,
-"Applications of second-order cone programming", 1998, section 3.4) by Clarabel through Drake. A
-fingertip touches at points with Coulomb friction, which it pushes along the inward normal and along
-the surface; it neither pulls nor twists. It has one point, or several that make a patch: they share
-the finger's force in any way, so that together they resist twisting, too.
+"Applications of second-order cone programming", 1998, section 3.4), with Clarabel through Drake. A
+fingertip touches at points with Coulomb friction. It pushes along the inward normal and along the
+surface; it neither pulls nor twists. It has one point, or several points that form a patch. The
+points of a patch share the finger's force in any way, so together they also resist twisting.
 
-A prediction only selects contacts of the surface that the hand meets in the simulation, so no
-choice of its numbers makes a force possible that the surface does not allow. The contact is the
-point nearest to the predicted one on a face whose normal is within `MAX_ANGLE` of the predicted
-normal. At an edge, where several of these faces are equally near, it is the one whose normal is
-closest to the predicted one; so a point on the wrong side of a thin wall is on the side that its
-normal names. If no such face is within `MAX_DISTANCE`, the contact is on the nearest face of all,
-and the prediction is off the surface by that distance or angle.
+A prediction only selects contacts on the surface that the hand meets in the simulation, so no
+choice of its numbers can make a force possible that the surface does not allow. The selected
+contact is the closest point to the predicted one on a face whose normal is within `MAX_ANGLE` of
+the predicted normal. At an edge, where several of these faces are equally close, it is on the face
+whose normal is closest to the predicted one. A point on the wrong side of a thin wall is therefore
+moved to the side that its normal names. If no such face is within `MAX_DISTANCE`, the contact is on
+the closest face of all, and the prediction is off the surface by that distance or angle.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.lift import lift_path
 from drakegrasp.table import Table
 
-#: Forces count as applying a wrench if their error is below this share of it.
+#: Forces apply a wrench if their error is below this fraction of the wrench.
 MAX_ERROR = 1e-7
 
 
@@ -52,10 +51,10 @@ class GraspContacts:
 
     Attributes:
         p_OQ: (k, 3), or (k, m, 3) for m points each; contact points in {O} [m].
-        nhat_Q_O: Likewise, normals out of the object in {O}.
+        nhat_Q_O: Normals out of the object in {O}, of the same shape.
         p_OOcm: (3,), centre of mass of the object in {O} [m].
-        force_limit: (k,), largest normal force of each fingertip, of all its points together, or
-            one for all, positive [N].
+        force_limit: (k,), largest total normal force of each fingertip over all its points, or one
+            value for all fingertips, positive [N].
     """
 
     p_OQ: npt.ArrayLike
@@ -81,7 +80,7 @@ class GraspContacts:
 
 
 def _is_not_from_clarabel(record: logging.LogRecord) -> bool:
-    """Return whether a log record is not Drake's note on the solver's status, which we read."""
+    """Return whether a record is not Drake's note on the solver's status, which we read instead."""
     return not record.getMessage().startswith("Clarabel returns")
 
 
@@ -93,10 +92,11 @@ class ContactForces:
     """Forces of k fingers on the object.
 
     Attributes:
-        feasible: Whether they apply the wrench that was asked for.
-        f_Q_O: (n, 3), at all points, finger by finger, in {O} [N]; NaN if there are none.
-        normal: (k,), inward normal components [N]; inf if there are none.
-        shares: (k,), of its limit that each of them takes; inf if there are none.
+        feasible: Whether the forces apply the requested wrench.
+        f_Q_O: (n, 3), forces at all points, finger by finger, in {O} [N]; NaN without forces.
+        normal: (k,), inward normal components [N]; inf without forces.
+        shares: (k,), normal component of each finger as a fraction of its limit; inf without
+            forces.
     """
 
     feasible: bool
@@ -111,7 +111,7 @@ class ContactForces:
 
     @property
     def share(self) -> float:
-        """Largest share of its limit that a contact takes; inf if there are no forces."""
+        """Largest fraction of a limit that a finger needs; inf if there are no forces."""
         return float(self.shares.max())
 
 
@@ -124,10 +124,10 @@ class ForceProgram:
         minimise t   subject to   Σ_ij G_ij f_ij = w,   |f_t| ≤ μ f_n,   Σ_j f_n,ij ≤ t N_i
 
     (Lobo et al., 3.4). The unknowns x are the three components of each force along the axes of its
-    point, the tangential ones divided by the friction coefficient mu. So every cone is
-    |tangential| <= normal. Forces are in units of the load, and torques are divided by the largest
-    distance of a point from Ocm, so that all grasps look alike to the solver. Limits are in units
-    of the largest one.
+    point. The tangential components are divided by the friction coefficient mu, so every cone is
+    |tangential| <= normal. Forces are in units of the load. Torques are divided by the largest
+    distance of a point from Ocm, so that all grasps have the same scale for the solver. Limits are
+    in units of the largest limit.
     """
 
     def __init__(self, contacts: GraspContacts, friction: float) -> None:
@@ -142,16 +142,16 @@ class ForceProgram:
         self._force = contacts.axes * [1.0, friction, friction]
         blocks = grasp_map(p_OcmQ).reshape(6, self._n, 3)
         A = np.einsum("wni,nij->wnj", blocks, self._force).reshape(6, -1) / self._units[:, None]
-        # Contacts that are not finite hold nothing; a map of zeros says the same.
+        # Contacts that are not finite hold nothing; a map of zeros has the same effect.
         self._map = A if np.isfinite(A).all() else np.zeros_like(A)
 
         self._limit = np.broadcast_to(np.asarray(contacts.force_limit, dtype=float), (self._k,))
         self._largest = float(self._limit.max())
 
     def smallest(self, wrench_O: npt.ArrayLike) -> ContactForces:
-        """Return the forces that apply a wrench and take the smallest share of the limits.
+        """Return the forces that apply a wrench and need the smallest fraction of the limits.
 
-        The share is the largest of the contacts'; the forces may be beyond the limits.
+        This fraction is the largest of all fingers; the forces may be beyond the limits.
 
         Args:
             wrench_O: (6,), torque about Ocm and force on the object in {O} [N m, N].
@@ -159,13 +159,13 @@ class ForceProgram:
         target = np.asarray(wrench_O, dtype=float) / self._units
         load = float(np.linalg.norm(target))
 
-        # Without a load no forces are needed; for an infinite one there are none.
+        # Without a load no forces are needed; for an infinite load there are none.
         if load == 0.0:
             return self._forces(np.zeros(3 * self._n), target)
         if not np.isfinite(load):
             return self._forces(None, target)
 
-        # Solve for the load's direction, and scale.
+        # Solve for the load's direction, and scale the solution.
         program, wrench = self._smallest
         wrench.UpdateCoefficients(self._with_t(self._map), target / load)
         x = self._solve(program)
@@ -192,7 +192,7 @@ class ForceProgram:
         return program, equality.evaluator()
 
     def _solve(self, program: MathematicalProgram) -> Array | None:
-        """Return the x (3 n,) of the solution, or None if the solver finds none."""
+        """Return the x (3 n,) of the solution, or None if the solver finds no solution."""
         result = ClarabelSolver().Solve(program)
         return np.asarray(result.get_x_val()[: 3 * self._n]) if result.is_success() else None
 
@@ -222,17 +222,17 @@ class ForceProgram:
 
 
 def hardest_forces(program: ForceProgram, wrenches_O: npt.ArrayLike) -> ContactForces:
-    """Return the forces of the wrench that takes the largest share of the fingers' limits.
+    """Return the forces of the wrench that needs the largest fraction of the fingers' limits.
 
-    The share that a wrench needs is a convex function of the wrench, so no wrench in between needs
-    more.
+    The needed fraction is a convex function of the wrench, so no wrench between the given ones
+    needs a larger one.
 
     Args:
-        program: Of the grasp.
+        program: Cone program of the grasp.
         wrenches_O: (n, 6), torque about Ocm and force on the object in {O} [N m, N].
 
     Returns:
-        The forces; if one of the wrenches cannot be applied, there are none.
+        The forces; there are none if one of the wrenches cannot be applied.
     """
     wrenches = np.asarray(wrenches_O, dtype=float)
     return max((program.smallest(wrench) for wrench in wrenches), key=lambda forces: forces.share)
@@ -242,8 +242,8 @@ def contact_axes(nhat_Q_O: npt.ArrayLike) -> Array:
     """Return axes (k, 3, 3) at each contact, as columns: the inward normal and two tangents.
 
     Args:
-        nhat_Q_O: (k, 3), normals out of the object in {O}, of any length; a zero normal has axes
-            of NaN.
+        nhat_Q_O: (k, 3), normals out of the object in {O}, of any length; the axes of a zero normal
+            are NaN.
     """
     normals = np.asarray(nhat_Q_O, dtype=float)
     with np.errstate(invalid="ignore"):
@@ -268,8 +268,8 @@ def grasp_map(p_OcmQ: Array) -> Array:
     return np.vstack([moments, np.tile(np.eye(3), len(p_OcmQ))])
 
 
-#: Edges of the pyramid that approximates a friction cone from inside. With 16, epsilon is about
-#: 2 % too small and varies by as much with the frame; the hull takes 15 ms.
+#: Edges of the pyramid that approximates a friction cone from inside. With 16 edges, epsilon is
+#: about 2 % too small and varies by as much with the frame; the hull takes 15 ms.
 FRICTION_EDGES = 16
 #: An epsilon below this is rounding: the origin is on the surface of the hull.
 ROUNDING = 1e-9
@@ -280,11 +280,11 @@ MAX_FRICTION, FRICTION_TOLERANCE = 10.0, 1e-4
 def characteristic_length(vertices: npt.ArrayLike, p_OOcm: npt.ArrayLike) -> float:
     """Return the largest distance of a surface from the centre of mass [m].
 
-    No contact has a longer arm, so torques divided by it are comparable with the forces that
-    cause them.
+    No contact has a longer arm, so torques divided by this length are comparable with the forces
+    that cause them.
 
     Args:
-        vertices: (n, 3), of the surface in {O} [m].
+        vertices: (n, 3), vertices of the surface in {O} [m].
         p_OOcm: (3,), the centre of mass in {O} [m].
     """
     arms = np.asarray(vertices, dtype=float) - np.asarray(p_OOcm, dtype=float)
@@ -294,18 +294,18 @@ def characteristic_length(vertices: npt.ArrayLike, p_OOcm: npt.ArrayLike) -> flo
 def ferrari_canny(contacts: GraspContacts, *, friction: float, length: float) -> float:
     """Return the epsilon of a grasp: the smallest wrench that can break it.
 
-    The L1 version of C. Ferrari and J. Canny, "Planning optimal grasps", ICRA 1992: the
-    distance of the origin from the surface of the convex hull of all contacts' friction
-    cones with unit normal forces, that is, for normal forces that sum to one. Each cone is
-    approximated by a pyramid of `FRICTION_EDGES` edges. Edge e of point i, with the inward normal
-    n_i, the tangents t, the arm p_i and the length L, has the wrench
+    This is the L1 version of C. Ferrari and J. Canny, "Planning optimal grasps", ICRA 1992: the
+    distance of the origin from the surface of the convex hull of all contacts' friction cones, for
+    normal forces that sum to one. Each cone is approximated by a pyramid with `FRICTION_EDGES`
+    edges. Edge e of point i, with the inward normal n_i, the tangents t, the arm p_i and the length
+    L, has the wrench
 
-        w_ie = [p_i × f_ie / L; f_ie],   f_ie = n_i + μ (cos(α_e) t_i1 + sin(α_e) t_i2),
+        w_ie = [p_i × f_ie / L; f_ie],   f_ie = n_i + μ (cos(α_e) t_i1 + sin(α_e) t_i2).
 
-    and, with the origin inside their hull, ε = min over |u| = 1 of max over i, e of u·w_ie.
+    If the origin is inside the hull, ε = min over |u| = 1 of max over i, e of u·w_ie.
 
     Args:
-        contacts: Of the grasp.
+        contacts: Contacts of the grasp.
         friction: Coulomb coefficient.
         length: Length by which torques are divided [m], see `characteristic_length`.
 
@@ -325,7 +325,7 @@ def ferrari_canny(contacts: GraspContacts, *, friction: float, length: float) ->
     if not np.isfinite(wrenches).all():
         return 0.0
 
-    # Distance of the origin from their hull.
+    # Compute the distance of the origin from the hull of these wrenches.
     try:
         hull = ConvexHull(wrenches)
     except QhullError:
@@ -338,19 +338,19 @@ def ferrari_canny(contacts: GraspContacts, *, friction: float, length: float) ->
 def force_margin(
     model: ObjectModel, X_TO: npt.ArrayLike, contacts: GraspContacts, config: Config
 ) -> tuple[float, float]:
-    """Return by what margin forces at the contacts of a grasp hold the object in its lift.
+    """Return the margin by which forces at the contacts of a grasp hold the object in its lift.
 
     Args:
         model: The object.
-        X_TO: (4, 4), its resting pose.
-        contacts: Of the grasp.
+        X_TO: (4, 4), resting pose of the object.
+        contacts: Contacts of the grasp.
         config: Friction and lift.
 
     Returns:
-        The epsilon of Ferrari and Canny at the configured friction, with torques divided by the
-        largest distance of the object's surface from its centre of mass, 0 without force closure;
-        and the smallest coefficient at which forces within the limits of the hand's fingertips
-        carry the lift, inf if none is enough.
+        Two numbers. The first is the epsilon of Ferrari and Canny at the configured friction, with
+        torques divided by the largest distance of the object's surface from its centre of mass; it
+        is 0 without force closure. The second is the smallest coefficient at which forces within
+        the limits of the hand's fingertips support the lift; it is inf if no coefficient suffices.
     """
     epsilon = ferrari_canny(
         contacts,
@@ -363,19 +363,19 @@ def force_margin(
 def smallest_friction(contacts: GraspContacts, wrenches_O: npt.ArrayLike) -> float:
     """Return the smallest friction coefficient at which all wrenches can be applied.
 
-    With t(w, μ) the share of the limits that a wrench takes (`ForceProgram`), it is
+    With t(w, μ) the fraction of the limits that a wrench needs (`ForceProgram`), it is
 
         μ* = min {μ : max over w of t(w, μ) ≤ 1}.
 
-    The force that is needed never grows with friction, so bisection finds the coefficient.
+    The needed force never grows with friction, so bisection finds the coefficient.
 
     Args:
-        contacts: Of the grasp.
+        contacts: Contacts of the grasp.
         wrenches_O: (n, 6), each torque about Ocm and force on the object in {O} [N m, N].
 
     Returns:
-        The coefficient, rounded up by at most `FRICTION_TOLERANCE`; inf if `MAX_FRICTION` is not
-        enough.
+        The coefficient, rounded up by at most `FRICTION_TOLERANCE`; inf if `MAX_FRICTION` does not
+        suffice.
     """
 
     def holds(friction: float) -> bool:
@@ -394,25 +394,25 @@ def smallest_friction(contacts: GraspContacts, wrenches_O: npt.ArrayLike) -> flo
 #: Usual area of a fingertip's contact [m^2]: the median of 498 patches of the Barrett Hand
 #: after closing, on five G3DB meshes; half of them are between 57 and 89 mm^2.
 PATCH_AREA = 68e-6
-#: Radius of a disc of this area [m], 4.65 mm, and its torsion radius under even pressure, 3.1 mm: a
-#: normal force f resists a torsional moment of mu f r (R. Howe, M. Cutkosky, "Practical
+#: Radius of a disc of this area [m], 4.65 mm, and its torsion radius r under even pressure, 3.1 mm.
+#: A normal force f resists a torsional moment of mu f r (R. Howe, M. Cutkosky, "Practical
 #: force-motion models for sliding manipulation", IJRR 15(6), 1996).
 PATCH_RADIUS = float(np.sqrt(PATCH_AREA / np.pi))
 TORSION_RADIUS = 2.0 / 3.0 * PATCH_RADIUS
-#: A prediction is off the surface if its point is farther from it than this [m], about the radius
-#: of a patch, or if its normal is farther from the surface's own than this [rad].
+#: A prediction is off the surface if its point is farther from the surface than this [m], about the
+#: radius of a patch, or if its normal differs from the surface normal by more than this [rad].
 MAX_DISTANCE, MAX_ANGLE = 0.005, np.deg2rad(45.0)
-#: Distances that differ by less are equal [m]: predictions are rounded to 0.1 mm.
+#: Distances that differ by less than this are equal [m]: predictions are rounded to 0.1 mm.
 SAME_DISTANCE = 1e-4
-#: A face that agrees with the normal may be so much farther than the nearest one [m]: less than the
-#: wall of a cup.
+#: A face that agrees with the normal may be farther than the closest face by at most this [m], less
+#: than the wall of a cup.
 MAX_DETOUR = 1e-3
-#: Points on the ring of a patch.
+#: Number of points on the ring of a patch.
 RING_POINTS = 8
 
 
 def surface_feet(triangles: Array, points: Array) -> Array:
-    """Return the point (n, m, 3) of each of m triangles that is nearest to each of n points."""
+    """Return the closest point (n, m, 3) on each of m triangles to each of n points."""
     n, m = len(points), len(triangles)
     near = trimesh.triangles.closest_point(
         np.tile(triangles, (n, 1, 1)), np.repeat(points, m, axis=0)
@@ -425,19 +425,21 @@ def surface_contacts(model: ObjectModel, p_OQ: npt.ArrayLike, nhat_Q_O: npt.Arra
 
     Args:
         model: The object.
-        p_OQ: In {O}.
-        nhat_Q_O: In {O}.
+        p_OQ: Predicted points in {O}.
+        nhat_Q_O: Predicted normals in {O}.
 
     Returns:
-        `p_OQ` (k, 3), points of the surface in {O} [m], and `nhat_Q_O` (k, 3), outward normals of
-        the faces there; of the predicted points `distance` (k,) from them [m] and whether they are
-        `inside` (k,) the object; `angle` (k,) between the predicted normals and these [rad]; and
-        whether a prediction is `off_surface` (k,), by its distance or its angle.
+        A table of k rows. `p_OQ` (k, 3) are points of the surface in {O} [m], and `nhat_Q_O` (k, 3)
+        outward normals of the faces there. `distance` (k,) is the distance of the predicted points
+        from them [m], `inside` (k,) whether the predicted points are inside the object, and `angle`
+        (k,) the angle between the predicted normals and these [rad]. `off_surface` (k,) states
+        whether a prediction is off the surface, by its distance or its angle.
     """
     points, normals = np.asarray(p_OQ, dtype=float), np.asarray(nhat_Q_O, dtype=float)
 
-    # Nearest among the faces that agree with the normal, else among all. Beyond a wall's other side
-    # no fingertip can be: a face that is much farther than the nearest one is not chosen.
+    # Choose the closest face among those that agree with the normal, or else among all. No
+    # fingertip can be beyond a wall, so a face that is much farther than the closest one is not
+    # chosen.
     feet = surface_feet(model.collision.triangles, points)
     distance = np.linalg.norm(feet - points[:, None], axis=2)
     cosine = normals @ model.collision.face_normals.T
@@ -446,7 +448,7 @@ def surface_contacts(model: ObjectModel, p_OQ: npt.ArrayLike, nhat_Q_O: npt.Arra
     found = agreeing.min(axis=1) <= MAX_DISTANCE
     chosen = _nearest(np.where(found[:, None], agreeing, distance), cosine)
 
-    # The point of that face, and how far the prediction is from it.
+    # The selected point of that face, and the distance and angle of the prediction from it.
     near = feet[np.arange(len(points)), chosen]
     own = np.asarray(model.collision.face_normals[chosen])
     winding = winding_numbers(
@@ -465,16 +467,17 @@ def surface_contacts(model: ObjectModel, p_OQ: npt.ArrayLike, nhat_Q_O: npt.Arra
 
 
 def patch_points(model: ObjectModel, contacts: Table) -> tuple[Array, Array]:
-    """Return points (k, m, 3) [m] of the patches about k contacts, and normals (k, m, 3) there.
+    """Return points (k, m, 3) [m] of the patches around k contacts, and normals (k, m, 3) there.
 
-    A patch is its contact and a ring of `RING_POINTS` points about it, each with the normal of its
-    own face. They are the surface's nearest points to a circle of the radius `TORSION_RADIUS` in
-    the contact's tangent plane; of equally near faces that most parallel to the contact's counts.
-    So a patch ends at an edge of 90 degrees or more, and bends around a blunter one.
+    A patch is its contact and a ring of `RING_POINTS` points around it, each with the normal of its
+    face. The ring has the surface points that are closest to a circle with the radius
+    `TORSION_RADIUS` in the contact's tangent plane. Of equally close faces, the one that is most
+    parallel to the contact's face is used. So a patch ends at an edge of 90 degrees or more, and
+    bends around a blunter edge.
 
     Args:
         model: The object.
-        contacts: On its surface.
+        contacts: Contacts on the surface of the object.
     """
     # A circle about each contact.
     angles = 2.0 * np.pi * np.arange(RING_POINTS) / RING_POINTS
@@ -482,7 +485,7 @@ def patch_points(model: ObjectModel, contacts: Table) -> tuple[Array, Array]:
     axes = contact_axes(contacts.nhat_Q_O)
     circles = contacts.p_OQ[:, None] + TORSION_RADIUS * ring @ axes.transpose(0, 2, 1)
 
-    # A point of it is at most a radius from the surface, so at most two from the contact.
+    # A point of the circle is at most a radius from the surface, so at most two from the contact.
     triangles, face_normals = model.collision.triangles, model.collision.face_normals
     arms = surface_feet(triangles, contacts.p_OQ) - contacts.p_OQ[:, None]
     near = np.linalg.norm(arms, axis=2) <= 2.0 * TORSION_RADIUS + SAME_DISTANCE
@@ -499,13 +502,13 @@ def patch_points(model: ObjectModel, contacts: Table) -> tuple[Array, Array]:
 
 
 def _nearest(distance: Array, cosine: Array) -> npt.NDArray[np.int64]:
-    """Return the index (n,) of the nearest face (n, m); of equally near ones the most parallel."""
+    """Return the index (n,) of the closest face (n, m); of equally close ones the most parallel."""
     near = distance <= distance.min(axis=1, keepdims=True) + SAME_DISTANCE
     return np.argmax(np.where(near, cosine, -np.inf), axis=1)
 
 
-#: Hands with so many fingers hold an object by points alone. With fewer, points resist no torque
-#: about the line between them, and patches decide.
+#: Hands with at least this many fingers are judged by points alone. With fewer fingers, points
+#: resist no torque about the line between them, so patches decide.
 ENOUGH_POINTS = 3
 
 
@@ -514,9 +517,9 @@ class ForceVerdict:
     """What forces at the contacts that a prediction selects can do.
 
     Attributes:
-        contacts: On the surface, see `surface_contacts`.
+        contacts: Contacts on the surface, see `surface_contacts`.
         points: Forces at one point of each contact, for the harder of the lift's two wrenches.
-        patches: Forces at the patches about them, likewise.
+        patches: Forces at the patches around the contacts, for the harder of the two wrenches.
     """
 
     contacts: Table
@@ -525,27 +528,27 @@ class ForceVerdict:
 
     @property
     def deciding(self) -> ContactForces:
-        """The forces that decide: at points, for a hand with two fingertips at patches."""
+        """The forces that decide: at points, or at patches for a hand with two fingertips."""
         return self.points if len(self.contacts.p_OQ) >= ENOUGH_POINTS else self.patches
 
     @property
     def on_surface(self) -> bool:
-        """Whether every predicted contact is near the surface, and its normal near its own."""
+        """Whether the surface is near every predicted contact, in position and normal."""
         return not self.contacts.off_surface.any()
 
     @property
     def held(self) -> bool:
-        """Whether the contacts are on the surface, and forces at them carry the object."""
+        """Whether the contacts are on the surface, and forces at them support the object."""
         return self.on_surface and self.planned_share <= 1.0
 
     @property
     def planned_force(self) -> float:
-        """Normal force of the finger that takes the largest share of its limit [N]; may be inf."""
+        """Normal force [N] of the finger that needs the largest fraction of its limit, or inf."""
         return float(self.deciding.normal[np.argmax(self.deciding.shares)])
 
     @property
     def planned_share(self) -> float:
-        """That share, as small as the lift allows; above 1 the fingers are too weak."""
+        """The smallest fraction of a limit that suffices; above 1 the fingers are too weak."""
         return self.deciding.share
 
     @property
@@ -567,7 +570,7 @@ class ForceVerdict:
                 f"more than {np.rad2deg(MAX_ANGLE):.0f}°"
             )
 
-        # Or the surface there cannot carry the load.
+        # Or the surface there cannot support the load.
         if not np.isfinite(self.planned_share):
             return f"no forces within the surface's friction cones carry it{self._other()}"
         if self.planned_share > 1.0:
@@ -583,7 +586,7 @@ class ForceVerdict:
         )
 
     def _other(self) -> str:
-        """Return what patches would do where points decide and fail."""
+        """Return what patches could do if points decide and fail."""
         if self.deciding is self.patches:
             return ""
         if not np.isfinite(self.patches.share):
@@ -598,13 +601,14 @@ def judge_forces(
     nhat_Q_O: npt.ArrayLike,
     config: Config,
 ) -> ForceVerdict:
-    """Return whether forces at the contacts that a prediction selects carry the object's lift.
+    """Return whether forces at the contacts that a prediction selects support the object's lift.
 
-    The object moves along `trajectory.lift_path`; friction is its own, or `physics.friction_hand`.
+    The object moves along `simulation.lift.lift_path`. The friction is the object's own, or
+    `physics.friction_hand`.
 
     Args:
         model: The object.
-        X_TO: (4, 4), its resting pose.
+        X_TO: (4, 4), resting pose of the object.
         p_OQ: (k, 3), predicted points in {O} [m].
         nhat_Q_O: (k, 3), predicted unit normals out of the object in {O}.
         config: The hand, its drive, friction and lift.
@@ -628,7 +632,7 @@ def hand_contacts(
 ) -> GraspContacts:
     """Return the contacts on the surface that a prediction selects for the configuration's hand.
 
-    They are points; for a hand with two fingertips patches.
+    They are points, or patches for a hand with two fingertips.
 
     Args:
         model: The object.
@@ -655,5 +659,5 @@ def _grasp(model: ObjectModel, contacts: Table, config: Config, *, patches: bool
 
 
 def _percent(forces: ContactForces) -> str:
-    """Return the largest share of a fingertip's limit as text."""
+    """Return the largest fraction of a fingertip's limit as text."""
     return f"{100.0 * forces.share:.0f} %" if np.isfinite(forces.share) else "more than all"

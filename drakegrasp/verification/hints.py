@@ -1,8 +1,9 @@
-"""What may be wrong with the numbers of a grasp that fails; nothing is changed by it.
+"""Possible faults in the numbers of a grasp that fails; hints do not change a verdict.
 
-In: a placed grasp. Out: how its contacts lie on the surface, and hints in words. A hint says that
-the same numbers, read in another way, would fit much better: in another frame or unit, with normals
-that point the other way, with fingers in another order. All factors are own choices.
+In: a placed grasp. Out: how its contacts lie on the surface, and hints in words. A hint states that
+the same numbers would fit much better if they were read in another way: in another frame or unit,
+with normals that point the other way, or with the fingers in another order. All factors are own
+choices.
 """
 
 from __future__ import annotations
@@ -29,16 +30,16 @@ from drakegrasp.verification.placing import PlacedGrasp
 from drakegrasp.verification.wrist_problem import hand_constants
 from drakegrasp.verification.wrist_solver import make_postures, posture_misfit
 
-#: A face may be this much farther than the nearest one and still count as next to the point [m]: a
-#: prediction is as often on the wrong side of a cup's wall as beside the wall.
+#: A face may be farther than the closest one by this and still be next to the point [m]. A
+#: predicted point is as often on the wrong side of a cup's wall as beside the wall.
 WALL = 0.005
 
 
 def fit_surface(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> Table:
     """Return how k contacts lie on the surface that the hand meets.
 
-    A predicted point may be beside an edge or on the wrong side of a thin wall, so each face that
-    is at most `WALL` farther than the nearest one is next to it.
+    A predicted point may be beside an edge or on the wrong side of a thin wall. So each face that
+    is at most `WALL` farther than the closest one is "next to" the point.
 
     Args:
         model: The object.
@@ -46,10 +47,11 @@ def fit_surface(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> Table:
         nhat_Q_O: (k, 3), unit normals in {O}.
 
     Returns:
-        `distance` (k,) of the points from the surface [m]; `nearest` (k, 3), the points of it
-        nearest to them in {O} [m], and `normals` (k, 3), outward, of its faces there; `agreement`
-        (k,), cosine between each normal and the outward normal of a face next to its point, of the
-        face where it is largest; negative where the normal points inwards.
+        A table of k rows. `distance` (k,) is the distance of the points from the surface [m],
+        `nearest` (k, 3) are the closest points of the surface in {O} [m], and `normals` (k, 3) the
+        outward normals of their faces. `agreement` (k,) is the largest cosine between each normal
+        and the outward normal of a face next to its point; it is negative if the normal points
+        inwards.
     """
     feet, rows = surface_feet(model.collision.triangles, p_OQ), np.arange(len(p_OQ))
     distances = np.linalg.norm(feet - p_OQ[:, None], axis=2)
@@ -64,24 +66,24 @@ def fit_surface(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> Table:
     )
 
 
-#: Contacts are misplaced if one is farther from the surface [m].
+#: Contacts are misplaced if one of them is farther from the surface than this [m].
 FAR = 0.01
-#: A posture is misplaced if all fingertips of its grasp are farther from the surface [m].
+#: A posture is misplaced if all fingertips of its grasp are farther from the surface than this [m].
 FAR_POSTURE = 0.05
-#: Another reading fits much better if its points are at most this share as far from the surface
-#: (mean over the contacts), and no farther than `FAR`.
+#: Another reading fits much better if the mean distance of its points from the surface is at most
+#: this fraction of the given one's, and at most `FAR`.
 MUCH_NEARER = 0.25
-#: Contacts are at least so far apart [m]: any that shrink come close to a small object.
+#: Smallest distance between contacts [m]; any contacts that shrink come close to a small object.
 LEAST_SPREAD = 0.01
-#: Normals agree with the surface if their mean cosine to its normals is above this, and point the
-#: wrong way if it is below zero and the reversed ones agree.
+#: Normals agree with the surface if their mean cosine to its normals is above this. They point the
+#: wrong way if this cosine is below zero and the reversed normals agree.
 AGREEMENT = 0.5
-#: Points this close to the surface are on the side of a thin wall that they are meant for [m].
+#: Points this close to the surface are on the intended side of a thin wall [m].
 ON_SURFACE = 0.001
 #: Another order of the fingers fits much better if its misfit to the hand's postures is at most
-#: this share of the given one's.
+#: this fraction of the given order's misfit.
 MUCH_LIKER = 0.25
-#: What lengths may have been meant in, by the factors to metres.
+#: Units that lengths may have been meant in, by their factors to metres.
 _UNITS = {
     1.0: "",
     1e-3: "points in millimetres instead of metres",
@@ -92,13 +94,13 @@ _UNITS = {
 #: The hint about normals.
 REVERSED = "normals that point the other way, out of the object"
 
-#: What numbers may have been meant as: the frame in words, empty for the given one; the unit in
-#: words, likewise; and what they are so in {O}, points (k, 3) [m] and unit normals (k, 3) or None.
+#: A possible reading of the numbers: frame and unit in words, empty for the given ones, and the
+#: resulting points (k, 3) [m] and unit normals (k, 3), or None, in {O}.
 Reading: TypeAlias = tuple[str, str, Array, Array | None]
 
 
 def _frames(grasp: PlacedGrasp, thing: PlacedObject) -> dict[str, Array]:
-    """Return the poses X_OF (4, 4) of the frames that numbers could be in, the given one first."""
+    """Return the poses X_OF (4, 4) of possible frames of the numbers; the given frame is first."""
     X_OT, given = invert_pose(thing.X_TO), grasp.attempt.X_TC
     frames = {
         "": grasp.X_OA(thing),
@@ -109,7 +111,7 @@ def _frames(grasp: PlacedGrasp, thing: PlacedObject) -> dict[str, Array]:
     frames |= {} if thing.X_OM is None else {"the mesh file's frame (mesh)": thing.X_OM}
     frames |= {name: multiply(X_OT, X_TC) for name, X_TC in grasp.cameras.items()}
     if given is not None and not grasp.cameras:
-        # A caller who states the pose of a camera may mean another pose by it.
+        # A caller who gives the pose of a camera may mean another pose.
         X_CT = invert_pose(given[0])
         frames |= {
             "the inverse of X_TC": multiply(X_OT, X_CT),
@@ -122,20 +124,20 @@ def _frames(grasp: PlacedGrasp, thing: PlacedObject) -> dict[str, Array]:
 def find_hints(
     grasp: PlacedGrasp, p_OQ: Array, nhat_Q_O: Array, *, fits: bool = False
 ) -> tuple[str, ...]:
-    """Return what would make contacts fit much better.
+    """Return hints on readings in which the contacts would fit much better.
 
     Args:
-        grasp: On its object.
-        p_OQ: (k, 3), its contact points in {O} [m].
+        grasp: The grasp on its object.
+        p_OQ: (k, 3), contact points in {O} [m].
         nhat_Q_O: (k, 3), unit normals in {O}.
-        fits: Whether the hand makes the contacts: then only their place may be wrong.
+        fits: Whether the hand makes the contacts; then only their place may be wrong.
     """
     thing, hand = grasp.placed, load_hand(grasp.config.hand_source)
     fit = fit_surface(thing.model, p_OQ, nhat_Q_O)
     X_AO = invert_pose(grasp.X_OA(thing))
     p_AQ, nhat_Q_A = transform_points(X_AO, p_OQ), rotate_vectors(X_AO, nhat_Q_O)
 
-    # Where the points are elsewhere, neither normals nor fingers say anything.
+    # If the points are elsewhere, neither normals nor fingers are informative.
     if fit.distance.max() > FAR:
         readings: list[Reading] = [
             (name, unit, transform_points(X_OF, factor * p_AQ), rotate_vectors(X_OF, nhat_Q_A))
@@ -152,16 +154,17 @@ def find_hints(
 def find_posture_hints(
     grasp: PlacedGrasp, thing: PlacedObject, posture: Posture
 ) -> tuple[tuple[str, ...], Array]:
-    """Return what would bring the fingertips of a posture much closer to the object.
+    """Return hints on readings that bring the fingertips of a posture much closer to the object.
 
     Args:
-        grasp: Of the posture.
-        thing: The object as it lies.
-        posture: Wrist and joints, in {O} of it.
+        grasp: The grasp of the posture.
+        thing: The object in its resting pose.
+        posture: Wrist and joints, in {O} of this object.
 
     Returns:
-        The hints, and how far the fingertips that it closes are from the surface (m,) [m]; none if
-        the hand's fingertips have no nominal contact points.
+        The hints, and the distances (m,) from the surface of the fingertips that the posture closes
+        [m]. There are none for a palm pose alone, or if the hand's fingertips have no nominal
+        contact points.
     """
     hand = load_hand(grasp.config.hand_source)
     try:
@@ -174,12 +177,12 @@ def find_posture_hints(
 
     p_OQ, _ = fingertips(posture.X_OG)
     fit = fit_surface(thing.model, p_OQ, np.zeros_like(p_OQ))
-    # Where the fingers of a palm pose alone would have been is not known.
+    # The final positions of the fingers of a palm pose alone are unknown.
     distance = np.zeros(0) if posture.q_grasp is None else fit.distance
     if fit.distance.mean() <= FAR:
         return (), distance
 
-    # Where the given pose is: lengths in another unit move the palm with it.
+    # The position of the given pose: lengths in another unit move the palm with it.
     X_AG, X_OA, attempt = grasp.attempt.X_FG[0], grasp.X_OA(thing), grasp.attempt
     X_AL = multiply(X_AG, invert_pose(hand.palm_in(attempt.link))) if attempt.link else X_AG
     p_AL = X_AL[:3, 3]
@@ -206,14 +209,14 @@ def find_posture_hints(
 
 
 def count_hints(hints: Iterable[tuple[str, ...]]) -> list[tuple[str, int]]:
-    """Return the hints of many grasps with how many have each, the most frequent first."""
+    """Return the hints of many grasps with their counts, the most frequent first."""
     return Counter(hint for each in hints for hint in each).most_common()
 
 
 def _better_place(model: ObjectModel, fit: Table, readings: Iterable[Reading]) -> str:
-    """Return the frame and unit in which far points are near the surface; empty if none is.
+    """Return the frame and unit in which far points are near the surface; empty if there is none.
 
-    Of several, one that changes only frame or unit wins, then the one that is nearest.
+    Of several readings, one that changes only frame or unit wins, then the closest one.
     """
     limit, found = min(MUCH_NEARER * fit.distance.mean(), FAR), list[tuple[bool, float, str]]()
     for frame, unit, points, normals in readings:
@@ -221,7 +224,7 @@ def _better_place(model: ObjectModel, fit: Table, readings: Iterable[Reading]) -
         if shrunk or not (frame or unit):
             continue
         there = fit_surface(model, points, np.zeros_like(points) if normals is None else normals)
-        # Another unit turns no normals, so these say nothing of it.
+        # Another unit does not turn normals, so they are not informative for it.
         agrees = normals is None or not frame or there.agreement.mean() > AGREEMENT
         if there.distance.mean() <= limit and agrees:
             text = ", with ".join(filter(None, (frame, unit)))
@@ -232,7 +235,7 @@ def _better_place(model: ObjectModel, fit: Table, readings: Iterable[Reading]) -
 def _fingertips(hand: Hand, posture: Posture) -> Array:
     """Return the nominal contact points p_GQ (m, 3) of the fingers that a posture closes.
 
-    A palm pose alone closes the hand until something stops it: there it counts as half closed.
+    A palm pose alone closes the hand until something stops it; here it is treated as half closed.
 
     Raises:
         HandError: If the hand has fingertips without such points.
@@ -251,9 +254,9 @@ def _fingertips(hand: Hand, posture: Posture) -> Array:
 
 
 def _turned(model: ObjectModel, fit: Table, p_OQ: Array, nhat_Q_O: Array) -> Iterator[str]:
-    """Yield that the normals point inwards, if they do."""
+    """Yield the hint that the normals point inwards, if they do."""
     given, other = fit.agreement.mean(), fit_surface(model, p_OQ, -nhat_Q_O).agreement.mean()
-    # Next to a thin wall both sides are near: there only points on the surface tell.
+    # Next to a thin wall both sides are near; then only points on the surface are informative.
     if fit.distance.max() < ON_SURFACE:
         given = np.sum(nhat_Q_O * fit.normals, axis=1).mean()
         other = -given
@@ -262,7 +265,7 @@ def _turned(model: ObjectModel, fit: Table, p_OQ: Array, nhat_Q_O: Array) -> Ite
 
 
 def _reordered(hand: Hand, p_OQ: Array, nhat_Q_O: Array) -> Iterator[str]:
-    """Yield the order of the fingers that is most like a posture of the hand."""
+    """Yield the order of the fingers that is most similar to a posture of the hand, if better."""
     postures, given = make_postures(hand), tuple(range(hand.num_fingers))
     misfits = {
         order: posture_misfit(postures, p_OQ[list(order)], nhat_Q_O[list(order)])

@@ -1,8 +1,8 @@
-"""What a caller asks to be verified: each attempt in {O} of its object on the table.
+"""The requests of a caller: each attempt in {O} of its object on the table.
 
-In: contacts or postures, with an object, with the objects of a dataset, or with rows of one. Out: a
-`PlacedGrasp` for each. Every mistake of the caller is found here, before
-anything is simulated; a bad row is not a mistake of the caller.
+In: contacts or postures, with an object, with the objects of a dataset, or with rows of a dataset.
+Out: a `PlacedGrasp` for each. Every mistake of the caller is found here, before anything is
+simulated; a bad row is not a mistake of the caller.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ from drakegrasp.simulation.posture import Posture
 from drakegrasp.simulation.settle import find_resting_poses
 from drakegrasp.verification.prediction import in_frame, read_grasps
 
-#: The row of a split for each of n grasps, or one for all; None: all rows, in order.
+#: The row of a split for each of n grasps, or one row for all; None for all rows, in order.
 RowChoice: TypeAlias = Sequence[int] | npt.NDArray[np.int64] | int | None
-#: What to call the frames of a dataset's cameras: of the data file's, and of the other file's.
+#: Names of the frames of a dataset's cameras: the data file's own camera, and the other camera.
 CAMERA, OTHER_CAMERA = "the camera's frame (camera)", "the frame of the dataset's other camera"
-#: Poses of an object at rest that differ by less are one: what is left of rounding in a file.
+#: Poses of an object at rest that differ by less than this are equal; a file has rounding errors.
 SAME_POSE = 1e-6
 #: How contacts are verified.
 METHODS = ("hand", "forces")
@@ -63,18 +63,20 @@ METHODS = ("hand", "forces")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlacedGrasp:
-    """An attempt on an object on the table: all that its verification needs.
+    """An attempt on an object on the table, with everything that its verification needs.
 
     Attributes:
-        index: Its place among the caller's grasps.
-        attempt: Its row of a table: contacts or a posture, or the reason why it is no grasp.
-        stands: The object as it lies; of a posture that names no resting pose, in each of them.
-        method: "hand" or "forces" of contacts, "posture".
-        config: Hand, physics, lift and rules. What ends or avoids lifts (`lift.stop_when`,
-            `lift.least_chance`, `lift.least_depth_variance`) is without effect: the verdict is that
-            of a whole lift.
+        index: Index among the caller's grasps.
+        attempt: The grasp's row of a table: contacts, a posture, or the reason why it is invalid.
+        stands: The object in its resting pose; in each of its resting poses for a posture that
+            names none.
+        method: "hand" or "forces" for contacts, "posture" for postures.
+        config: Hand, physics, lift and rules. Settings that end or avoid lifts (`lift.stop_when`,
+            `lift.least_chance`, `lift.least_depth_variance`) have no effect, because the verdict is
+            that of a whole lift.
         snap_points: Whether to move contact points to the surface.
-        cameras: (4, 4), poses X_TC of cameras in whose frames it could be, by these frames.
+        cameras: Poses X_TC (4, 4) of cameras in whose frames the grasp could be, by the names of
+            these frames.
     """
 
     index: int
@@ -92,19 +94,19 @@ class PlacedGrasp:
 
     @property
     def invalid(self) -> str:
-        """Why it is no grasp; empty if it is one."""
+        """Reason why the grasp is invalid; empty if it is valid."""
         return self.attempt.invalid[0]
 
     def X_OA(self, thing: PlacedObject) -> Array:
-        """Return the pose (4, 4) of the frame of its numbers in {O} of the object as it lies."""
+        """Return the pose (4, 4) of the frame of the grasp's numbers in {O} of a resting object."""
         return self.attempt.frame_pose(0, thing.X_TO, thing.X_OM)
 
     def posture(self, thing: PlacedObject) -> Posture:
-        """Return wrist and joints of a posture, in {O} of the object as it lies."""
+        """Return wrist and joints of a posture, in {O} of a resting object."""
         return self.attempt.posture(0, thing.X_TO, thing.X_OM)
 
     def contacts(self) -> tuple[Array, Array]:
-        """Return points p_OQ [m] and unit normals nhat_Q_O (k, 3) in {O}; NaN where it has none."""
+        """Return points p_OQ [m] and unit normals nhat_Q_O (k, 3) in {O}; NaN without contacts."""
         points, normals = self.attempt.points, self.attempt.normals
         if points is None or normals is None:
             nothing = np.full((load_hand(self.config.hand_source).num_fingers, 3), np.nan)
@@ -125,8 +127,9 @@ def place_on_object(
 ) -> list[PlacedGrasp]:
     """Return grasps in {O} of one object, in their order; see `drakegrasp.verify_grasps`.
 
-    Postures are of it, whatever they call it. Those that name no resting pose are for all of a
-    build. `overrides` is what the caller sets, which is stronger than the conditions of a posture.
+    Postures are tried on this object, whatever object name they give. Postures that name no resting
+    pose are tried in all resting poses of a build. `overrides` are settings of the caller; they
+    take precedence over the conditions of a posture.
 
     Raises:
         GraspError: As `drakegrasp.verify_grasps`.
@@ -156,13 +159,13 @@ def place_on_rows(
 ) -> list[PlacedGrasp]:
     """Return grasps in {O} of the objects of a dataset's rows.
 
-    Those of the same object stand together, so that its scene is built once. Arguments and errors
-    are those of `drakegrasp.verify_grasps`, and of `dataset_config`; one row may be for all grasps.
-    Where no configuration is given, each grasp has the friction and mass that were drawn for its
-    row, but for what is overridden. Postures lie as their rows, whatever they say of object and
-    pose.
+    Grasps of the same object are adjacent, so that its scene is built once. Arguments and errors
+    are those of `drakegrasp.verify_grasps` and of `dataset_config`. One row may be given for all
+    grasps. Without a configuration, each grasp has the friction and mass that were drawn for its
+    row, except for overridden values. Postures are tried on the object and in the resting pose of
+    their rows, whatever they state themselves.
     """
-    # Read all grasps before any object: a wrong number is reported at once.
+    # Read all grasps before any object, so that a wrong number is reported at once.
     used = dataset_config(dataset, config, hand, overrides)
     table = _read(grasps, method, used)
     count = len(table)
@@ -171,7 +174,7 @@ def place_on_rows(
     if table.points is not None:
         table = in_frame(table, frame, cameras[CAMERA] if frame == "camera" else None)
 
-    # They lie as their rows, and have what was drawn for these.
+    # Object, resting pose and drawn conditions are those of the rows.
     table = replace(
         table,
         objects=tuple(dataset.column("object_props/object_name")[chosen].tolist()),
@@ -184,9 +187,9 @@ def place_on_rows(
 
 
 def cameras_of_rows(dataset: GraspDataset, rows: npt.NDArray[np.int64]) -> dict[str, Array]:
-    """Return the poses X_TC (n, 4, 4) of a dataset's cameras in some rows (n,), by their frames.
+    """Return the poses X_TC (n, 4, 4) of a dataset's cameras in rows (n,), by their frames.
 
-    The first is that of the data file. The cameras of scenes stand alone.
+    The first camera is the data file's own. A camera of scenes is the only one.
     """
     names = {dataset.camera: CAMERA}
     if dataset.camera in CAMERAS:
@@ -203,7 +206,7 @@ def cameras_of_rows(dataset: GraspDataset, rows: npt.NDArray[np.int64]) -> dict[
 def overridden_keys(overrides: Sequence[str]) -> set[str]:
     """Return the paths of the keys that overrides set, e.g. "physics.friction_hand".
 
-    They decide beside the configuration: what was drawn for a row gives way even to an equal value.
+    An overridden value takes precedence over the value drawn for a row, even if both are equal.
     """
     return {text.partition("=")[0].strip() for text in overrides}
 
@@ -218,13 +221,13 @@ def dataset_config(
 
     Args:
         dataset: The data file.
-        config: The given one; that of the dataset if None.
-        hand: Name or YAML file of the hand; that of the configuration if None.
-        overrides: `"a.b=c"` strings, applied to the configuration.
+        config: The given configuration; None for the dataset's.
+        hand: Name or YAML file of the hand; None for the configuration's.
+        overrides: Strings `"a.b=c"`, applied to the configuration.
 
     Raises:
-        ConfigError: If it is not a `Config`, or the objects were prepared with other values.
-        HandError: If the dataset's hand has other files now, and the caller names none.
+        ConfigError: If config is not a `Config`, or the objects were prepared with other values.
+        HandError: If the files of the dataset's hand have changed, and the caller names no hand.
         DataError: If the dataset cannot be used.
     """
     if config is not None:
@@ -246,7 +249,7 @@ def dataset_config(
 
 
 def _read(grasps: npt.ArrayLike | Attempts, method: str, config: Config) -> Attempts:
-    """Return a table of attempts: as it is given, or of contacts of the configuration's hand."""
+    """Return a given table of attempts, or read contacts of the configuration's hand."""
     if method not in METHODS:
         raise GraspError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     if isinstance(grasps, Attempts):
@@ -255,10 +258,10 @@ def _read(grasps: npt.ArrayLike | Attempts, method: str, config: Config) -> Atte
 
 
 def _drawn(dataset: GraspDataset, rows: npt.NDArray[np.int64]) -> Array:
-    """Return the `CONDITIONS` (n, 3) that were drawn for rows of a dataset; NaN where none was."""
+    """Return the `CONDITIONS` (n, 3) that were drawn for rows of a dataset; NaN if not drawn."""
     rules = read_manifest(dataset.path.parent).config.randomize
     told = np.full((len(rows), 3), np.nan)
-    # Where one coefficient was drawn, both are taken from the row.
+    # If one coefficient was drawn, both are taken from the row.
     if rules.friction_hand is not None or rules.friction_table is not None:
         for k, name in enumerate(("friction_hand", "friction_table")):
             told[:, k] = dataset.column(f"conditions/{name}")[rows]
@@ -274,7 +277,7 @@ def choose_rows(dataset: GraspDataset, rows: RowChoice, count: int) -> npt.NDArr
         GraspError: If there is not exactly one row per grasp, or a row does not exist.
     """
     chosen = np.arange(count) if rows is None else np.asarray(rows)
-    # NumPy takes an empty list for real numbers.
+    # NumPy treats an empty list as real numbers.
     if chosen.size and chosen.dtype.kind not in "iu":
         raise GraspError(f"rows must be whole numbers, got values of type {chosen.dtype}")
     chosen = chosen.astype(np.int64)
@@ -308,19 +311,18 @@ def read_several(
     rows: RowChoice = None,
     confidence: npt.ArrayLike | None = None,
 ) -> Attempts:
-    """Return predicted contacts for rows of a split, of which each may have several.
+    """Return predicted contacts for rows of a split; a row may have several predictions.
 
     Args:
-        grasps: (n, 6k), or (n, m, 6k), m per row. NaN stays: it is a bad prediction, not a mistake
-            of the caller.
+        grasps: (n, 6k), or (n, m, 6k) with m grasps per row. NaN is kept: it is a bad prediction,
+            not a mistake of the caller.
         data: The split.
         fingers: Number of fingers, k.
-        rows: (n,), the row that each is for, which may come several times; all rows in order if
-            None.
+        rows: (n,), row that each prediction is for, with repeats; None for all rows in order.
         confidence: (n,) or (n, m), greater is better.
 
     Raises:
-        GraspError: If shapes do not fit each other, or a row does not exist.
+        GraspError: If the shapes do not match, or a row does not exist.
     """
     array = as_numbers(grasps, "grasps must be numbers")
     if array.ndim not in (2, 3) or array.size == 0:
@@ -343,23 +345,23 @@ def place_on_dataset(
 ) -> list[PlacedGrasp]:
     """Return the rows of a table on the objects of a dataset that they name.
 
-    Those of an object in a resting pose stand together, so that its scene is built once.
+    Rows of an object in a resting pose are adjacent, so that its scene is built once.
 
     Args:
         table: The attempts.
         out: Directory of the dataset.
-        config: By which they are tried; that of each object if None.
+        config: Configuration for the trials; None for each object's configuration.
         how: See `_placed`.
 
     Raises:
-        GraspError: If they are in the frames of mesh files.
+        GraspError: If the rows are in the frames of mesh files.
         DataError: If the dataset cannot be used.
     """
     manifest, placed = read_manifest(out), list[PlacedGrasp]()
     names = [entry.name for entry in manifest.objects]
     table = table.refuse(unknown_objects(table, names))
     for name in dict.fromkeys(table.objects):
-        # An object that is not there is known by its name alone.
+        # An object that does not exist is known by its name alone.
         there = name if name in names else names[0]
         own = manifest.config_of(there)
         prepared = load_prepared(out, there, own)
@@ -387,16 +389,16 @@ def _placed(
     overrides: Sequence[str] = (),
     cameras: Mapping[str, Array] | None = None,
 ) -> list[PlacedGrasp]:
-    """Return some rows of a table on one object, which is there in each of its resting poses.
+    """Return some rows of a table on one object, given in each of its resting poses.
 
     Args:
         table: The attempts.
-        rows: Which of them.
-        things: The object.
-        config: By which they are tried.
-        method: Of contacts.
-        snap_points: Of each `PlacedGrasp`.
-        overrides: What the caller sets, which is stronger than the conditions of a row.
+        rows: Indices of the rows.
+        things: The object in its resting poses.
+        config: Configuration for the trials.
+        method: Method for contacts.
+        snap_points: See `PlacedGrasp`.
+        overrides: Settings of the caller; they take precedence over the conditions of a row.
         cameras: Poses X_TC (n, 4, 4) for all rows of the table, by their frames.
     """
     model, known_cameras = things[0].model, dict(cameras or {})
@@ -406,7 +408,7 @@ def _placed(
         method = "posture"
         known_cameras |= {} if table.X_TC is None else {CAMERA: table.X_TC}
 
-    # A row that tells how the object lies is tried so, whether or not it was dropped so.
+    # A row that gives the pose of the object is tried in that pose, even if no drop ended in it.
     anywhere = replace(table, X_TO=np.full_like(table.X_TO, np.nan))
     poses = np.array([thing.X_TO for thing in things])
     table = table.refuse(misfits(anywhere, model.name, model.scale, poses))
@@ -433,17 +435,17 @@ def _placed(
 
 
 class _Stands:
-    """An object in its resting poses, and as rows tell: one `PlacedObject` for all equal ones."""
+    """An object in its resting poses and in poses that rows give; equal poses share an object."""
 
     def __init__(self, things: Sequence[PlacedObject]) -> None:
         self._dropped, self._told = list(things), list[PlacedObject]()
         self._known: dict[tuple[int, bytes], tuple[PlacedObject, Config]] = {}
 
     def of(self, table: Attempts, i: int) -> Sequence[PlacedObject]:
-        """Return the object as a row may be for it.
+        """Return the object in each pose that a row is tried in.
 
         Raises:
-            GraspError: If the row tells a pose in which it does not stand on the table.
+            GraspError: If the row gives a pose in which the object does not stand on the table.
         """
         X_TO = table.X_TO[i]
         if np.isnan(X_TO).any():
@@ -471,12 +473,13 @@ class _Stands:
                     for name, value in frictions.items()
                     if value is not None and f"physics.{name}" not in overridden
                 }
-                # They come before the object's own, which would win otherwise.
+                # The configuration's values come before the object's own, which would win
+                # otherwise.
                 physics = config.physics.model_copy(update=used)
                 config = config.model_copy(update={"physics": physics})
                 model = replace(model, friction=None)
             if np.isfinite(mass) and "objects.mass" not in overridden and mass != model.mass:
-                # The inertia grows in proportion.
+                # The inertia scales with the mass.
                 model = replace(model, mass=mass, I_OOcm_O=mass / model.mass * model.I_OOcm_O)
             same = model is thing.model
             self._known[key] = thing if same else replace(thing, model=model), config

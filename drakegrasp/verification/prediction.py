@@ -1,8 +1,8 @@
 """Predicted contacts: grasp vectors become a table of attempts.
 
-In: grasp vectors in one of four frames, as a network put them out. Out: contact points and unit
-normals in that frame; for a row that is no grasp the reason. An array that is
-none of grasps at all is an error that says in one line what is wrong.
+In: grasp vectors in one of four frames, as a network returned them. Out: contact points and unit
+normals in that frame, or the reason why a row is not a valid grasp. An array that cannot hold
+grasps at all is an error, with a message of one line.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from drakegrasp.simulation.attempts import CONDITIONS, UNTOLD, Attempts
 
 Frame = Literal["object", "camera", "table", "mesh"]
 FRAMES: tuple[str, ...] = get_args(Frame)
-#: An earlier name of the frame "table", which is read still.
+#: An earlier name of the frame "table", which is still accepted.
 WORKSPACE = "workspace"
 
-#: A normal whose length differs from one by more is said to have been normalised.
+#: A normal whose length differs from one by more than this is reported as normalised.
 NORMAL_TOLERANCE = 0.01
-#: A shorter normal has no direction.
+#: Length below which a normal has no direction.
 SHORTEST_NORMAL = 1e-6
 
 
@@ -36,23 +36,23 @@ def read_grasps(
     rows: npt.NDArray[np.int64] | None = None,
     confidence: Array | None = None,
 ) -> Attempts:
-    """Return the grasps of grasp vectors (n, 6k), each by itself: a bad row spoils no other.
+    """Return the grasps of grasp vectors (n, 6k); a bad row does not affect other rows.
 
     Args:
-        grasps: (n, 6k), or (6k,) for one: k points [m], then k outward normals. A list of rows of
-            which some have another length, or are no numbers, is one with invalid rows.
+        grasps: (n, 6k), or (6k,) for one grasp: k points [m], then k outward normals. In a list of
+            rows, rows of another length and rows that are not numbers are invalid rows.
         fingers: Number of fingers, k.
-        rows: (n,), the row of a split that each is for.
+        rows: (n,), row of a split that each grasp is for.
         confidence: (n,), greater is better.
 
     Raises:
         GraspError: If the array does not hold such rows.
     """
-    # 6k numbers in each row that has as many.
+    # Each valid row has 6k numbers.
     size = 6 * fingers
     array, invalid = _read_rows(grasps, size, fingers)
 
-    # Numbers that no contact has.
+    # Reject numbers that no contact has.
     limit = np.r_[np.full(size // 2, FARTHEST), np.full(size // 2, LARGEST)]
     usable = np.abs(array) <= limit  # false for NaN
     for row, column in zip(*np.nonzero(~usable), strict=True):
@@ -60,14 +60,14 @@ def read_grasps(
         must = f"beyond {limit[column]:g}" if np.isfinite(value) else "not finite"
         invalid[row] = invalid[row] or f"number {column + 1} is {value:g}, {must}"
 
-    # Normals without a direction.
+    # Reject normals without a direction.
     known = np.where(usable, array, np.nan)
     points, normals = known.reshape(len(array), 2, fingers, 3).swapaxes(0, 1).copy()
     length = np.linalg.norm(normals, axis=-1)
     for row, finger in zip(*np.nonzero(length < SHORTEST_NORMAL), strict=True):
         invalid[row] = invalid[row] or f"normal {finger + 1} is zero"
 
-    # Unit normals in the others.
+    # Normalise the remaining normals.
     bad = np.array([bool(reason) for reason in invalid], dtype=np.bool_)
     points[bad], normals[bad], length[bad] = np.nan, np.nan, 1.0
     count, nothing = len(array), np.full((len(array), 0), np.nan)
@@ -96,7 +96,7 @@ def read_grasps(
 
 
 def _read_rows(grasps: npt.ArrayLike, size: int, fingers: int) -> tuple[Array, list[str]]:
-    """Return rows (n, 6k), NaN where a row has another length, and the reasons."""
+    """Return rows (n, 6k), NaN for rows of another length, and the reasons."""
     # Rows of different lengths come as a list, or as an array of objects.
     rows = without_torch(grasps)
     rows = rows if isinstance(rows, list) else np.asarray(rows)
@@ -123,7 +123,7 @@ def _read_rows(grasps: npt.ArrayLike, size: int, fingers: int) -> tuple[Array, l
 
 
 def _shape(row: Any) -> tuple[int, ...] | None:
-    """Return the shape of a row of numbers; None if it is none, () for a single one."""
+    """Return the shape of a row of numbers, () for a single number; None for no numbers."""
     try:
         return as_numbers(row, "").shape
     except GraspError:
@@ -131,16 +131,16 @@ def _shape(row: Any) -> tuple[int, ...] | None:
 
 
 def in_frame(table: Attempts, frame: str, X_TC: Array | None) -> Attempts:
-    """Return contacts in the frame in which a caller says that they are.
+    """Return contacts with the frame that a caller states for them.
 
     Args:
-        table: Of n grasps.
+        table: Table of n grasps.
         frame: "object" {O}, "camera" {C}, "table" {T} or "mesh" {M}.
         X_TC: With the frame "camera": pose of the camera, (4, 4), or one per grasp (n, 4, 4).
 
     Raises:
-        GraspError: If the frame is unknown, a camera's pose is missing, or one is given for another
-            frame, or not one per grasp.
+        GraspError: If the frame is unknown, or the camera's pose is missing, is given for another
+            frame, or is not one per grasp.
     """
     frame = "table" if frame == WORKSPACE else frame
     if frame not in FRAMES:

@@ -1,8 +1,9 @@
 """The result of verifying one grasp: the verdict, what was simulated, and why, in sentences.
 
-In: what `verify` measured. Out: a `Verification`, and its explanation: whether the grasp holds and
-why, what moved, how close the contacts are to those asked for, and what forces at them alone could
-do. Numbers that are in another frame or unit, or normals that point inwards, come first.
+In: what `verify` measured. Out: a `Verification` and its explanation. The explanation states
+whether the grasp holds and why, what moved, how close the contacts are to the requested ones, and
+what forces at the contacts alone can do. Numbers in another frame or unit, or normals that point
+inwards, are reported first.
 """
 
 from __future__ import annotations
@@ -41,14 +42,14 @@ class PoseTrial:
 
     Attributes:
         fit: Palm pose and joints that bring the fingertips to the contacts; None for a posture,
-            which says them itself.
-        pregrasp: Palm and opened fingers that the trial started from.
+            which specifies them itself.
+        pregrasp: Palm and opened fingers at the start of the trial.
         trial: What happened in the simulator.
-        contact_error: (k,), distance between the contact that was asked for and the one after
-            closing [m]; NaN for a fingertip that does not touch, and for a posture.
-        normal_error: (k,), angle between their normals [rad]; NaN likewise.
-        removal: The first filter of a dataset that would remove the grasp, `KEPT` if none does, see
-            `generation.attempts`; None if it does not hold.
+        contact_error: (k,), distance between the requested contact and the contact after closing
+            [m]; NaN for a fingertip that does not touch, and for a posture.
+        normal_error: (k,), angle between the two normals [rad]; NaN in the same cases.
+        removal: The first filter of a dataset that would remove the grasp, `KEPT` if no filter
+            would, see `generation.attempts`; None if the grasp does not hold.
     """
 
     fit: WristFit | None
@@ -68,30 +69,32 @@ class PoseTrial:
 class Verification:
     """The verdict on a grasp of k contacts. Stages that were not reached are None or NaN.
 
-    The grasp is judged by its first wrist pose, the one that fits the contacts best.
+    The grasp is judged by its first wrist pose, which fits the contacts best.
 
     Attributes:
         method: "hand", "forces" or "posture".
-        outcome: How the trial of the first wrist pose ended; as in a dataset, or `invalid`, or with
-            method `forces` `off_surface`.
-        reason: Why, in one sentence without a full stop.
+        outcome: Outcome of the trial of the first wrist pose, as in a dataset; or `invalid`; or
+            `off_surface` with method `forces`.
+        reason: Reason for the outcome, in one sentence without a full stop.
         placed: The object and its pose on the table.
         config: Hand, physics, lift and rules of the verification.
         p_OQ, nhat_Q_O: (k, 3), the contact points [m] and unit normals in {O} that were tried; NaN
-            where an invalid row or a posture has none.
-        surface_distance: (k,), of the predicted points from the object's surface [m].
-        fingertip_distance: Of a posture that fails, distances of the fingertips of its grasp from
-            the surface [m], one per finger that it closes; None of all else.
+            for an invalid row or a posture.
+        surface_distance: (k,), distances of the predicted points from the object's surface [m].
+        fingertip_distance: For a posture that fails, distances of the fingertips of its grasp from
+            the surface [m], one per finger that it closes; None for all other grasps.
         normalised: Whether a predicted normal was not of unit length, and was normalised.
-        snapped: Whether the points were moved to the nearest points of the surface.
-        hints: What would make a grasp that fails fit much better, see `verification.hints`.
+        snapped: Whether the points were moved to the closest points of the surface.
+        hints: Readings in which a grasp that fails would fit much better, see
+            `verification.hints`.
         tries: The wrist poses that were simulated, in order.
         forces: What forces at the contacts alone can do, with method `forces`.
         epsilon: Ferrari-Canny measure of the contacts; 0 without force closure.
         smallest_friction: Smallest friction coefficient at which forces within the hand's limit
-            hold the object at the contacts; inf if none does.
+            hold the object at the contacts; inf if no coefficient suffices.
         seconds: Wall-clock time by stage [s].
-        stand: The resting pose of this verdict: the best of those in which a posture was tried.
+        stand: Index of the resting pose of this verdict: the best of those in which a posture was
+            tried.
     """
 
     method: str
@@ -115,37 +118,39 @@ class Verification:
 
     @property
     def success(self) -> bool:
-        """Whether the first wrist pose holds, with every contact where it was asked for.
+        """Whether the first wrist pose holds, with every contact where it was requested.
 
-        That is within `verify.max_contact_error`. With method `forces`: whether forces hold it; of
-        a posture, which asks for no contacts: whether it holds.
+        "Where it was requested" means within `verify.max_contact_error`. With method `forces`, it
+        is whether forces hold the object. A posture requests no contacts, so it is whether it
+        holds.
         """
         return self.held and not self.farthest_contact > self.config.verify.max_contact_error
 
     @property
     def held(self) -> bool:
-        """Whether the first wrist pose holds the object at the end of the lift, wherever."""
+        """Whether the first wrist pose holds the object at the end of the lift, anywhere."""
         return self.outcome is Outcome.SUCCESS
 
     @property
     def held_any(self) -> bool:
-        """Whether any of the wrist poses that were tried holds it; nobody knows which in advance.
+        """Whether any of the tried wrist poses holds the object.
 
-        The 18 numbers leave the wrist open: this is what an oracle that chooses it would reach.
+        The 18 numbers leave the wrist open, and nobody knows in advance which pose holds. This is
+        what an oracle that chooses the wrist pose would reach.
         """
         return self.held or self.held_by is not None
 
     @property
     def held_by(self) -> int | None:
-        """Index of the first wrist pose that holds the object, None if none does."""
+        """Index of the first wrist pose that holds the object, None if no wrist pose does."""
         return next((i for i, each in enumerate(self.tries) if each.held), None)
 
     @property
     def misplaced(self) -> bool:
         """Whether a contact is more than 10 mm off the surface: frame or unit may be wrong.
 
-        A posture that fails is misplaced if that is so of all its fingertips, and hints say more or
-        it is 50 mm.
+        A posture that fails is misplaced if all its fingertips are more than 10 mm off and there
+        are hints, or if all are more than 50 mm off.
         """
         if self.fingertip_distance is not None:
             limit = FAR if self.hints else FAR_POSTURE
@@ -154,35 +159,35 @@ class Verification:
 
     @property
     def precision(self) -> bool:
-        """Whether the grasp is held, and by the fingertips alone."""
+        """Whether the object is held, and only by the fingertips."""
         return self.held and (self.trial is None or self.trial.precision)
 
     @property
     def stable(self) -> bool:
-        """Whether it is a precision grasp that moved less than 5 mm and 5 degrees in the hand.
+        """Whether it is a precision grasp that moves less than 5 mm and 5 degrees in the hand.
 
-        With method `forces` nothing moves: what is held is stable.
+        With method `forces` nothing moves, so a grasp that holds is stable.
         """
         return self.held and (self.trial is None or self.trial.stable)
 
     @property
     def sample(self) -> bool:
-        """Whether the grasp passes the filters of a dataset, but for those in `unjudged`."""
+        """Whether the grasp passes the filters of a dataset, except for those in `unjudged`."""
         return self.removal is Removal.KEPT
 
     @property
     def removal(self) -> Removal | None:
-        """The first filter that removes it, `KEPT` if none does; None if the hand lost it."""
+        """The first filter that removes the grasp, `KEPT` if none does; None if not held."""
         return self.first.removal if self.first else None
 
     @property
     def unjudged(self) -> tuple[Removal, ...]:
-        """Filters about which a verdict knows nothing, e.g. those of images."""
+        """Filters that a verdict cannot judge, e.g. those of images."""
         return unjudged(self.config.filters)
 
     @property
     def words(self) -> str:
-        """The verdict in words: those of held to sample that apply, or the failure."""
+        """The verdict in words: "held", "precision", "stable", "sample", or the failure."""
         if not self.held:
             return f"fails: {self.outcome.label.replace('_', ' ')}"
         names = ("held", "precision", "stable", "sample")
@@ -206,12 +211,12 @@ class Verification:
 
     @property
     def pregrasp(self) -> Attempt | None:
-        """Palm and opened fingers that the first trial started from."""
+        """Palm and opened fingers at the start of the first trial."""
         return self.first.pregrasp if self.first else None
 
     @property
     def closing_start(self) -> Array | None:
-        """(k,), where the closing joints began; NaN for fingers that a preshape leaves out."""
+        """(k,), initial closing positions; NaN for fingers that a preshape leaves out."""
         start = self.pregrasp
         if start is None or start.closing is None:
             return None
@@ -224,37 +229,38 @@ class Verification:
 
     @property
     def contact_error(self) -> Array | None:
-        """(k,), distances [m] between contacts asked for and reached, of the first wrist pose."""
+        """(k,), distances [m] between requested and reached contacts, of the first wrist pose."""
         return self.first.contact_error if self.first else None
 
     @property
     def normal_error(self) -> Array | None:
-        """(k,), angles [rad] between their normals."""
+        """(k,), angles [rad] between the requested and reached normals, of the first wrist pose."""
         return self.first.normal_error if self.first else None
 
     @property
     def farthest_contact(self) -> float:
         """The largest `contact_error` [m]; NaN if no fingertip touches.
 
-        The share of grasps that hold within d, as a curve, is that of `held` ones with less.
+        A curve over d of the fraction of grasps that hold within d counts the `held` grasps with a
+        smaller value than d.
         """
         return _largest(self.contact_error)
 
     @property
     def closed(self) -> Contacts | None:
-        """Contacts after closing; `trial.closed` has the joints then, too."""
+        """Contacts after closing; `trial.closed` also has the joint positions at that time."""
         end = None if self.trial is None else self.trial.closed
         return None if end is None else end.contacts
 
     @property
     def lifted(self) -> Contacts | None:
-        """Contacts after the lift; `trial.lift` has joints, poses, slip and turn then, too."""
+        """Contacts after the lift; `trial.lift` also has joints, poses, slip and turn then."""
         end = None if self.trial is None else self.trial.lift
         return None if end is None else end.contacts
 
     @property
     def solver_status(self) -> int:
-        """Exit mode of SLSQP, 0 for success; -1 where it was not asked."""
+        """Exit mode of SLSQP, 0 for success; -1 if it was not used."""
         return -1 if self.fit is None else self.fit.status
 
     @property
@@ -265,7 +271,7 @@ class Verification:
     def save_html(self, path: str | Path) -> None:
         """Write an HTML file that plays the simulation in a browser, from any side.
 
-        The grasp is simulated again for it, which gives the same bits.
+        The grasp is simulated again for the file, which gives the same bits.
 
         Args:
             path: The file to write.
@@ -278,13 +284,13 @@ class Verification:
         record_verification(self, Path(path))
 
     def figure(self) -> Figure:
-        """Return a figure of predicted and reached contacts on the mesh; it has `savefig`."""
+        """Return a matplotlib figure of predicted and reached contacts on the mesh."""
         from drakegrasp.verification.figure import verification_figure
 
         return verification_figure(self)
 
     def explain(self) -> str:
-        """Return the verdict, and why, in a few sentences."""
+        """Return the verdict and its reason in a few sentences."""
         return " ".join(_sentences(self))
 
     def __repr__(self) -> str:
@@ -292,13 +298,13 @@ class Verification:
 
 
 def _largest(values: Array | None) -> float:
-    """Return the largest number, NaN if there is none."""
+    """Return the largest finite number, NaN if there is none."""
     there = np.zeros(0) if values is None else values[np.isfinite(values)]
     return float(there.max()) if there.size else np.nan
 
 
 def _sentences(verified: Verification) -> Iterator[str]:
-    # What is wrong with the numbers comes first: all else is of another grasp than was meant.
+    # Faults in the numbers come first: if there are any, all else is about another grasp.
     inwards = REVERSED in verified.hints
     if verified.misplaced:
         yield from _misplaced(verified)
@@ -308,7 +314,7 @@ def _sentences(verified: Verification) -> Iterator[str]:
             f"would fit much better: {verified.hint_text}."
         )
 
-    # The verdict, and what was done to the row of numbers.
+    # The verdict, and the changes to the row of numbers.
     verdict = "holds" if verified.held else f"fails ({verified.outcome.label})"
     yield f"The grasp of {verified.placed.model.name} {verdict}: {verified.reason}."
     if verified.outcome is Outcome.INVALID:
@@ -319,7 +325,7 @@ def _sentences(verified: Verification) -> Iterator[str]:
         moved = in_mm(verified.surface_distance.max())
         yield f"The points were moved to the surface, by at most {moved}."
 
-    # What the hand did, by the first wrist pose and by the others.
+    # What the hand did, with the first wrist pose and with the others.
     if verified.fit is not None:
         yield from _contacts(verified)
     if verified.num_tries > 1:
@@ -332,7 +338,7 @@ def _sentences(verified: Verification) -> Iterator[str]:
         yield _as_a_sample(verified, verified.removal)
         yield from _loads(verified)
 
-    # What forces at the contacts alone can do, and what else may be wrong with the numbers.
+    # What forces at the contacts alone can do, and other possible faults in the numbers.
     if not np.isnan(verified.smallest_friction):
         yield _margin(verified)
     if verified.hints and not inwards:
@@ -341,7 +347,7 @@ def _sentences(verified: Verification) -> Iterator[str]:
 
 def _misplaced(verified: Verification) -> Iterator[str]:
     """Yield how far the contacts or the posture are off the object, and where they would fit."""
-    # What is how far away.
+    # State what is off and how far.
     distance = verified.surface_distance
     all_far = bool(np.all(distance > FAR))
     more = ", so the grasp that was asked for does not touch it"
@@ -359,7 +365,7 @@ def _misplaced(verified: Verification) -> Iterator[str]:
         between = f"{1e3 * distance.min():.1f} to {between}"
     yield f"{what} {between} off the object{more}."
 
-    # Where it would fit. Where some points are near, the frame is hardly wrong.
+    # State where it would fit. If some points are near, the frame is hardly wrong.
     if verified.hints:
         yield f"This would fit much better: {verified.hint_text}."
     elif all_far:
@@ -370,8 +376,8 @@ def _misplaced(verified: Verification) -> Iterator[str]:
 
 
 def _contacts(verified: Verification) -> Iterator[str]:
-    """Yield how well the hand makes the contacts that were asked for."""
-    # Before closing, as the fit leaves them.
+    """Yield how well the hand makes the requested contacts."""
+    # Before closing, according to the fit.
     fit, limit = verified.fit, verified.config.verify.max_contact_error
     errors = verified.contact_error, verified.normal_error
     assert fit is not None and errors[0] is not None and errors[1] is not None
@@ -399,7 +405,7 @@ def _contacts(verified: Verification) -> Iterator[str]:
 
 
 def _other_poses(verified: Verification) -> str:
-    """Return what became of the other wrist poses."""
+    """Return the results of the other wrist poses."""
     if verified.held_by is None:
         return f"None of {verified.num_tries} wrist poses for these contacts holds it."
     return (
@@ -410,7 +416,7 @@ def _other_poses(verified: Verification) -> str:
 
 def _in_the_hand(verified: Verification, lift: Lift) -> str:
     """Return what moved in the hand, and what touched the object at the end."""
-    # What happened.
+    # State what happened.
     links = lift.contacts.other_links
     touching = {0: "no other link of the hand touches it", 1: "another link touches it"}.get(
         links, f"{links} other links touch it"
@@ -420,7 +426,7 @@ def _in_the_hand(verified: Verification, lift: Lift) -> str:
         f"{np.rad2deg(lift.turn):.1f}° in the hand, and at the end {touching}"
     )
 
-    # What that is called, if it is held at all.
+    # Name the kind of grasp, if the object is held at all.
     if not verified.held:
         tips = lift.contacts.touching
         still = f"{int(tips.sum())} of {len(tips)} fingertips still touch it"
@@ -430,7 +436,7 @@ def _in_the_hand(verified: Verification, lift: Lift) -> str:
 
 
 def _loads(verified: Verification) -> Iterator[str]:
-    """Yield how the largest force of a fingertip compares with what its maker allows, if known."""
+    """Yield how the largest fingertip force compares with the hand's rated load, if known."""
     rated, trial = load_hand(verified.config.hand_source).rated_load, verified.trial
     if rated is None or trial is None or trial.closed is None or trial.lift is None:
         return
@@ -443,7 +449,7 @@ def _loads(verified: Verification) -> Iterator[str]:
 
 
 def _as_a_sample(verified: Verification, removal: Removal) -> str:
-    """Return whether it would be a sample of a dataset, and what is not known of that."""
+    """Return whether it would be a sample of a dataset, and which filters were not judged."""
     kept = removal is Removal.KEPT
     verdict = "would be a sample" if kept else f"would be no sample ({removal.label})"
     rules = ", ".join(each.label for each in verified.unjudged)
@@ -451,7 +457,7 @@ def _as_a_sample(verified: Verification, removal: Removal) -> str:
 
 
 def _margin(verified: Verification) -> str:
-    """Return the friction that the contacts alone need."""
+    """Return the friction that forces at the contacts alone need."""
     physics = verified.placed.model.own_physics(verified.config.physics)
     needed, simulated = verified.smallest_friction, physics.friction_hand
     if np.isfinite(needed):
@@ -460,8 +466,8 @@ def _margin(verified: Verification) -> str:
         text = "Forces at these points alone are not enough at any friction"
     text += f"; the simulation has {simulated:.2f}"
     if verified.held and verified.method == "hand" and needed > simulated:
-        # A point does not resist twisting, an area of contact does; and what slips is held
-        # elsewhere.
+        # A point does not resist twisting, but an area of contact does; and a grasp that slips is
+        # held at other points.
         text += ", but the hand's contacts are areas"
         text += "" if verified.stable else ", and the object is not held where they were"
     return f"{text} (epsilon {verified.epsilon:.3f})."

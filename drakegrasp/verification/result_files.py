@@ -2,7 +2,7 @@
 
 In: `Verification`s in the order of the caller's grasps. Out: a file with one object of strict JSON
 per line, and an HDF5 file with the fields `schema.VERIFICATION_FIELDS`. Equal results give equal
-HDF5 files, because wall-clock times are in the JSON only.
+HDF5 files, because only the JSON contains wall-clock times.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from drakegrasp.verification.result import Verification
 
 #: Group of the HDF5 file that holds the fields.
 GROUP = "grasps"
-#: Suffixes of the two files, and those that a caller may append to their common name.
+#: Suffixes of the two files, and suffixes that a caller may append to their common name.
 JSON_SUFFIX, HDF5_SUFFIX = ".jsonl", ".h5"
 _KNOWN_SUFFIXES = (JSON_SUFFIX, HDF5_SUFFIX, ".hdf5", ".json")
 #: Significant digits of the numbers in JSON: a micrometre in a metre.
@@ -48,14 +48,14 @@ def result_paths(out: Path) -> tuple[Path, Path]:
 
 
 def refuse_unwritable(out: Path) -> None:
-    """Refuse a common name under which the files cannot be written; nothing is left behind.
+    """Reject a common name under which the files cannot be written; no file is left behind.
 
     Args:
         out: The name, see `result_paths`.
 
     Raises:
-        DataError: If a folder has the name of a file, or if the folder, or the first existing one
-            above it, cannot be written.
+        DataError: If a folder has the name of one of the files, or the folder of the files cannot
+            be written (if it does not exist: the first existing folder above it).
     """
     # Folders in the place of files.
     if out.is_dir():
@@ -64,7 +64,7 @@ def refuse_unwritable(out: Path) -> None:
         if path.is_dir():
             raise DataError(f"{path}: must be a file, got a folder; choose another --out")
 
-    # The first folder above that exists.
+    # Find the first existing folder above the files.
     folder = out.absolute().parent
     while not os.path.lexists(folder):
         folder = folder.parent
@@ -75,7 +75,7 @@ def refuse_unwritable(out: Path) -> None:
 
 
 def _is_writable(folder: Path) -> bool:
-    """Return whether a file can be made in a folder."""
+    """Return whether a file can be created in a folder."""
     try:
         probe_folder(folder)
     except OSError:
@@ -91,11 +91,11 @@ def text_lines(out: Path | None, *, echo: bool = False) -> Iterator[Callable[[st
     """Yield a function that writes the next line of NAME.jsonl, and flushes it.
 
     Until the block ends, the lines are in NAME.part.jsonl; they stay there if the block raises. No
-    file is made before the first line.
+    file is created before the first line.
 
     Args:
-        out: The common name of the files, see `result_paths`; None: standard output.
-        echo: Whether lines of a file go to standard output, too.
+        out: The common name of the files, see `result_paths`; None for standard output.
+        echo: Whether the lines of a file are also written to standard output.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written.
@@ -114,12 +114,12 @@ def text_lines(out: Path | None, *, echo: bool = False) -> Iterator[Callable[[st
 
         yield write
     if out is not None and opened:
-        # Not `atomic_path`: the lines of a run that is stopped must stay.
+        # Do not use `atomic_path`: the lines of a run that is stopped must stay.
         sync_and_rename(part_path(out), result_paths(out)[0])
 
 
 def part_path(out: Path) -> Path:
-    """Return the path of the JSON lines until they are complete, for a common name."""
+    """Return the path of the JSON lines while they are incomplete, for a common name."""
     lines, _ = result_paths(out)
     return lines.with_suffix(f".part{JSON_SUFFIX}")
 
@@ -127,11 +127,11 @@ def part_path(out: Path) -> Path:
 def json_line(index: int, result: Verification) -> str:
     """Return a verdict as a line of strict JSON; NaN and infinity become null.
 
-    Keys that are HDF5 fields have the same meaning.
+    Keys that are also HDF5 fields have the same meaning there.
 
     Args:
-        index: Of the grasp.
-        result: Its verdict.
+        index: Index of the grasp.
+        result: The verdict on the grasp.
     """
     fit, trial, forces = result.fit, result.trial, result.forces
     values = {field.name: field.value_of(result) for field in VERIFICATION_FIELDS}
@@ -142,7 +142,7 @@ def json_line(index: int, result: Verification) -> str:
     def degrees(name: str) -> Any:
         return None if values[name] is None else np.rad2deg(values[name])
 
-    # In the order in which a person reads them: verdict, contacts, hand, lift, margin.
+    # The order is for human readers: verdict, contacts, hand, lift, margin.
     line = {
         "index": index,
         **fields("object", "method", "success", "held", "precision", "stable", "sample"),
@@ -165,7 +165,7 @@ def json_line(index: int, result: Verification) -> str:
         "slip": values["slip"],
         "turn_deg": degrees("turn"),
         **fields("epsilon", "smallest_friction"),
-        # A null above is either infinity or not computed; this tells which.
+        # A null above is either infinity or not computed; this key distinguishes them.
         "friction_can_hold": None
         if math.isnan(result.smallest_friction)
         else math.isfinite(result.smallest_friction),
@@ -195,7 +195,7 @@ def _end_as_dict(stage: Closed | Lift | None) -> dict[str, Any] | None:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value in types of strict JSON."""
+    """Return a value converted to types of strict JSON."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -217,13 +217,14 @@ def write_results(
     config: Config,
     rows: PredictedRows | None = None,
 ) -> None:
-    """Write results to an HDF5 file, which appears whole or not at all.
+    """Write results to an HDF5 file, which appears complete or not at all.
 
     Args:
-        results: In the order of the grasps.
+        results: The results, in the order of the grasps.
         path: The file.
         config: Configuration of the verification.
-        rows: Of the dataset that the grasps are for, in the same order; None without one.
+        rows: Rows of the dataset that the grasps are for, in the same order; None without a
+            dataset.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written.
@@ -243,7 +244,7 @@ def write_results(
 
 
 def _column(field: Field, results: Sequence[Verification], shape: dict[str, int]) -> AnyArray:
-    """Return the values of a field for all results; what was not reached has its empty value."""
+    """Return the values of a field for all results; empty values for stages not reached."""
     if field.dtype == "str":
         return np.array([field.value_of(result) for result in results], dtype=object)
     column = field.empty(len(results), shape)

@@ -1,11 +1,12 @@
-"""The verdict on grasps of objects: each from its contacts in {O} or from its posture.
+"""The verdict on grasps of objects, each given by its contacts in {O} or by a posture.
 
-In: `PlacedGrasp`s. Out: a `Verification` for each, in the caller's order. A posture is tried as it
-is. Of contacts, method `hand` finds palm poses that bring the fingertips to the points, and runs a
-trial from the best, as a build does; if that does not hold, from the others, too. Method `forces`
-asks whether forces at the surface's own contacts can lift the object. Every row of numbers that has
-contacts is tried, however wrong they look: what is measured is judged afterwards. A wrong
-prediction, a failed solver and a lost object are outcomes, not exceptions.
+In: `PlacedGrasp`s. Out: a `Verification` for each, in the caller's order. A posture is tried as
+given. For contacts, method `hand` finds palm poses that bring the fingertips to the points, and
+runs a trial from the best pose, as a build does. If that does not hold, it also tries the others.
+Method `forces` computes whether forces at the surface's own contacts can lift the object. Every
+row with contacts is tried, even if the numbers look wrong, and faults are judged afterwards from
+the measurements. A wrong prediction, a failed solver and a lost object are outcomes, not
+exceptions.
 """
 
 from __future__ import annotations
@@ -40,10 +41,10 @@ from drakegrasp.verification.result import PoseTrial, Verification
 from drakegrasp.verification.wrist_solver import WristFit, fit_wrist
 
 #: Decimals to which points [m] and unit normals are rounded: 0.1 mm and 0.06 degrees. This is
-#: finer than any contact is known and coarser than single precision, so the same grasp given in
-#: another frame becomes the same numbers, and rounding cannot change a close verdict.
+#: finer than any contact is known, and coarser than single precision. So the same grasp in another
+#: frame becomes the same numbers, and rounding errors cannot change a close verdict.
 POINT_DIGITS, NORMAL_DIGITS = 4, 3
-#: Shares of `verify.open_margin_deg` by which the fingers are opened, in turn, until the hand is
+#: Fractions of `verify.open_margin_deg` by which the fingers are opened, in turn, until the hand is
 #: clear of object and table.
 MARGINS = (1.0, 0.5)
 
@@ -69,7 +70,7 @@ def verify_placed(grasp: PlacedGrasp) -> Verification:
     if grasp.method == "posture":
         return _best_stand(base, grasp)
 
-    # How the contacts lie on the surface, and what forces at them alone can do.
+    # Measure how the contacts lie on the surface, and what forces at the contacts alone can do.
     model, (points, normals) = base.placed.model, _rounded(p_OQ, nhat_Q_O)
     with timed(base.seconds, "surface"):
         fit = fit_surface(model, points, normals)
@@ -89,7 +90,7 @@ def verify_placed(grasp: PlacedGrasp) -> Verification:
         smallest_friction=smallest_friction,
     )
 
-    # The trial; where it fails, or the points are far away, what may be wrong with the numbers.
+    # Run the trial. If it fails or the points are far away, look for faults in the numbers.
     result = _lift_by_hand(base) if grasp.method == "hand" else _lift_by_forces(base)
     if (result.success and not result.misplaced) or result.outcome.inconclusive:
         return result
@@ -100,7 +101,7 @@ def verify_placed(grasp: PlacedGrasp) -> Verification:
 
 @one_thread
 def first_fit(grasp: PlacedGrasp) -> WristFit:
-    """Return the wrist pose by which a grasp that is none of the invalid is judged."""
+    """Return the wrist pose by which a valid grasp is judged."""
     return _fits(grasp.placed, *_rounded(*grasp.contacts()), grasp.config)[0]
 
 
@@ -121,20 +122,20 @@ def _rounded(p_OQ: Array, nhat_Q_O: Array) -> tuple[Array, Array]:
 
 def _lift_by_hand(base: Verification) -> Verification:
     """Find palm poses for the contacts, and try them until one holds the object."""
-    # Palm poses that bring the fingertips to the contacts, the best first.
+    # The palm poses bring the fingertips to the contacts; the best is first.
     hand = load_hand(base.config.hand_source)
     with timed(base.seconds, "fit"):
         fits = _fits(base.placed, base.p_OQ, base.nhat_Q_O, base.config)
     with timed(base.seconds, "simulate"):
         # Two contacts leave the palm's turn about their line open, and most of these poses are
-        # within the object or the table: the first that is clear is the first pose.
+        # inside the object or the table: the first clear pose counts as the first pose.
         tries = _try_poses(base, fits, pass_collisions=hand.num_fingers == 2)
 
     return _judged(base, tries)
 
 
 def _best_stand(base: Verification, grasp: PlacedGrasp) -> Verification:
-    """Try a posture in each resting pose and preshape that it is for; return the best verdict."""
+    """Try a posture in each of its resting poses and preshapes; return the best verdict."""
     shapes = grasp.attempt.shapes(0, load_hand(base.config.hand_source))
     found = [
         (_try_posture(replace(base, placed=placed, stand=k), grasp, shape), shape)
@@ -155,7 +156,7 @@ def _best_stand(base: Verification, grasp: PlacedGrasp) -> Verification:
 
 
 def _try_posture(base: Verification, grasp: PlacedGrasp, preshape: str) -> Verification:
-    """Try a posture, which says wrist and joints itself, in a preshape; empty for none."""
+    """Try a posture in a preshape; an empty name means no preshape."""
     posture = replace(grasp.posture(base.placed), preshape=preshape or None)
     with timed(base.seconds, "simulate"):
         trial = run_trial(base.placed, posture, base.config)
@@ -173,14 +174,14 @@ def _try_posture(base: Verification, grasp: PlacedGrasp, preshape: str) -> Verif
     if result.held or result.outcome.inconclusive:
         return result
 
-    # Where it fails, what may be wrong with the numbers.
+    # If it fails, look for faults in the numbers.
     with timed(base.seconds, "hints"):
         hints, distance = find_posture_hints(grasp, base.placed, posture)
     return replace(result, hints=hints, fingertip_distance=distance)
 
 
 def _of_all_fingers(trial: TrialRecord, unused: int, fingers: int) -> TrialRecord:
-    """Return a trial with contacts of all fingers; those that a preshape leaves out have none."""
+    """Return a trial with contacts of all fingers; fingers that a preshape leaves out have none."""
     fills = {**dict.fromkeys(("p_OQ", "nhat_Q_O"), np.nan), "touching": False}
     fills |= dict.fromkeys(("f_Q_O", "area", "penetration"), 0.0)
 
@@ -209,10 +210,10 @@ def _judged(base: Verification, tries: tuple[PoseTrial, ...]) -> Verification:
 def _try_poses(
     base: Verification, fits: Iterable[WristFit], *, pass_collisions: bool
 ) -> tuple[PoseTrial, ...]:
-    """Return the trials of wrist poses until one holds or enough were tried; one at least.
+    """Return the trials of wrist poses until one holds or enough were tried; at least one.
 
     Args:
-        base: What is asked for.
+        base: The verification so far, with the requested contacts.
         fits: The wrist poses.
         pass_collisions: Whether poses that collide at the start do not count, unless all do.
     """
@@ -227,12 +228,12 @@ def _try_poses(
 
 
 def _try(base: Verification, fit: WristFit) -> PoseTrial:
-    """Run the trial of a wrist pose, and measure how close its contacts are to those asked for."""
+    """Run the trial of a wrist pose, and measure the errors of its contacts."""
     model = base.placed.model
     pregrasp, trial = _run(base.placed, base.placed.X_TO_simulated, fit, base.config)
 
-    # Distances and angles of the fingertips that touch; patches that face each other have no
-    # normal.
+    # Distances and angles for the fingertips that touch; a contact whose patches face each other
+    # has no normal.
     contact_error, normal_error = np.full((2, len(base.p_OQ)), np.nan)
     if trial.closed is not None:
         closed = trial.closed.contacts
@@ -255,7 +256,7 @@ def _run(
     """Open the fingers of a fit until the hand is clear, and run the trial from there.
 
     Returns:
-        What the trial started from, and what happened.
+        The start of the trial, and its record.
     """
     scene = cached_scene(placed.model, config.physics, config.hand_source)
     hand = load_hand(config.hand_source)
@@ -275,7 +276,7 @@ def _run(
 
 
 def _lift_by_forces(base: Verification) -> Verification:
-    """Ask whether forces at the surface's own contacts can lift the object, without a hand."""
+    """Compute whether forces at the surface's own contacts can lift the object, without a hand."""
     placed = base.placed
     with timed(base.seconds, "forces"):
         forces = judge_forces(
@@ -287,7 +288,7 @@ def _lift_by_forces(base: Verification) -> Verification:
     return replace(base, outcome=outcome, reason=forces.reason, forces=forces)
 
 
-#: Receives results as they come: called with a grasp's index and its result.
+#: Receives results as they are computed: called with a grasp's index and its result.
 ResultCallback: TypeAlias = Callable[[int, Verification], None]
 
 
@@ -306,12 +307,12 @@ def verify_batch(
     """Return the results of grasps in the caller's order.
 
     Args:
-        grasps: With indices 0 to n - 1, in any order; those of one object stand together.
+        grasps: Grasps with indices 0 to n - 1, in any order; grasps of one object are adjacent.
         execute: Runs the verifications.
-        report: Is told how many are done and how many succeed.
+        report: Is called with the numbers of finished and of successful grasps.
         on_result: Is called with each result in the caller's order, once all earlier ones exist.
-        together: Most grasps of one object that are one task: they share its meshes on the way to
-            a worker, and what a worker derives from them.
+        together: Largest number of grasps of one object in a task. They are sent to a worker with
+            one copy of the meshes, and share what the worker computes from the meshes.
     """
     objects = {g.index: g.stands for g in grasps}
     results: dict[int, Verification] = {}
@@ -322,7 +323,7 @@ def verify_batch(
             results[index] = replace(result, placed=objects[index][result.stand])
             holding += result.success
 
-        # Deliver these results, and later ones that were waiting for them.
+        # Deliver these results, and later results that were waiting for them.
         while delivered in results:
             on_result(delivered, results[delivered])
             delivered += 1
@@ -331,7 +332,7 @@ def verify_batch(
 
 
 def _tasks(grasps: Sequence[PlacedGrasp], together: int) -> Iterator[list[PlacedGrasp]]:
-    """Yield the grasps in lists of at most so many, of one object each."""
+    """Yield the grasps in lists of at most `together`, each list for one object."""
     for _, same in groupby(grasps, key=lambda grasp: id(grasp.placed)):
         # `itertools.batched` is newer than Python 3.11.
         while task := list(islice(same, together)):

@@ -1,23 +1,24 @@
 """The wrist problem: which palm pose and joints bring the fingertips to given contacts?
 
 In: a hand, k contact points with outward normals in {O}, and the height of the table. Out: the
-residuals whose sum of squares is to be minimised and the clearances that must not be negative,
-with exact derivatives. `wrist_solver` minimises.
+residuals whose sum of squares is minimised, and the clearances that must not be negative, with
+exact derivatives. `wrist_solver` minimises.
 
-The objective is that of Veres et al. (2017), appendix, sum |C_i - Y_i|^2 over the rotations
-and translations of X_OG, with the hand's joints as further unknowns. Y_i is the predicted
-point and C_i the nearest point of fingertip i, because a real contact may lie anywhere on a
-fingertip. Terms with small weights (our own) decide what the points leave open: each pad should
-face the predicted normal, each finger should close against it, the contacts should be near
-the hand file's pad points, and the joints near those of the start. `evaluate` has the formulas.
+The objective is that of Veres et al. (2017), appendix: sum |C_i - Y_i|^2 over the rotations and
+translations of X_OG. Here the hand's joints are further unknowns. Y_i is the predicted point, and
+C_i the closest point of fingertip i, because a real contact may lie anywhere on a fingertip. Terms
+with small weights (our own) decide what the points leave open: each pad should face the predicted
+normal, each finger should close against it, the contacts should be near the hand file's pad points,
+and the joints near those of the start. `evaluate` has the formulas.
 
-The surfaces of the fingertips are smooth signed distances (`Pads`): the distance of p from a convex
+The surfaces of the fingertips are smooth signed distances (`Pads`). The distance of p from a convex
 body with face planes n_j . p = d_j is at least the largest of n_j . p - d_j, and equal to it in
 front of a face. Here the largest is replaced by the smooth maximum s log sum exp((n_j . p - d_j)/s)
 (Boyd and Vandenberghe, "Convex Optimization", 3.1.5), which rounds edges with a radius of about s.
-A fingertip may touch within its pad region only. The planes of the region are no surface, so the
-distance is that of the whole fingertip, and how far a point is outside of the region is told beside
-it: a point on the fingertip but so far outside is about as far from the pad.
+
+A fingertip may only touch within its pad region. The planes of the region are not surface, so the
+distance is that of the whole fingertip, and the distance of a point outside the region is a
+separate value. A point on the fingertip but outside the region is about that far from the pad.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from drakegrasp.hand.file_format import HalfSpace
 from drakegrasp.hand.kinematics import coordinate_limits, link_poses, still_links
 from drakegrasp.hand.shapes import link_shapes, pad_surfaces
 
-#: Rounding s of the edges [m]: about the unevenness of the pads themselves.
+#: Rounding s of the edges [m], about as large as the unevenness of the pads.
 ROUNDING = 0.7e-3
 #: Faces whose normals and offsets agree to this many decimals are one plane.
 SAME_PLANE = 6
@@ -66,17 +67,17 @@ class Pads:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PadContact:
-    """Distances and normals of k pads at k points, one each.
+    """Distances and normals of k pads, each at one point.
 
     Attributes:
         distance: (k,), smooth signed distance from the pad, negative inside [m].
         normal: (k, 3), unit outward normal of the pad next to the point.
-        gradient: (k, 3), derivative of `distance` by the point; along `normal`, shorter than one at
-            edges.
-        normal_jacobian: (k, 3, 3), derivative of `normal` by the point [1/m].
-        outside: (k, h), how far the point is outside of each half-space of the pad region, 0 inside
-            [m].
-        outside_gradient: (k, h, 3), derivative of `outside` by the point.
+        gradient: (k, 3), derivative of `distance` with respect to the point; it is parallel to
+            `normal`, and shorter than one at edges.
+        normal_jacobian: (k, 3, 3), derivative of `normal` with respect to the point [1/m].
+        outside: (k, h), distance of the point outside each half-space of the pad region [m], 0
+            inside.
+        outside_gradient: (k, h, 3), derivative of `outside` with respect to the point.
     """
 
     distance: Array
@@ -93,15 +94,16 @@ def make_pads(
     """Return the pads of k fingertips.
 
     Args:
-        corners: (n, 3), of each fingertip; its shape is their convex hull [m].
+        corners: (n, 3) for each fingertip; its shape is their convex hull [m].
         regions: Half-spaces of each pad.
-        triangles: (t, 3, 3), surface of each pad, see `hand.shapes.pad_surfaces` [m].
+        triangles: (t, 3, 3) for each fingertip, surface of its pad, see
+            `hand.shapes.pad_surfaces` [m].
     """
     # The planes of each hull; a row of equations is a unit normal and minus the offset.
     hulls = [ConvexHull(points) for points in corners]
     planes = [np.unique(np.round(hull.equations, SAME_PLANE), axis=0) for hull in hulls]
 
-    # Stack them; a plane at infinity never has the largest n . p - d.
+    # Stack the planes; a plane at infinity never has the largest n . p - d.
     most = max(map(len, planes))
     normals = np.zeros((len(planes), most, 3))
     offsets = np.full((len(planes), most), np.inf)
@@ -109,7 +111,7 @@ def make_pads(
         normals[i, : len(equations)] = equations[:, :3]
         offsets[i, : len(equations)] = -equations[:, 3]
 
-    # Stack the half-spaces; every point is in one without a normal whose border is at -1.
+    # Stack the half-spaces; a half-space with zero normal and border -1 contains every point.
     most = max(map(len, regions))
     region_normals = np.zeros((len(planes), most, 3))
     region_offsets = np.full((len(planes), most), -1.0)
@@ -129,10 +131,10 @@ def make_pads(
 
 
 def nearest_on_pads(pads: Pads, p_FiQ: Array) -> Array:
-    """Return the point of each pad, without rounding, that is nearest to a point.
+    """Return the point of each pad, without rounding, that is closest to a point.
 
     Args:
-        pads: Of k fingertips.
+        pads: Pads of k fingertips.
         p_FiQ: (k, 3), a point in each fingertip's frame [m].
 
     Returns:
@@ -156,11 +158,11 @@ def signed_distance(pads: Pads, p_FiQ: Array) -> PadContact:
         H = ∇∇φ = (Σ_j w_j n_j n_jᵀ − g gᵀ) / s
         m = g / |g|,   ∂m/∂p = (1 − m mᵀ) H / |g|
 
-    (Boyd and Vandenberghe, 3.1.5), and outside of a half-space n·p ≥ d of the pad region by
+    (Boyd and Vandenberghe, 3.1.5). A point is outside a half-space n·p ≥ d of the pad region by
     o = max(0, d − n·p).
 
     Args:
-        pads: Of k fingertips.
+        pads: Pads of k fingertips.
         p_FiQ: (k, 3), a point in each fingertip's frame [m].
     """
     # The smooth maximum of the heights over the planes, and the weights of the planes.
@@ -170,7 +172,7 @@ def signed_distance(pads: Pads, p_FiQ: Array) -> PadContact:
     total = weight.sum(axis=1)
     weight /= total[:, None]
 
-    # First and second derivatives by the point.
+    # First and second derivatives with respect to the point.
     gradient = np.matmul(weight[:, None, :], pads.normals)[:, 0]
     weighted = pads.normals * weight[:, :, None]
     outer = gradient[:, :, None] * gradient[:, None, :]
@@ -182,7 +184,7 @@ def signed_distance(pads: Pads, p_FiQ: Array) -> PadContact:
     along = np.matmul(normal[:, None, :], hessian)
     normal_jacobian = (hessian - normal[:, :, None] * along) / length[:, None, None]
 
-    # How far outside of the pad region the point is.
+    # The distance of the point outside the pad region.
     outside = pads.region_offsets - np.matmul(pads.region_normals, p_FiQ[:, :, None])[..., 0]
 
     return PadContact(
@@ -201,16 +203,16 @@ _SKEW = np.array([np.cross(e, np.eye(3)).T for e in np.eye(3)]).reshape(3, 9)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HandConstants:
-    """A hand of k fingers with chains of m joints as stacked arrays; shorter chains are padded.
+    """A hand with k fingers and chains of m joints as stacked arrays; shorter chains are padded.
 
     Attributes:
-        X_PJ: (m, k, 4, 4), pose of each joint in the moving frame of the joint before it; that
-            of the first joint is in {G}.
+        X_PJ: (m, k, 4, 4), pose of each joint in the moving frame of the previous joint; the first
+            joint's pose is in {G}.
         axis: (m, k, 3), unit axis in the joint's frame; zero if the joint slides.
         slide: (m, k, 3), unit direction in the joint's frame; zero if the joint turns.
         slides: (m, k), whether the joint slides.
-        twist, twist2: (m, k, 4, 4), matrix of the joint's motion per position, and its square: of
-            the cross product by its axis, or of its direction.
+        twist, twist2: (m, k, 4, 4), matrix of the joint's motion per position, and its square. It
+            is the cross product by the joint's axis, or the translation along its direction.
         gain: (m, k, 1 + k), joint position per coordinate.
         offset: (m, k), joint positions at zero coordinates [rad or m].
         finger_gain: (k, m, 1 + k), the gain by finger.
@@ -218,13 +220,14 @@ class HandConstants:
         X_JFi: (k, 4, 4), pose of the fingertip link in the moving frame of the last joint.
         pads: The fingertips' surfaces.
         pad_points: (k, 3), nominal contact points in {Fi} [m].
-        limits: (1 + m, 2), of the coordinates: the spread, and the closing of each finger that has
-            a motor [rad or m].
-        units: (1 + m,), what counts as a radian of each coordinate [rad or m].
+        limits: (1 + m, 2), limits of the coordinates: the spread, and the closing of each finger
+            with its own motor [rad or m].
+        units: (1 + m,), change of each coordinate that is treated as equal to one radian [rad or
+            m].
         fingertips: (k, n, 3), corners of the fingertips in {Fi} [m].
         closing_ratio: (k, m), see `Hand.closing_ratio`.
         motor_of: (k,), the motor that moves each finger.
-        palm: (n, 3), corners of the palm and of what is fixed to it, in {G} [m].
+        palm: (n, 3), corners of the palm and of the links fixed to it, in {G} [m].
     """
 
     X_PJ: Array
@@ -253,9 +256,9 @@ def hand_constants(hand: Hand) -> HandConstants:
     """Return the constants of a hand.
 
     Raises:
-        HandError: If its palm or a fingertip has no shape, or one that is not convex.
+        HandError: If the palm or a fingertip has no shape, or a shape that is not convex.
     """
-    # The palm and the fingertips need shapes; those of a palm may be on links fixed to it.
+    # The palm and the fingertips need shapes; a palm's shapes may be on links fixed to it.
     shapes = link_shapes(hand.model)
     still = [link for link in still_links(hand) if shapes[link]]
     missing = [] if still else [hand.palm_link]
@@ -341,21 +344,22 @@ def _stack_chains(hand: Hand) -> dict[str, Array]:
 
 
 def skew(a: Array) -> Array:
-    """Return the matrices (..., 3, 3) of the cross products by a (..., 3)."""
+    """Return the matrices (..., 3, 3) of the cross products with vectors a (..., 3)."""
     return np.asarray((a @ _SKEW).reshape(*a.shape, 3))
 
 
 #: Number of unknowns of the palm's pose: three angles and three translations.
 POSE = 6
-#: Weight w_n of the angle between a pad and the predicted normal [m/rad]. The weights are the
-#: ratios that simulated grasps show: half a millimetre between point and pad goes with 7 degrees of
-#: this angle, 24 degrees of the closing motion, 5 mm along the pad, and 7 degrees of a joint.
+#: Weight w_n of the angle between a pad and the predicted normal [m/rad]. The weights are ratios
+#: that were found in simulated grasps: half a millimetre between point and pad corresponds to 7
+#: degrees of this angle, 24 degrees of the closing motion, 5 mm along the pad, and 7 degrees of a
+#: joint.
 NORMAL_WEIGHT = 0.004
 #: Weight w_v of the angle between a finger's closing motion and the predicted normal [m/rad].
 CLOSING_WEIGHT = 0.0012
 #: Weight w_p of the distance between contact and pad point, without unit.
 PAD_WEIGHT = 0.1
-#: Weight w_c of the angle between a joint and its value in the start [m/rad].
+#: Weight w_c of the angle between a joint and its value at the start [m/rad].
 POSTURE_WEIGHT = 0.004
 #: Rounding of the smooth minimum over the corners of a link [m].
 CLEARANCE_ROUNDING = 0.5e-3
@@ -365,16 +369,16 @@ _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WristProblem:
-    """Contacts to reach, and a start to reach them from.
+    """Contacts to reach, and a start for the search.
 
     Attributes:
-        constants: Of the hand.
+        constants: Constants of the hand.
         p_OQ, nhat_Q_O: (k, 3), predicted points [m] and outward unit normals in {O}.
         up_O: (3,), the table's upward normal in {O}.
         height: Height of the origin of {O} above the table [m].
-        X_OS: (4, 4), palm pose of the start: that of zero angles and translations.
-        posture: (1 + m,), coordinates of the start, which the solution stays near to where the
-            contacts leave them open [rad, or m where a finger slides].
+        X_OS: (4, 4), palm pose of the start, at zero angles and translations.
+        posture: (1 + m,), coordinates of the start [rad, or m if a finger slides]; the solution
+            stays near them if the contacts leave them open.
     """
 
     constants: HandConstants
@@ -393,15 +397,15 @@ class Evaluation:
     Attributes:
         X_OG: (4, 4), palm pose.
         p_FiQ: (k, 3), the predicted points in the fingertips' frames [m].
-        contact: Their distances from the pads, and the pads' normals.
+        contact: Distances of the points from the pads, and the pads' normals.
         pad_normals_O: (k, 3), outward normals of the pads there, in {O}.
-        residuals: (r,), weighted misfits [m]; the objective is their sum of squares. Those of
-            normals and closing directions are vectors expressed in {G}.
-        jacobian: (r, n), their derivatives. For a residual that is a vector expressed in {G} this
-            is the derivative as seen from {O}, not that of its three components, because {G}
-            turns with x. The gradient of the objective is exactly 2 residuals @ jacobian.
+        residuals: (r,), weighted misfits [m]; the objective is their sum of squares. The residuals
+            of normals and closing directions are vectors expressed in {G}.
+        jacobian: (r, n), derivatives of the residuals. For a residual that is a vector expressed in
+            {G}, it is the derivative as seen from {O}, not that of its three components, because
+            {G} turns with x. The gradient of the objective is exactly 2 residuals @ jacobian.
         clearance: (1 + k,), heights of palm and fingertips above the table [m].
-        clearance_jacobian: (1 + k, n), their derivatives.
+        clearance_jacobian: (1 + k, n), derivatives of the heights.
     """
 
     X_OG: Array
@@ -417,24 +421,24 @@ class Evaluation:
 def evaluate(problem: WristProblem, x: Array) -> Evaluation:
     """Return residuals, clearances and their exact derivatives.
 
-    The unknowns are x = (alpha, beta, gamma, t, c), n = 7 + m. With the start X_OS the palm is at
+    The unknowns are x = (alpha, beta, gamma, t, c), n = 7 + m. With the start X_OS, the palm is at
 
         X_OG = X_OS X(Rx(alpha) Ry(beta) Rz(gamma), t),
 
-    and c = (spread, closing of each of the m fingers that have a motor). The objective is
+    and c = (spread, closing of each of the m fingers with a motor). The objective is
 
         sum_i  phi_i^2 + w_n^2 |m_i + n_i|^2 + w_v^2 |v_i + n_i|^2 + w_p^2 |p_FiQi - p_FiP|^2
         + w_c^2 |c - c_S|^2 + |o_i|^2
 
-    with phi_i the distance of the predicted point Q_i from the surface of fingertip i, m_i the
-    pad's outward normal there (`pads.signed_distance`), n_i the predicted outward normal, v_i the
-    unit direction in which fingertip i moves at Q_i when its finger closes, p_FiP the hand file's
-    pad point, c_S the coordinates of the start, and o_i how far Q_i is outside of each half-space
-    of the pad region of finger i. The weights are `NORMAL_WEIGHT` (w_n),
-    `CLOSING_WEIGHT` (w_v), `PAD_WEIGHT` (w_p) and `POSTURE_WEIGHT` (w_c). The residuals are the
-    terms in this order, unsquared. Coordinates of fingers that slide are weighed in
-    `Hand.closing_unit`. The constraints are that the clearances, the smooth minima of
-    the heights of palm and fingertips over the table, are not negative.
+    where phi_i is the distance of the predicted point Q_i from the surface of fingertip i, m_i the
+    pad's outward normal there (`signed_distance`), n_i the predicted outward normal, v_i the unit
+    direction in which fingertip i moves at Q_i when its finger closes, p_FiP the hand file's pad
+    point, c_S the coordinates of the start, and o_i the distance of Q_i outside each half-space of
+    the pad region of finger i. The weights are `NORMAL_WEIGHT` (w_n), `CLOSING_WEIGHT` (w_v),
+    `PAD_WEIGHT` (w_p) and `POSTURE_WEIGHT` (w_c). The residuals are the terms in this order,
+    unsquared. Coordinates of fingers that slide are weighted in units of `Hand.closing_unit`. The
+    constraints are that the clearances are not negative. They are the smooth minima of the heights
+    of palm and fingertips over the table.
 
     Args:
         problem: The contacts and the start.
@@ -461,8 +465,8 @@ def evaluate(problem: WristProblem, x: Array) -> Evaluation:
     velocity[:, :, 3:POSE] = R_SG.T
     velocity[:, :, POSE:] = np.matmul(arms.transpose(1, 2, 0), constants.finger_gain)
 
-    # Distance phi of each point from its pad, and the pad's normal m. {O} sees the pad turn with
-    # the palm and the finger, while the predicted normal does not turn.
+    # Distance phi of each point from its pad, and the pad's normal m. Seen from {O}, the pad turns
+    # with the palm and the finger, while the predicted normal does not turn.
     p_FQ = np.matmul(R_FG, (p_GQ - X_GF[:, :3, 3])[:, :, None])[..., 0]
     dp_F = -np.matmul(R_FG, velocity)
     contact = signed_distance(constants.pads, p_FQ)
@@ -511,7 +515,7 @@ def evaluate(problem: WristProblem, x: Array) -> Evaluation:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return a x b of (..., 3); for a few vectors five times as fast as NumPy's."""
+    """Return a x b of (..., 3); for few vectors it is five times as fast as NumPy's function."""
     return np.asarray(
         a.take(_NEXT, axis=-1) * b.take(_LAST, axis=-1)
         - a.take(_LAST, axis=-1) * b.take(_NEXT, axis=-1)
@@ -530,18 +534,18 @@ def _rotation(angles: Array) -> tuple[Array, Array]:
 def _forward(constants: HandConstants, coordinates: Array) -> tuple[Array, Array, Array, Array]:
     """Return X_GFi (k, 4, 4), and each joint's axis, direction and origin (m, k, 3) in {G}.
 
-    A joint that slides has no axis, and one that turns no direction: they are zero. From the palm
+    A joint that slides has a zero axis, and a joint that turns has a zero direction. From the palm
     outwards the poses are
 
         X_GF = Π_j X_PJ(j) M_j(q_j) · X_JF,   q_j = Σ_c gain_jc c + offset_j,
         M(q) = 1 + sin(q) K + (1 − cos(q)) K K   (Rodrigues; turns)
         M(q) = 1 + q K                           (slides)
 
-    with the 4 × 4 matrix K of the joint's motion per position: the cross product by its axis, or
+    with the 4 × 4 matrix K of the joint's motion per position: the cross product with its axis, or
     the translation along its direction, whose square is zero.
     """
-    # `frames.rotation_about` has one axis for all angles; here each joint has its own, and K K is
-    # computed once per hand.
+    # `frames.rotation_about` has one axis for all angles. Here each joint has its own axis, and K K
+    # is computed once per hand.
     q = (constants.gain @ coordinates + constants.offset)[..., None, None]  # (m, k, 1, 1)
     first = np.where(constants.slides[..., None, None], q, np.sin(q))
     motion = np.eye(4) + first * constants.twist + (1.0 - np.cos(q)) * constants.twist2
@@ -572,11 +576,11 @@ def _closing_direction(
         dv = (1 − v vᵀ) dV / |V|
 
     Args:
-        constants: Of the hand.
+        constants: Constants of the hand.
         p_GQ: (k, 3), the predicted points in {G} [m].
-        axes: (m, k, 3), of the joints in {G}; zero where they slide.
+        axes: (m, k, 3), axes of the joints in {G}; zero if they slide.
         arms: (m, k, 3), velocity at Q per position of each joint, in {G} [m/rad, or -].
-        velocity: (k, 3, n), of the fingertips' material points at Q per unknown, in {G}.
+        velocity: (k, 3, n), velocity of the fingertips' material points at Q per unknown, in {G}.
 
     Returns:
         Directions (k, 3) in {G}, and their derivatives (k, 3, n) as seen from {G}.
@@ -586,12 +590,12 @@ def _closing_direction(
     turning, motion = own * axes, own * arms
     total_turning, total_motion = turning.sum(axis=0), motion.sum(axis=0)
 
-    # By the palm's pose: Q is fixed in {O}, so {G} sees it move against the palm's motion.
+    # With respect to the palm's pose: Q is fixed in {O}, so in {G} it moves against the palm.
     derivative = np.empty(velocity.shape)
     derivative[:, :, :POSE] = -np.matmul(skew(total_turning), velocity[:, :, :POSE])
 
-    # By the coordinates: joint j carries the screws of all later joints. A velocity field v that
-    # turns about an axis a changes at a fixed point by a x v - (dv/dp) arm.
+    # With respect to the coordinates: joint j moves the screws of all later joints. At a fixed
+    # point, a velocity field v that turns about an axis a changes by a x v - (dv/dp) arm.
     later_turning = total_turning - turning.cumsum(axis=0)
     later_motion = total_motion - motion.cumsum(axis=0)
     carried = _cross(axes, later_motion) - _cross(later_turning, arms)
@@ -616,9 +620,9 @@ def _clearance(
     """Return the smooth heights (1 + k,) of palm and fingertips over the table [m].
 
     Args:
-        problem: With the table.
+        problem: The problem, with the table.
         X_OG: (4, 4), pose of the palm.
-        R_SG: (3, 3), its rotation from the start.
+        R_SG: (3, 3), rotation of the palm from the start.
         spin_G: (3, 3), angular velocities per angle, as columns.
         X_GF: (k, 4, 4), poses of the fingertips.
         joints: Axes, directions and origins (m, k, 3) of the joints in {G}, see `_forward`.
@@ -649,7 +653,8 @@ def _clearance(
 def _lowest(heights: Array, points: Array) -> tuple[Array, Array]:
     """Return the smooth minima (g,) of heights (g, n) [m], and weighted means (g, 3) of the points.
 
-    The minimum is -s log sum exp(-h / s), and the weights are its derivatives by the heights.
+    The minimum is -s log sum exp(-h / s); the weights are its derivatives with respect to the
+    heights.
     """
     scaled = heights / -CLEARANCE_ROUNDING
     highest = scaled.max(axis=1)

@@ -1,11 +1,11 @@
 """Solving the wrist problem: SciPy's SLSQP from several starts.
 
 In: a hand and k contacts in {O}. Out: palm poses with joints, the best first. Contacts leave a
-family of palm poses open, so solutions from different starts are different ways to make the same
-grasp. The starts are postures of a table whose nominal fingertip contacts are close to the given
-ones: distances and angles among contacts and normals do not depend on the frame, so a tree finds
-the postures in which they are similar, and only those are aligned with the contacts (our own
-construction).
+family of palm poses open, so solutions from different starts are different palm poses for the same
+grasp. The starts come from a table of postures whose nominal fingertip contacts are close to the
+given contacts. Distances and angles among contacts and normals do not depend on the frame, so a
+tree finds the postures in which they are similar. Only these postures are aligned with the contacts
+(our own construction).
 """
 
 from __future__ import annotations
@@ -35,21 +35,22 @@ from drakegrasp.verification.wrist_problem import (
     signed_distance,
 )
 
-#: Steps of the table's angles [rad]; closing steps are longer for hands with many fingers. Closing
-#: joints that slide count in `Hand.closing_unit`.
+#: Steps of the table's angles [rad]; closing steps are longer for hands with many fingers. The unit
+#: of a sliding closing joint is `Hand.closing_unit`.
 SPREAD_STEP, CLOSING_STEP = np.deg2rad(11.25), np.deg2rad(8.0)
-#: Least number of closing steps from the open hand to the limit: some fingers move by little.
+#: Minimum number of closing steps from the open hand to the limit; some fingers move only a little.
 LEAST_STEPS = 5
-#: Most closing postures in the table.
+#: Maximum number of closing postures in the table.
 MAX_CLOSINGS = 5000
-#: Largest angles in the table [rad]: spread fingers point sideways, closed fingers make almost a
-#: fist.
+#: Largest angles in the table [rad]: spread fingers point sideways, and closed fingers almost make
+#: a fist.
 MAX_SPREAD, MAX_CLOSING = np.deg2rad(45.0), np.deg2rad(112.0)
+#: Lever that converts angles between normals to lengths when contacts are compared [m].
 #: Lever by which normals are weighed against points when contacts are compared [m].
 LEVER = 0.02
 #: Number of postures that are aligned with the contacts.
 NEAREST = 96
-#: Any two starts differ in some joint by more than this [rad], because contacts leave a family of
+#: Any two starts differ by more than this in some joint [rad], because contacts leave a family of
 #: postures open.
 DIFFERENT = np.deg2rad(14.0)
 
@@ -63,12 +64,11 @@ Start: TypeAlias = tuple[Array, Array]
 class Postures:
     """N postures of a hand.
 
-    Attributes:
-        coordinates: (N, 1 + m), see `HandConstants.limits` [rad or m].
-        p_GP: (N, k, 3), nominal contact points in {G} [m].
-        n_G: (N, k, 3), outward pad normals there, in {G}.
-        units: (1 + m,), what counts as a radian of each coordinate [rad or m].
-        tree: Of their features, see `_features`.
+    coordinates: (N, 1 + m), see `HandConstants.limits` [rad or m].
+    p_GP: (N, k, 3), nominal contact points in {G} [m].
+    n_G: (N, k, 3), outward pad normals there, in {G}.
+    units: (1 + m,), see `HandConstants.units` [rad or m].
+    tree: Tree of their features, see `_features`.
     """
 
     coordinates: Array
@@ -108,14 +108,14 @@ def find_starts(postures: Postures, p_OQ: Array, nhat_Q_O: Array, count: int) ->
     """Return up to `count` different starts, the best first.
 
     Args:
-        postures: Of the hand.
+        postures: Postures of the hand.
         p_OQ: (k, 3), contact points [m].
         nhat_Q_O: (k, 3), outward unit normals.
-        count: Most starts to return.
+        count: Maximum number of starts.
     """
     rows, X_OG, misfit = _nearest_postures(postures, p_OQ, nhat_Q_O)
 
-    # The best of them that differ enough.
+    # Take the best starts that differ enough.
     starts: list[Start] = []
     for i in np.argsort(misfit, kind="stable"):
         c = postures.coordinates[rows[i]]
@@ -127,10 +127,10 @@ def find_starts(postures: Postures, p_OQ: Array, nhat_Q_O: Array, count: int) ->
 
 
 def posture_misfit(postures: Postures, p_OQ: Array, nhat_Q_O: Array) -> float:
-    """Return how little contacts look like those of any posture: a sum of squares [m^2].
+    """Return the smallest misfit of contacts to those of any posture: a sum of squares [m^2].
 
     Args:
-        postures: Of the hand.
+        postures: Postures of the hand.
         p_OQ: (k, 3), contact points [m].
         nhat_Q_O: (k, 3), outward unit normals.
     """
@@ -149,15 +149,15 @@ def _nearest_postures(
 
 
 def turned_starts(starts: Sequence[Start], p_OQ: Array, count: int) -> list[Start]:
-    """Return starts turned about the line through two contacts, which leaves both where they are.
+    """Return starts turned about the line through two contacts, which does not move the contacts.
 
-    Two contacts leave that turn open, and most of these palm poses would be within the object or
-    the table. Those of one turn come together, the starts as they are first.
+    Two contacts leave this turn open, and most of these palm poses would be inside the object or
+    the table. Starts with the same turn are adjacent; the given starts are first.
 
     Args:
-        starts: For a hand of two fingers.
+        starts: Starts for a hand with two fingers.
         p_OQ: (2, 3), the contact points [m].
-        count: Number of turns, evenly over a full one.
+        count: Number of turns, evenly spaced over a full turn.
     """
     centre, line = p_OQ.mean(axis=0), p_OQ[1] - p_OQ[0]
     axis = line / max(float(np.linalg.norm(line)), 1e-9)
@@ -170,7 +170,7 @@ def turned_starts(starts: Sequence[Start], p_OQ: Array, count: int) -> list[Star
 
 
 def _features(p: Array, n: Array) -> Array:
-    """Return features (..., f) [m] of contacts that do not depend on their frame.
+    """Return features (..., f) [m] of contacts that do not depend on the frame of the contacts.
 
     Args:
         p: (..., k, 3), points [m].
@@ -189,7 +189,7 @@ def _features(p: Array, n: Array) -> Array:
             LEVER * np.sum(away * n[..., j, :], axis=-1),
         ]
     if p.shape[-2] >= 3:
-        # Distances and angles are the same for mirror images; the side of the triangle is not.
+        # Distances and angles are equal for mirror images, but the side of the triangle is not.
         across = np.cross(p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :])
         across /= np.maximum(np.linalg.norm(across, axis=-1), 1e-9)[..., None]
         values += [LEVER * np.sum(across * n[..., i, :], axis=-1) for i in range(p.shape[-2])]
@@ -199,8 +199,9 @@ def _features(p: Array, n: Array) -> Array:
 def _align(p_GP: Array, n_G: Array, p_OQ: Array, n_O: Array) -> tuple[Array, Array]:
     """Return the palm poses that bring N sets of contacts closest to the given ones.
 
-    Kabsch (1976), on the points and on points `LEVER` along the normals: with the centred sets A
-    and B as rows, AᵀB = U Σ Vᵀ, the sum Σ_i |R a_i + p − b_i|² is smallest for
+    It is the method of Kabsch (1976), on the points and on points `LEVER` along the normals. With
+    the centred sets A and B as rows and AᵀB = U Σ Vᵀ, the sum Σ_i |R a_i + p − b_i|² is smallest
+    for
 
         R = V diag(1, 1, det(U Vᵀ)) Uᵀ,   p = mean(b) − R mean(a).
 
@@ -223,7 +224,7 @@ def _align(p_GP: Array, n_G: Array, p_OQ: Array, n_O: Array) -> tuple[Array, Arr
     V[mirrored, :, 2] *= -1.0
     R = V @ np.swapaxes(U, -1, -2)
 
-    # Translations, and what distance remains.
+    # Translations, and the remaining distances.
     p = centre_B - np.einsum("nab,nb->na", R, centre_A[:, 0])
     misfit = np.sum((A @ np.swapaxes(R, -1, -2) + p[:, None] - B) ** 2, axis=(-1, -2))
     X = np.tile(np.eye(4), (len(R), 1, 1))
@@ -233,21 +234,21 @@ def _align(p_GP: Array, n_G: Array, p_OQ: Array, n_O: Array) -> tuple[Array, Arr
 
 #: Number of starts, and so of solutions.
 STARTS = 5
-#: Two contacts leave the palm's turn about their line open: number of turns that are tried.
+#: Number of turns that are tried: two contacts leave the palm's turn about their line open.
 TURNS = 36
 #: Unit of the objective [m^2]: residuals of a few millimetres give values of order one.
 UNIT = 0.005**2
 #: Unit of the clearance over the table [m].
 CLEARANCE_UNIT = 0.01
-#: Share of the identity in the scaling matrix; it keeps steps short along directions that the
+#: Fraction of the identity in the scaling matrix; it keeps steps short along directions that the
 #: contacts hardly determine.
 DAMPING = 3e-4
-#: SLSQP stops after so many iterations, or when the scaled objective changes by less than this.
+#: SLSQP stops after this many iterations, or when the scaled objective changes by less than this.
 MAX_ITERATIONS, TOLERANCE = 50, 1e-3
 #: Steps of Newton's method that bring each pad onto its point.
 REFINEMENTS = 3
-#: A closing position is refined only if the distance changes with it by more than this [m per
-#: `Hand.closing_unit`]: a pad that slides along its point cannot be brought nearer by closing.
+#: A closing position is refined only if it changes the distance by more than this [m per
+#: `Hand.closing_unit`]: closing cannot bring a pad closer that slides along its point.
 MIN_SLOPE = 0.01
 
 
@@ -259,12 +260,12 @@ class WristFit:
         X_OG: (4, 4), palm pose.
         spread: Angle of the spread joints [rad].
         closing: (k,), closing positions at which the pads meet the points [rad or m].
-        objective: Sum of squared residuals where SLSQP ended, before each finger was brought onto
+        objective: Sum of squared residuals at the end of SLSQP, before each finger was moved onto
             its point [m^2].
         residual: (k,), distance of each predicted point from its fingertip's surface [m].
         normal_error: (k,), angle between each pad's inward and the predicted normal [rad].
         status: SLSQP's exit mode; 0 is success.
-        message: SLSQP's text for it.
+        message: SLSQP's message for the exit mode.
         iterations, evaluations: Numbers of SLSQP's iterations and of evaluations of the problem.
     """
 
@@ -286,7 +287,7 @@ def fit_wrist(
     """Return the solutions from all starts, the one with the smallest objective first.
 
     Args:
-        hand: Of k fingers.
+        hand: A hand with k fingers.
         p_OQ: (k, 3), contact points [m].
         nhat_Q_O: (k, 3), outward unit normals.
         up_O: (3,), the table's upward normal in {O}.
@@ -311,7 +312,7 @@ def fit_wrist(
 
 
 def solve(problem: WristProblem) -> WristFit:
-    """Return SLSQP's solution from the problem's start, with each finger brought onto its point."""
+    """Return SLSQP's solution from the problem's start, with each finger moved onto its point."""
     # Minimise the sum of squares.
     scaled = _ScaledProblem(problem)
     result = minimize(
@@ -350,16 +351,16 @@ def solve(problem: WristProblem) -> WristFit:
 def _refine(problem: WristProblem, coordinates: Array) -> tuple[Evaluation, Array]:
     """Close or open each finger until its pad meets its point; the palm does not move.
 
-    Newton's method on the distance φ_i of each finger from its point, by its own closing position:
-    c_i ← c_i − φ_i / (∂φ_i/∂c_i), within the limits, as long as Σ |φ_i| falls. Fingers that share a
-    motor take the mean of their steps.
+    It is Newton's method on the distance φ_i of each finger from its point, as a function of the
+    finger's closing position: c_i ← c_i − φ_i / (∂φ_i/∂c_i), within the limits, as long as Σ |φ_i|
+    decreases. Fingers that share a motor take the mean of their steps.
 
     Args:
-        problem: With its start at the palm's pose.
-        coordinates: (1 + m,), of the start, see `HandConstants.limits` [rad or m].
+        problem: The problem, whose start is at the palm's pose.
+        coordinates: (1 + m,), coordinates of the start, see `HandConstants.limits` [rad or m].
 
     Returns:
-        The problem at the refined coordinates, and these.
+        The problem evaluated at the refined coordinates, and these coordinates.
     """
     lower, upper = problem.constants.limits.T
     pose, own = np.zeros(POSE), np.arange(len(problem.p_OQ))
@@ -367,7 +368,7 @@ def _refine(problem: WristProblem, coordinates: Array) -> tuple[Evaluation, Arra
     c = np.clip(coordinates, lower, upper)
     best = evaluate(problem, np.concatenate([pose, c]))
     for _ in range(REFINEMENTS):
-        # A step of each closing angle, within the limits.
+        # A step of each closing position, within the limits.
         distance = best.contact.distance
         slope = best.jacobian[own, POSE + 1 + motor]
         moves = np.abs(slope) * problem.constants.units[1 + motor] > MIN_SLOPE
@@ -375,7 +376,7 @@ def _refine(problem: WristProblem, coordinates: Array) -> tuple[Evaluation, Arra
         step = np.bincount(motor, step) / np.bincount(motor)
         trial = np.clip(c - np.concatenate([[0.0], step]), lower, upper)
 
-        # Stop when it brings the fingers no nearer.
+        # Stop if it does not bring the fingers closer.
         after = evaluate(problem, np.concatenate([pose, trial]))
         if not np.abs(after.contact.distance).sum() < np.abs(distance).sum():
             break
@@ -386,13 +387,13 @@ def _refine(problem: WristProblem, coordinates: Array) -> tuple[Evaluation, Arra
 class _ScaledProblem:
     """The problem in scaled unknowns y with x = x_S + S y, as SLSQP needs it.
 
-    S is an inverse square root of the Gauss-Newton matrix H at the start x_S: with the residuals'
+    S is an inverse square root of the Gauss-Newton matrix H at the start x_S. With the residuals'
     Jacobian J there, n unknowns, the unit U (`UNIT`) and λ (`DAMPING`),
 
         H₀ = 2 Jᵀ J / U,   H = H₀ + λ tr(H₀)/n · 1 = L Lᵀ (Cholesky),   S = L⁻ᵀ,   Sᵀ H S = 1.
 
     SLSQP's first step assumes an identity Hessian, so in y it is the Gauss-Newton step. The last
-    evaluation is kept, because SLSQP asks for objective and constraints at the same point.
+    evaluation is cached, because SLSQP requests objective and constraints at the same point.
     """
 
     def __init__(self, problem: WristProblem) -> None:
@@ -418,18 +419,18 @@ class _ScaledProblem:
         return self._last
 
     def objective(self, y: Array) -> tuple[float, Array]:
-        """Return the sum of squares, in units of `UNIT`, and its gradient (n,) by y."""
+        """Return the sum of squares in units of `UNIT`, and its gradient (n,) in y."""
         e = self.at(y)
         slope = 2.0 * (e.residuals @ e.jacobian) @ self._S / UNIT
         return float(e.residuals @ e.residuals) / UNIT, slope
 
     def constraints(self, y: Array) -> Array:
-        """Return what must not be negative: distances to the joints' limits and to the table."""
+        """Return the distances to the joints' limits and to the table, all at least 0."""
         c, (lower, upper) = self.x(y)[POSE:], self._problem.constants.limits.T
         return np.concatenate([c - lower, upper - c, self.at(y).clearance / CLEARANCE_UNIT])
 
     def constraint_jacobian(self, y: Array) -> Array:
-        """Return the derivative of `constraints` by y."""
+        """Return the derivative of `constraints` with respect to y."""
         joints = self._S[POSE:]
         over_table = self.at(y).clearance_jacobian @ self._S / CLEARANCE_UNIT
         return np.concatenate([joints, -joints, over_table])
