@@ -1,9 +1,9 @@
-"""Solids of what a camera saw: the visible points of an object on the table, filled.
+"""Solids from what a camera saw: the visible points of an object on the table, filled.
 
-In: points (n, 3) in {T}, whose table is z = 0. Out: distance fields in {T}. Of the object's back
-and of its underside nothing is seen, so a solid is a guess; two of them bracket it. The convex hull
-of the points and of what is below them fills every hollow; the columns from the points down to the
-table keep handles and waists that are seen from above.
+In: points (n, 3) in {T}, whose table is z = 0. Out: distance fields in {T}. The back and the
+underside of the object are not seen, so a solid is a guess; two solids bracket the object. The
+convex hull of the points and of their projections on the table fills every hollow; the columns from
+the points down to the table keep handles and waists that are seen from above.
 """
 
 from __future__ import annotations
@@ -20,23 +20,25 @@ from drakegrasp.errors import GraspError
 from drakegrasp.frames import as_numbers
 from drakegrasp.mesh.distance_field import DistanceField
 
-#: Fewest points of a cloud, most that are used, and its largest size [m]: that of an object.
+#: Minimum number of points of a cloud, maximum number that is used, and the largest size [m] of an
+#: object.
 FEWEST, MOST, LARGEST = 10, 4096, 1.0
-#: Points rise at least so far above the table [m]: thinner objects no solid shows.
+#: The highest point must be at least this far above the table [m]: a solid cannot show thinner
+#: objects.
 LEAST_HEIGHT = 0.004
-#: Approximate number of cells of a grid, no finer than this [m], and empty cells around it.
+#: Approximate number of cells of a grid, its smallest spacing [m], and empty cells around it.
 CELLS, FINEST, PADDING = 150_000, 0.002, 6
-#: Normals are slopes between points this many cells apart from where they are asked for: columns
-#: have steps of a cell.
+#: A normal is the slope between points this many cells to both sides, since columns have steps of
+#: one cell.
 SLOPE = 2.0
-#: Gaps between columns are filled up to this many times the distance between neighbouring points,
-#: and at least and at most up to so many cells.
+#: Gaps between columns are filled up to this multiple of the distance between neighbouring points,
+#: with this minimum and maximum number of cells.
 CLOSED, LEAST_CLOSED, MOST_CLOSED = 2.0, 3, 2 * PADDING - 1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solid:
-    """A filled cloud: its distance field in {T}, and the middle (3,) of its volume [m]."""
+    """A filled cloud: its distance field in {T}, and the centre (3,) of its volume [m]."""
 
     field: DistanceField
     middle: Array
@@ -54,10 +56,10 @@ class Solid:
 
 
 def read_cloud(cloud: npt.ArrayLike) -> Array:
-    """Return the points (n, 3) of a cloud [m], none below the table, `MOST` of them at most.
+    """Return at most `MOST` points (n, 3) of a cloud [m], raised to the table if below it.
 
     Raises:
-        GraspError: If they are no points of one object that stands on the table.
+        GraspError: If they cannot be points of one object that stands on the table.
     """
     must = "cloud must be points (n, 3) of one object, in {T} and in metres"
     points = as_numbers(cloud, must)
@@ -77,16 +79,16 @@ def read_cloud(cloud: npt.ArrayLike) -> Array:
 
 
 def hull_solid(points: Array) -> Solid:
-    """Return the convex hull of points (n, 3) and of what is below them on the table.
+    """Return the convex hull of points (n, 3) and of their projections on the table.
 
     Raises:
-        GraspError: If the points lie in a vertical plane.
+        GraspError: If the points are in a vertical plane.
     """
     planes = _hull(np.concatenate([points, points * [1.0, 1.0, 0.0]])).equations
     origin, spacing, shape = _grid(points)
     x, y, z = (o + spacing * np.arange(n) for o, n in zip(origin, shape, strict=True))
 
-    # Distances from the nearest face: outside of edges and corners they are too small.
+    # Distances from the face planes: beside edges and corners they are too small.
     values = np.full(shape, -np.inf)
     for a, b, c, d in np.unique(planes.round(6), axis=0):
         np.maximum(values, a * x[:, None, None] + b * y[:, None] + (c * z + d), out=values)
@@ -94,7 +96,7 @@ def hull_solid(points: Array) -> Solid:
 
 
 def column_solid(points: Array) -> Solid:
-    """Return the columns from points (n, 3) down to the table, small gaps between them filled."""
+    """Return the columns from points (n, 3) down to the table, with small gaps filled."""
     origin, spacing, shape = _grid(points)
     i, j, k = np.rint((points - origin) / spacing).astype(np.int64).T
     top = np.full(shape[:2], -1)
@@ -102,25 +104,25 @@ def column_solid(points: Array) -> Solid:
     layers = np.arange(shape[2])
     filled = (layers <= top[:, :, None]) & (layers >= PADDING)
 
-    # Few points leave wide gaps.
+    # If there are few points, the gaps between them are wide.
     apart = np.quantile(cKDTree(points).query(points, k=2)[0][:, 1], 0.9)
     width = int(np.clip(np.ceil(CLOSED * apart / spacing) + 1, LEAST_CLOSED, MOST_CLOSED))
     filled |= binary_closing(filled, np.ones((width, width, 1)))
 
-    # Half a cell: the surface is between a filled point and one that is not.
+    # Half a cell, since the surface is between a filled grid point and an empty one.
     inside, outside = distance_transform_edt(filled), distance_transform_edt(~filled)
     steps = np.where(filled, 0.5 - inside, outside - 0.5)
     return _solid(spacing * steps, points, origin, spacing)
 
 
 def smallest_rectangle(points: Array) -> tuple[Array, Array, Array]:
-    """Return the smallest rectangle about points (n, 3) seen from above.
+    """Return the smallest rectangle around points (n, 3), seen from above.
 
     Returns:
-        Unit axes (2, 2) as rows, the long side first; the middle (2,) and half sides (2,) [m].
+        Unit axes (2, 2) as rows, the long side first; the centre (2,) and the half sides (2,) [m].
 
     Raises:
-        GraspError: If the points lie in a vertical plane.
+        GraspError: If the points are in a vertical plane.
     """
     corners = points[_hull(points[:, :2]).vertices, :2]
     edges = np.roll(corners, -1, axis=0) - corners
@@ -143,7 +145,7 @@ def _hull(points: Array) -> ConvexHull:
 
 
 def _grid(points: Array) -> tuple[Array, float, tuple[int, ...]]:
-    """Return the first point (3,) [m], the spacing [m] and the shape of a grid about a cloud."""
+    """Return the first point (3,) [m], the spacing [m] and the shape of a grid around a cloud."""
     low, high = points.min(axis=0) * [1.0, 1.0, 0.0], points.max(axis=0)
     room = high - low + 2 * PADDING * FINEST
     spacing = max(FINEST, float(np.cbrt(np.prod(room) / CELLS)))

@@ -1,9 +1,9 @@
 """Components: the triangles of a file come in, its connected pieces of surface go out, closed.
 
-The faces of a component agree on which side is outside, and it shares no vertex with another.
-Half-edge 3f + i leaves corner i of face f; its twin is the opposite half-edge of the neighbouring
-face, or -1 at a rim. Of its open rims only one that is flat or small is surely a hole, and can be
-closed; others raise `MeshError`.
+All faces of a component agree on which side is outside, and a component shares no vertex with
+another. Half-edge 3f + i starts at corner i of face f; its twin is the opposite half-edge of the
+neighbouring face, or -1 at a rim. Only an open rim that is flat or small is certainly a hole and
+can be closed; other rims raise `MeshError`.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from drakegrasp.mesh.surfaces import (
     split_faces,
 )
 
-#: Two touching edges of one face share the faces between their new vertices, which are parted in
-#: a second turn; a third was never needed.
+#: If two touching edges belong to one face, the faces between their new vertices still touch and
+#: are
+#: parted in a second turn; a third turn was never needed.
 MAX_PARTINGS = 4
 
 
@@ -47,12 +48,12 @@ class Component:
 
     @property
     def is_closed(self) -> bool:
-        """Whether every edge has two faces."""
+        """Whether every edge belongs to two faces."""
         return bool((self.twins >= 0).all())
 
 
 def find_components(vertices: Array, faces: Faces, notes: list[str]) -> list[Component]:
-    """Return the components of a surface, each with agreeing faces and vertices of its own.
+    """Return the components of a surface, each with consistent faces and its own vertices.
 
     Args:
         vertices: (n, 3) [m].
@@ -64,8 +65,9 @@ def find_components(vertices: Array, faces: Faces, notes: list[str]) -> list[Com
     """
     twins = pair_half_edges(vertices, faces, radial=True)
 
-    # Corners that meet across a paired edge share a vertex; all others are separated, even
-    # where two components of the file touch at a single point.
+    # Corners that meet across a paired edge share a vertex. All other corners are separated, even
+    # if
+    # two components of the file touch at a single point.
     halves = np.flatnonzero(twins >= 0)
     ends = half_edges(faces)
     start, end = halves, halves - halves % 3 + (halves + 1) % 3
@@ -79,7 +81,7 @@ def find_components(vertices: Array, faces: Faces, notes: list[str]) -> list[Com
     vertices = vertices[faces.ravel()[first]]
     faces = corner_vertex.reshape(-1, 3).astype(np.int64)
 
-    # Neighbouring faces must run along their common edge in opposite directions.
+    # Neighbouring faces must have opposite directions along their common edge.
     flip, flipped = _orient(vertices, faces, twins)
     if flipped:
         notes.append(
@@ -102,9 +104,9 @@ def _orient(vertices: Array, faces: Faces, twins: Faces) -> tuple[Faces, int]:
     """Return whether to flip each face (m,) so that neighbours agree, and how many to flip.
 
     Each face and its flipped copy are two nodes of a graph, whose connected components are
-    consistent choices. The choice that keeps the orientation of more of the area wins.
+    consistent choices. The choice that keeps the orientation of the larger area is taken.
     """
-    # A node is joined to the neighbour's node that runs the opposite way along their edge.
+    # A node is joined to the neighbour's node that has the opposite direction along their edge.
     m = len(faces)
     halves = np.flatnonzero(twins >= 0)
     ends = half_edges(faces)
@@ -115,7 +117,7 @@ def _orient(vertices: Array, faces: Faces, twins: Faces) -> tuple[Faces, int]:
     if (labels[:m] == labels[m:]).any():
         raise MeshError("the surface must have two sides, got one like a Möbius strip")
 
-    # Keep the first face of each component, or flip all of it if that keeps more of the area.
+    # Keep the first face of each component, or flip the component if that keeps more of the area.
     count, piece = face_components(twins, m)
     _, first = np.unique(piece, return_index=True)
     flip = labels[:m] != labels[first[piece]]
@@ -126,7 +128,7 @@ def _orient(vertices: Array, faces: Faces, twins: Faces) -> tuple[Faces, int]:
 
 
 def count_parts(vertices: Array, faces: Faces) -> int:
-    """Return how many separate parts a solid has; cavities do not count."""
+    """Return the number of separate parts of a solid; cavities do not count."""
     count, piece = face_components(pair_half_edges(vertices, faces, radial=False), len(faces))
     if count == 1:
         return 1
@@ -136,15 +138,15 @@ def count_parts(vertices: Array, faces: Faces) -> int:
 def part_touching_edges(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
     """Return the same surface with as few edges of four or more faces as possible.
 
-    Where a surface touches itself along an edge, the two faces that bound the same wedge of solid
-    get a vertex of their own in its middle, so that each half of the edge has two faces again.
+    If a surface touches itself along an edge, the two faces that bound the same wedge of solid get
+    their own vertex at the centre of the edge, so that each half of the edge has two faces again.
 
     Args:
         vertices: (n, 3) [m].
         faces: (m, 3).
     """
     for _ in range(MAX_PARTINGS):
-        # The pairs of half-edges at such edges; each pair is taken once.
+        # The pairs of half-edges at such edges, each pair once.
         ids, counts = edge_ids(faces)
         if not (counts > 2).any():
             break
@@ -166,7 +168,7 @@ def part_touching_edges(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
 
 
 def edge_ids(faces: Faces) -> tuple[Faces, Faces]:
-    """Return the edge of every half-edge (3m,) and the number of faces of every edge."""
+    """Return the edge of every half-edge (3m,), and the number of faces of every edge."""
     halves = np.sort(half_edges(faces), axis=1)
     key = halves[:, 0] * (int(faces.max(initial=0)) + 1) + halves[:, 1]
     _, ids, counts = np.unique(key, return_inverse=True, return_counts=True)
@@ -174,12 +176,12 @@ def edge_ids(faces: Faces) -> tuple[Faces, Faces]:
 
 
 def pair_half_edges(vertices: Array, faces: Faces, *, radial: bool) -> Faces:
-    """Return the opposite of every half-edge (3m,), -1 where there is none.
+    """Return the opposite of every half-edge (3m,), or -1 if it has none.
 
-    At an edge with four or more faces, `radial` pairs those that bound the same wedge
-    of solid, so that components that touch along an edge come apart.
+    At an edge with four or more faces, `radial` pairs the faces that bound the same wedge of solid,
+    so that components that touch along an edge are separated.
     """
-    # An edge with two faces: they are each other's neighbours.
+    # The two faces of an edge with two faces are neighbours.
     ids, counts = edge_ids(faces)
     order = np.argsort(ids, kind="stable")
     starts = np.concatenate(([0], np.cumsum(counts)[:-1]))
@@ -187,7 +189,7 @@ def pair_half_edges(vertices: Array, faces: Faces, *, radial: bool) -> Faces:
     pairs = starts[counts == 2]
     twins[order[pairs]], twins[order[pairs + 1]] = order[pairs + 1], order[pairs]
 
-    # An edge with four or more.
+    # An edge with four or more faces.
     if radial:
         for edge in np.flatnonzero((counts > 2) & (counts % 2 == 0)):
             _pair_radially(
@@ -197,9 +199,9 @@ def pair_half_edges(vertices: Array, faces: Faces, *, radial: bool) -> Faces:
 
 
 def _pair_radially(vertices: Array, faces: Faces, halves: Faces, twins: Faces) -> None:
-    """Pair the half-edges of one edge by their angles about it.
+    """Pair the half-edges of one edge by their angles around it.
 
-    They stay unpaired if not equally many run each way along the edge.
+    They stay unpaired if the numbers of half-edges in the two directions differ.
     """
     face, corner = halves // 3, halves % 3
     start, end = faces[face, corner], faces[face, (corner + 1) % 3]
@@ -207,7 +209,7 @@ def _pair_radially(vertices: Array, faces: Faces, halves: Faces, twins: Faces) -
     if 2 * int(leaves.sum()) != len(halves):
         return
 
-    # The angle of each face about the edge, from its third corner.
+    # The angle of each face around the edge, from its third corner.
     low, high = int(start.min()), int(end.max())
     axis = vertices[high] - vertices[low]
     axis = axis / np.linalg.norm(axis)
@@ -217,13 +219,15 @@ def _pair_radially(vertices: Array, faces: Faces, halves: Faces, twins: Faces) -
     angles = np.round(np.arctan2(arms @ second, arms @ first) % (2.0 * np.pi), 6)
     angles[angles >= 6.283185] = 0.0
 
-    # Going around the axis, the solid ends at a face that runs along it, and begins at one that
-    # runs against it. At equal angles the end comes first: components that share a wall are two.
+    # Around the axis, the solid ends at a face whose half-edge has the axis' direction, and begins
+    # at
+    # a face with the opposite one. At equal angles the end comes first, so that components that
+    # share a wall stay two.
     turn = np.lexsort((~leaves, angles))
     depth = np.cumsum(np.where(leaves[turn], -1, 1))
     turn = np.roll(turn, -(int(np.argmin(depth)) + 1))
 
-    # Each end belongs to the last beginning before it.
+    # Each end is paired with the last beginning before it.
     entered: list[int] = []
     for half in turn:
         if leaves[half]:
@@ -239,7 +243,7 @@ def face_components(twins: Faces, face_count: int) -> tuple[int, Faces]:
     return connect(halves // 3, twins[halves] // 3, face_count)
 
 
-#: A rim is planar if it leaves its plane by no more than this fraction of its own size ...
+#: A rim is planar if it deviates from its plane by at most this fraction of its own size ...
 PLANAR = 0.05
 #: ... and small if its size is below this fraction of the object's diagonal.
 SMALL_RIM = 0.15
@@ -255,13 +259,13 @@ def close_rims(component: Component, size: float) -> tuple[list[Faces], int]:
     Raises:
         MeshError: If a rim is neither flat nor small, or crosses itself.
     """
-    # Large rims first, so that an outer rim comes before the inner ones in its plane.
+    # Large rims come first, so that an outer rim comes before the inner rims in its plane.
     vertices = component.vertices
     rims = sorted(_rims(component), key=lambda r: -float(np.linalg.norm(_area_vector(vertices[r]))))
     lids: list[Faces] = []
     holes = 0
     while rims:
-        # The plane through the rim, by least squares, with its normal towards the missing side.
+        # The least-squares plane through the rim, with its normal towards the missing side.
         outer = rims.pop(0)
         points = vertices[outer]
         centre, width = points.mean(axis=0), diagonal(points)
@@ -276,8 +280,8 @@ def close_rims(component: Component, size: float) -> tuple[list[Faces], int]:
                 f"{width * 1e3:.3g} mm and leave their plane by {off_plane * 1e3:.3g} mm"
             )
 
-        # A second rim in the same plane, inside the first and running the other way,
-        # is the inner edge of a wall: the gap between the two is a ring.
+        # A second rim in the same plane, inside the first and in the opposite direction, is the
+        # inner edge of a wall: the gap between the two rims is a ring.
         flat = (points - centre) @ basis.T
         loops, polygons = [outer], [flat]
         for rim in list(rims):
@@ -289,7 +293,7 @@ def close_rims(component: Component, size: float) -> tuple[list[Faces], int]:
                 polygons.append(local)
                 rims = [r for r in rims if r is not rim]
 
-        # Triangulate in the plane; a rim that crosses itself covers more than its area.
+        # Triangulate in the plane. A rim that crosses itself covers more than its area.
         triangles = manifold3d.triangulate([np.ascontiguousarray(p) for p in polygons])
         corners = np.vstack(polygons)[triangles]
         u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -304,7 +308,7 @@ def close_rims(component: Component, size: float) -> tuple[list[Faces], int]:
 
 def _rims(component: Component) -> list[Faces]:
     """Return the boundary loops as vertex indices, in the direction of the missing faces."""
-    # The vertex that follows each vertex; two followers mean that two rims touch.
+    # The successor of each vertex; a vertex with two successors means that two rims touch.
     open_halves = np.flatnonzero(component.twins < 0)
     ends = half_edges(component.faces)[open_halves]
     after = {int(b): int(a) for a, b in ends}

@@ -1,7 +1,8 @@
-"""Crossings: where rays first meet a surface of triangles, and which of its faces cross others.
+"""Crossings: where rays first meet a surface of triangles, and which faces cross others.
 
-The same bits on every machine: nothing but sums, products and roots. Embree is no alternative: it
-works in single precision, with kernels that depend on the CPU.
+The results have the same bits on every machine, since only sums, products and roots are used.
+Embree cannot replace this module: it computes in single precision, with kernels that depend on the
+CPU.
 """
 
 from __future__ import annotations
@@ -15,31 +16,31 @@ from drakegrasp.mesh.surfaces import Faces, diagonal, pair_blocks, unit_normals
 
 # Rays
 
-#: A ray that misses a triangle by this share of it still meets it, so that no ray passes between
-#: two triangles.
+#: A ray that misses a triangle by this fraction of its size still meets it, so that no ray passes
+#: between two triangles.
 EDGE = 1e-9
-#: By how much the sphere around a triangle is widened [m], far above rounding.
+#: Margin of the sphere around a triangle [m], far above rounding.
 MARGIN = 1e-6
-#: Pairs of a ray and a triangle that are tested together; they fit into a CPU's cache.
+#: Number of pairs of a ray and a triangle that are tested together; they fit into a CPU's cache.
 PAIRS = 65_536
 
 
 def first_hits(triangles: Array, p: Array, z: Array) -> Array:
-    """Return the distance (n,) [m] at which each ray first meets a triangle; inf where none does.
+    """Return the distance (n,) [m] at which each ray first meets a triangle; inf if it meets none.
 
-    Möller and Trumbore's test (1997); a ray through an edge or a corner meets it.
+    Möller and Trumbore's test (1997); a ray through an edge or a corner meets the triangle.
 
     Args:
         triangles: Corners (m, 3, 3) [m].
-        p: Where the rays begin, (n, 3) [m].
-        z: Their unit directions, (n, 3).
+        p: Starting points of the rays, (n, 3) [m].
+        z: Unit directions of the rays, (n, 3).
     """
     # A sphere around each triangle.
     a, b, c = np.moveaxis(np.asarray(triangles, dtype=float), 1, 0)
     centre = (a + b + c) / 3.0
     radius = np.sqrt(np.max([dot(q - centre, q - centre) for q in (a, b, c)], axis=0, initial=0.0))
 
-    # Test only triangles whose sphere the ray passes.
+    # Test only triangles whose sphere the ray meets.
     distance = np.full(len(p), np.inf)
     step = max(1, PAIRS // max(1, len(a)))
     for start in range(0, len(p), step):
@@ -52,36 +53,37 @@ def first_hits(triangles: Array, p: Array, z: Array) -> Array:
 
 
 def _pass_spheres(p: Array, z: Array, centre: Array, radius: Array) -> npt.NDArray[np.bool_]:
-    """Return (n, m) whether each ray passes each sphere of centre (m, 3) and radius (m,)."""
+    """Return (n, m) whether each ray meets each sphere of centre (m, 3) and radius (m,)."""
     along, squared = np.zeros((len(p), len(centre))), np.zeros((len(p), len(centre)))
     for axis in range(3):
         apart = centre[:, axis] - p[:, None, axis]
         along += apart * z[:, None, axis]
         squared += apart * apart
-    # The difference of two squares loses digits; MARGIN in the radius is far above that error.
+    # The difference of two squares loses digits; MARGIN in the radius is far above this error.
     return (squared - along * along <= radius * radius) & (along >= -radius)
 
 
 def _triangle_hits(p: Array, z: Array, a: Array, b: Array, c: Array) -> Array:
-    """Return the distance (n,) at which each ray meets its triangle; inf where it does not."""
+    """Return the distance (n,) at which each ray meets its triangle; inf if it does not."""
     ab, ac, ap = b - a, c - a, p - a
     across, up = np.cross(z, ac), np.cross(ap, ab)
     volume = dot(ab, across)
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v, t = dot(ap, across) / volume, dot(z, up) / volume, dot(ac, up) / volume
         meets = (u >= -EDGE) & (v >= -EDGE) & (u + v <= 1.0 + EDGE) & (t >= 0.0)
-    # A triangle that is seen edge-on is skipped: the ray meets its neighbours.
+    # A triangle seen edge-on is skipped: the ray meets its neighbours.
     flat = np.abs(volume) <= EDGE * norm(ab) * norm(ac)
     return np.where(meets & ~flat, t, np.inf)
 
 
 # Faces that cross
 
-#: An edge passes through a face if its ends are farther than this on both sides, and it farther
-#: than this from the face's edges, as a fraction of the diagonal. Surfaces that only touch do
-#: not, though their vertices are rounded.
+#: An edge passes through a face if its ends are farther than this from the face's plane, on
+#: opposite
+#: sides, and the edge is farther than this from the face's edges, as a fraction of the diagonal.
+#: Surfaces that only touch do not cross, even if their vertices are rounded.
 DEPTH = 2e-6
-#: Pairs of faces that are looked at together.
+#: Number of pairs of faces that are tested together.
 FACE_PAIRS = 1_000_000
 
 Mask = npt.NDArray[np.bool_]
@@ -90,22 +92,22 @@ Mask = npt.NDArray[np.bool_]
 def crossing_faces(vertices: Array, faces: Faces) -> Faces:
     """Return the faces (k,) that pass through another face, in their order.
 
-    Faces with a common edge do not count, as they cannot cross unless they are folded flat. An edge
-    that passes exactly through another face's edge is not seen; that of a neighbour is. The same
-    bits everywhere: nothing but sums, products and roots.
+    Faces with a common edge do not count, since they cannot cross unless they are folded flat. An
+    edge that passes exactly through another face's edge is not found, but a neighbouring one is.
+    The result has the same bits on every machine, since only sums, products and roots are used.
 
     Args:
         vertices: (n, 3) [m].
         faces: (m, 3).
     """
-    # Sweep along the longest axis: boxes that overlap there come in runs.
+    # Sweep along the longest axis: faces whose boxes overlap along it are consecutive.
     low, high = vertices[faces].min(axis=1), vertices[faces].max(axis=1)
     axis = int(np.argmax(np.ptp(vertices, axis=0)))
     order = np.argsort(low[:, axis], kind="stable")
     ends = np.searchsorted(low[order, axis], high[order, axis], side="right")
     counts = ends - np.arange(len(faces)) - 1
 
-    # Test the pairs of many runs at a time.
+    # Test the pairs of many faces at a time.
     crosses = np.zeros(len(faces), dtype=bool)
     depth = DEPTH * diagonal(vertices)
     for i, j in pair_blocks(counts, FACE_PAIRS):
@@ -121,7 +123,7 @@ def _cross(vertices: Array, first: Faces, second: Faces, depth: float) -> Mask:
     """Return which pairs (k,) of faces (k, 3) and (k, 3) pass through each other."""
     crossing = np.zeros(len(first), dtype=bool)
     shared = (first[:, :, None] == second[:, None, :]).any(axis=2)
-    # Only an edge without a common vertex can pass through the other face.
+    # Only an edge that shares no vertex with the other face can pass through it.
     apart = np.flatnonzero(shared.sum(axis=1) < 2)
     for mine, other in ((first, second), (second, first)):
         shared = (mine[:, :, None] == other[:, None, :]).any(axis=2)
@@ -135,13 +137,13 @@ def _cross(vertices: Array, first: Faces, second: Faces, depth: float) -> Mask:
 
 def _pass(p: Array, q: Array, triangles: Array, depth: float) -> Mask:
     """Return which segments p (k, 3) to q (k, 3) pass through their triangle (k, 3, 3)."""
-    # The ends lie on different sides of its plane ...
+    # The ends are on different sides of the triangle's plane ...
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = unit_normals(triangles)
     above, below = dot(p - a, normal), dot(q - a, normal)
     sides = (np.minimum(above, below) < -depth) & (np.maximum(above, below) > depth)
 
-    # ... and it passes all three edges on the same side, at a distance.
+    # ... and the segment passes all three edges on the same side, with a distance.
     along = q - p
     passed = []
     for u, v in ((a, b), (b, c), (c, a)):

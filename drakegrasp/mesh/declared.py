@@ -1,6 +1,6 @@
 """What a mesh file declares: polygons come in, triangles go out; nothing is silently ignored.
 
-Here are what the readers of all formats share, and that of STL.
+This module has what the readers of all formats share, and the reader of STL.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from drakegrasp.frames import Array
 from drakegrasp.mesh.surfaces import Faces
 
-#: Share of a polygon's area by which a triangle of its fan may be turned over: rounding.
+#: A fan has turned a triangle over if its negative area exceeds this fraction of the polygon's.
 TURNED = 1e-6
 
 
@@ -28,7 +28,7 @@ class Declared:
     Args:
         vertices: (n, 3), in the file's order.
         faces: (m, 3), in the file's order.
-        fans: No polygon needed more care than a fan from its first corner.
+        fans: Whether every polygon is a fan from its first corner.
     """
 
     vertices: Array
@@ -42,16 +42,16 @@ def triangulate(vertices: Array, corners: Faces, counts: Faces) -> Declared:
     Args:
         vertices: (n, 3).
         corners: Vertices of all polygons, one polygon after the other.
-        counts: Number of corners of each polygon; those of fewer than three have no area.
+        counts: Number of corners of each polygon; polygons of fewer than three have no area.
 
     Raises:
-        ValueError: If a corner is no vertex of the file.
+        ValueError: If a corner is not a vertex of the file.
     """
     if len(corners) and not (corners.min() >= 0 and corners.max() < len(vertices)):
         bad = corners.max() if corners.min() >= 0 else corners.min()
         raise ValueError(f"a face with vertex number {bad + 1} of {len(vertices)}")
 
-    # A fan from the first corner, as everybody reads convex polygons.
+    # A fan from the first corner, as all programs read convex polygons.
     starts = np.cumsum(counts) - counts
     shares = np.maximum(counts - 2, 0)
     polygon = np.repeat(np.arange(len(counts)), shares)
@@ -61,7 +61,7 @@ def triangulate(vertices: Array, corners: Faces, counts: Faces) -> Declared:
     if (counts <= 3).all():
         return Declared(vertices=vertices, faces=faces)
 
-    # It covers what lies outside of a polygon if it turns a triangle over.
+    # A fan that turns a triangle over covers area outside of its polygon.
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     with np.errstate(all="ignore"):
         area = np.cross(b - a, c - a)
@@ -80,7 +80,7 @@ def _cut(p: Array, normal: Array) -> Faces:
     """Return the triangles (k - 2, 3) of a concave polygon (k, 3).
 
     Raises:
-        ValueError: If it cannot be cut.
+        ValueError: If the polygon cannot be triangulated.
     """
     # Project onto two axes that turn counter-clockwise about the normal.
     x = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
@@ -96,7 +96,7 @@ def read_floats(words: Iterable[bytes]) -> list[float]:
     """Return words as numbers.
 
     Raises:
-        ValueError: If one is no number; it gives the word.
+        ValueError: If a word is not a number; the message has the word.
     """
     numbers = []
     for word in words:
@@ -132,7 +132,7 @@ def declared_stl(content: bytes) -> Declared:
 def _binary_corners(content: bytes, count: int) -> Array:
     data = memoryview(content)[_HEADER:]
     held, end = len(data) // _RECORD.itemsize, count * _RECORD.itemsize
-    # Less than a triangle behind the last one is padding, and so are zeros.
+    # A rest that is shorter than a triangle is padding, and so are zeros.
     if len(content) < _HEADER or held < count or (held > count and bytes(data[end:]).strip(b"\0")):
         raise ValueError(f"{held:,} triangles, but its header declares {count:,}")
     return np.frombuffer(data, _RECORD, count)["corners"].reshape(-1, 3).astype(np.float64)
@@ -141,13 +141,13 @@ def _binary_corners(content: bytes, count: int) -> Array:
 def _text_corners(content: bytes) -> Array:
     text = content.removeprefix(codecs.BOM_UTF8).lower().replace(b"\r", b"\n")
     text = re.sub(rb"\bend[ \t]+(?=(?:solid|facet|loop)\b)", b"end", text)
-    # The name of a solid may be any words.
+    # The name of a solid may consist of any words.
     text, solids = re.subn(rb"^[ \t]*solid\b.*$", b"", text, flags=re.M)
     text, ends = re.subn(rb"\bendsolid\b.*$", b"", text, flags=re.M)
     if solids != ends:
         raise ValueError(f"text that begins {solids:,} solids and ends {ends:,}")
 
-    # Each facet ends, and has three corners.
+    # Each facet must have an end and three corners.
     facets, ends, corners = (
         len(re.findall(rb"\b%b\b" % word, text)) for word in (b"facet", b"endfacet", b"vertex")
     )

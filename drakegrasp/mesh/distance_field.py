@@ -1,8 +1,8 @@
 """Signed distances from an object's surface on a grid, for many points at a time.
 
 In: a closed surface of triangles. Out: a `DistanceField`. The simulation uses Drake's exact
-distances; this is for deciding in bulk what need not be simulated. Its error is a fraction of the
-grid's spacing: see `DistanceField.error`.
+distances; this field decides for many poses at once what need not be simulated. Its error is a
+fraction of the grid's spacing, see `DistanceField.error`.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from drakegrasp.mesh.surfaces import cover_triangles, enumerate_pairs
 
 Distances = npt.NDArray[np.float32]
 
-#: Approximate number of cells; it decides the spacing, so that every object costs the same.
+#: Approximate number of cells; it determines the spacing, so that all objects take equally long.
 CELLS = 800_000
-#: No grid is finer than this [m], because the collision mesh is not.
+#: Smallest spacing of a grid [m], because the collision mesh is not finer.
 FINEST = 1.5e-3
 #: Empty cells around the bounding box on each side.
 PADDING = 4
-#: Within this many cells of the surface, distances are to a triangle instead of a point on it.
+#: Within this many cells of the surface, distances are from a triangle instead of a point on it.
 BAND = 2.5
-#: Grid points per chunk of those distances; all at once would take hundreds of megabytes.
+#: Number of grid points per chunk of these distances; all at once would take hundreds of megabytes.
 BAND_CHUNK = 20_000
 #: Error of `nearest` in cells: half of a cell's diagonal plus the error of the stored distances.
 ERROR_CELLS = 1.3
@@ -45,7 +45,7 @@ class DistanceField:
         spacing: Distance between neighbouring grid points [m].
         values: (nx, ny, nz), signed distances [m].
         lower: (3,), lowest corner of the object's bounding box in {O} [m].
-        upper: (3,), highest corner of it [m].
+        upper: (3,), highest corner of the bounding box in {O} [m].
     """
 
     origin: Array
@@ -58,8 +58,8 @@ class DistanceField:
     def error(self) -> float:
         """Largest error of `nearest` [m].
 
-        `interpolate` is several times better near a surface that is smooth on the scale of a
-        cell, but no better than this where a wall is thinner than a cell.
+        `interpolate` is several times better near a surface that is smooth on the scale of a cell,
+        but no better than this at a wall thinner than a cell.
         """
         return ERROR_CELLS * self.spacing
 
@@ -67,20 +67,20 @@ class DistanceField:
     def blur(self) -> float:
         """Largest error of `interpolate` at walls and slots thinner than a cell [m].
 
-        A wall thinner than a cell may contain no grid point; the field then reads spacing / 2 on
-        its surface.
+        A wall thinner than a cell may contain no grid point; the field is then spacing / 2 on its
+        surface.
         """
         return self.spacing / 2.0
 
     def nearest(self, x: Distances, y: Distances, z: Distances) -> Distances:
         """Return the distances [m] that are stored at the nearest grid points.
 
-        Outside the grid they are lower bounds.
+        Outside of the grid they are lower bounds.
 
         Args:
             x: Coordinates in {O} [m], of any shape.
-            y: Likewise.
-            z: Likewise.
+            y: Coordinates of the same shape.
+            z: Coordinates of the same shape.
         """
         scale = np.float32(1.0 / self.spacing)
         index = np.zeros(np.shape(x), dtype=np.int32)
@@ -101,14 +101,14 @@ class DistanceField:
         return np.asarray(np.maximum(self.values.ravel().take(index), beside))
 
     def interpolate(self, x: Distances, y: Distances, z: Distances) -> Distances:
-        """Return distances [m], trilinearly interpolated in the grid's cells.
+        """Return distances [m] by trilinear interpolation in the grid's cells.
 
-        Outside the grid they are those of the nearest point of it.
+        Outside of the grid they are the distances at the nearest point of the grid.
 
         Args:
             x: Coordinates in {O} [m], of any shape.
-            y: Likewise.
-            z: Likewise.
+            y: Coordinates of the same shape.
+            z: Coordinates of the same shape.
         """
         # Flat index of each cell's lowest corner, and the position within the cell, 0 to 1.
         scale = np.float32(1.0 / self.spacing)
@@ -150,7 +150,7 @@ def make_distance_field(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> Distan
     triangles = v[np.asarray(faces)]
     lower, upper = v.min(axis=0), v.max(axis=0)
     spacing = FINEST
-    # The spacing gives about CELLS cells; the padding depends on it, hence the iterations.
+    # The spacing is chosen for about CELLS cells; the padding depends on it, hence the iterations.
     for _ in range(4):
         room = upper - lower + 2 * PADDING * spacing
         spacing = max(FINEST, float(np.cbrt(np.prod(room) / CELLS)))
@@ -169,9 +169,9 @@ def make_distance_field(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> Distan
 def _unsigned(triangles: Array, origin: Array, spacing: float, shape: tuple[int, ...]) -> Distances:
     """Return the distance of each grid point from the surface [m], an array of `shape`.
 
-    A grid point is a seed if a point of the surface lies in the cell around it. A distance
-    transform gives each grid point its nearest seed. Its distance is that from the seed's surface
-    point or, near the surface, from the triangle on which this point lies.
+    A grid point is a seed if a point of the surface is in the cell around it. A distance transform
+    finds the nearest seed of each grid point. The distance is measured from the seed's surface
+    point or, near the surface, from the triangle of this surface point.
     """
     # Seeds: one surface point for each cell that has any.
     points, owner = cover_triangles(triangles, DENSITY * spacing)
@@ -196,7 +196,7 @@ def _unsigned(triangles: Array, origin: Array, spacing: float, shape: tuple[int,
         squared += (coordinate - sample[seed, axis]) ** 2
     distance = np.sqrt(squared)
 
-    # Near the surface, the distance from its triangle.
+    # Near the surface, the distance from the triangle.
     band = np.flatnonzero(far.ravel() <= BAND)
     for start in range(0, len(band), BAND_CHUNK):
         chunk = band[start : start + BAND_CHUNK]
@@ -212,8 +212,8 @@ def _inside(
 ) -> npt.NDArray[np.bool_]:
     """Return which grid points are inside a closed surface, an array of `shape`.
 
-    Going up a column of grid points, a triangle that faces down is an entry and one that faces up
-    is an exit; the sum of both is the winding number.
+    On the way up a column of grid points, a triangle that faces down is an entry and one that faces
+    up is an exit; the sum of both is the winding number.
     """
     # All pairs of a triangle and a column (x, y) within its bounding rectangle, in cells.
     flat = (triangles - origin) / spacing
@@ -224,8 +224,8 @@ def _inside(
     t, k = enumerate_pairs(count)
     x, y = low[t, 0] + k // size[t, 1], low[t, 1] + k % size[t, 1]
 
-    # Twice the signed areas of the three triangles that the column makes with the projected edges:
-    # it passes through the triangle if all have the same sign.
+    # Twice the signed areas of the three triangles between the column and the projected edges: the
+    # column passes through the triangle if all have the same sign.
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = np.moveaxis(flat, 0, 2)
     u = (bx[t] - x) * (cy[t] - y) - (cx[t] - x) * (by[t] - y)
     v = (cx[t] - x) * (ay[t] - y) - (ax[t] - x) * (cy[t] - y)
@@ -242,8 +242,8 @@ def _inside(
     np.add.at(winding, (x, y, np.ceil(z).astype(int)), np.where(area < 0.0, 1, -1))
     np.cumsum(winding, axis=2, out=winding)
 
-    # A column exactly through an edge may count it twice or not at all, and then does not end at
-    # zero: copy its neighbour.
+    # A column exactly through an edge may count the edge twice or not at all, and then does not end
+    # at zero: copy the neighbouring column.
     for i, j in np.argwhere(winding[:, :, -1] != 0):
         winding[i, j] = winding[i - 1, j]
     return np.asarray(winding > 0)

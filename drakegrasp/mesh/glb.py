@@ -14,39 +14,39 @@ from drakegrasp.mesh.declared import Declared
 from drakegrasp.mesh.ply import strip_faces
 from drakegrasp.mesh.surfaces import Faces
 
-#: Most nodes of a scene: trimesh takes a millisecond for each.
+#: Maximum number of nodes of a scene: trimesh takes a millisecond for each.
 MOST_NODES = 10_000
-#: Parts of the names of extensions that change how a mesh looks, not its shape.
+#: Parts of the names of extensions that change the look of a mesh, but not its shape.
 _LOOKS = ("material", "texture", "light")
-#: Extensions of shape that are read, and those that change it even where they are not required.
+#: Extensions of shape that are read, and those that change the shape even if not required.
 _READ = frozenset(("KHR_mesh_quantization",))
 _SHAPES = frozenset(("EXT_mesh_gpu_instancing",))
-#: Numbers of what places a node: trimesh makes a matrix of as many rows, however many there are.
+#: Lengths of the arrays that place a node: trimesh would make a matrix of any length it is given.
 _PLACES = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-#: Modes of a primitive that have faces.
+#: Modes of a primitive that has faces.
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
-#: Share of its diagonal by which a part may differ from the bounds that the file states of it.
+#: Fraction of its diagonal by which a part may differ from the bounds that the file states for it.
 BOUNDS = 1e-3
-#: Difference of two matrices that are the same but for rounding.
+#: Largest difference, by rounding, of two matrices that count as equal.
 _SAME = 1e-5
 
 
 def declared_glb(content: bytes) -> Declared:
     """Return the surface of a GLB file's default scene, with all transforms applied.
 
-    Sparse accessors, default weights of morph targets, and skins in their bind pose are applied;
-    lines and points are no surface, animations are not played.
+    Sparse accessors, default weights of morph targets, and skins in their bind pose are applied.
+    Lines and points are ignored, since they are not surfaces; animations are not played.
 
     Raises:
-        ValueError: If its shape needs an extension or another file, differs from the bounds that
-            the file states, or is placed by what is not read.
+        ValueError: If the shape needs an extension or another file, if it differs from the bounds
+            that the file states, or if it is placed by something that is not read.
     """
     tree, chunk = _read_chunks(content)
     _refuse_description(tree)
 
-    # Each mesh of the scene, where its node or its skin places it.
+    # Each mesh of the scene, at the pose of its node or its skin.
     file = _File(tree, chunk, len(content))
     X_SN = _place_nodes(tree)
     vertices, faces, total = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
@@ -72,7 +72,7 @@ def declared_glb(content: bytes) -> Declared:
 
 
 def _read_chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
-    """Return the description and the binary chunk (empty if there is none)."""
+    """Return the description and the binary chunk, which is empty if the file has none."""
     chunks: dict[bytes, bytes] = {}
     at, length = 12, int.from_bytes(content[8:12], "little")
     if content[:4] != b"glTF" or content[4:8] != b"\2\0\0\0" or length > len(content):
@@ -90,10 +90,11 @@ def _read_chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def _refuse_description(tree: dict[str, Any]) -> None:
-    """Refuse a file that trimesh would read only in part, or never finish reading.
+    """Raise an error for a file that trimesh would read only in part or never finish reading.
 
     Raises:
-        ValueError: If its shape needs an extension, it has too many nodes, or one has no place.
+        ValueError: If the shape needs an extension, if there are too many nodes, or if the pose of
+            a node has the wrong number of values.
     """
     # Extensions of the shape.
     shapes = [
@@ -122,7 +123,7 @@ def _needs(extension: str) -> ValueError:
 
 def _place_nodes(tree: dict[str, Any]) -> dict[int, Array]:
     """Return the pose X_SN (4, 4) of each node of the default scene, scales included."""
-    # Where the scene begins.
+    # The roots of the scene.
     nodes, scenes = tree.get("nodes", []), tree.get("scenes", [])
     if len(scenes) > 1 and "scene" not in tree:
         raise ValueError(f"{len(scenes)} scenes, none of which is the default")
@@ -132,7 +133,7 @@ def _place_nodes(tree: dict[str, Any]) -> dict[int, Array]:
         inner = {child for node in nodes for child in node.get("children", [])}
         roots = [number for number in range(len(nodes)) if number not in inner]
 
-    # From there to all children.
+    # From the roots to all children.
     X_SN: dict[int, Array] = {}
     waiting = [(number, np.eye(4)) for number in reversed(roots)]
     while waiting:
@@ -168,15 +169,15 @@ def _local_pose(node: dict[str, Any]) -> Array:
 class _File:
     tree: dict[str, Any]
     chunk: bytes
-    size: int  # of the whole file [bytes]
+    size: int  # size of the whole file [bytes]
 
     def surface(self, primitive: dict[str, Any], weights: list[float]) -> tuple[Array, Faces]:
-        """Return the vertices and triangles of a primitive, its morph targets applied."""
+        """Return the vertices and triangles of a primitive, with its morph targets applied."""
         mode = primitive.get("mode", _TRIANGLES)
         if mode not in (_TRIANGLES, _STRIP, _FAN):
             return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
 
-        # What is compressed lies in no buffer.
+        # Compressed values are not in a buffer.
         number = primitive["attributes"]["POSITION"]
         for one in (number, primitive.get("indices", number)):
             accessor = self.tree["accessors"][one]
@@ -225,17 +226,17 @@ class _File:
                     f"{_numbers(stated)}"
                 )
 
-        # Whole numbers may stand for -1 to 1.
+        # Normalized integers represent the range -1 to 1.
         values = raw.astype(np.float64)
         if accessor.get("normalized") and raw.dtype.kind in "iu":
             values = np.maximum(values / np.iinfo(raw.dtype).max, -1.0)
         return values
 
     def skin_pose(self, skin: dict[str, Any], X_SN: dict[int, Array]) -> Array:
-        """Return the pose that a skin gives to all its vertices.
+        """Return the pose that a skin applies to all its vertices.
 
         Raises:
-            ValueError: If its joints have moved against each other.
+            ValueError: If its joints have moved relative to each other.
         """
         inverse = np.tile(np.eye(4), (len(skin["joints"]), 1, 1))
         if "inverseBindMatrices" in skin:
@@ -257,7 +258,7 @@ class _File:
         if "bufferView" in accessor:
             values = self._view(accessor, kind, width, count)
         else:
-            # Zeros cost nothing to declare: a part of the surface has bytes for each vertex.
+            # Declaring zeros takes no bytes, so their number is limited by the size of the file.
             if count > self.size:
                 raise ValueError(f"{count:,} values without bytes")
             values = np.zeros((count, width), dtype=_COMPONENTS[kind])
@@ -278,7 +279,7 @@ class _File:
         if len(data) != view["byteLength"]:
             raise ValueError("a buffer that is cut off")
 
-        # Their numbers, which may lie between others.
+        # The numbers, which may be interleaved with others.
         dtype = np.dtype(_COMPONENTS[kind])
         step = view.get("byteStride", width * dtype.itemsize)
         return np.ndarray(

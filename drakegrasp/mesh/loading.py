@@ -18,15 +18,15 @@ from drakegrasp.mesh.repair import weld
 from drakegrasp.mesh.surfaces import Faces, compact, stack
 from drakegrasp.mesh.wavefront import declared_obj
 
-#: Mesh files that can be read, and by what; other files are ignored.
+#: Reader of each kind of mesh file that can be read; other files are ignored.
 _DECLARED = {".obj": declared_obj, ".stl": declared_stl, ".ply": declared_ply, ".glb": declared_glb}
 SUFFIXES = tuple(_DECLARED)
-#: Share of the largest coordinate by which transforms of the same vertex may differ.
+#: Fraction of the largest coordinate by which transforms of the same vertex may differ.
 SAME = 1e-6
-#: Coordinates that are numbers, in any unit; beyond it, squares and single precision overflow.
+#: Largest valid coordinate, in any unit: beyond it, squares and single precision overflow.
 LARGEST = 1e9
-#: Faces from which what reading a file leaves behind is worth freeing at once: a scene of trimesh
-#: refers to itself, so it would wait for Python's collector.
+#: Number of faces from which on the memory of reading a file is freed at once: a scene of trimesh
+#: refers to itself, so it would wait for Python's garbage collector.
 MANY_FACES = 100_000
 
 
@@ -34,7 +34,7 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     """Return the triangles of a mesh file, in the file's units and axes.
 
     Raises:
-        MeshError: If the file cannot be read or holds no finite triangles.
+        MeshError: If the file cannot be read or contains no finite triangles.
     """
     path = Path(path)
     vertices, faces = parse_mesh(path.name, read_bytes(path))
@@ -45,7 +45,7 @@ def read_bytes(path: Path) -> bytes:
     """Return a mesh file's content.
 
     Raises:
-        MeshError: If it cannot be read.
+        MeshError: If the file cannot be read.
     """
     try:
         return read_content(path)
@@ -58,16 +58,16 @@ def read_bytes(path: Path) -> bytes:
 def parse_mesh(name: str, content: bytes) -> tuple[Array, Faces]:
     """Return the vertices (n, 3) and faces (m, 3) of a mesh file, in the file's units and axes.
 
-    All geometries of a scene are joined, with their transforms applied; materials are not read.
-    What comes out is what the file declares, see `drakegrasp.mesh.declared`.
-    The triangles are as they stand in the file: see `clean_triangles`.
+    All geometries of a scene are joined, with their transforms applied; materials are not read. The
+    result is the surface that the file declares, see `drakegrasp.mesh.declared`. The triangles are
+    unchanged; `clean_triangles` cleans them.
 
     Args:
-        name: Name of the file; its suffix gives the format.
+        name: Name of the file; its suffix determines the format.
         content: The file's bytes.
 
     Raises:
-        MeshError: If it is no mesh file.
+        MeshError: If the file is not a mesh file.
     """
     suffix = Path(name).suffix.lower()
     if suffix not in SUFFIXES:
@@ -75,7 +75,7 @@ def parse_mesh(name: str, content: bytes) -> tuple[Array, Faces]:
     if not content:
         raise MeshError(f"{name}: must hold a mesh, got an empty file")
 
-    # Parsers raise all kinds of exceptions on foreign bytes.
+    # Parsers raise all kinds of exceptions for files of other formats.
     try:
         with np.errstate(all="ignore"):
             declared = _DECLARED[suffix](content)
@@ -84,19 +84,19 @@ def parse_mesh(name: str, content: bytes) -> tuple[Array, Faces]:
     if suffix == ".stl":
         return declared.vertices, declared.faces
 
-    # The order of vertices and faces that trimesh gives is that of the datasets made so far. Where
-    # it leaves something out, the file is right.
+    # Existing datasets have the order of vertices and faces that trimesh returns. If trimesh leaves
+    # something out, the file's own order is used.
     try:
         vertices, faces = _read_by_trimesh(suffix[1:], content)
         if _are_same(vertices, faces, declared):
             return vertices, faces
     except Exception:
-        pass  # the file was read without it
+        pass  # the file was read without trimesh
     return compact(declared.vertices, declared.faces)
 
 
 def _read_by_trimesh(kind: str, content: bytes) -> tuple[Array, Faces]:
-    """Return the vertices and faces that trimesh finds in a file; if none, raise `IndexError`."""
+    """Return the vertices and faces that trimesh finds; `IndexError` if it finds none."""
     with np.errstate(all="ignore"):
         scene = trimesh.load_scene(
             io.BytesIO(content), file_type=kind, process=False, skip_materials=True
@@ -138,12 +138,12 @@ def clean_triangles(vertices: Array, faces: Faces, name: str) -> trimesh.Trimesh
     Args:
         vertices: (n, 3).
         faces: (m, 3).
-        name: What to call the mesh in an error.
+        name: Name of the mesh, for errors.
 
     Raises:
-        MeshError: If there are no triangles, or vertices that are missing or not finite.
+        MeshError: If there are no triangles, or if vertices are missing or not finite.
     """
-    # Refuse what is no mesh.
+    # Check that the arrays are a mesh.
     if not len(faces):
         raise MeshError(f"{name}: must hold triangles, got no faces")
     if faces.min() < 0 or faces.max() >= len(vertices):

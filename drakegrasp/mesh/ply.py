@@ -25,7 +25,7 @@ _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 class _Property(NamedTuple):
     name: str
     dtype: np.dtype
-    length: np.dtype | None  # of a list: the type of its length
+    length: np.dtype | None  # type of a list's length; None if the property is not a list
 
 
 class _Element(NamedTuple):
@@ -34,7 +34,7 @@ class _Element(NamedTuple):
     properties: list[_Property]
 
 
-#: Values of properties by name, and for lists the length of each, else None.
+#: Values of the properties by name; for lists also the length of each, else None.
 _Columns = dict[str, tuple[np.ndarray, Faces | None]]
 
 
@@ -42,12 +42,12 @@ def declared_ply(content: bytes) -> Declared:
     """Return the surface of a PLY file.
 
     Raises:
-        ValueError: If the file holds more or less than its header declares.
+        ValueError: If the file contains more or less than its header declares.
     """
     elements, order, data = _read_header(content)
     source = _Text(data) if not order else _Binary(data)
 
-    # Elements that are no part of the surface are read to come to the next one.
+    # Elements that are not part of the surface are read to get to the next one.
     vertices, corners, counts = np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64)
     for element in elements:
         columns = source.read(element)
@@ -109,7 +109,7 @@ class _Binary:
         return self._any_rows(element) if columns is None else columns
 
     def finish(self) -> None:
-        """Refuse bytes after the last element."""
+        """Raise an error if there are bytes after the last element."""
         rest = len(self._data[self._at :].rstrip(b"\0 \t\r\n"))
         if rest:
             raise ValueError(f"{rest:,} bytes more than its header declares")
@@ -122,7 +122,7 @@ class _Binary:
         return np.frombuffer(self._data, dtype, count, self._at - size)
 
     def _equal_rows(self, element: _Element) -> _Columns | None:
-        """Return the values if all rows have lists as long as the first, else None."""
+        """Return the values if all rows have lists as long as those of the first, else None."""
         start = self._at
         fields: list[Any] = []
         lengths: dict[int, int] = {}
@@ -171,7 +171,7 @@ class _Binary:
 
 
 class _Text:
-    """Elements of a text file: one row a line."""
+    """Elements of a text file, with one row per line."""
 
     def __init__(self, data: bytes) -> None:
         self._lines = [line for line in data.splitlines() if line.strip()]
@@ -184,7 +184,7 @@ class _Text:
             raise ValueError(f"{len(lines):,} of {element.rows:,} lines of {element.name!r}")
         self._at += element.rows
 
-        # One property after the other, along each line.
+        # Read one property after the other along each line.
         values: list[list[float]] = [[] for _ in element.properties]
         lengths: list[list[int]] = [[] for _ in element.properties]
         for line in lines if element.properties else ():
@@ -210,7 +210,7 @@ class _Text:
         }
 
     def finish(self) -> None:
-        """Refuse lines after the last element."""
+        """Raise an error if there are lines after the last element."""
         rest = len(self._lines) - self._at
         if rest:
             raise ValueError(f"{rest:,} lines more than its header declares")
@@ -221,7 +221,7 @@ def _said(line: bytes) -> str:
 
 
 def _polygons(element: _Element, columns: _Columns) -> tuple[Faces, Faces]:
-    """Return the corners of all polygons of an element, and the number of each."""
+    """Return the corners of all polygons of an element, and the number of corners of each."""
     names = [name for name in _CORNERS if name in columns]
     lists = [name for name, (_, lengths) in columns.items() if lengths is not None]
     name = names[0] if names else lists[0] if len(lists) == 1 else None
@@ -233,7 +233,7 @@ def _polygons(element: _Element, columns: _Columns) -> tuple[Faces, Faces]:
 
 
 def _unroll(corners: Faces, lengths: Faces) -> tuple[Faces, Faces]:
-    """Return the triangles of strips; -1 begins a new one."""
+    """Return the triangles of strips; -1 starts a new strip."""
     triangles: list[Faces] = []
     for strip in np.split(corners, np.cumsum(lengths)[:-1]):
         for run in np.split(strip, np.flatnonzero(strip < 0)):
@@ -243,7 +243,7 @@ def _unroll(corners: Faces, lengths: Faces) -> tuple[Faces, Faces]:
 
 
 def strip_faces(strip: Faces) -> Faces:
-    """Return the triangles (n - 2, 3) of a strip of n vertices; every second one is turned."""
+    """Return the triangles (n - 2, 3) of a strip of n vertices; every second one is turned over."""
     faces = np.stack((strip[:-2], strip[1:-1], strip[2:]), axis=1) if len(strip) > 2 else None
     if faces is None:
         return np.zeros((0, 3), dtype=np.int64)

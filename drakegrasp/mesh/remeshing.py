@@ -1,16 +1,16 @@
-"""Remeshing: a surface comes in; about the same surface in other triangles goes out.
+"""Remeshing: a surface comes in; about the same surface, with other triangles, goes out.
 
-`decimate` makes what Drake simulates of a solid. `coarsen` comes before a file is mended: mending
-takes kilobytes for each face, and a scan may have millions of them, far finer than what a fingertip
-feels or a camera sees. It merges near vertices first, as quadric decimation itself takes much
-memory, and that does the rest; a surface of at most `MOST_FACES` faces stays as it is.
+`decimate` reduces a solid to what Drake simulates. `coarsen` is applied before a file is repaired:
+repair takes kilobytes for each face, and a scan may have millions of faces, far finer than what a
+fingertip feels or a camera sees. It first merges near vertices, since quadric decimation itself
+takes much memory, and then decimates; a surface of at most `MOST_FACES` faces is not changed.
 
-The others make surfaces that carry. A face of a rigid hydroelastic surface gives one contact
-polygon, and a polygon has one point of force: a base of two triangles carries at two points and
-tips over; one of many small faces carries nearly up to its rim. So `resting_hull` makes each plane
-facet of a convex hull a fan of triangles about a point inside it. Within long edges it has a narrow
-rim, so that it also carries near its border: on fans alone a box that is set down from 2 mm falls
-over. `subdivide` splits long edges.
+The other functions prepare surfaces that support an object. Each face of a rigid hydroelastic
+surface yields one contact polygon, and each polygon has one point of force: a base of two triangles
+is supported at two points and tips over; a base of many small faces is supported nearly up to its
+rim. So `resting_hull` divides each plane facet of a convex hull into a fan of triangles around a
+point inside it. A facet with long edges also gets a narrow rim, so that it is supported near its
+border: with fans only, a box that is set down from 2 mm falls over. `subdivide` splits long edges.
 """
 
 from __future__ import annotations
@@ -52,33 +52,33 @@ from drakegrasp.runtime.environment import release_memory
 DECIMATION_STEPS = (2.0, 3.0, 5.0, 7.0)
 #: Deviation, as a fraction of the diagonal, above which the second method is tried.
 FAITHFUL = 2e-3
-#: Deviation above which the ways for scans are tried too [m].
+#: Deviation [m] above which the methods for scans are tried as well.
 COARSE = 2e-3
-#: The ways for scans aim at this fraction of the faces that are allowed, as parting adds some; and
-#: at so many times as many first: then fewer spikes of noise are left.
+#: Target of the methods for scans, as a fraction of the allowed faces, since parting adds some; and
+#: the larger target of a first decimation, after which fewer spikes of noise are left.
 PARTED, FIRST = 0.97, 5.0 / 3.0
 #: Fraction of its volume that a decimated mesh may gain or lose.
 MAX_VOLUME_CHANGE = 0.05
-#: Points on each surface at which the deviation of two surfaces is measured.
+#: Number of points on each surface at which the deviation of two surfaces is measured.
 DEVIATION_POINTS = 3000
 
 
 def decimate(solid: Solid, max_faces: int) -> tuple[Solid, float]:
-    """Return a solid with at most `max_faces` faces, and its deviation from the given one [m].
+    """Return a solid with at most `max_faces` faces, and its deviation [m] from the original.
 
-    Quadric decimation (Garland and Heckbert 1997) keeps the shape better, but does not guarantee
-    a closed surface; manifold3d's simplification does. The second is tried where the first fails
-    or deviates by more than `FAITHFUL`. Where both fail or deviate by more than `COARSE`, as with
-    noisy thin walls, quadric decimation follows whose surface is parted where it then touches
-    itself. The closest result wins.
+    Quadric decimation (Garland and Heckbert 1997) keeps the shape better, but does not guarantee a
+    closed surface; manifold3d's simplification does. The latter is tried if the former fails or
+    deviates by more than `FAITHFUL`. If both fail or deviate by more than `COARSE`, as for noisy
+    thin walls, quadric decimation is tried again, with its surface parted where it then touches
+    itself. The closest result is returned.
 
     Raises:
-        MeshError: If none gives a closed surface of about the same volume.
+        MeshError: If no method yields a closed surface of about the same volume.
     """
     if len(solid.faces) <= max_faces:
         return solid, 0.0
 
-    # The closest sound result; the first that is close enough ends the search.
+    # Keep the closest valid result; the first that is close enough ends the search.
     faithful = FAITHFUL * diagonal(solid.vertices)
     best: tuple[Solid, float] | None = None
     for candidate, enough in (
@@ -104,11 +104,11 @@ def decimate(solid: Solid, max_faces: int) -> tuple[Solid, float]:
 
 
 def surface_deviation(first: Solid, second: Solid) -> float:
-    """Return the largest distance between two surfaces [m], both ways, at fixed points."""
+    """Return the largest distance between two surfaces [m], in both directions, at fixed points."""
     meshes = [trimesh.Trimesh(s.vertices, s.faces, process=False) for s in (first, second)]
     worst = 0.0
     for mesh, other in (meshes, meshes[::-1]):
-        # Points evenly spread over the faces, and vertices, where the deviation is largest.
+        # Points evenly spread over the faces, and vertices, at which the deviation is largest.
         points = on_faces(mesh.vertices, mesh.faces, even_points(DEVIATION_POINTS))[0]
         points = np.vstack((points, some_vertices(mesh.vertices)))
         worst = max(worst, float(trimesh.proximity.closest_point(other, points)[1].max()))
@@ -116,7 +116,7 @@ def surface_deviation(first: Solid, second: Solid) -> float:
 
 
 def some_vertices(vertices: Array) -> Array:
-    """Return at most `DEVIATION_POINTS` of the vertices (n, 3), spread over their order."""
+    """Return at most `DEVIATION_POINTS` of the vertices (n, 3), evenly spaced in their order."""
     count = min(DEVIATION_POINTS, len(vertices))
     return vertices[np.linspace(0, len(vertices) - 1, count).astype(int)]
 
@@ -133,21 +133,21 @@ def _is_sound(reduced: Solid, solid: Solid) -> bool:
 
 
 def _decimate_quadric(solid: Solid, max_faces: int) -> Solid | None:
-    """Return the result of the least aggressive decimation that gives few enough faces."""
+    """Return the result of the least aggressive decimation that has few enough faces, or None."""
     for aggressiveness in DECIMATION_STEPS:
         vertices, faces = _simplify(solid, max_faces, aggressiveness)
         if 0 < len(faces) <= max_faces:
-            # Walls that have come to touch now share edges; separating them closes both again.
+            # Walls that now touch share edges; separating the walls closes both again.
             components = find_components(vertices, faces, [])
             return stack([(part.vertices, part.faces) for part in components])
     return None
 
 
 def _decimate_parted(solid: Solid, max_faces: int) -> Solid | None:
-    """Return the least aggressive decimation, parted where its surface touches itself."""
+    """Return the least aggressive decimation, parted where its surface touches itself, or None."""
     target = int(PARTED * max_faces)
     if len(solid.faces) <= target:
-        return solid  # fast_simplification refuses to aim at more faces than there are
+        return solid  # fast_simplification rejects a target above the number of faces
     for aggressiveness in DECIMATION_STEPS:
         reduced = reduce_and_part(solid, target, aggressiveness)
         if 0 < len(reduced.faces) <= max_faces:
@@ -156,10 +156,10 @@ def _decimate_parted(solid: Solid, max_faces: int) -> Solid | None:
 
 
 def _decimate_twice(solid: Solid, max_faces: int) -> Solid | None:
-    """Return what `_decimate_parted` makes of a surface with somewhat more faces."""
+    """Return `_decimate_parted` of a surface that was first reduced to somewhat more faces."""
     between = int(FIRST * max_faces)
     if len(solid.faces) <= between:
-        return None  # fast_simplification refuses to aim at more faces than there are
+        return None  # fast_simplification rejects a target above the number of faces
     return _decimate_parted(reduce_and_part(solid, between, DECIMATION_STEPS[0]), max_faces)
 
 
@@ -168,7 +168,7 @@ def reduce_and_part(solid: Solid, target: int, aggressiveness: float) -> Solid:
 
     Args:
         solid: The surface, which has more faces than `target`.
-        target: Number of faces to aim at.
+        target: Desired number of faces.
         aggressiveness: How fast the error may grow from round to round, see `DECIMATION_STEPS`.
     """
     vertices, faces = part_touching_edges(*weld(*_simplify(solid, target, aggressiveness)))
@@ -187,7 +187,7 @@ def _simplify(solid: Solid, target: int, aggressiveness: float) -> tuple[Array, 
 
 
 def _simplify_manifold(solid: Solid, max_faces: int) -> Solid | None:
-    """Return the result of the smallest tolerance that gives few enough faces, by bisection."""
+    """Return the simplification of smallest tolerance with few enough faces, by bisection."""
     source = to_manifold(solid.vertices, solid.faces).as_original()
     low, high = 1e-6 * diagonal(solid.vertices), 0.05 * diagonal(solid.vertices)
     best = None
@@ -201,21 +201,22 @@ def _simplify_manifold(solid: Solid, max_faces: int) -> Solid | None:
     return None if best is None else stack([from_manifold(best)])
 
 
-# Before mending
+# Before repair
 
-#: Faces above which a surface is reduced, to about as many: edges of 0.9 mm on a ball of 10 cm.
+#: Number of faces to which a surface with more is reduced: edges of 0.9 mm on a ball of 10 cm.
 MOST_FACES = 100_000
-#: Faces above which near vertices are merged first, to at most as many.
+#: Number of faces above which near vertices are first merged, to at most as many faces.
 MOST_DECIMATED = 300_000
-#: Cells in which vertices are merged: the first edge, as a fraction of the diagonal, and the factor
-#: from one try to the next. Products, so that every machine has the same.
+#: Edge of the cells in which vertices are merged: the first edge, as a fraction of the diagonal,
+#: and
+#: the factor from one try to the next. They are products, so that all machines have the same edges.
 FIRST_CELL, CELL_FACTOR = 1.0 / 8192.0, 1.25
 
 
 def coarsen(vertices: Array, faces: Faces) -> tuple[Array, Faces, tuple[str, ...]]:
-    """Return a surface with about `MOST_FACES` faces at most, and what was done in a sentence.
+    """Return a surface with at most about `MOST_FACES` faces, and a sentence about what was done.
 
-    It may be open, and need not be of one piece.
+    The surface may be open and consist of several pieces.
 
     Args:
         vertices: (n, 3) [m].
@@ -224,15 +225,15 @@ def coarsen(vertices: Array, faces: Faces) -> tuple[Array, Faces, tuple[str, ...
     if len(faces) <= MOST_FACES:
         return vertices, faces, ()
 
-    # The allocator keeps what reading the file took.
+    # The allocator still holds the memory that reading the file took.
     release_memory()
 
-    # What is too much for quadric decimation is clustered first.
+    # A surface too large for quadric decimation is clustered first.
     solid = Solid(vertices=vertices, faces=faces)
     if len(faces) > MOST_DECIMATED:
         solid = _cluster(vertices, faces)
 
-    # The least aggressive decimation that gives few enough faces; what it parts adds some.
+    # The least aggressive decimation with few enough faces; parting adds some.
     if len(solid.faces) > MOST_FACES:
         full = solid
         for aggressiveness in DECIMATION_STEPS:
@@ -253,12 +254,14 @@ def _cluster(vertices: Array, faces: Faces) -> Solid:
     """Return a surface with at most `MOST_DECIMATED` faces by merging near vertices.
 
     After Rossignac and Borrel 1993, "Multi-resolution 3D approximations for rendering complex
-    scenes": vertices in the same cell of a grid become their mean. Only those that edges join
+    scenes": vertices in the same cell of a grid are replaced by their mean. Here only vertices that
+    are joined by edges within the cell are merged, so that two nearby sheets of surface stay
+    separate.
     within the cell do here, so that two sheets of surface that lie close to each other stay two.
     """
     low, cell = vertices.min(axis=0), FIRST_CELL * diagonal(vertices)
     while True:
-        # Of a closed surface, vertices are half as many as faces.
+        # A closed surface has half as many vertices as faces.
         key = _cells(vertices - low, cell)
         if len(np.unique(key)) <= MOST_DECIMATED // 2:
             merged = weld(*_merge(vertices, faces, key))
@@ -268,13 +271,13 @@ def _cluster(vertices: Array, faces: Faces) -> Solid:
 
 
 def _cells(points: Array, cell: float) -> Faces:
-    """Return the number of the cell of each point (n,) in a grid of cubes with an edge `cell`."""
+    """Return the index of the cell of each point (n,) in a grid of cubes with edge `cell`."""
     x, y, z = np.floor(points / cell).astype(np.int64).T
     return np.asarray((x * (int(y.max()) + 1) + y) * (int(z.max()) + 1) + z)
 
 
 def _merge(vertices: Array, faces: Faces, key: Faces) -> tuple[Array, Faces]:
-    """Return a surface whose vertices that edges join within a cell are one, at their mean."""
+    """Return a surface in which vertices joined by edges within a cell are merged at their mean."""
     # The edges within cells, from each corner to the next.
     pairs = []
     for corner in range(3):
@@ -291,28 +294,28 @@ def _merge(vertices: Array, faces: Faces, key: Faces) -> tuple[Array, Faces]:
 
 
 def _deviation(vertices: Array, solid: Solid) -> float:
-    """Return how far some vertices of the full surface are at most from the reduced one [m]."""
-    # In millimetres: trimesh (5) takes triangles with edges below a millimetre for degenerate.
+    """Return the largest distance [m] of some vertices of the full surface from the reduced one."""
+    # In millimetres: trimesh (5) treats triangles with edges below a millimetre as degenerate.
     surface = trimesh.Trimesh(1e3 * solid.vertices, solid.faces, process=False)
     points = 1e3 * some_vertices(vertices)
     return float(trimesh.proximity.closest_point(surface, points)[1].max()) / 1e3
 
 
-# Surfaces that carry
+# Surfaces that support
 
-#: Triangles of the hull are one facet where their corners are this near to the plane of its largest
-#: one [m], and their normals agree with its normal to this cosine.
+#: Triangles of the hull belong to one facet if their corners are this close to the plane of the
+#: facet's largest triangle [m], and the cosine between their normals is at least this.
 FLATNESS, ALIKE = 1e-5, 0.99
-#: Facets of a smaller extent stay as they are; those with a longer edge get a rim [m].
+#: Facets with a smaller extent are not changed; facets with a longer edge get a rim [m].
 SMALL, LONG = 0.01, 0.02
 #: Width of the rim, as a fraction of the way from the border to the inner point.
 RIM = 0.1
 
 
 def resting_hull(points: Array) -> Solid:
-    """Return the convex hull of points (n, 3) [m] as a closed surface, its facets as fans.
+    """Return the convex hull of points (n, 3) [m] as a closed surface, with its facets as fans.
 
-    Facets that are plane to within `FLATNESS` are made of the corners of their border alone.
+    Facets that are plane within `FLATNESS` keep only the corners of their border.
     """
     hull = trimesh.convex.convex_hull(points)
     vertices, faces = np.asarray(hull.vertices), np.asarray(hull.faces, dtype=np.int64)
@@ -328,7 +331,7 @@ def resting_hull(points: Array) -> Solid:
         weights = face_areas(vertices, facet)
         centroid = weights @ vertices[facet].mean(axis=1) / weights.sum()
 
-        # Two narrow triangles within each edge.
+        # Two narrow triangles inside of each edge.
         if norm(np.roll(corners, -1, axis=0) - corners).max() > LONG:
             inner = count + np.arange(len(border))
             after, inner_after = np.roll(border, -1), np.roll(inner, -1)
@@ -350,7 +353,7 @@ def _facets(vertices: Array, faces: Faces) -> list[Faces]:
     """Return the facets of a convex surface, each as its triangles (m, 3), largest first."""
     areas, normals = face_areas(vertices, faces), unit_normals(vertices[faces])
 
-    # The largest triangle that is left takes those in its plane.
+    # The largest remaining triangle takes all triangles in its plane.
     facets, free = [], np.ones(len(faces), dtype=bool)
     for largest in np.argsort(-areas, kind="stable"):
         if free[largest]:
@@ -365,7 +368,7 @@ def _facets(vertices: Array, faces: Faces) -> list[Faces]:
 
 
 def _border(facet: Faces) -> Faces | None:
-    """Return the corners (n,) around a facet in order; None if it has more than one border."""
+    """Return the corners (n,) around a facet in order; None if it has several borders."""
     halves = {(int(start), int(end)) for start, end in half_edges(facet)}
     rim = [(start, end) for start, end in halves if (end, start) not in halves]
     after = dict(rim)
@@ -377,19 +380,19 @@ def _border(facet: Faces) -> Faces | None:
     return np.array(corners) if len(corners) == len(rim) else None
 
 
-#: An edge that is longer than the limit by rounding is not split.
+#: An edge that exceeds the limit only by rounding is not split.
 TOLERANCE = 1e-9
 
 
 def subdivide(solid: Solid, max_edge: float, max_faces: int) -> Solid:
     """Return the same surface with no edge longer than `max_edge` [m].
 
-    All edges that are too long are split at their midpoints, in both of their faces, until there
-    is none: so no vertex lies within another face's edge, and a closed surface stays closed. The
-    old vertices come first, in their order.
+    All edges that are too long are split at their midpoints, in both of their faces, until none is
+    left. So no vertex is inside another face's edge, and a closed surface stays closed. The old
+    vertices come first, in their order.
 
-    Where that gives more than `max_faces` faces, the limit is raised by steps of a quarter until
-    it does not; a surface that has more already stays as it is.
+    If this results in more than `max_faces` faces, the limit is raised in steps of a quarter until
+    it does not; a surface that already has more is not changed.
     """
     while True:
         finer = _split_long_edges(solid, max_edge, max(max_faces, len(solid.faces)))
@@ -399,11 +402,11 @@ def subdivide(solid: Solid, max_edge: float, max_faces: int) -> Solid:
 
 
 def _split_long_edges(solid: Solid, max_edge: float, max_faces: int) -> Solid | None:
-    """Return the surface without longer edges, or None if that takes more than `max_faces`."""
+    """Return the surface without longer edges, or None if it would have too many faces."""
     vertices, faces = solid.vertices, solid.faces
     limit = (max_edge * (1.0 + TOLERANCE)) ** 2
     while len(faces) <= max_faces:
-        # The ends of each edge, of one of its two half-edges, and which edges are too long.
+        # The ends of each edge, from one of its two half-edges, and which edges are too long.
         ids, counts = edge_ids(faces)
         ends = np.empty((len(counts), 2), dtype=np.int64)
         ends[ids] = np.sort(half_edges(faces), axis=1)
@@ -412,7 +415,7 @@ def _split_long_edges(solid: Solid, max_edge: float, max_faces: int) -> Solid | 
         if not long.any():
             return Solid(vertices=vertices, faces=faces, notes=solid.notes)
 
-        # A vertex in the middle of each, for the faces on both sides.
+        # A vertex at the centre of each such edge, for the faces on both sides.
         midpoint = np.full(len(counts), -1, dtype=np.int64)
         midpoint[long] = len(vertices) + np.arange(int(long.sum()))
         new = (vertices[ends[long, 0]] + vertices[ends[long, 1]]) / 2.0

@@ -1,14 +1,15 @@
 """Geometric repair: from a soup of triangles to one watertight solid.
 
-`repair_solid` takes welded triangles in metres and returns the surface of one solid: closed, every
-edge shared by exactly two faces that run along it in opposite directions, normals outward. Notes
-say what was changed. A mesh that cannot be repaired without inventing shape raises `MeshError`
-with the reason; `drakegrasp.objects.model` adds the file's name. A mesh that is a clean solid keeps
-its own vertices.
+`repair_solid` takes welded triangles in metres and returns the surface of one solid: it is closed,
+every edge is shared by exactly two faces with opposite directions along it, and normals point
+outward. Notes list what was changed. A mesh that cannot be repaired without inventing shape raises
+`MeshError` with the reason; `drakegrasp.objects.model` adds the file's name. A mesh that is a clean
+solid keeps its own vertices.
 
-The order matters: gaps are stitched and inner walls dropped while neighbours are still known. Then
-the surface is separated into `components`, whose holes are closed. Last come their `union` and a
-check of the result by generalised winding numbers, which is independent of the steps before.
+The order matters: gaps are stitched and inner walls are dropped while neighbours are still known.
+Then the surface is separated into `components`, whose holes are closed. Finally the components are
+united (`union`), and the result is checked by generalised winding numbers, which are independent of
+the previous steps.
 """
 
 from __future__ import annotations
@@ -44,36 +45,37 @@ from drakegrasp.mesh.union import separate, unite
 #: Vertices closer than this fraction of the diagonal are merged: above the rounding of files
 #: with eight digits, far below the detail of any scan.
 WELD = 1e-8
-#: Vertices that are sorted at a time while equal ones are merged.
+#: Number of vertices that are sorted at a time while equal ones are merged.
 WELD_PART = 300_000
-#: Number of vertices below which three indices of them go into one 64-bit integer.
+#: Number of vertices below which three vertex indices fit into one 64-bit integer.
 MOST_PACKED = 2**21
-#: Most pieces of a surface: each takes milliseconds, and no thing that a hand lifts has more.
+#: Maximum number of pieces of a surface: each takes milliseconds, and no object that a hand lifts
+#: has more.
 MOST_PIECES = 5_000
 #: Rims closer than this fraction of the diagonal are the two sides of one seam.
 STITCH = 1e-4
-#: A component whose mean thickness is below this fraction of its diagonal encloses nothing.
+#: A component encloses nothing if its mean thickness is below this fraction of its diagonal.
 FLAT = 1e-4
-#: Fraction of the surface that filled holes may make up: an open box just passes (1/6);
-#: a hemispherical bowl made of a single sheet (1/3) does not, as it would become solid.
+#: Fraction of the surface that filled holes may make up: an open box just passes (1/6); a
+#: hemispherical bowl of a single sheet (1/3) does not, since it would become solid.
 MAX_FILLED = 0.25
 #: Fragments outside the solid that may be dropped, as a fraction of the surface.
 MAX_DROPPED = 0.01
-#: Inner walls are found by trying all subsets of patches; 2^12 take milliseconds.
+#: Inner walls are found by testing all subsets of patches; 2^12 subsets take milliseconds.
 MAX_PATCHES = 12
 
 
 def weld(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
     """Return a mesh with equal vertices merged and degenerate and duplicate faces dropped.
 
-    Collinear faces with three different vertices stay, because dropping them would open the
+    Collinear faces with three different vertices are kept, because dropping them would open the
     surface.
 
     Args:
         vertices: (n, 3).
         faces: (m, 3).
     """
-    # Merge vertices that round to the same grid point; drop faces that then use one twice.
+    # Merge vertices that round to the same grid point; drop faces that then have a vertex twice.
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
     low = vertices.min(axis=0, initial=np.inf, where=used[:, None])
@@ -83,7 +85,8 @@ def weld(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
 
     # A face that occurs twice is a copy, or the wall between two touching solids. The
-    # interpretation that leaves fewer edges with an odd number of faces is the right one.
+    # interpretation
+    # that leaves fewer edges with an odd number of faces is taken.
     index, inverse, counts = _unique_faces(faces)
     if (counts > 1).any():
         once = faces[np.sort(index)]
@@ -93,10 +96,10 @@ def weld(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
 
 
 def _first_equal(vertices: Array, spacing: float) -> Faces:
-    """Return the first vertex (n,) that rounds to the same point of a grid, for each vertex.
+    """Return for each vertex the first vertex (n,) that rounds to the same point of a grid.
 
-    Sorting all vertices at once would take several times their memory: an STL file has each of
-    them six times. So each part of them is sorted first, and then what is left of the parts.
+    Sorting all vertices at once would take several times their memory: an STL file has each vertex
+    six times. So each part of the vertices is sorted first, and then what remains of the parts.
     """
     firsts, indices, total = [], [], 0
     for start in range(0, len(vertices), WELD_PART):
@@ -109,18 +112,18 @@ def _first_equal(vertices: Array, spacing: float) -> Faces:
     if len(firsts) == 1:
         return kept[index].astype(np.int64)
 
-    # Equal ones of two parts: the earlier part is the first.
+    # If vertices of two parts are equal, the one of the earlier part is the first.
     grid = np.round(vertices[kept] / spacing)
     _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
     return kept[first[inverse.reshape(-1)]][index].astype(np.int64)
 
 
 def _unique_faces(faces: Faces) -> tuple[Faces, Faces, Faces]:
-    """Return the first face of each set of three vertices, the set of each face, and its size."""
+    """Return the first face of each set of three vertices, and each face's set and its size."""
     corners = np.sort(faces, axis=1)
     base = int(corners.max(initial=0)) + 1
     if base < MOST_PACKED:
-        # One number for each face sorts like its three, and takes a third of the memory.
+        # One number per face sorts like its three indices, and takes a third of the memory.
         corners = (corners[:, 0] * base + corners[:, 1]) * base + corners[:, 2]
     _, index, inverse, counts = np.unique(
         corners, axis=0, return_index=True, return_inverse=True, return_counts=True
@@ -141,7 +144,7 @@ def repair_solid(vertices: Array, faces: Faces) -> Solid:
     try:
         return _repair(vertices, faces, [])
     except MeshError as reason:
-        # Scans touch themselves along edges, where rims then cross; part these, and try again.
+        # Scans touch themselves along edges, where rims then cross: part these edges and try again.
         touching = int((edge_ids(faces)[1] > 2).sum())
         if not touching:
             raise
@@ -153,14 +156,14 @@ def repair_solid(vertices: Array, faces: Faces) -> Solid:
 
 
 def _repair(vertices: Array, faces: Faces, notes: list[str]) -> Solid:
-    # Make one surface of it, while neighbours are still known.
+    # Make one surface, while neighbours are still known.
     size = diagonal(vertices)
     vertices, faces = _stitch(vertices, faces, notes)
     faces, walls = _drop_inner_walls(vertices, faces)
     total = float(face_areas(vertices, faces).sum())
     fragments = [(vertices[walls], "it ends at edges with three faces")] if len(walls) else []
 
-    # Close each component; those that enclose nothing are fragments.
+    # Close each component; components that enclose nothing are fragments.
     closed: list[tuple[Array, Faces]] = []
     holes, filled = 0, 0.0
     components = find_components(vertices, faces, notes)
@@ -190,7 +193,7 @@ def _repair(vertices: Array, faces: Faces, notes: list[str]) -> Solid:
         holes += new_holes
         filled += new_area
 
-    # Refuse a surface that is too open to be a solid.
+    # Reject a surface that is too open to be a solid.
     if not closed:
         raise MeshError(max(fragments, key=lambda fragment: _triangle_area(fragment[0]))[1])
     share = filled / (filled + total)
@@ -211,13 +214,13 @@ def _repair(vertices: Array, faces: Faces, notes: list[str]) -> Solid:
 
 
 def _stitch(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Faces]:
-    """Return a surface with vertices on rims that nearly touch merged, if that closes edges."""
+    """Return a surface whose nearly touching rim vertices are merged, if that closes edges."""
     ids, counts = edge_ids(faces)
     rim = np.unique(half_edges(faces)[counts[ids] == 1])
     if not len(rim):
         return vertices, faces
 
-    # Merge rim vertices that are close to each other, directly or by others between them.
+    # Merge rim vertices that are close to each other, directly or through others between them.
     pairs = cKDTree(vertices[rim]).query_pairs(STITCH * diagonal(vertices), output_type="ndarray")
     _, labels = connect(pairs[:, 0], pairs[:, 1], len(rim))
     _, first = np.unique(labels, return_index=True)
@@ -237,9 +240,9 @@ def _stitch(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Fac
 def _drop_inner_walls(vertices: Array, faces: Faces) -> tuple[Faces, Faces]:
     """Return the faces that bound the solid, and the faces of inner walls and fins.
 
-    Where three faces meet at an edge, one of them is a wall inside the solid or a fin. Patches
-    are pieces of surface between such edges. The best choice of patches to keep leaves the fewest
-    edges with an odd number of faces; of equals, the one that keeps the most area.
+    If three faces meet at an edge, one of them is a fin or a wall inside the solid. Patches are the
+    pieces of surface between such edges. The best choice of patches leaves the fewest edges with an
+    odd number of faces; among equal choices, the one that keeps the most area is taken.
     """
     ids, counts = edge_ids(faces)
     if not ((counts > 2) & (counts % 2 == 1)).any():
@@ -247,7 +250,7 @@ def _drop_inner_walls(vertices: Array, faces: Faces) -> tuple[Faces, Faces]:
     twins = pair_half_edges(vertices, faces, radial=False)
     patch_count, patch = face_components(twins, len(faces))
 
-    # How many faces each patch (column) has at each edge (row) that has not just two.
+    # How many faces each patch (column) has at each edge (row) whose number of faces is not two.
     bad = counts != 2
     order = np.cumsum(bad) - 1
     table = np.zeros((int(bad.sum()), patch_count), dtype=np.int64)
@@ -260,7 +263,7 @@ def _drop_inner_walls(vertices: Array, faces: Faces) -> tuple[Faces, Faces]:
             f"from each other, got {len(doubtful)}"
         )
 
-    # Try all subsets of those patches.
+    # Test all subsets of these patches.
     bits = (np.arange(2 ** len(doubtful))[:, None] >> np.arange(len(doubtful))) & 1
     odd = ((bits @ table[:, doubtful].T) % 2).sum(axis=1)
     areas = np.bincount(patch, face_areas(vertices, faces), patch_count)[doubtful]
@@ -281,10 +284,10 @@ def _drop_fragments(
     total: float,
     notes: list[str],
 ) -> None:
-    """Note the fragments that are not part of the solid.
+    """Add a note about the fragments that are not part of the solid.
 
     Args:
-        fragments: Corners (m, 3, 3) [m] of each fragment, and why it is one.
+        fragments: Corners (m, 3, 3) [m] of each fragment, and why it is a fragment.
         vertices: Vertices of the solid (n, 3) [m].
         faces: Faces of the solid (k, 3).
         total: Area of the whole surface [m^2].
@@ -295,7 +298,7 @@ def _drop_fragments(
     """
     lost, worst, reason = 0.0, 0.0, ""
     for triangles, why in fragments:
-        # A quarter, not a half: a wall that lies in the surface itself is not visible.
+        # A quarter instead of a half, since a wall within the surface itself is not visible.
         hidden = winding_numbers(triangles.mean(axis=1), vertices, faces) > 0.25
         visible = _triangle_area(triangles[~hidden])
         lost += visible

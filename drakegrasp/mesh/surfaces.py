@@ -1,7 +1,7 @@
 """Surfaces of triangles: measures, points on them, inside and outside, other forms.
 
-Vertices are (n, 3) [m], faces (m, 3), counter-clockwise seen from outside. Nothing here
-changes a shape.
+Vertices are (n, 3) [m]; faces are (m, 3), counter-clockwise seen from outside. Nothing here changes
+a shape.
 """
 
 from __future__ import annotations
@@ -21,19 +21,20 @@ from drakegrasp.frames import Array
 
 Faces = npt.NDArray[np.int64]
 
-#: Points of the winding-number check, and its budget of point-triangle pairs.
+#: Number of points of the winding-number check, and its budget of point-triangle pairs.
 CHECK_POINTS = 2000
 CHECK_BUDGET = 20_000_000
-#: Point-triangle pairs of winding numbers that are in memory at a time.
+#: Number of point-triangle pairs of winding numbers in memory at a time.
 CHUNK_PAIRS = 400_000
-#: A line passes a triangle's edge for certain at more than this fraction of the diagonal squared,
-#: the area between them; a point lies off a triangle at more than this of its cube, the volume.
+#: Limits of rounding: a line certainly passes beside a triangle's edge if the area between them
+#: exceeds this fraction of the diagonal squared; a point is certainly off a triangle if the volume
+#: between them exceeds this fraction of the diagonal cubed.
 ROUNDING = 1e-12
 #: Distance from the faces at which thin objects are checked, as a fraction of the diagonal.
 NEAR = 3e-4
-#: Fraction of its volume that a surface may enclose twice or backwards. This makes the mass
-#: properties wrong, not the surface that is touched (slots of real toasters are dents deeper
-#: than the wall).
+#: Fraction of its volume that a surface may enclose twice or backwards. This falsifies the mass
+#: properties, but not the surface that is touched (slots of real toasters are dents deeper than
+#: the wall).
 MAX_OVERLAP = 0.05
 
 
@@ -68,7 +69,7 @@ def face_areas(vertices: Array, faces: Faces) -> Array:
 
 
 def unit_normals(triangles: Array) -> Array:
-    """Return the outward unit normal (m, 3) of triangles (m, 3, 3); 0 for one without an area."""
+    """Return the outward unit normals (m, 3) of triangles (m, 3, 3); 0 if they have no area."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     normals = np.cross(b - a, c - a)
     return np.asarray(normals / np.maximum(norm(normals), 1e-300)[:, None])
@@ -80,7 +81,7 @@ def diagonal(vertices: Array) -> float:
 
 
 def is_solid_surface(faces: Faces) -> bool:
-    """Return whether each edge has two faces that run along it in opposite directions."""
+    """Return whether each edge has two faces with opposite directions along it."""
     halves = half_edges(faces)
     count = int(halves.max()) + 1
     forward = np.unique(halves[:, 0] * count + halves[:, 1])
@@ -89,7 +90,7 @@ def is_solid_surface(faces: Faces) -> bool:
 
 
 def half_edges(faces: Faces) -> Faces:
-    """Return the half-edges (3m, 2): start and end; 3f + i leaves corner i of face f."""
+    """Return the half-edges (3m, 2) as start and end; 3f + i starts at corner i of face f."""
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
@@ -101,7 +102,7 @@ def connect(first: Faces, second: Faces, count: int) -> tuple[int, Faces]:
 
     Args:
         first: (e,), one node of each edge.
-        second: (e,), the other one.
+        second: (e,), the other node of each edge.
         count: Number of nodes.
     """
     edges = np.ones(len(first), dtype=bool), (first, second)
@@ -116,7 +117,7 @@ def enumerate_pairs(counts: Faces) -> tuple[Faces, Faces]:
 
 
 def pair_blocks(counts: Faces, most: int) -> Iterator[tuple[Faces, Faces]]:
-    """Yield the pairs of `enumerate_pairs` in blocks of about `most` at a time."""
+    """Yield the pairs of `enumerate_pairs` in blocks of about `most` pairs."""
     blocks = np.flatnonzero(np.diff(np.cumsum(counts) // most, prepend=0))
     for run in np.split(np.arange(len(counts)), blocks):
         i, j = enumerate_pairs(counts[run])
@@ -127,18 +128,18 @@ def pair_blocks(counts: Faces, most: int) -> Iterator[tuple[Faces, Faces]]:
 
 
 def winding_numbers(p_OQ: Array, vertices: Array, faces: Faces) -> Array:
-    """Return how often a surface winds around points (k, 3), as (k,).
+    """Return the winding numbers (k,) of a surface around points (k, 3).
 
-    1 is inside, 0 outside; other integers mean a surface that is inside out or passes
-    through itself, and fractions an open one (Jacobson et al. 2013, "Robust inside-outside
-    segmentation using generalized winding numbers"; solid angles after Van Oosterom and
-    Strackee 1983, "The solid angle of a plane triangle").
+    1 is inside, 0 is outside; other integers mean that the surface is inside out or passes through
+    itself, and fractions that it is open (Jacobson et al. 2013, "Robust inside-outside segmentation
+    using generalized winding numbers"; solid angles after Van Oosterom and Strackee 1983, "The
+    solid angle of a plane triangle").
     """
     triangles = vertices[faces]
     winding = np.empty(len(p_OQ))
     step = max(1, CHUNK_PAIRS // len(faces))
     for start in range(0, len(p_OQ), step):
-        # Half of the solid angle that each triangle covers, seen from each point.
+        # Half of the solid angle of each triangle, seen from each point.
         a, b, c = np.moveaxis(triangles[None] - p_OQ[start : start + step, None, None], 2, 0)
         la, lb, lc = (norm(x) for x in (a, b, c))
         numerator = dot(a, np.cross(b, c))
@@ -149,13 +150,13 @@ def winding_numbers(p_OQ: Array, vertices: Array, faces: Faces) -> Array:
 
 
 def whole_windings(p_OQ: Array, vertices: Array, faces: Faces) -> Array:
-    """Return how often a closed surface winds around points (k, 3), as (k,).
+    """Return the winding numbers (k,) of a closed surface around points (k, 3).
 
-    The whole numbers that `winding_numbers` gives but for rounding, in a small part of the time.
-    On the way up from a point, a face that looks up ends one winding and one that looks down begins
-    one. Where rounding may decide whether the way meets a face, the solid angles do.
+    These are the integers that `winding_numbers` returns up to rounding, in a small part of the
+    time. Along a ray up from a point, a face that faces up ends a winding and a face that faces
+    down begins one. If rounding may decide whether the ray meets a face, solid angles are used.
     """
-    # The points between each triangle's smallest and largest x, as a run of the points in order.
+    # The points between each triangle's smallest and largest x are consecutive in sorted order.
     triangles = vertices[faces]
     low, high = triangles.min(axis=1), triangles.max(axis=1)
     order = np.argsort(p_OQ[:, 0], kind="stable")
@@ -165,13 +166,13 @@ def whole_windings(p_OQ: Array, vertices: Array, faces: Faces) -> Array:
 
     winding, doubtful = np.zeros(len(p_OQ)), np.zeros(len(p_OQ), dtype=bool)
     for t, j in pair_blocks(counts, CHUNK_PAIRS):
-        # Of these pairs, those where some of the triangle may be above the point.
+        # Keep the pairs whose triangle may be above the point, at least in part.
         q = order[begins[t] + j]
         y, z = p_OQ[q, 1], p_OQ[q, 2]
         near = (low[t, 1] <= y) & (y <= high[t, 1]) & (z <= high[t, 2])
         t, q = t[near], q[near]
 
-        # The way passes all three edges on the same side, or is beside the triangle.
+        # The ray passes all three edges on the same side, or it passes beside the triangle.
         a, b, c = np.moveaxis(triangles[t] - p_OQ[q, None], 1, 0)
         sides = np.stack(
             [i[:, 0] * j[:, 1] - i[:, 1] * j[:, 0] for i, j in ((b, c), (c, a), (a, b))], axis=1
@@ -180,7 +181,7 @@ def whole_windings(p_OQ: Array, vertices: Array, faces: Faces) -> Array:
         meets = (least > area) | (most < -area)
         beside = (least < -area) & (most > area)
 
-        # The triangle is above the point if their tetrahedron is on the side that it looks to.
+        # The triangle is above the point if their tetrahedron is on the side that it faces.
         height = dot(sides, np.stack([a[:, 2], b[:, 2], c[:, 2]], axis=1)) * np.sign(least)
         above = (low[t, 2] > p_OQ[q, 2]) | (height > volume)
         doubtful[q[~(beside | (meets & (above | (height < -volume))))]] = True
@@ -194,13 +195,13 @@ def whole_windings(p_OQ: Array, vertices: Array, faces: Faces) -> Array:
 def overlap_share(vertices: Array, faces: Faces, *, points: int = CHECK_POINTS) -> float:
     """Return the fraction of the volume that a closed surface encloses twice or backwards.
 
-    It is measured at fixed, evenly spread points of the bounding box, or on both sides of the
-    faces if the object fills little of the box.
+    It is measured at fixed points, evenly spread in the bounding box, or on both sides of the faces
+    if the object fills little of the box.
 
     Args:
         vertices: (n, 3) [m].
         faces: (m, 3).
-        points: Number of points; fewer, but at least 200, for very many faces.
+        points: Number of points; fewer, but at least 200, for a large number of faces.
     """
     # In the bounding box.
     count = int(np.clip(CHECK_BUDGET // len(faces), min(points, 200), points))
@@ -218,7 +219,7 @@ def overlap_share(vertices: Array, faces: Faces, *, points: int = CHECK_POINTS) 
 
 
 def _count_wrong(points: Array, vertices: Array, faces: Faces) -> tuple[int, int]:
-    """Return how many points are inside, and how many have a winding number besides 0 and 1."""
+    """Return the number of points inside, and of points whose winding number is not 0 or 1."""
     w = whole_windings(points, vertices, faces)
     wrong = np.minimum(np.abs(w), np.abs(w - 1.0)) > 0.05
     return int((np.abs(w) > 0.5).sum()), int(wrong.sum())
@@ -230,8 +231,8 @@ def on_faces(vertices: Array, faces: Faces, spread: Array) -> tuple[Array, Faces
     Args:
         vertices: (n, 3) [m].
         faces: (m, 3).
-        spread: Points (k, 3) of the unit cube; if they are spread evenly, so are the results
-            over the area.
+        spread: Points (k, 3) of the unit cube; if these are evenly spread, so are the results over
+            the area.
     """
     until = np.cumsum(face_areas(vertices, faces))
     picked = np.minimum(np.searchsorted(until, spread[:, 2] * until[-1]), len(faces) - 1)
@@ -253,8 +254,8 @@ def even_points(count: int) -> Array:
 def cover_triangles(triangles: Array, spacing: float) -> tuple[Array, Faces]:
     """Return points (k, 3) [m] that cover triangles, and the triangle (k,) of each.
 
-    Each triangle carries a regular grid of points, its corners among them. Triangles with
-    equally fine grids come together.
+    Each triangle gets a regular grid of points that includes its corners. Triangles with equally
+    fine grids are consecutive in the result.
 
     Args:
         triangles: (m, 3, 3) [m], without degenerate ones.
@@ -279,12 +280,12 @@ def cover_triangles(triangles: Array, spacing: float) -> tuple[Array, Faces]:
 
 
 def compact(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
-    """Return a surface without its unused vertices; the others keep their order."""
+    """Return a surface without its unused vertices; the other vertices keep their order."""
     if faces.size < len(vertices):
         few, inverse = np.unique(faces, return_inverse=True)
         return vertices[few], inverse.reshape(-1, 3).astype(np.int64)
 
-    # The same without sorting, which takes four times the memory of the faces.
+    # The same without sorting, which would take four times the memory of the faces.
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
     return vertices[used], (np.cumsum(used) - 1)[faces].astype(np.int64)
@@ -294,19 +295,19 @@ def split_faces(vertices: Array, faces: Faces, midpoints: Faces) -> Faces:
     """Return faces (k, 3), each split at the midpoints of its edges.
 
     Args:
-        vertices: (n, 3) [m], midpoints among them.
+        vertices: (n, 3) [m], which include the midpoints.
         faces: (m, 3).
-        midpoints: (m, 3), the vertex amid the edge that leaves each corner, or -1.
+        midpoints: (m, 3), the vertex at the centre of the edge that starts at each corner, or -1.
     """
-    # Turn each face so that a lone midpoint is on its first edge, and a lone whole edge is its
-    # last.
+    # Rotate the corners of each face so that a single midpoint is on its first edge, and a single
+    # unsplit edge is its last.
     split = midpoints >= 0
     number = split.sum(axis=1)
     turn = np.where(number == 1, split.argmax(axis=1), 0)
     turn = np.where(number == 2, (split.argmin(axis=1) + 1) % 3, turn)
     order = (np.arange(3) + turn[:, None]) % 3
     a, b, c = np.take_along_axis(faces, order, axis=1).T
-    d, e, f = np.take_along_axis(midpoints, order, axis=1).T  # amid ab, bc, ca
+    d, e, f = np.take_along_axis(midpoints, order, axis=1).T  # midpoints of ab, bc, ca
 
     # Two midpoints leave a quadrilateral a d e c, which its shorter diagonal halves.
     ae, dc = vertices[e] - vertices[a], vertices[c] - vertices[d]
@@ -325,7 +326,7 @@ def split_faces(vertices: Array, faces: Faces, midpoints: Faces) -> Faces:
 
 
 def stack(parts: list[tuple[Array, Faces]]) -> Solid:
-    """Return several surfaces as one, in their order; they share no vertices."""
+    """Return several surfaces as one, in their order; they do not share vertices."""
     offsets = np.cumsum([0] + [len(vertices) for vertices, _ in parts[:-1]])
     faces = [faces + offset for (_, faces), offset in zip(parts, offsets, strict=True)]
     return Solid(vertices=np.vstack([vertices for vertices, _ in parts]), faces=np.vstack(faces))

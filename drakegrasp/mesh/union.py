@@ -1,6 +1,6 @@
-"""Union: closed components come in, one surface that encloses each point once at most goes out.
+"""Union: closed components come in, one surface that encloses each point at most once goes out.
 
-Components may overlap, lie inside each other, be inside out, and pass through themselves.
+Components may overlap, be inside of each other, be inside out, and pass through themselves.
 """
 
 from __future__ import annotations
@@ -26,29 +26,30 @@ from drakegrasp.mesh.surfaces import (
     whole_windings,
 )
 
-#: Triangles lower than this fraction of the diagonal are slivers, made by rounding.
+#: Triangles whose height is below this fraction of the diagonal are slivers due to rounding.
 SLIVER = 1e-8
 #: Tolerance of the clean-up after a Boolean operation, as a fraction of the diagonal.
 TIDY = 1e-5
-#: Pieces of a union below this fraction of its volume are rounding, not geometry.
+#: Pieces of a union below this fraction of its volume are due to rounding, not geometry.
 CHIP = 1e-6
-#: A surface is untangled if it passes through itself in more than the first fraction of its volume,
-#: and in at most the second. What is left is noted above the third, refused above `MAX_OVERLAP`.
+#: A surface is untangled if it passes through itself in more than NOTICED_OVERLAP and at most
+#: MAX_TANGLED of its volume. What is left is noted above NOTED_OVERLAP, and rejected above
+#: `MAX_OVERLAP`.
 NOTICED_OVERLAP = 0.01
 MAX_TANGLED = 0.10
 NOTED_OVERLAP = 0.002
 #: Fraction of the volume that untangling may change by mistake.
 MAX_CHANGED = 0.01
-#: Largest number of cuts in a row while untangling, and where each cut lies: not quite in the
-#: middle, where modelled objects often have a face.
+#: Largest number of successive cuts while untangling, and the position of each cut: not exactly at
+#: the centre, where modelled objects often have a face.
 MAX_CUTS = 6
 CUT = 0.4871
-#: Points at which a piece is checked.
+#: Number of points at which a piece is checked.
 CELL_POINTS = 300
-#: Pieces smaller than this [m^3] are rounding.
+#: Pieces smaller than this [m^3] are due to rounding.
 NOTHING = 1e-15
-#: Pieces of an untangled surface below this fraction of its volume are dropped: loose crumbs
-#: where walls cross.
+#: Pieces of an untangled surface below this fraction of its volume are dropped: loose small
+#: fragments where walls cross.
 CRUMB = 1e-3
 
 
@@ -83,7 +84,7 @@ def unite(
 
 
 def _shells(components: list[tuple[Array, Faces]], notes: list[str]) -> list[manifold3d.Manifold]:
-    """Return closed components as solids: cavities cut out, others that are inside out turned."""
+    """Return closed components as solids: cavities are cut out, other inverted ones turned."""
     volumes = [signed_volume(*component) for component in components]
     if volumes[int(np.argmax(np.abs(volumes)))] < 0.0:
         # The largest component decides: the whole file is inside out, cavities included.
@@ -95,7 +96,7 @@ def _shells(components: list[tuple[Array, Faces]], notes: list[str]) -> list[man
         for (v, f), volume in zip(components, volumes, strict=True)
     ]
 
-    # A component that is inside out is a cavity of the smallest one around it, if there is any.
+    # A component that is inside out is a cavity of the smallest component around it, if any.
     boxes = [(v.min(axis=0), v.max(axis=0)) for v, _ in components]
     outer = [i for i, volume in enumerate(volumes) if volume > 0.0]
     inverted = [i for i, volume in enumerate(volumes) if volume <= 0.0]
@@ -116,7 +117,7 @@ def _shells(components: list[tuple[Array, Faces]], notes: list[str]) -> list[man
     if hollow:
         notes.append(f"{hollow} sealed cavities were kept hollow")
 
-    # A cavity is cut only from the component around it, so that a component inside it survives.
+    # A cavity is cut only from the component around it, so that components inside it remain.
     cut = {i for holes in cavities.values() for i in holes}
     return [
         manifold3d.Manifold.batch_boolean(
@@ -152,9 +153,10 @@ def separate(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Fa
         notes: Repairs are appended here, in sentences.
 
     Raises:
-        MeshError: If it still passes through itself in more than `MAX_OVERLAP` of its volume.
+        MeshError: If the surface still passes through itself in more than `MAX_OVERLAP` of its
+            volume.
     """
-    # Untangle it if that is needed, and keep the result if it is better and the same shape.
+    # Untangle it if needed, and keep the result if it is better and has the same shape.
     tangled = left = overlap_share(vertices, faces)
     if NOTICED_OVERLAP < tangled <= MAX_TANGLED:
         solid = to_manifold(vertices, faces)
@@ -183,20 +185,20 @@ def separate(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Fa
 def _untangle(solid: manifold3d.Manifold, depth: int) -> list[manifold3d.Manifold]:
     """Return pieces that do not pass through themselves and together make up the solid.
 
-    A surface that passes through itself falls apart into separate pieces when it is
-    cut small enough, and separate pieces can be united. Only what is still tangled is
-    cut again, so that the rest keeps its large triangles. Where the surface lies
-    inside out there is no material: these are dents deeper than the wall is thick.
+    A surface that passes through itself falls apart into separate pieces if it is cut small enough,
+    and separate pieces can be united. Only pieces that are still tangled are cut again, so that the
+    others keep their large triangles. A part that is inside out contains no material: it is a dent
+    deeper than the wall is thick.
     """
     # Drop dents.
     pieces = [piece for piece in solid.decompose() if abs(piece.volume()) > NOTHING]
     if any(piece.volume() < 0.0 for piece in pieces):
         pieces = [piece for piece in pieces if not _is_dent(piece, pieces)]
-        # What else has negative volume is a cavity, or too tangled to tell: it stays
-        # together with what is around it.
+        # Any other piece of negative volume is a cavity, or too tangled to tell: it stays together
+        # with the pieces around it.
         pieces = [manifold3d.Manifold.compose(pieces)] if pieces else []
 
-    # Cut what is still tangled across its longest side, and go on with the halves.
+    # Cut pieces that are still tangled across their longest side, and continue with the halves.
     done: list[manifold3d.Manifold] = []
     for piece in pieces:
         vertices, faces = from_manifold(piece)
@@ -214,7 +216,7 @@ def _untangle(solid: manifold3d.Manifold, depth: int) -> list[manifold3d.Manifol
 
 
 def _is_dent(piece: manifold3d.Manifold, pieces: list[manifold3d.Manifold]) -> bool:
-    """Return whether a piece is inside out throughout and lies in no other piece."""
+    """Return whether a piece is inside out throughout and is not inside of another piece."""
     if piece.volume() > 0.0:
         return False
     vertices, faces = from_manifold(piece)

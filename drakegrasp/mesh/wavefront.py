@@ -1,4 +1,4 @@
-"""Wavefront files: read as they stand, and written for Drake's in-memory meshes."""
+"""Wavefront files: read without changes, and written for Drake's in-memory meshes."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from drakegrasp.frames import Array
 from drakegrasp.mesh.declared import Declared, triangulate
 from drakegrasp.mesh.surfaces import Faces
 
-#: Faces that meet at less than this angle are shaded as one smooth surface.
+#: Faces that meet at an angle below this are shaded as one smooth surface.
 CREASE_DEG = 30.0
 
 
 def obj_text(vertices: npt.ArrayLike, faces: npt.ArrayLike, *, normals: bool) -> str:
     """Return a triangle mesh as Wavefront text, for Drake's in-memory meshes.
 
-    Coordinates are written so that they read back exactly. With `normals`, every corner
-    gets the area-weighted mean normal of those faces at its vertex that are within 30
-    degrees of its own face: curved surfaces look smooth, edges of boxes stay crisp.
+    Coordinates are written so that they are read back exactly. With `normals`, every corner gets
+    the area-weighted mean normal of the faces at its vertex that are within 30 degrees of its own
+    face: curved surfaces look smooth, and edges of boxes stay crisp.
     """
     v = np.asarray(vertices, dtype=np.float64)
     f = np.asarray(faces, dtype=np.int64)
-    # Positions, and faces alone if no normals are wanted.
+    # Positions, and faces without normals if none are requested.
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in v.tolist()]
     if not normals:
         lines += [f"f {a} {b} {c}" for a, b, c in (f + 1).tolist()]
         return "\n".join(lines) + "\n"
 
-    # Equal normals are written once; each corner refers to one.
+    # Equal normals are written once; each corner refers to one normal.
     vn, index = np.unique(np.round(_corner_normals(v, f), 6), axis=0, return_inverse=True)
     lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in (vn + 0.0).tolist()]
     corners = np.stack((f, index.reshape(f.shape)), axis=2).reshape(-1, 6) + 1
@@ -43,7 +43,7 @@ def obj_text(vertices: npt.ArrayLike, faces: npt.ArrayLike, *, normals: bool) ->
 
 
 def hull_text(corners: npt.ArrayLike) -> str:
-    """Return the convex hull of corners (n, 3) as Wavefront text, its faces turned outwards."""
+    """Return the convex hull of corners (n, 3) as Wavefront text, with its faces turned outward."""
     hull = trimesh.convex.convex_hull(np.asarray(corners, dtype=float))
     return obj_text(hull.vertices, hull.faces, normals=False)
 
@@ -61,7 +61,7 @@ def _corner_normals(vertices: Array, faces: Faces) -> Array:
     ).tocsr()
     pairs = at_vertex[faces.ravel()].tocoo()
 
-    # The mean of those within the crease angle of the corner's own face, weighted by area.
+    # The area-weighted mean of the faces within the crease angle of the corner's own face.
     smooth = (unit[pairs.row // 3] * unit[pairs.col]).sum(axis=1) >= np.cos(np.radians(CREASE_DEG))
     smooth |= pairs.row // 3 == pairs.col
     rows, columns = pairs.row[smooth], pairs.col[smooth]
@@ -72,7 +72,7 @@ def _corner_normals(vertices: Array, faces: Faces) -> Array:
     return np.asarray(mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300))
 
 
-#: Statements of surfaces that are no polygons, and of another file.
+#: Statements of surfaces that are not polygons, and of other files.
 _NOT_READ = frozenset((b"surf", b"curv", b"bzp", b"bsp", b"cdp", b"res", b"call"))
 
 
@@ -80,7 +80,7 @@ def declared_obj(content: bytes) -> Declared:
     """Return the surface of a Wavefront file.
 
     Raises:
-        ValueError: If a line cannot be read; it gives the line.
+        ValueError: If a line cannot be read; the message has the line.
     """
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise ValueError("text in UTF-16: save it in UTF-8")
@@ -117,7 +117,7 @@ def declared_obj(content: bytes) -> Declared:
 
 
 def _lines(content: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield each statement with the number of its last line: a backslash continues it."""
+    """Yield each statement with the number of its last line; a backslash continues a line."""
     begun = b""
     for number, line in enumerate(content.removeprefix(codecs.BOM_UTF8).splitlines(), start=1):
         said = begun + line.partition(b"#")[0].rstrip()

@@ -1,4 +1,4 @@
-"""Audit: a directory of meshes comes in; whether each can be simulated goes out, and how well."""
+"""Audit: a directory of meshes comes in; how well each can be simulated goes out."""
 
 from __future__ import annotations
 
@@ -36,63 +36,65 @@ from drakegrasp.runtime.progress import Report, silent
 
 Status = Literal["fit", "repaired", "refused"]
 
-#: Diagonals of what a hand grasps [m]; a unit that gives one is a plausible one.
+#: Diagonals of objects that a hand grasps [m]; a unit that results in such a size is plausible.
 HOUSEHOLD = (0.03, 0.6)
-#: A wall thinner than this is one that a fingertip may feel from behind [m].
+#: A fingertip may feel a wall thinner than this from behind [m].
 THIN_WALL = AHEAD
-#: Points at which the wall is measured, and the share of them that may be thinner than told.
+#: Number of points at which the wall is measured, and the fraction of them that may be thinner than
+#: the reported thickness.
 WALL_POINTS, WALL_SHARE = 300, 0.05
 #: The ray through a wall begins this far below the surface [m].
 BELOW = 1e-6
-#: Densities that things have, from foam to steel [kg/m^3].
+#: Densities of real objects, from foam to steel [kg/m^3].
 DENSITIES = (20.0, 8000.0)
-#: Radii of gyration of things, as fractions of their hull's: a sheet's and a shell's are larger.
+#: Radii of gyration of real objects, as fractions of that of their hull; sheets and shells have
+#: larger ones.
 GYRATION = (0.5, 2.0)
-#: Faces up to which self-intersections are looked for: beyond it takes minutes.
+#: Number of faces up to which self-intersections are searched; more would take minutes.
 MOST_CROSSED = 60_000
-#: Points between which a hand is looked for that can close, and how much farther than the sides
-#: of the object such points may be, as they do not lie exactly opposite.
+#: Number of points among which two opposed sides are searched, and the factor by which the distance
+#: of two such points may exceed that of the sides, since they are not exactly opposite.
 SIDE_POINTS, SIDE_SLACK = 500, 1.1
-#: Sides of an object are opposed if the product of their outward normals is at most this.
+#: Sides of an object are opposed if the dot product of their outward normals is at most this.
 OPPOSED = -0.3
-#: Part of the height that a hand which faces the table needs below which objects get a warning: one
-#: that tilts comes a little lower. Measured, see docs/explanation/sampling.md.
+#: Objects get a warning if they are lower than this fraction of the height that a hand facing the
+#: table needs; a hand that tilts gets a little lower. Measured, see docs/explanation/sampling.md.
 LOW_SHARE = 0.85
-#: Volume that a repair may change without a word, as a fraction.
+#: Fraction of the volume that a repair may change without a warning.
 NOTED_CHANGE = 0.02
-#: Memory of scenes, distances and renderer [B]: of any object, and per face for contact and of the
-#: solid; measured on spheres of 1,280 to 20,480 faces.
+#: Memory of scenes, distances and renderer [B]: for any object, per face of the contact mesh, and
+#: per face of the solid; measured on spheres of 1,280 to 20,480 faces.
 BASE_MEMORY, COLLISION_MEMORY, VISUAL_MEMORY = 98e6, 5.3e3, 0.3e3
 
 
 @dataclass(frozen=True, kw_only=True)
 class AuditRow:
-    """What a build would do with one mesh. What is not known is None.
+    """What a build would do with one mesh. Unknown values are None.
 
     Attributes:
         name: Name of the object.
-        class_name: Its class.
-        status: "fit" as it is, "repaired", or "refused".
-        notes: What was repaired, or the one reason of the refusal.
-        warnings: What may be wrong with a mesh that is not refused.
+        class_name: Class of the object.
+        status: "fit" without changes, "repaired", or "refused".
+        notes: What was repaired, or the one reason of the rejection.
+        warnings: Possible problems in a mesh that was accepted.
         faces: Number of faces of the file.
         bodies: Number of connected pieces of surface in the file.
         watertight: Whether each edge of the file has two faces that agree.
-        extents: Edges of the bounding box [m], of the solid or, if refused, of the file.
-        units_guess: Unit with which the size would be that of something to grasp, if the given
-            one does not; None if it does, or none would.
+        extents: Edges of the bounding box [m] of the solid or, if rejected, of the file.
+        units_guess: Unit with which the object would have a plausible size, if it does not have one
+            with the given unit; None if it does, or if no unit fits.
         volume: Volume of the solid [m^3].
-        volume_change: What repair added to the volume within the file's faces, as a fraction.
+        volume_change: Volume that repair added to that within the file's faces, as a fraction.
         crossing: Number of faces of the solid that pass through others.
-        wall: Thickness [m] that 95 % of its walls have.
-        mass: [kg]
-        density: [kg/m^3]
+        wall: Thickness [m] that 95 % of the walls have.
+        mass: Mass of the object [kg].
+        density: Density of the object [kg/m^3].
         gyration: Radius of gyration over that of the convex hull.
         collision_faces: Number of faces for contact.
-        collision_error: Largest distance of these from the solid [m].
-        memory: Of a worker for this object, besides its usual memory [B].
-        preparing: Most memory of a worker while it prepares the mesh, in all [B].
-        width: Least distance of two opposed sides [m], see `least_width`.
+        collision_error: Largest distance of these faces from the solid [m].
+        memory: Memory of a worker for this object, besides its usual memory [B].
+        preparing: Maximum total memory of a worker while it prepares the mesh [B].
+        width: Smallest distance of two opposed sides [m], see `least_width`.
         model: The object.
     """
 
@@ -134,21 +136,21 @@ def audit(
     flat: tuple[float, float] = (0.0, 0.0),
     progress: Report = silent,
 ) -> list[AuditRow]:
-    """Return, mesh by mesh, whether it is fit to be simulated, needs repair, or is refused.
+    """Return for each mesh whether it is fit to be simulated, needs repair, or is rejected.
 
     Objects are prepared with the default `objects` of the configuration.
 
     Args:
-        directory: The meshes, as for `find_meshes`.
-        units: Unit of their lengths.
-        manifest: Their YAML file, if it is not in the same folder.
+        directory: Directory of the meshes, as for `find_meshes`.
+        units: Unit of length of the meshes.
+        manifest: YAML file of the meshes, if it is not in the same folder.
         opening: Largest distance of the hand's fingertips [m], see `hand.kinematics.opening`;
             objects that are wider everywhere get a warning.
-        flat: See `hand.kinematics.flat_limits` [m]; objects that stand lower get one as well.
+        flat: See `hand.kinematics.flat_limits` [m]; objects that are lower also get a warning.
         progress: Called for each mesh.
 
     Raises:
-        MeshError: As `find_meshes` does; a bad mesh is a row, not an error.
+        MeshError: As `find_meshes` does; a faulty mesh results in a row, not an error.
     """
     sources, rows = find_meshes(directory, units=units, manifest=manifest), list[AuditRow]()
     for source in sources:
@@ -158,7 +160,7 @@ def audit(
 
 
 def _audit_one(source: MeshSource, opening: float, flat: tuple[float, float]) -> AuditRow:
-    """Return the row of a mesh: what the file holds, then what becomes of it."""
+    """Return the row of a mesh: what the file contains, then what a build makes of it."""
     known: dict[str, Any] = {"name": source.name, "class_name": source.class_name}
     try:
         mesh, _ = load_source(source)
@@ -192,7 +194,7 @@ def _audit_one(source: MeshSource, opening: float, flat: tuple[float, float]) ->
 
 
 def guess_units(size: float, scale: float) -> str | None:
-    """Return the unit of length with which a file has a plausible size, if the given one has not.
+    """Return the unit with which a file has a plausible size, if it does not have one already.
 
     Args:
         size: Diagonal with the given unit [m].
@@ -201,16 +203,16 @@ def guess_units(size: float, scale: float) -> str | None:
     low, high = HOUSEHOLD
     if low <= size <= high:
         return None
-    # Of several, the one that gives the most usual size, a decimetre or two.
+    # If several fit, take the one with the most usual size, one or two decimetres.
     fits = {unit: size / scale * metres for unit, metres in UNITS.items()}
     usual = [unit for unit, diagonal_then in fits.items() if low <= diagonal_then <= high]
     return min(usual, key=lambda unit: abs(np.log(fits[unit] / 0.15)), default=None)
 
 
 def wall_thickness(vertices: Array, faces: Faces) -> float:
-    """Return the thickness that 95 % of a solid's walls have [m].
+    """Return the thickness [m] that 95 % of a solid's walls have.
 
-    It is how far a ray along the inward normal goes before it leaves the solid.
+    A thickness is the length of a ray along the inward normal until it leaves the solid.
 
     Args:
         vertices: (n, 3) [m].
@@ -223,9 +225,9 @@ def wall_thickness(vertices: Array, faces: Faces) -> float:
 
 
 def least_width(vertices: Array, faces: Faces) -> float:
-    """Return the least distance of two opposed sides of a solid [m], which a hand must span.
+    """Return the smallest distance of two opposed sides of a solid [m], which a hand must span.
 
-    It is looked for among even points of the surface, so it is a little too large.
+    It is searched among evenly spread points of the surface, so it is slightly too large.
 
     Args:
         vertices: (n, 3) [m].
@@ -234,15 +236,15 @@ def least_width(vertices: Array, faces: Faces) -> float:
     p, picked = on_faces(vertices, faces, even_points(SIDE_POINTS))
     n = unit_normals(vertices[faces[picked]])
     between = p[None] - p[:, None]  # (i, j): from point i to point j
-    # The solid is between them: the normal of each points away from the other.
+    # The solid is between them if each normal points away from the other point.
     outward = np.einsum("ik,ijk->ij", n, between) < 0.0
     opposed = (n @ n.T <= OPPOSED) & outward & outward.T
     return float(np.sqrt(np.sum(between**2, axis=2)[opposed].min(initial=np.inf)))
 
 
 def _measures(model: ObjectModel, vertices: Array, faces: Faces) -> dict[str, Any]:
-    """Return what is measured on an object, and on its file's surface (n, 3) [m], (m, 3)."""
-    # Volume of the file, inertia of the hull per mass, and size of the solid.
+    """Return measures of an object and of its file's surface, vertices (n, 3) [m], faces (m, 3)."""
+    # Volume within the file's surface, inertia of the hull per mass, and size of the solid.
     own, solid = model.visual_vertices, model.visual_faces.astype(np.int64)
     before = abs(signed_volume(vertices, faces))
     hull = trimesh.Trimesh(own, solid, process=False).convex_hull
@@ -268,13 +270,13 @@ def _measures(model: ObjectModel, vertices: Array, faces: Faces) -> dict[str, An
 
 
 def _warnings(row: AuditRow, opening: float, height: float, width: float) -> Iterator[str]:
-    """Yield what may be wrong with an object that a build would take.
+    """Yield possible problems of an object that a build would accept.
 
     Args:
-        row: The object; what is not known of it gives no warning.
+        row: The object; unknown values yield no warning.
         opening: Largest distance of the hand's fingertips [m].
-        height: Least height for a hand that faces the table [m].
-        width: Of what may be lower [m].
+        height: Smallest height for a hand that faces the table [m].
+        width: Width [m] below which an object may be lower.
     """
     if row.units_guess is not None:
         yield f"its lengths may be in {row.units_guess}"
@@ -293,7 +295,7 @@ def _warnings(row: AuditRow, opening: float, height: float, width: float) -> Ite
     if row.volume_change is not None and abs(row.volume_change) > NOTED_CHANGE:
         yield f"repair changed the volume by {row.volume_change:+.0%}"
 
-    # The fingertips cannot meet two opposed sides, or fingers come beside it above the table.
+    # The fingertips cannot meet two opposed sides; fingers beside a low object meet the table.
     if row.width is not None and row.width > SIDE_SLACK * opening:
         yield (
             f"its opposed sides are at least {row.width * 1e3:.0f} mm apart, and the hand opens "

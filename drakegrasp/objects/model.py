@@ -1,10 +1,10 @@
 """The object that Drake simulates: a mesh file comes in, an `ObjectModel` goes out.
 
 An `ObjectModel` is a watertight solid in metres with its origin {O} at the centre of the bounding
-box, mass properties of uniform density, and a collision mesh that is not too fine for
-hydroelastic contact. Drake accepts open, inverted and flat meshes without a warning and
-simulates nonsense, so everything that it needs is checked here. Faults are repaired
-(`drakegrasp.mesh.repair`) and noted, or the mesh is refused with a `MeshError`.
+box, mass properties of uniform density, and a collision mesh that is not too fine for hydroelastic
+contact. Drake accepts open, inverted and flat meshes without a warning and simulates nonsense, so
+all that it needs is checked here. Faults are repaired (`drakegrasp.mesh.repair`) and noted, or the
+mesh is rejected with a `MeshError`.
 """
 
 from __future__ import annotations
@@ -54,24 +54,26 @@ _ARRAYS = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectModel:
-    """A rigid object, ready to be simulated. Lengths in [m], all arrays read-only.
+    """A rigid object, ready to be simulated. Lengths are in [m]; all arrays are read-only.
 
     Attributes:
         name: Unique name.
-        class_name: Class.
-        mesh_sha256: Digest of the source file's bytes and of what is said of it, hexadecimal.
+        class_name: Name of the class.
+        mesh_sha256: Hash of the source file's bytes and of its attributes, see `source_sha256`,
+            hexadecimal.
         visual_vertices: (n, 3) float64, in {O}, full resolution.
         visual_faces: (m, 3) int32, counter-clockwise seen from outside.
         collision_vertices: (k, 3) float64, in {O}.
         collision_faces: (l, 3) int32.
-        mass: [kg]
+        mass: Mass [kg].
         p_OOcm: (3,) centre of mass.
         I_OOcm_O: (3, 3) rotational inertia about the centre of mass, in axes of {O} [kg m^2].
         collision_error: Largest distance between visual and collision surface.
-        notes: What was repaired, and what is unexpected of how it rests, in sentences.
-        friction: Its own effective coefficient with hand and table; None: the configuration's.
-        scale: Metres per unit of length of its file.
-        up: Axis of its file that is +z of {O}.
+        notes: What was repaired, and what is unexpected about how the object rests, in sentences.
+        friction: The object's own effective coefficient of friction with hand and table; None:
+            those of the configuration.
+        scale: Metres per unit of length of the source file.
+        up: Axis of the source file that is +z of {O}.
     """
 
     name: str
@@ -132,12 +134,12 @@ class ObjectModel:
 
     @property
     def collision_solid(self) -> Solid:
-        """The collision surface in {O}, which a hand meets."""
+        """The collision surface in {O}, which touches the hand."""
         return Solid(vertices=self.collision_vertices, faces=self.collision_faces.astype(np.int64))
 
     @cached_property
     def resting_surface(self) -> Solid:
-        """The surface in {O} that a table meets: the convex hull of the collision surface."""
+        """The surface in {O} that touches the table: the convex hull of the collision surface."""
         return resting_hull(self.collision_vertices)
 
     @cached_property
@@ -146,19 +148,20 @@ class ObjectModel:
         return make_distance_field(self.collision_vertices, self.collision_faces)
 
 
-# Preparing
+# Preparation
 
 
 def prepare_object(source: MeshSource, config: ObjectConfig | None = None) -> ObjectModel:
-    """Return the simulated object of a mesh file, repaired where that invents no shape.
+    """Return the simulated object of a mesh file, repaired if that invents no shape.
 
     Args:
-        source: Where the mesh is and what unit it is in.
-        config: Mass of what has no own, and limits of size and faces; the defaults if None.
+        source: The mesh file, with its unit of length.
+        config: Mass of objects without their own mass, and limits of size and faces; the defaults
+            if None.
 
     Raises:
-        MeshError: If the file is no mesh, its size is implausible, or it cannot be made a
-            solid; the message gives the reason.
+        MeshError: If the file is not a mesh, its size is implausible, or it cannot become a solid;
+            the message has the reason.
     """
     mesh, digest = load_source(source)
     vertices, faces = upright_vertices(mesh, source), np.asarray(mesh.faces)
@@ -179,7 +182,7 @@ def prepare_object(source: MeshSource, config: ObjectConfig | None = None) -> Ob
     except MeshError as reason:
         raise MeshError(f"{source.path.name}: {reason}") from reason
 
-    # What its triangles do not say.
+    # Add what the triangles do not specify.
     model = replace(model, friction=source.friction, scale=source.scale, up=source.up)
     if source.density is None:
         return model
@@ -205,13 +208,13 @@ def make_object(
         config: Mass, and limits of size and faces.
         name: Name of the object.
         class_name: Class of the object.
-        mesh_sha256: Digest of its source.
-        unit: The assumed unit of length, for the message if the size is refused.
+        mesh_sha256: Hash of the object's source.
+        unit: The assumed unit of length, for the message if the size is rejected.
 
     Raises:
-        MeshError: If the size is implausible, or the surface cannot be made a solid.
+        MeshError: If the size is implausible, or the surface cannot become a solid.
     """
-    # A wrong unit shows as an implausible size.
+    # A wrong unit results in an implausible size.
     vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces)
     size = diagonal(vertices)
     if not config.min_diagonal <= size <= config.max_diagonal:
@@ -222,12 +225,12 @@ def make_object(
             f"mesh in {MANIFEST_NAME}"
         )
 
-    # One watertight solid, with no more faces than mending has memory for.
+    # One watertight solid, with no more faces than there is memory to repair.
     vertices, faces, reduced = coarsen(vertices, faces)
     solid = repair_solid(vertices, faces)
     _refuse_slight(solid)
 
-    # In {O}: the origin is the centre of the bounding box.
+    # In {O}, whose origin is the centre of the bounding box.
     centre = (solid.vertices.min(axis=0) + solid.vertices.max(axis=0)) / 2.0
     visual = Solid(vertices=solid.vertices - centre, faces=solid.faces)
     p_OOcm, I_OOcm_O = _mass_properties(visual, config.mass)
@@ -254,7 +257,7 @@ def make_object(
 
 
 def _refuse_slight(solid: Solid) -> None:
-    """Refuse sheets, specks, and a volume that the convex hull contradicts."""
+    """Raise an error for sheets, specks, and a volume that contradicts the convex hull."""
     extents = np.ptp(solid.vertices, axis=0)
     if extents.min() < MIN_EXTENT:
         raise MeshError(
@@ -280,7 +283,7 @@ def _mass_properties(solid: Solid, mass: float) -> tuple[Array, Array]:
     inertia = np.asarray(properties["inertia"])
     I_OOcm_O = (inertia + inertia.T) / 2.0
 
-    # What no solid has is an error of the surface.
+    # Values that are impossible for a solid are due to an error of the surface.
     moments = np.linalg.eigvalsh(I_OOcm_O)
     if not (moments[0] > 0.0 and moments[0] + moments[1] >= moments[2] * (1.0 - 1e-9)):
         raise MeshError(f"the moments of inertia must obey the triangle inequality, got {moments}")
@@ -291,12 +294,12 @@ def _mass_properties(solid: Solid, mass: float) -> tuple[Array, Array]:
     return p_OOcm, I_OOcm_O
 
 
-# Keeping
+# Storage
 
 
 def save_object(model: ObjectModel, path: str | Path) -> None:
-    """Write an object to a .npz file, atomically; equal objects give equal bytes."""
-    # The same bytes for the same object: `np.savez` stores no time stamps.
+    """Write an object to a .npz file, atomically; equal objects produce equal bytes."""
+    # Equal objects produce equal bytes, since `np.savez` stores no time stamps.
     content: dict[str, Any] = {f.name: np.asarray(getattr(model, f.name)) for f in fields(model)}
     content["notes"] = np.array(model.notes, dtype=np.str_)
     content["friction"] = np.float64(np.nan if model.friction is None else model.friction)
@@ -311,7 +314,7 @@ def load_object(path: str | Path) -> ObjectModel:
     Raises:
         MeshError: If the file is missing, damaged or something else.
     """
-    # The arrays, as they are in the file.
+    # Read the arrays as they are in the file.
     path = Path(path)
     try:
         with np.load(io.BytesIO(read_content(path)), allow_pickle=False) as content:
@@ -369,20 +372,20 @@ def _mistake(values: dict[str, Any]) -> str | None:
     return None
 
 
-#: On a wall thinner than twice this the face behind a contact may be nearer than its own, so the
-#: face nearest to the point this far ahead along the normal counts too [m].
+#: On a wall thinner than twice this, the face behind a contact may be nearer than the contact's own
+#: face, so the face nearest to the point this far ahead along the normal counts as well [m].
 AHEAD = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
 class ContactFit:
-    """How n contacts lie on the full mesh.
+    """How well n contacts fit the full mesh.
 
     Attributes:
-        distance: (n,), of the points from the mesh [m]; NaN for a point that is NaN.
-        normal_angle: (n,), between the normals and that face's which agrees better: the one nearest
-            to the point, or the one nearest to the point `AHEAD` of it [rad]; pi for a normal
-            that is NaN, which has no direction, and NaN for a point that is.
+        distance: (n,), distance of the points from the mesh [m]; NaN for a point that is NaN.
+        normal_angle: (n,), angle between each normal and that of a face [rad]: the face nearest to
+            the point, or the face nearest to the point `AHEAD` of it, whichever agrees better. It
+            is pi for a normal that is NaN, i.e. has no direction, and NaN for a point that is NaN.
     """
 
     distance: Array
@@ -390,21 +393,21 @@ class ContactFit:
 
 
 def fit_contacts(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> ContactFit:
-    """Return how contacts lie on an object.
+    """Return how well contacts fit an object.
 
     Args:
         model: The object.
         p_OQ: (n, 3), points [m]; NaN for a fingertip that does not touch.
         nhat_Q_O: (n, 3), unit normals out of the object.
     """
-    # Points that there are.
+    # Points that exist.
     fit = ContactFit(*np.full((2, len(p_OQ)), np.nan))
     there = np.asarray(np.isfinite(p_OQ).all(axis=1))
     if not there.any():
         return fit
     p, n, mesh = p_OQ[there], nhat_Q_O[there], model.visual
 
-    # The faces nearest to the points, and to those ahead of them.
+    # The faces nearest to the points, and to the points ahead of them.
     known = np.asarray(np.isfinite(n).all(axis=1))
     _, fit.distance[there], own = mesh.nearest.on_surface(p)
     _, _, ahead = mesh.nearest.on_surface(p + AHEAD * np.where(known[:, None], n, 0.0))
@@ -413,16 +416,16 @@ def fit_contacts(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> ContactFit
     return fit
 
 
-#: Memory of a worker that prepares a small mesh [B], of which 240 MB are there before; and of each
-#: face that is mended and that is read: largest of balls of 20,000 to 1,300,000 faces in STL, OBJ
-#: and PLY, with 30 MB for what a worker has besides.
+#: Memory of a worker that prepares a small mesh [B], of which 240 MB are in use before; and memory
+#: for each face that is repaired and that is read. These are the maxima over balls of 20,000 to
+#: 1,300,000 faces in STL, OBJ and PLY, with 30 MB for the worker's other data.
 BASE, MENDED, READ = 425e6, 0.6e3, 0.14e3
-#: Share of its limit at which Dask ends a worker, and steps in which a limit is told [B].
+#: Fraction of its limit at which Dask ends a worker, and step of the limits that are reported [B].
 ENDED, STEP = 0.95, 50e6
 
 
 def forecast_memory(faces: int) -> float:
-    """Return the most memory that a worker takes to prepare a mesh [B].
+    """Return the maximum memory that a worker needs to prepare a mesh [B].
 
     Args:
         faces: Number of triangles in the file.
@@ -431,5 +434,5 @@ def forecast_memory(faces: int) -> float:
 
 
 def needed_limit(memory: float) -> float:
-    """Return the limit of a worker's memory [B] that lets it use a given amount [B]."""
+    """Return the limit of a worker's memory [B] that allows it to use a given amount [B]."""
     return STEP * math.ceil(memory / ENDED / STEP)

@@ -1,17 +1,17 @@
-"""Morphs: one object comes in, others of its kind and of other proportions go out.
+"""Morphs: one object comes in, others of its kind with other proportions go out.
 
-The radial morph of the Grasping 3D Database [Kleinhans2016], from whose morphs the paper's objects
-come. Around an axis, with p the projection of a vertex on it, normalised to -1..1,
-and r its distance from it: the distance is scaled by max(0.25, c1 + c2 p + c3 p^2), and the
-projection by c4 + c5 (r / r_max)^2.
+The radial morph of the Grasping 3D Database [Kleinhans2016], whose morphs include the paper's
+objects. Let p be the projection of a vertex on an axis, normalised to -1..1, and r its distance
+from the axis. The distance is scaled by max(0.25, c1 + c2 p + c3 p^2), and the projection by c4 +
+c5 (r / r_max)^2.
 
-Axis and origin are our own choice: the axis is one of x, y and z, and passes through the middle of
-the footprint at the height of the base. So what is flat at the base stays flat and on the table.
+Axis and origin are our own choice: the axis is x, y or z, and passes through the centre of the
+footprint at the height of the base. So what is flat at the base stays flat and on the table.
 
 `morph_meshes` writes morphs of all meshes of a directory: `<class>_<name>_m<k>.obj` in metres, +z
-up. An `objects.yaml` in their folder keeps the class of each one's mesh (else each would be a
-class of its own) and its name as their group: in a split by object all morphs of a mesh, and
-the mesh itself, stay together.
+up. An `objects.yaml` in their folder gives each morph the class of its mesh (else each would be its
+own class) and the name of the mesh as its group: in a split by object all morphs of a mesh, and the
+mesh itself, stay together.
 """
 
 from __future__ import annotations
@@ -46,32 +46,33 @@ from drakegrasp.runtime.files import atomic_folder
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream, object_key
 
-#: Bounds of the draws: of c1 and c4, and of c2, c3 and c5 (the database's).
+#: Bounds of the draws: of c1 and c4, and of c2, c3 and c5 (those of the database).
 SCALE, CURVE = (0.75, 1.5), (-0.25, 0.25)
-#: The distance is scaled by at least this (the database's).
+#: Smallest scale of the distance (that of the database).
 LEAST_SCALE = 0.25
-#: Longest edge of what is morphed, as a fraction of the diagonal, and faces up to which longer ones
-#: are split: a long straight edge would not bend.
+#: Longest edge of a surface to be morphed, as a fraction of the diagonal, and the number of faces
+#: up
+#: to which longer edges are split: a long straight edge would not bend.
 BEND, MAX_FACES = 0.06, 4000
-#: A morph of a mesh whose faces pass through others may have so many times as many of them: a morph
-#: of space keeps the curves along which they do, but not which faces lie there.
+#: If faces of a mesh pass through others, their number in a morph may be larger by this factor: the
+#: morph keeps the curves along which faces cross, but not which faces are there.
 SLACK = 1.5
-#: Draws of one morph before its mesh is given up.
+#: Number of draws of one morph after which its mesh is given up.
 MAX_DRAWS = 20
-#: Decimals of the coordinates [m].
+#: Number of decimals of the coordinates [m].
 DECIMALS = 7
-#: Least thickness of a morph.
+#: Smallest thickness of a morph.
 MIN_EXTENT = 2e-3  # [m]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Original:
-    """An object to make morphs of.
+    """An object to be morphed.
 
     Attributes:
         vertices: (n, 3) [m], +z up.
         faces: (m, 3), a closed surface.
-        crossing: Number of faces that pass through others: 0 unless the mesh itself is so.
+        crossing: Number of faces that pass through others; 0 unless the mesh itself has such faces.
     """
 
     vertices: Array
@@ -80,14 +81,14 @@ class Original:
 
 
 def draw_morph(stream: Stream) -> tuple[int, Array]:
-    """Return the next draw of a stream: the axis, 0 to 2 for x to z, and c1 .. c5 (5,)."""
+    """Return the next draw of a stream: the axis (0 to 2 for x to z), and c1 .. c5 (5,)."""
     (axis,) = stream.integers(3, 1).tolist()
     low, high = np.array([SCALE, CURVE, CURVE, SCALE, CURVE]).T
     return axis, low + (high - low) * stream.uniform(5)
 
 
 def morph_points(points: Array, axis: int, c: npt.ArrayLike) -> Array | None:
-    """Return where a morph puts the vertices of an object (n, 3) [m].
+    """Return the morphed vertices of an object, (n, 3) [m].
 
     Args:
         points: (n, 3) [m].
@@ -97,7 +98,7 @@ def morph_points(points: Array, axis: int, c: npt.ArrayLike) -> Array | None:
     Returns:
         The points (n, 3) [m], or None if the morph turns a part of space inside out.
     """
-    # Coordinates about the middle of the footprint.
+    # Coordinates relative to the centre of the footprint.
     low, high = points.min(axis=0), points.max(axis=0)
     origin = np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, low[2]])
     local = points - origin
@@ -106,7 +107,7 @@ def morph_points(points: Array, axis: int, c: npt.ArrayLike) -> Array | None:
     p = along / max(float(np.abs(along).max()), 1e-300)
     share = (r / max(float(r.max()), 1e-300)) ** 2
 
-    # The two scales; space keeps its sides where the determinant is positive.
+    # The two scales; the morph is valid if its determinant is positive everywhere.
     c1, c2, c3, c4, c5 = np.asarray(c, dtype=float).tolist()
     radial, axial = c1 + c2 * p + c3 * p * p, c4 + c5 * share
     slope = np.where(radial > LEAST_SCALE, c2 + 2.0 * c3 * p, 0.0)
@@ -124,7 +125,7 @@ def load_original(source: MeshSource) -> Original:
     """Return the repaired surface of a mesh, fine enough to bend.
 
     Raises:
-        MeshError: If the mesh cannot be a solid or is of implausible size.
+        MeshError: If the mesh cannot become a solid or has an implausible size.
     """
     limits = ObjectConfig()
     mesh, _ = load_source(source)
@@ -147,19 +148,19 @@ def load_original(source: MeshSource) -> Original:
 
 
 def morph_object(original: Original, name: str, number: int, seed: int) -> tuple[Array, int]:
-    """Return one morph of an object: watertight, and no more self-intersecting than it.
+    """Return a morph of an object: watertight, and about as free of self-intersections as it is.
 
-    Of the same faces, it is its vertices (n, 3) [m], as high above z = 0 as the original, and the
-    number of draws that it took.
+    The result is the morph's vertices (n, 3) [m] and the number of draws. The morph has the faces
+    of the original and is as high above z = 0.
 
     Args:
-        original: From `load_original`.
-        name: Of the original.
-        number: Of the morph among those of the original.
-        seed: Of the draws.
+        original: Result of `load_original`.
+        name: Name of the original.
+        number: Number of the morph among the morphs of the original.
+        seed: Seed of the draws.
 
     Raises:
-        MeshError: If no draw of `MAX_DRAWS` can be used.
+        MeshError: If none of `MAX_DRAWS` draws can be used.
     """
     stream = Stream(seed, object_key(name), number)
     for draw in range(1, MAX_DRAWS + 1):
@@ -167,7 +168,7 @@ def morph_object(original: Original, name: str, number: int, seed: int) -> tuple
         if points is None:
             continue
         vertices, faces = np.round(points, DECIMALS) + 0.0, original.faces
-        # It bounds a solid, and crosses itself no more than the original.
+        # It must bound a solid, and its crossing faces must be within the limit.
         if (
             is_solid_surface(faces)
             and signed_volume(vertices, faces) > 0.0
@@ -183,14 +184,14 @@ def morph_object(original: Original, name: str, number: int, seed: int) -> tuple
 
 @dataclass(frozen=True, kw_only=True)
 class MorphReport:
-    """What was written.
+    """Summary of the written morphs.
 
     Attributes:
         morphs: Number of morphs.
-        first_draws: Number of those whose first draw could be used.
-        crossing: Number of faces that pass through others in a mesh, by its name, if any: its
-            morphs have about as many.
-        refused: Why a mesh has no morphs, a line each.
+        first_draws: Number of morphs whose first draw could be used.
+        crossing: For each mesh with faces that pass through others, by name, the number of these
+            faces; its morphs have about as many.
+        refused: Reasons why meshes have no morphs, one line each.
     """
 
     morphs: int
@@ -209,28 +210,28 @@ def morph_meshes(
     manifest: str | Path | None = None,
     progress: Report = silent,
 ) -> MorphReport:
-    """Write morphs of all meshes of a directory; the same bytes for the same seed.
+    """Write morphs of all meshes of a directory; the same seed produces the same bytes.
 
     Args:
-        directory: The meshes, as for `find_meshes`.
-        out: Directory of the morphs: new or empty. It appears whole or not at all.
-        per_mesh: Morphs of each mesh.
-        seed: Of the draws.
-        units: Unit of the meshes' lengths.
-        manifest: Their YAML file, if it is not in the same folder.
+        directory: Directory of the meshes, as for `find_meshes`.
+        out: Directory of the morphs, new or empty. It appears completely or not at all.
+        per_mesh: Number of morphs of each mesh.
+        seed: Seed of the draws.
+        units: Unit of length of the meshes.
+        manifest: YAML file of the meshes, if it is not in the same folder.
         progress: Called for each morph.
 
     Raises:
-        MeshError: If there is no mesh, `out` holds anything, or no mesh can be morphed.
+        MeshError: If there is no mesh, if `out` is not empty, or if no mesh can be morphed.
     """
-    # What is wanted, and what comes of it.
+    # The requested morphs, and the results.
     sources = find_meshes(directory, units=units, manifest=manifest)
     total, draws, refused = len(sources) * per_mesh, list[int](), list[str]()
     entries: dict[str, dict[str, Any]] = {}
     crossing: dict[str, int] = {}
 
     with _whole_directory(Path(out)) as folder:
-        # Mesh by mesh; one that has no morphs costs no other.
+        # Mesh by mesh; a mesh without morphs does not affect others.
         for source in sources:
             try:
                 texts, tries, faces = _morphs_of(source, per_mesh, seed)
@@ -256,7 +257,7 @@ def morph_meshes(
             if faces:
                 crossing[source.name] = faces
 
-        # The manifest, which keeps their classes and groups.
+        # The manifest, which keeps classes and groups.
         if not draws:
             raise MeshError(f"{directory}: one mesh must have morphs, got none: {refused[0]}")
         content = {"units": "m", "objects": entries}
@@ -273,12 +274,12 @@ def _morphs_of(
     """Return the Wavefront texts of a mesh's morphs by name, their draws, and its crossing faces.
 
     Raises:
-        MeshError: If it has no morphs.
+        MeshError: If the mesh has no morphs.
     """
     original = load_original(source)
     texts, draws = dict[str, str](), list[int]()
     for number in range(1, per_mesh + 1):
-        # Also checks the name, which is that of a file.
+        # The constructor also checks the name, which becomes the name of a file.
         name = f"{source.class_name}_{source.name}_m{number}"
         MeshSource(name=name, class_name=source.class_name, path=source.path)
         vertices, draw = morph_object(original, source.name, number, seed)
@@ -289,10 +290,10 @@ def _morphs_of(
 
 @contextmanager
 def _whole_directory(out: Path) -> Iterator[Path]:
-    """Yield a new directory that becomes `out` when the block ends well.
+    """Yield a new directory, which becomes `out` if the block succeeds.
 
     Raises:
-        MeshError: If `out` holds anything, or cannot be written.
+        MeshError: If `out` is not empty, or cannot be written.
     """
     try:
         if out.exists() and (not out.is_dir() or any(out.iterdir())):

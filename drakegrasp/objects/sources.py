@@ -1,14 +1,14 @@
 """Sources of meshes: a directory comes in; names, classes and units of its meshes go out.
 
-`find_meshes` lists the files of a directory and `load_source` reads one;
-`drakegrasp.objects.model` makes the object that Drake simulates.
+`find_meshes` lists the files of a directory and `load_source` reads one file;
+`drakegrasp.objects.model` prepares the object that Drake simulates.
 
-File names and `objects.yaml`: a mesh called `<number>_<class>_<rest>.ext` belongs to
-`<class>`, which may itself contain underscores: the number is dropped, and so is the last
-part if at least two parts remain (24_mug_final and 1_mug are mugs, 30_fruit_juicer_final
-is a fruit_juicer). A name without a number is its own class. A file `objects.yaml` beside the
-meshes overrides these for one mesh, and the unit for all. It also states the licence of the meshes
-and what no file of triangles says:
+File names and `objects.yaml`: a mesh called `<number>_<class>_<rest>.ext` belongs to `<class>`,
+which may itself contain underscores: the number is dropped, and so is the last part if at least two
+parts remain (24_mug_final and 1_mug are mugs, 30_fruit_juicer_final is a fruit_juicer). A name
+without a number is its own class. A file `objects.yaml` beside the meshes overrides these for
+single meshes, and the unit for all. It also states the licence of the meshes and what a file of
+triangles cannot specify:
 
     units: cm
     licence: CC-BY-4.0
@@ -17,8 +17,8 @@ and what no file of triangles says:
       7_scan: {scale: 1.02, up: +y, density: 700}
       8_scan_bent: {group: 7_scan}
 
-Objects of a group are of one mesh, as morphs are: a split by object keeps them together. An object
-that names no group has its own name for one.
+Objects of a group come from one mesh, as morphs do: a split by object keeps them together. The
+group of an object that names none is its own name.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from drakegrasp.yaml_text import parse_yaml
 
 #: Metres per unit of length of a file.
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-#: The rotation (3, 3) that turns an axis of a file to +z; +z itself turns nothing.
+#: Rotations (3, 3) that turn an axis of a file to +z; the one for +z is the identity.
 UPRIGHT = {
     "+x": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
     "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
@@ -63,16 +63,17 @@ class MeshSource:
     """A mesh file and what is known about it before it is read.
 
     Attributes:
-        name: Unique name of the object; the file's stem unless the manifest says otherwise.
+        name: Unique name of the object; the file's stem unless the manifest states another one.
         class_name: Class of the object.
         path: The mesh file.
         scale: Metres per unit of length of the file.
         up: Axis of the file that points up, e.g. "+y"; it becomes +z of {O}.
-        mass: [kg]; None: that of the density, or of the configuration.
-        density: [kg/m^3], instead of the mass.
-        friction: Effective coefficient with hand and table; None: those of the configuration.
-        licence: Identifier of the mesh's licence, e.g. of spdx.org/licenses; None: not stated.
-        group: What it shares with other objects of the same mesh; None: its name.
+        mass: Mass [kg]; None: that of the density, or of the configuration.
+        density: Density [kg/m^3], instead of the mass.
+        friction: Effective coefficient of friction with hand and table; None: those of the
+            configuration.
+        licence: Identifier of the mesh's licence, e.g. one of spdx.org/licenses; None: not stated.
+        group: Name shared by objects of the same mesh; None: the object's name.
     """
 
     name: str
@@ -161,7 +162,7 @@ def _read_manifest(path: Path) -> _Manifest:
 
 
 def _class_of(stem: str) -> str:
-    """Return the class that a file's stem names, as the module describes."""
+    """Return the class that a file's stem names, as the module's docstring describes."""
     number, *parts = stem.split("_")
     if not (number.isdigit() and parts):
         return stem
@@ -174,14 +175,14 @@ def find_meshes(
     """Return the meshes of a directory, sorted by name; subdirectories are not searched.
 
     Args:
-        directory: Holds .obj, .stl, .ply and .glb files.
-        units: Unit of the files' lengths: m, cm or mm. The manifest's unit for the set
-            overrides it, and the manifest's unit for a mesh overrides both.
-        manifest: A YAML file as the module describes; without it `objects.yaml` in
-            `directory`, if there is one.
+        directory: Directory of .obj, .stl, .ply and .glb files.
+        units: Unit of length of the files: m, cm or mm. The manifest's unit for all meshes
+            overrides it, and the manifest's unit for one mesh overrides both.
+        manifest: A YAML file as the module's docstring describes; if None, `objects.yaml` in
+            `directory`, if it exists.
 
     Raises:
-        MeshError: If there is no mesh, two have the same name, or the manifest is wrong.
+        MeshError: If there is no mesh, two have the same name, or the manifest is invalid.
     """
     # The mesh files.
     directory = Path(directory)
@@ -200,11 +201,11 @@ def find_meshes(
             f"{directory}: must hold at least one mesh ({', '.join(SUFFIXES)}), got none"
         )
 
-    # Their stems; some file systems store é as two characters where the manifest has one.
+    # The stems of the files; some file systems store é as two characters, the manifest as one.
     stems = {path: unicodedata.normalize("NFC", path.stem) for path in sorted(paths)}
     _refuse_twins(directory, stems)
 
-    # The manifest, which must speak of these files only.
+    # The manifest, which may only refer to these files.
     if manifest is None and (directory / MANIFEST_NAME).is_file():
         manifest = directory / MANIFEST_NAME
     table = _Manifest() if manifest is None else _read_manifest(Path(manifest))
@@ -222,10 +223,10 @@ def find_meshes(
 
 
 def find_mesh(path: str | Path, *, units: str = "m") -> MeshSource:
-    """Return one mesh file as `find_meshes` does, whatever else is in its directory.
+    """Return one mesh file in the form of `find_meshes`, whatever else is in its directory.
 
     Raises:
-        MeshError: If it is no mesh file, or the manifest beside it is wrong.
+        MeshError: If the file is not a mesh file, or the manifest beside it is invalid.
     """
     path = Path(path)
     refuse_units(units)
@@ -238,7 +239,7 @@ def find_mesh(path: str | Path, *, units: str = "m") -> MeshSource:
 
 
 def _entries(table: _Manifest) -> dict[str, _Entry]:
-    """Return the manifest's entries by stem, spelled as `find_meshes` spells stems."""
+    """Return the manifest's entries by stem, with stems normalised as in `find_meshes`."""
     return {unicodedata.normalize("NFC", key): entry for key, entry in table.objects.items()}
 
 
@@ -251,10 +252,10 @@ def _source(path: Path, stem: str, table: _Manifest, units: str) -> MeshSource:
 
 
 def refuse_units(units: str) -> None:
-    """Refuse a unit of length that is not known.
+    """Raise an error for an unknown unit of length.
 
     Raises:
-        MeshError: If it is.
+        MeshError: If the unit is unknown.
     """
     if units not in UNITS:
         raise MeshError(f"units must be one of {', '.join(UNITS)}, got {units!r}")
@@ -267,13 +268,13 @@ def _refuse_twins(directory: Path, names: dict[Path, str]) -> None:
             raise MeshError(f"{directory}: names must be unique, got {name!r} for {twins}")
 
 
-# Reading one
+# Reading a mesh
 
 
 def source_sha256(source: MeshSource) -> str:
-    """Return the SHA-256 of a mesh file's bytes and of what is said of it, hexadecimal.
+    """Return the SHA-256 of a mesh file's bytes and of the object's attributes, hexadecimal.
 
-    Name, class, licence and group do not count.
+    Name, class, licence and group do not affect it.
 
     Raises:
         MeshError: If the file cannot be read.
@@ -282,12 +283,12 @@ def source_sha256(source: MeshSource) -> str:
 
 
 def load_source(source: MeshSource) -> tuple[trimesh.Trimesh, str]:
-    """Return a mesh in the file's units and axes, and its digest as `source_sha256` gives it.
+    """Return a mesh in the file's units and axes, and its hash as in `source_sha256`.
 
-    The file is read once, so the digest is surely that of these triangles.
+    The file is read once, so the hash certainly belongs to these triangles.
 
     Raises:
-        MeshError: If the file cannot be read or holds no finite triangles.
+        MeshError: If the file cannot be read or contains no finite triangles.
     """
     content = read_bytes(source.path)
     digest = _sha256(content, source)
@@ -299,15 +300,15 @@ def load_source(source: MeshSource) -> tuple[trimesh.Trimesh, str]:
 
 
 def upright_vertices(mesh: trimesh.Trimesh, source: MeshSource) -> Array:
-    """Return the vertices (n, 3) of a file [m], turned so that its axis `up` is +z."""
+    """Return the vertices (n, 3) of a file [m], turned so that the file's axis `up` is +z."""
     vertices = np.asarray(mesh.vertices) * source.scale
     return vertices if source.up == "+z" else multiply(vertices, np.transpose(UPRIGHT[source.up]))
 
 
 def file_frame(source: MeshSource) -> Array:
-    """Return the pose X_OM (4, 4) in {O} of a file's frame M, whose lengths are in metres.
+    """Return the pose X_OM (4, 4) of a file's frame M, whose lengths are in metres, in {O}.
 
-    The origin of {O} is the centre of the bounding box of all that the file holds.
+    The origin of {O} is the centre of the bounding box of everything in the file.
 
     Raises:
         MeshError: If the file cannot be read.
@@ -319,7 +320,7 @@ def file_frame(source: MeshSource) -> Array:
 
 
 def _sha256(content: bytes, source: MeshSource) -> str:
-    # What is not said leaves no trace.
+    # Attributes that are not given do not affect the hash.
     said = [f"\nscale {source.scale!r}"]
     said += [] if source.up == "+z" else [f"up {source.up}"]
     for what in ("mass", "density", "friction"):

@@ -1,9 +1,10 @@
-"""jemalloc in place of the C library's allocator, which makes trials faster and no bit different.
+"""jemalloc instead of the C library's allocator: trials run faster, and no bit changes.
 
-A process has the allocator it starts with: the loader puts jemalloc before the C library where
-LD_PRELOAD names it. What `cluster` starts gets it by `dask_setup` on the machine where
-it starts, as each may have the library or not; commands that simulate start again with it. The
-library is found by its name, by the loader itself, so it may be wherever the system has it.
+A process keeps the allocator that it starts with: the loader loads jemalloc before the C library if
+LD_PRELOAD names it. Processes that `cluster` starts get it by `dask_setup` on the machine on which
+they start, since each machine may have the library or not; commands that simulate restart
+themselves with it. The loader itself finds the library by its name, so it may be anywhere in the
+system.
 """
 
 from __future__ import annotations
@@ -20,17 +21,17 @@ from typing import Any
 
 LIBRARY = "libjemalloc.so.2"
 PRELOAD, SETTINGS = "LD_PRELOAD", "MALLOC_CONF"
-#: Arrays up to 4 MiB are kept for the next of their size. Without, jemalloc hands the pages of
-#: each large array of zeros back to the system, and the screen takes a fifth longer.
+#: Arrays up to 4 MiB are kept for the next array of their size. Otherwise jemalloc would return the
+#: pages of each large array of zeros to the system, and the screen would take a fifth longer.
 TUNING = "lg_tcache_max:22"
-#: How long the trial with the library may take on a busy machine [s].
+#: Time limit of the trial with the library [s], for a busy machine.
 TRIAL_SECONDS = 30.0
-#: What the trial runs.
+#: Program that the trial runs.
 _CHILD = "from drakegrasp.runtime.allocator import allocator; print(allocator())"
 
 
 class _Place(ctypes.Structure):
-    """`Dl_info`: where an address is from."""
+    """`Dl_info`: the library to which an address belongs."""
 
     _fields_ = (
         ("file", ctypes.c_char_p),
@@ -41,25 +42,25 @@ class _Place(ctypes.Structure):
 
 
 def allocator() -> str:
-    """Return the file name of the library from which this process has its memory."""
+    """Return the file name of the library that allocates this process's memory."""
     if sys.platform != "linux":
         return "unknown"
     process, place = ctypes.CDLL(None), _Place()
-    # Not `malloc`, whose address is the program's own where it is not position-independent.
+    # Not `malloc`: its address is in the program itself if that is not position-independent.
     if not process.dladdr(process.malloc_usable_size, ctypes.byref(place)):
         return "unknown"
     return Path(os.fsdecode(place.file)).name
 
 
 def has_jemalloc() -> bool:
-    """Return whether this process has its memory from jemalloc."""
+    """Return whether jemalloc allocates this process's memory."""
     return allocator().startswith("libjemalloc")
 
 
 def jemalloc_environment() -> dict[str, str]:
-    """Return the variables with which a process starts with jemalloc; none where it cannot.
+    """Return the variables with which a process starts with jemalloc; empty if it cannot.
 
-    What the user preloads stays, and stays before it: an allocator there is the one that serves.
+    Libraries that the user preloads stay, and stay in front: if one is an allocator, it is used.
     """
     if sys.platform != "linux":
         return {}
@@ -70,7 +71,7 @@ def jemalloc_environment() -> dict[str, str]:
 
 @cache
 def _serves(preload: str, settings: str) -> bool:
-    """Return whether a process that starts so has its memory from jemalloc, by starting one."""
+    """Return whether a process with these variables uses jemalloc, by starting one."""
     paths = os.pathsep.join(str(Path(p).resolve()) for p in sys.path if p)
     environment = {PRELOAD: preload, SETTINGS: settings, "PYTHONPATH": paths}
     try:
@@ -85,11 +86,11 @@ def _serves(preload: str, settings: str) -> bool:
         )
     except (OSError, subprocess.TimeoutExpired):
         return False
-    return child.stdout.startswith("libjemalloc")  # of what is missing the loader only warns
+    return child.stdout.startswith("libjemalloc")  # the loader only warns of a missing library
 
 
 def restart_with_jemalloc() -> None:
-    """Start this program again with jemalloc, where it is there and this process has another."""
+    """Restart this program with jemalloc, if it is installed and another allocator is in use."""
     if has_jemalloc() or "libjemalloc" in os.environ.get(PRELOAD, ""):
         return
     found = jemalloc_environment()
@@ -98,16 +99,17 @@ def restart_with_jemalloc() -> None:
 
 
 def restart(variables: Mapping[str, str]) -> None:
-    """Start this program again as it was called, with Python's own options.
+    """Restart this program as it was called, with Python's own options.
 
-    Call it before anything is opened or started: nothing of this process remains but its number.
+    Call this before anything is opened or started: nothing of this process remains except its
+    number.
     """
     os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], {**os.environ, **variables})
 
 
 @contextmanager
 def kept_variables(*names: str) -> Iterator[None]:
-    """Give variables of the environment their values back when the block ends."""
+    """Restore variables of the environment to their previous values when the block ends."""
     before = {name: os.environ.get(name) for name in names}
     try:
         yield
@@ -120,5 +122,5 @@ def kept_variables(*names: str) -> Iterator[None]:
 
 
 def dask_setup(nanny: Any) -> None:
-    """Have a nanny start its worker with jemalloc; Dask calls this where the nanny runs."""
+    """Let a nanny start its worker with jemalloc; Dask calls this on the nanny's machine."""
     nanny.pre_spawn_env.update(jemalloc_environment())

@@ -1,15 +1,15 @@
-"""This process: who it is, its cores, memory, time, and Drake's ban on the network.
+"""This process: its identity, cores, memory, time, and Drake's ban on the network.
 
-Diagrams and meshes are megabytes of C++ and NumPy memory. Python's garbage collector does not see
+Diagrams and meshes take megabytes of C++ and NumPy memory. Python's garbage collector does not see
 the C++ part, and the allocator keeps freed memory for later use, separately for each thread.
 
-Workers run with `DRAKE_ALLOW_NETWORK=none`. Drake (1.51 to 1.58) then refuses to make some
-objects even if they would not use the network; `allow_network` eases the ban for these.
+Workers run with `DRAKE_ALLOW_NETWORK=none`. Drake (1.51 to 1.58) then refuses to create some
+objects even if they would not use the network; `allow_network` relaxes the ban for these.
 
-A process is identified by its machine, the start of the machine, its number and its start: the
-kernel reuses numbers. psutil is no substitute: it computes the start of a process from the wall
-clock, which may be set, so a living process could look like another one. Linux's clock ticks since
-the machine's start never change.
+A process is identified by its machine, the boot of the machine, its number and its start time,
+since the kernel reuses numbers. psutil cannot replace this: it computes the start time of a process
+from the wall clock, which may be set, so a living process could look like another one. Linux's
+clock ticks since the boot never change.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from drakegrasp.runtime.allocator import has_jemalloc, kept_variables
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Where Linux keeps a number that is new at every start of the machine.
+#: File in which Linux has a number that is new at every boot of the machine.
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-#: Least time between two returns of free memory [s]; one takes about 20 ms.
+#: Minimum time between two releases of free memory [s]; one takes about 20 ms.
 TRIM_SECONDS = 5.0
-#: What jemalloc is told: forget what this thread keeps, and return the free pages of every arena
+#: Commands for jemalloc: clear the cache of this thread, and return the free pages of every arena
 #: (4096 is its MALLCTL_ARENAS_ALL).
 _PURGE = (b"thread.tcache.flush", b"arena.4096.purge")
-#: Least limit of virtual memory under which an image is rendered [byte]: with 1.0 GB OpenGL has a
-#: segmentation fault, 1.5 GB are enough for `figures`.
+#: Smallest limit of virtual memory with which an image is rendered [byte]: with 1.0 GB OpenGL ends
+#: in a segmentation fault; 1.5 GB are enough for `figures`.
 RENDER_MEMORY = 1.5e9
 
 _trimmed = -TRIM_SECONDS
@@ -56,9 +56,9 @@ class Process:
 
     Attributes:
         host: Name of the machine.
-        pid: Number of the process there.
-        began: Clock ticks from the machine's start to the process's; -1 if unknown.
-        boot: What tells one start of the machine from the next; empty if unknown.
+        pid: Number of the process on that machine.
+        began: Clock ticks from the boot of the machine to the start of the process; -1 if unknown.
+        boot: Identifier of the boot of the machine; empty if unknown.
     """
 
     host: str
@@ -67,7 +67,7 @@ class Process:
     boot: str
 
     def runs(self) -> bool | None:
-        """Return whether the process still runs, or None where this machine cannot know."""
+        """Return whether the process still runs; None if this machine cannot know."""
         if self.host != socket.gethostname():
             return None
         if self.boot != _boot() or not is_running(self.pid):
@@ -76,13 +76,13 @@ class Process:
 
 
 def this_process() -> Process:
-    """Return the process that calls."""
+    """Return the calling process."""
     pid = os.getpid()
     return Process(host=socket.gethostname(), pid=pid, began=_began(pid), boot=_boot())
 
 
 def is_running(pid: int) -> bool:
-    """Return whether this machine runs a process of a number; a zombie is dead."""
+    """Return whether this machine runs a process with a number; a zombie counts as dead."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -93,7 +93,7 @@ def is_running(pid: int) -> bool:
 
 
 def host_label() -> str:
-    """Return this machine's name as it may stand in a file's name: short, without dots."""
+    """Return this machine's name in a form for names of files: short, without dots."""
     return re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[:20] or "-"
 
 
@@ -110,9 +110,9 @@ def _began(pid: int) -> int:
 
 
 def _stat(pid: int) -> list[str]:
-    """Return what Linux says of a process, from its state on; empty where it says nothing."""
+    """Return Linux's fields about a process, beginning with its state; empty if there are none."""
     try:
-        # The name before it stands in parentheses and may hold blanks.
+        # The preceding name is in parentheses and may contain blanks.
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
         return []
@@ -126,13 +126,13 @@ def available_cores() -> int:
 
 
 def require_mujoco(*modules: str) -> None:
-    """Refuse work that needs libraries of the extra `[peer]` which are missing.
+    """Raise an error if libraries of the extra `[peer]` are missing.
 
     Args:
         modules: `mujoco`, `coacd` or both.
 
     Raises:
-        MachineError: If one is missing.
+        MachineError: If a library is missing.
     """
     for module in modules:
         if find_spec(module) is None:
@@ -140,10 +140,10 @@ def require_mujoco(*modules: str) -> None:
 
 
 def require_render_memory() -> None:
-    """Refuse to render within a limit of memory at which OpenGL would end with a crash.
+    """Raise an error if the limit of memory is so small that OpenGL would crash.
 
     Raises:
-        MachineError: If it would.
+        MachineError: If it is.
     """
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY and limit < RENDER_MEMORY:
@@ -178,7 +178,7 @@ def _trim() -> None:
 
 @contextmanager
 def allow_network(kind: str) -> Iterator[None]:
-    """Allow Drake one kind of network use, e.g. `package_map`, while the block runs."""
+    """Allow Drake one kind of network use while the block runs, e.g. `package_map`."""
     with kept_variables(_VARIABLE):
         os.environ[_VARIABLE] = kind
         yield
@@ -187,9 +187,9 @@ def allow_network(kind: str) -> Iterator[None]:
 def one_thread(function: Callable[P, R]) -> Callable[P, R]:
     """Return a function whose linear algebra runs in one thread of the process.
 
-    OpenBLAS divides large products among its threads and adds up in another order for each number
-    of them, so the last bits differ. With one thread, workers and callers' own processes compute
-    the same bits on any number of cores.
+    OpenBLAS divides large products among its threads and adds up in a different order for each
+    number of threads, so the last bits differ. With one thread, workers and callers' own processes
+    compute the same bits on any number of cores.
     """
 
     @wraps(function)
@@ -212,7 +212,7 @@ def _libraries() -> Any:
 def timed(
     seconds: dict[str, float], stage: str, clock: Callable[[], float] = time.perf_counter
 ) -> Iterator[None]:
-    """Add the duration of the block to a stage's total, also when the block raises.
+    """Add the duration of the block to a stage's total, even if the block raises an error.
 
     Args:
         seconds: Total by stage [s]; updated in place.

@@ -1,7 +1,7 @@
 """How tasks are run: the protocol of executors, the plain loop, and processes of this machine.
 
-`run_here` is the plain loop, `processes` gives an executor for work that no cluster is started for;
-`drakegrasp.cluster.executor` has the executor on Dask.
+`run_here` is the plain loop; `processes` provides an executor for work for which no cluster is
+started; `drakegrasp.cluster.executor` has the executor on Dask.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ from drakegrasp.runtime.environment import available_cores
 T = TypeVar("T")
 R = TypeVar("R")
 
-#: Processes on one machine; more are a mistyped number.
+#: Maximum number of processes on one machine; a larger number is a typing error.
 MOST_PROCESSES = 10_000
-#: Work that ends within this time starts no processes, which takes seconds by itself [s].
+#: Work that ends within this time [s] starts no processes, since starting them takes seconds.
 ALONE_SECONDS = 5.0
 
 
 class Executor(Protocol):
-    """Runs a function on items, somewhere, and yields the results in any order."""
+    """Runs a function on items in any process, and yields the results in any order."""
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-        """Yield function(item) of every item; items are taken only as workers become free."""
+        """Yield function(item) for every item; items are taken only when workers become free."""
 
 
 @dataclass
 class WorkerPool:
-    """The worker processes of an executor; each is started again when it dies.
+    """The worker processes of an executor; a worker that dies is started again.
 
     Attributes:
-        size: Number of workers now.
-        on_change: Called with the addresses of workers that joined and of those that left.
-        on_none: Called once when there has been no worker for long, and the work waits for one.
+        size: Current number of workers.
+        on_change: Called with the addresses of workers that joined and of workers that left.
+        on_none: Called once if there has been no worker for a long time and the work waits for one.
     """
 
     size: int = 0
@@ -58,14 +58,14 @@ class WorkerPool:
 
 
 def run_here(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Run in this process, one item after the other: for tests and debuggers."""
+    """Run in this process, one item after the other, for tests and debuggers."""
     return (function(item) for item in items)
 
 
 def in_order(execute: Executor) -> Executor:
     """Return an executor that yields the results in the order of the items.
 
-    Results that come early wait in memory.
+    Results that arrive early wait in memory.
     """
 
     def run(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
@@ -79,7 +79,7 @@ def in_order(execute: Executor) -> Executor:
                     yield early.pop(due)
                     due += 1
         finally:
-            # Who closes this iterator ends the work as well.
+            # Closing this iterator ends the work as well.
             close = getattr(results, "close", None)
             if close is not None:
                 close()
@@ -88,16 +88,16 @@ def in_order(execute: Executor) -> Executor:
 
 
 def _numbered(function: Callable[[T], R], item: tuple[int, T]) -> tuple[int, R]:
-    """Return the number of an item with its result."""
+    """Return the number of an item and its result."""
     number, argument = item
     return number, function(argument)
 
 
 def count_workers(workers: int | None) -> int:
-    """Return how many processes of this machine to start: one per core if None.
+    """Return how many processes of this machine to start; one per core if None.
 
     Raises:
-        ConfigError: If the number makes no sense.
+        ConfigError: If the number is not valid.
     """
     if workers is not None and workers < 1:
         raise ConfigError(f"workers must be at least 1, got {workers}")
@@ -107,11 +107,11 @@ def count_workers(workers: int | None) -> int:
 
 
 def refuse_to_start_workers() -> None:
-    """Refuse to start processes where they cannot start, whatever the caller's script looks like.
+    """Raise an error if processes cannot be started here.
 
     Raises:
-        MachineError: If this process may have no children, or its script is no file, which each
-            process that Python starts would import.
+        MachineError: If this process may not have children, or if its script is not a file, which
+            each process that Python starts would import.
     """
     if multiprocessing.current_process().daemon:
         raise MachineError(
@@ -133,20 +133,20 @@ def processes(workers: int | None = None) -> Iterator[Executor]:
     """Run tasks in processes of this machine while the block runs; one worker is this process.
 
     Args:
-        workers: Number of processes. If None it is one per core, and this process does the work
-            of the first `ALONE_SECONDS`: small datasets need no other.
+        workers: Number of processes. If None, there is one per core, and this process does the work
+            of the first `ALONE_SECONDS`: small datasets need no other process.
 
     Raises:
-        ConfigError: If there cannot be so many.
+        ConfigError: If the number of processes is not valid.
     """
     count = count_workers(workers)
     if count == 1:
         yield run_here
         return
 
-    # A forked process could hang: this one may have threads.
+    # A forked process could hang, since this process may have threads.
     context = multiprocessing.get_context("spawn")
-    resource_tracker.ensure_running()  # it clears the mask of the thread that starts it
+    resource_tracker.ensure_running()  # starting it clears the signal mask of the calling thread
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_begin_worker)
     try:
         alone = ALONE_SECONDS if workers is None else 0.0
@@ -170,7 +170,7 @@ class _PoolExecutor:
     alone_until: float
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-        """Yield function(item) of every item as they are done.
+        """Yield function(item) for every item as soon as it is done.
 
         Raises:
             MachineError: If a process died or cannot start.
@@ -196,7 +196,7 @@ class _PoolExecutor:
                 "a worker process died; if memory is short, fewer --workers need less"
             ) from None
         finally:
-            # What is begun ends, so that nothing is written behind the caller's back.
+            # Tasks that have begun are finished, so that nothing is written after this call.
             for future in pending:
                 future.cancel()
             wait(pending)
@@ -206,7 +206,7 @@ class _PoolExecutor:
 def _interrupts_blocked() -> Iterator[None]:
     """Keep Ctrl-C from processes that start within the block, and from this one until it ends.
 
-    At a terminal Ctrl-C goes to every process; one that has just begun to start would print a
+    A terminal sends Ctrl-C to every process; a process that has just started would print a
     traceback.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -217,7 +217,7 @@ def _interrupts_blocked() -> Iterator[None]:
 
 
 def _begin_worker() -> None:
-    """Leave Ctrl-C to the parent process, and end with it, however it ends."""
+    """Leave Ctrl-C to the parent process, and end when it ends, whatever the reason."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

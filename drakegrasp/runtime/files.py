@@ -1,14 +1,14 @@
-"""Files that are complete or absent, and whose damage shows.
+"""Files that are complete or absent, and whose damage is detected.
 
 A file is written under a temporary name in its own folder, closed, synced and renamed. A reader
-never sees half a file, and a crash leaves only a temporary file. A seal shows any changed bit: it
+never sees half a file, and a crash leaves only a temporary file. A seal reveals any changed bit: it
 is the SHA-256 of all other bytes, in the user block that HDF5 leaves free at a file's start.
 
-Files of a folder that are replaced together are all the old ones, or all the new ones. When all new
-ones are complete and synced under temporary names, a list of them appears, `replacement.json`: from
-then on the new files count. Each gets its name, and the list goes. A process that dies before there
-is a list leaves the old files. One that dies later leaves the list, and `complete_replacement` does
-the rest; until then nobody may read in the folder.
+Files of a folder that are replaced together are either all old or all new. When all new files are
+complete and synced under temporary names, a list of them is written, `replacement.json`: from then
+on the new files count. Each file gets its name, and the list is removed. A process that dies before
+it writes the list leaves the old files. A process that dies later leaves the list, and
+`complete_replacement` does the rest; until then nobody may read in the folder.
 """
 
 from __future__ import annotations
@@ -40,29 +40,29 @@ if TYPE_CHECKING:
 
 #: Size of the user block that holds the seal [B]; HDF5 demands a power of two.
 SEAL_SIZE = 512
-#: Format of HDF5 files. Unlike HDF5's first one it has checksums of where values lie, and a small
-#: column takes a quarter of the bytes. Every HDF5 since 1.10 reads it.
+#: Format of HDF5 files. Unlike HDF5's first format it has checksums of the positions of values, and
+#: a small column takes a quarter of the bytes. Every HDF5 since 1.10 reads it.
 FORMAT = ("v110", "v110")
 #: Suffix of a file that is being written; after a crash such a file may be deleted.
 TEMPORARY_SUFFIX = ".tmp"
-#: End of its name: the machine and the process that write it.
+#: End of the name of such a file: the machine and the process that write it.
 _TEMPORARY = re.compile(r"\.(?P<host>[A-Za-z0-9-]+)~(?P<pid>\d+)~[0-9a-f]{12}\.tmp")
 #: Age after which another machine's temporary file counts as left by a dead process [s].
 STALE_SECONDS = 3600.0
-#: Error numbers of no room: on the disk, in the quota, or by a limit on a file's size.
+#: Error numbers for a lack of room: on the disk, in the quota, or by a limit on the size of files.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 #: The list of files that are being replaced.
 LIST_NAME = "replacement.json"
-#: How long a reader waits for a process that is just replacing files [s]; it takes milliseconds.
+#: Time [s] that a reader waits for a process that is replacing files, which takes milliseconds.
 PATIENCE = 2.0
 
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Give the block a temporary path to write; it becomes `path` when the block ends well.
+    """Provide a temporary path for the block to write; it becomes `path` if the block succeeds.
 
     Args:
-        path: Of the file. Its folder is made if it is missing; an older file is replaced.
+        path: Path of the file. Its folder is created if it is missing; an older file is replaced.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written; nothing is left behind.
@@ -77,17 +77,17 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def write_atomic(path: Path, content: bytes) -> None:
-    """Write a file of these bytes, see `atomic_path`."""
+    """Write a file with these bytes, see `atomic_path`."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Give the block a temporary folder to fill; it becomes `path` when the block ends well.
+    """Provide a temporary folder for the block to fill; it becomes `path` if the block succeeds.
 
     Args:
-        path: Of the folder, which must be missing or empty.
+        path: Path of the folder, which must be missing or empty.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written; nothing is left behind.
@@ -95,7 +95,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     path = path.absolute()
     path.parent.mkdir(parents=True, exist_ok=True)
 
-    # Remove what a process that died left of the same folder.
+    # Remove what a dead process left of the same folder.
     for entry in path.parent.iterdir():
         ours = entry.name.startswith(f".{path.name}.") and _TEMPORARY.search(entry.name)
         if ours and entry.is_dir() and _is_stale(entry):
@@ -112,12 +112,12 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
-    """Open a new HDF5 file that appears at `path` when the block ends well, see `atomic_path`.
+    """Open a new HDF5 file that appears at `path` if the block succeeds, see `atomic_path`.
 
     Args:
-        path: Of the file.
-        sealed: Whether to leave room for a seal and set it, see `seal`. Such a file is built in
-            memory; others may be larger than that.
+        path: Path of the file.
+        sealed: Whether to reserve room for a seal and set it, see `seal`. A sealed file is built in
+            memory; other files may be larger than the memory.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written; nothing is left behind.
@@ -136,26 +136,26 @@ def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
 
 @contextmanager
 def new_hdf5(path: Path) -> Iterator[h5py.File]:
-    """Open a new HDF5 file that the block writes; after an error it is of no use.
+    """Open a new HDF5 file for the block to write; after an error the file is unusable.
 
     Raises:
-        OSError: If there is a file, the disk is full or the folder cannot be written.
+        OSError: If the file exists, the disk is full or the folder cannot be written.
     """
     with _PatientFile(path) as patient:
         try:
             with h5py.File(patient, "w", libver=FORMAT) as file:
                 yield file
         finally:
-            # Other errors follow from this one.
+            # Other errors would follow from this one.
             patient.refuse_failure()
 
 
 class _PatientFile(FileIO):
     """A new file whose writes never fail for HDF5, although the disk may be full.
 
-    HDF5 (1.14) repeats a write that failed when it frees a handle, and closing the file then ends
-    in a segmentation fault. Here the first error is kept, every later write is dropped, so that
-    HDF5 can close the broken file without crashing.
+    HDF5 (1.14) repeats a failed write when it frees a handle, and closing the file then ends in a
+    segmentation fault. Here the first error is stored and every later write is dropped, so that
+    HDF5 can close the broken file without a crash.
     """
 
     def __init__(self, path: Path) -> None:
@@ -163,7 +163,7 @@ class _PatientFile(FileIO):
         self._failure: OSError | None = None
 
     def write(self, content: Buffer, /) -> int:
-        """Write bytes, unless an earlier write failed; return their number."""
+        """Write bytes, unless an earlier write failed; return the number of bytes."""
         view = memoryview(content).cast("B")
         try:
             done = 0 if self._failure is None else len(view)
@@ -174,14 +174,14 @@ class _PatientFile(FileIO):
         return len(view)
 
     def readinto(self, buffer: Buffer, /) -> int:
-        """Fill a buffer; zeros stand for what could not be written."""
+        """Fill a buffer, with zeros for bytes that could not be written."""
         view = memoryview(buffer).cast("B")
         done = super().readinto(view)
         view[done:] = bytes(len(view) - done)
         return len(view)
 
     def truncate(self, size: int | None = None, /) -> int:
-        """Set the size of the file, unless a write failed; return it."""
+        """Set the size of the file, unless a write failed; return the size."""
         try:
             return (size or 0) if self._failure is not None else super().truncate(size)
         except OSError as error:
@@ -195,7 +195,7 @@ class _PatientFile(FileIO):
 
 
 def seal(path: Path) -> None:
-    """Write the hash of a file's bytes after the seal into the seal."""
+    """Write the seal of a file: the hash of all bytes after the seal."""
     with path.open("r+b") as file:
         text = _seal_of(file)
         file.seek(0)
@@ -203,7 +203,7 @@ def seal(path: Path) -> None:
 
 
 def read_seal(path: Path) -> bytes:
-    """Return the seal of a file, which tells it from every other file; it is not verified.
+    """Return the seal of a file, which identifies its content; the seal is not verified.
 
     Raises:
         DataError: If the file cannot be read.
@@ -217,10 +217,10 @@ def read_seal(path: Path) -> bytes:
 
 
 def refuse_broken_seal(path: Path, what: str = "shard") -> None:
-    """Refuse a sealed file in which any bit has changed.
+    """Raise an error if any bit of a sealed file has changed.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
         what: What the file is, for the error message.
 
     Raises:
@@ -251,13 +251,13 @@ def sync_and_rename(temporary: Path, path: Path) -> None:
 
 
 def temporary_name(path: Path) -> Path:
-    """Return a name beside a file under which it may be written, unlike any other process's."""
+    """Return a temporary name for a file, in the same folder; no other process uses this name."""
     writer = f"{host_label()}~{os.getpid()}~{secrets.token_hex(6)}"
     return path.with_name(f".{path.name}.{writer}{TEMPORARY_SUFFIX}")
 
 
 def is_temporary_of(temporary: str, name: str) -> bool:
-    """Return whether a name is one that `temporary_name` gives for a file of another name."""
+    """Return whether a name is a result of `temporary_name` for a file of a given name."""
     prefix = f".{name}"
     return (
         temporary.startswith(prefix)
@@ -277,15 +277,15 @@ def probe_folder(folder: Path) -> None:
 
 
 def open_own(path: Path, flags: int) -> int:
-    """Open a file to write it in place; return its descriptor. No link is followed.
+    """Open a file to write it in place, without following links; return its descriptor.
 
     Args:
-        path: Of the file.
-        flags: As for `os.open`; a new file has the rights that the umask leaves.
+        path: Path of the file.
+        flags: As for `os.open`; a new file gets the permissions that the umask allows.
 
     Raises:
-        OSError: If it cannot be opened.
-        DataError: If it is a link, has another name elsewhere, or is no plain file.
+        OSError: If the file cannot be opened.
+        DataError: If the path is a link, or the file has another name elsewhere or is not regular.
     """
     refusal = DataError(f"{path}: must be a file of its own, got a link or no file")
     try:
@@ -305,7 +305,7 @@ def open_own(path: Path, flags: int) -> int:
 def stale_temporary(out: Path) -> Iterator[Path]:
     """Yield the temporary files of dead processes in a dataset's directory.
 
-    Whether another machine's process still runs is unknown: its files count when they are old.
+    It is unknown whether another machine's process still runs, so its files count if they are old.
     """
     return (path for path in _temporary_files(out) if _is_stale(path))
 
@@ -339,7 +339,7 @@ def _is_stale(path: Path) -> bool:
 def _remove(path: Path) -> bool:
     try:
         if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)  # of `atomic_folder`
+            shutil.rmtree(path)  # from `atomic_folder`
         else:
             path.unlink()
     except FileNotFoundError:
@@ -349,7 +349,7 @@ def _remove(path: Path) -> bool:
 
 @contextmanager
 def disk_full_named(out: Path) -> Iterator[None]:
-    """Turn the system's errors of a full disk, within the block, into one clear error.
+    """Convert the system's errors of a full disk, within the block, to one clear error.
 
     Raises:
         DiskFullError: If there is no room for what the block writes.
@@ -366,7 +366,7 @@ def disk_full_named(out: Path) -> Iterator[None]:
 
 
 def _is_no_room(error: BaseException) -> bool:
-    # HDF5 gives the error number only within its own text.
+    # HDF5 has the error number only in its message.
     text = str(error)
     return getattr(error, "errno", None) in _NO_ROOM or any(
         f"errno = {number}," in text or os.strerror(number) in text for number in _NO_ROOM
@@ -383,13 +383,13 @@ def sync(path: Path) -> None:
 
 
 def lock_file(file: IO[bytes]) -> bool | None:
-    """Take the kernel's lock on an open file, which it frees when this process closes it or dies.
+    """Take the kernel's lock on an open file; it is freed when this process closes it or dies.
 
     Args:
-        file: Open for writing; NFS locks no other.
+        file: File that is open for writing, since NFS locks no other files.
 
     Returns:
-        Whether it is ours now; None where the file system knows no locks.
+        Whether this process now has the lock; None if the file system does not support locks.
     """
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -402,12 +402,12 @@ def lock_file(file: IO[bytes]) -> bool | None:
 
 @contextmanager
 def replaced_together(folder: Path) -> Iterator[Callable[[str], Path]]:
-    """Yield a function that gives the path under which to write a file; it takes its name.
+    """Yield a function from a file's name to the path under which to write the file.
 
-    The files appear in the folder when the block ends well. One process at a time may do this.
+    The files appear in the folder if the block succeeds. Only one process at a time may do this.
 
     Args:
-        folder: Of the files.
+        folder: Folder of the files.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written; the old files stay.
@@ -421,13 +421,13 @@ def replaced_together(folder: Path) -> Iterator[Callable[[str], Path]]:
     try:
         yield begin
 
-        # On the disk before the list is, or a power cut could leave a list of empty files.
+        # Sync the files before the list is written: a power cut could else leave empty files.
         for path in temporary.values():
             sync(path)
         listed = {name: path.name for name, path in temporary.items()}
         write_atomic(folder / LIST_NAME, json.dumps(listed, indent=1).encode() + b"\n")
     except BaseException:
-        # The list first: a list of files that are gone must not stay.
+        # Remove the list first: a list of missing files must not stay.
         for path in (folder / LIST_NAME, *temporary.values()):
             path.unlink(missing_ok=True)
         raise
@@ -438,7 +438,7 @@ def complete_replacement(folder: Path) -> bool:
     """Give the files in a folder's list their names; return whether there was a list.
 
     Raises:
-        DataError: If the list is of something else.
+        DataError: If the file is not a list of files that are being replaced.
         OSError: If the folder cannot be written.
     """
     path = folder / LIST_NAME
@@ -447,7 +447,7 @@ def complete_replacement(folder: Path) -> bool:
     except FileNotFoundError:
         return False
 
-    # What is no longer there has its name already.
+    # A file that no longer exists under its temporary name already has its name.
     for name, temporary in listed.items():
         new = folder / temporary
         try:
@@ -464,10 +464,10 @@ def complete_replacement(folder: Path) -> bool:
 
 
 def refuse_half_replaced(folder: Path) -> None:
-    """Refuse to read in a folder some of whose files are old and some new.
+    """Raise an error if some files of a folder are old and others new.
 
     Raises:
-        DataError: If the list stays for `PATIENCE`: the process that wrote it is dead.
+        DataError: If the list is still there after `PATIENCE`: the process that wrote it is dead.
     """
     end = time.monotonic() + PATIENCE
     while (folder / LIST_NAME).exists():
@@ -480,11 +480,11 @@ def refuse_half_replaced(folder: Path) -> None:
 
 
 def _read_list(path: Path) -> dict[str, str]:
-    """Return the names in the folder by which names they shall get.
+    """Return the temporary name of each file in a list, by the name that the file shall get.
 
     Raises:
         FileNotFoundError: If there is no list.
-        DataError: If it names anything but files of its folder that were written for it.
+        DataError: If it names anything except files of its folder that were written for it.
     """
     try:
         content = read_json(path)

@@ -1,34 +1,34 @@
-"""A work unit's journal: the step that runs now, so that we know in which step a process died.
+"""A work unit's journal: it records the current step, so that we know in which step a process died.
 
 While a unit runs, a small file beside its shard names the current step: building the scene, an
 attempt, rendering its images. Each step overwrites one record of fixed size. A native crash and a
-step that passes its time limit leave a mark behind the record, which Python's `faulthandler`
-writes without the interpreter; SIGKILL leaves none. The file is removed when the unit is done. A
-file that is there when a unit starts shows that an earlier run died, and in which step:
+step that exceeds its time limit leave a mark after the record, which Python's `faulthandler` writes
+without the interpreter; SIGKILL leaves none. The file is removed when the unit is done. A file that
+exists when a unit starts shows that an earlier run died, and in which step:
 
-* a step that passed its time limit `HUNG_DEATHS` times in a row is not tried again;
+* a step that exceeded its time limit `HUNG_DEATHS` times in a row is not tried again;
 * a step in which the process crashed `NATIVE_DEATHS` times in a row is not tried again;
-* a step in which the process vanished `SILENT_DEATHS` times in a row (the kernel or the nanny
-  kills a process that takes too much memory) is not tried again; a mesh that is prepared has fewer
-  chances, `PREPARE_DEATHS`, because each of them takes longer.
+* a step in which the process vanished `SILENT_DEATHS` times in a row (the kernel or the nanny kills
+  a process that takes too much memory) is not tried again; preparing a mesh gets fewer tries,
+  `PREPARE_DEATHS`, because each of them takes longer.
 
 Unresolved steps, in which a process died but not often enough, run first: a failing step then costs
-a start of the process and not the whole unit, and a step that passes is cleared. A process must
-vanish eight times in a row in the very same step: a machine that is switched off, or a random
-SIGKILL, does not do that.
+one start of the process instead of the whole unit, and a step that succeeds is cleared. A process
+must vanish eight times in a row in the very same step; a machine that is switched off, or a random
+SIGKILL, does not cause that.
 
-The limit of a step is computing time: a process that is suspended, or shares its core with many,
-computes little while hours pass. A step that hangs without computing (it waits for ever) meets a
-limit of wall-clock time that is longer. A long suspension also passes that limit, so a
-step has a second chance.
+The limit of a step is computing time: a process that is suspended, or shares its core with many
+others, computes little while hours pass. A step that hangs without computing (it waits forever)
+exceeds a longer limit of wall-clock time. A long suspension also exceeds that limit, so a step gets
+a second chance.
 
-The file is text: a line of JSON with the unit's identity and the deaths before, the record, and
-what faulthandler wrote.
+The file is text: a line of JSON with the unit's identity and the previous deaths, the record, and
+the output of faulthandler.
 
 Tests cause deaths by the environment variable DRAKEGRASP_TEST_FAULT, which nobody else sets:
 `KIND:OBJECT:CANDIDATE:STANDOFF` for an attempt, `KIND:OBJECT` for preparing an object,
-`KIND:OBJECT:distances` for its distance field, `KIND:OBJECT:predict` for the screen; several
-separated by blanks.
+`KIND:OBJECT:distances` for its distance field, `KIND:OBJECT:predict` for the screen; several faults
+are separated by blanks.
 """
 
 from __future__ import annotations
@@ -51,29 +51,31 @@ from drakegrasp.errors import BlankImageError
 from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
 from drakegrasp.runtime.files import lock_file, temporary_name
 
-#: Crashes in a row in one step after which it is not tried again: one may be the machine's fault.
+#: Number of successive crashes in one step after which the step is not tried again: one crash may
+#: be the machine's fault.
 NATIVE_DEATHS = 2
-#: Passed time limits in a row in one step after which it is not tried again: one may be due to a
-#: process that somebody suspended.
+#: Number of successive exceeded time limits in one step after which the step is not tried again:
+#: one
+#: may be due to a suspended process.
 HUNG_DEATHS = 2
-#: The limit of wall-clock time of a step: this multiple of its limit of computing time, for a
-#: machine that has far more to do than cores, but at most so much more [s].
+#: The wall-clock limit of a step is this multiple of its limit of computing time, for a machine
+#: with far more work than cores, but exceeds it by at most this much [s].
 WALL_FACTOR, WALL_SECONDS = 10.0, 3600.0
-#: Deaths without a mark in a row in one step after which it is not tried again.
+#: Number of successive deaths without a mark in one step after which the step is not tried again.
 SILENT_DEATHS = 8
-#: The same for preparing a mesh, which is one step.
+#: The same number for preparing a mesh, which is one step.
 PREPARE_DEATHS = 5
-#: Deaths of a unit since the last verdict after which it is in a crash loop.
+#: Number of deaths of a unit since the last verdict after which it is in a crash loop.
 GIVE_UP_DEATHS = 20
-#: Bytes of the record.
+#: Size of the record [bytes].
 _RECORD_SIZE = 32
-#: How the text of faulthandler begins, for a crash and for a passed limit of either time.
+#: Beginnings of faulthandler's text for a crash, and for an exceeded limit of either time.
 _CRASH_MARK, _TIME_MARKS = b"Fatal Python error", (b"Timeout (", b"hread 0x")
-#: How the names of steps that are attempts begin; the step that prepares a mesh.
+#: Beginning of the names of steps that are attempts; name of the step that prepares a mesh.
 ATTEMPT, PREPARE = "try", "prepare"
-#: What the record says before the first step.
+#: Step in the record before the first step.
 _START = "start"
-#: Names the deaths that a test wants.
+#: Variable that specifies the deaths that a test requests.
 VARIABLE = "DRAKEGRASP_TEST_FAULT"
 
 
@@ -87,12 +89,12 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Deaths:
-    """Deaths in a row in one step.
+    """Successive deaths in one step.
 
     Attributes:
         native: Number of crashes.
         silent: Number of deaths without a mark.
-        hung: Number of passed time limits.
+        hung: Number of exceeded time limits.
     """
 
     native: int = 0
@@ -105,7 +107,7 @@ class _History:
     """How earlier runs of a unit died.
 
     Attributes:
-        deaths: By step.
+        deaths: Deaths by step.
         crash_loop: Number of deaths since the last verdict.
     """
 
@@ -118,7 +120,7 @@ class _History:
             return Verdict.HUNG
         if deaths.native >= NATIVE_DEATHS:
             return Verdict.CRASHED
-        # Before its first step a process dies of nothing that the unit does.
+        # A process that dies before its first step does not die because of the unit.
         most = PREPARE_DEATHS if step == PREPARE else SILENT_DEATHS
         return Verdict.VANISHED if deaths.silent >= most and step != _START else None
 
@@ -126,12 +128,13 @@ class _History:
         return [step for step in self.deaths if self.verdict(step) is None]
 
     def add(self, step: str, passed: int, marks: bytes) -> None:
-        """Add that a run died in a step.
+        """Record that a run died in a step.
 
         Args:
             step: The step.
-            passed: Bit i says that the i-th unresolved step ran well; it is cleared.
-            marks: What faulthandler wrote.
+            passed: Mask of the unresolved steps that succeeded, bit i for the i-th; these are
+                cleared.
+            marks: Output of faulthandler.
         """
         for i, cleared in enumerate(self.unresolved()):
             if passed >> i & 1:
@@ -156,16 +159,16 @@ class Journal:
 
     @property
     def unresolved(self) -> list[str]:
-        """The steps in which a process died without a verdict yet; run these first, in order."""
+        """Steps in which a process died, still without a verdict; run these first, in order."""
         return self._history.unresolved()
 
     @property
     def in_crash_loop(self) -> bool:
-        """Whether the unit died again and again without a verdict on any step."""
+        """Whether the unit died many times without a verdict on any step."""
         return self._history.crash_loop >= GIVE_UP_DEATHS
 
     def verdict(self, step: str) -> Verdict | None:
-        """Return why a step must not be tried again, or None if it may."""
+        """Return why a step must not be tried again; None if it may be tried."""
         return self._history.verdict(step)
 
     @contextmanager
@@ -174,14 +177,15 @@ class Journal:
 
         Args:
             name: Name of the step, up to 14 ASCII characters.
-            seconds: Computing time [s] after which this process ends itself, wherever it is, and
-                after `wall_limit` of it by the wall clock; None for a step that cannot hang.
+            seconds: Computing time [s] after which this process ends itself, whatever it is doing;
+                it also ends after `wall_limit` of this by the wall clock. None for a step that
+                cannot hang.
         """
         if self._file is None:
             yield
             return
 
-        # Before the step: its record, and an alarm.
+        # Before the step: write its record, and set an alarm.
         os.pwrite(self._file.fileno(), _record(name, self._passed), self._start)
         if seconds is not None:
             # Both alarms are in C: they also end a process that never returns to Python.
@@ -190,36 +194,36 @@ class Journal:
         try:
             yield
         except MemoryError:
-            # End as if the kernel had killed it: a new process starts with free memory.
+            # End as if the kernel had killed the process: a new one starts with free memory.
             os._exit(1)
         finally:
             if seconds is not None:
                 signal.setitimer(signal.ITIMER_PROF, 0.0)
                 faulthandler.cancel_dump_traceback_later()
 
-        # The next record clears it.
+        # The next record clears the step.
         if name in self.unresolved:
             self._passed |= 1 << self.unresolved.index(name)
 
 
 def wall_limit(seconds: float) -> float:
-    """Return the limit of wall-clock time [s] of a step with a limit of computing time [s]."""
+    """Return the wall-clock limit [s] of a step with a limit of computing time [s]."""
     return min(WALL_FACTOR * seconds, seconds + WALL_SECONDS)
 
 
-#: The journal of a process that is not started again when it dies: it records nothing.
+#: The journal of a process that is not restarted when it dies: it records nothing.
 NO_JOURNAL = Journal(None, 0, _History())
 
 
 @contextmanager
 def open_journal(path: Path, identity: Mapping[str, Any]) -> Iterator[Journal]:
-    """Keep a journal while the block runs, with what is known of earlier runs that died.
+    """Keep a journal while the block runs, including what is known of earlier runs that died.
 
-    It is removed when the block ends, also by an exception, because the caller then learns how
+    It is removed when the block ends, even with an exception, because the caller then learns how
     the unit ended. Only a death leaves the journal behind.
 
     Args:
-        path: Of the journal.
+        path: Path of the journal.
         identity: Identifies the unit, as JSON types; a journal of another unit is ignored.
 
     Raises:
@@ -228,11 +232,11 @@ def open_journal(path: Path, identity: Mapping[str, Any]) -> Iterator[Journal]:
     path.parent.mkdir(parents=True, exist_ok=True)
     history = _read_history(path, identity)
     if history is None:
-        # Another process runs this unit as well: both will write the same shard.
+        # Another process also runs this unit: both will write the same shard.
         yield NO_JOURNAL
         return
 
-    # The first line is what is known; the record and faulthandler's text follow.
+    # The first line has the history; the record and faulthandler's text follow.
     line = json.dumps(
         {
             "unit": dict(identity),
@@ -243,8 +247,8 @@ def open_journal(path: Path, identity: Mapping[str, Any]) -> Iterator[Journal]:
     ).encode()
     start = len(line) + 1
 
-    # The file gets its name when it is complete and locked. Not `atomic_path`: it stays open and is
-    # not synced.
+    # The file gets its name when it is complete and locked. This is not `atomic_path`, since the
+    # file stays open and is not synced.
     temporary = temporary_name(path)
     try:
         temporary.write_bytes(line + b"\n" + _record(_START, 0))
@@ -264,14 +268,14 @@ def _record(step: str, passed: int) -> bytes:
 
 
 def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
-    """Return how earlier runs died, or None if one of them is still alive."""
+    """Return how earlier runs died, or None if one of them is still running."""
     history = _History()
     if path.is_symlink():
         return history  # it will be replaced
     try:
         refuse_irregular(path, LARGEST_TEXT)
         with path.open("r+b") as file:  # NFS locks only files that are open for writing
-            # On a file system without locks (None) nobody is known to hold one.
+            # On a file system without locks (None), nobody is known to hold a lock.
             if lock_file(file) is False:
                 return None
             head, _, rest = file.read().partition(b"\n")
@@ -286,16 +290,16 @@ def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
     except FileNotFoundError:
         return _History()
     except (KeyError, TypeError, ValueError):
-        return _History()  # this version did not write it
+        return _History()  # another version wrote the file
     return history
 
 
 @contextmanager
 def _crashes_marked(file: FileIO) -> Iterator[None]:
-    """Write native crashes and passed limits of this process to a file while the block runs."""
+    """Mark native crashes and exceeded limits of this process in a file while the block runs."""
     before = faulthandler.is_enabled()
     faulthandler.enable(file=file, all_threads=False)
-    # The alarm of computing time: a mark in the file, then the signal's own effect, the end.
+    # The alarm of computing time: it writes a mark to the file, then the signal ends the process.
     faulthandler.register(signal.SIGPROF, file=file, all_threads=True, chain=True)
     try:
         yield
@@ -303,15 +307,15 @@ def _crashes_marked(file: FileIO) -> Iterator[None]:
         faulthandler.unregister(signal.SIGPROF)
         faulthandler.disable()
         if before and sys.__stderr__ is not None:
-            with suppress(OSError, ValueError):  # stderr may be no real file
+            with suppress(OSError, ValueError):  # stderr may not be a real file
                 faulthandler.enable(file=sys.__stderr__)
 
 
 def inject_fault(*place: str | int) -> None:
-    """Cause the fault that the environment asks for at a place, if any.
+    """Cause the fault that the environment requests at a place, if any.
 
     Args:
-        place: An object's name; for an attempt also its candidate and its standoff, for other
+        place: An object's name; for an attempt also its candidate and its stand-off, for other
             steps what they do.
 
     Raises:

@@ -1,8 +1,8 @@
-"""Pickled dictionaries of strangers, read without running anything.
+"""Pickled dictionaries from untrusted sources, read without running any code.
 
 In: a .npy file whose one element is a Python object, as DexGraspBench writes them. Out: the object,
-if it is made of dictionaries, lists, texts, numbers and NumPy arrays; anything else is refused
-before it is made.
+if it consists of dictionaries, lists, texts, numbers and NumPy arrays; anything else is rejected
+before it is created.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ import numpy as np
 
 from drakegrasp.errors import GraspError, one_line
 
-#: Files of grasps are smaller [bytes].
+#: Maximum size of a file of grasps [bytes].
 MOST_BYTES = 64_000_000
-#: The types of an array: floats, integers, booleans and texts, as NumPy's pickles name them.
+#: Types of an array: floats, integers, booleans and texts, as NumPy's pickles name them.
 _CODE = re.compile(r"f[248]|[iu][1248]|b1|[US][1-9][0-9]{0,6}|O8?")
 
 
 class _StandIn:
-    """What a pickle gets for a name of NumPy's: a call of ours, whose attributes it cannot set."""
+    """What a pickle gets for a NumPy name: a function of ours whose attributes it cannot set."""
 
     def __init__(self, make: Callable[..., Any]) -> None:
         self._make = make
@@ -39,7 +39,7 @@ class _StandIn:
 
 
 class _Type:
-    """A type of an array; NumPy's own would take fields and flags that make pointers of bytes."""
+    """Type of an array; NumPy's own would accept fields and flags that make pointers of bytes."""
 
     def __init__(self, code: Any, *_: Any) -> None:
         if not isinstance(code, str) or not _CODE.fullmatch(code):
@@ -55,7 +55,7 @@ class _Type:
 
 
 class _Array:
-    """An array to be: NumPy's pickles make it first and say later what is in it."""
+    """A future array: NumPy's pickles create it first and specify its content later."""
 
     def __init__(self, *_: Any) -> None:
         self.parts: tuple[Any, ...] = ()
@@ -65,7 +65,7 @@ class _Array:
 
 
 def _buffered(data: Any, kind: Any, shape: Any, order: Any, *_: Any) -> _Array:
-    """Stand in for `_frombuffer` of NumPy, by which pickles of protocol 5 make arrays."""
+    """Replacement of NumPy's `_frombuffer`, with which pickles of protocol 5 create arrays."""
     if order not in ("C", "F"):
         raise ValueError(f"order of an array must be C or F, got {order!r}")
     array = _Array()
@@ -74,7 +74,7 @@ def _buffered(data: Any, kind: Any, shape: Any, order: Any, *_: Any) -> _Array:
 
 
 def _array(shape: Any, kind: Any, fortran: Any, data: Any) -> np.ndarray:
-    """Return an array of which each byte is in the file."""
+    """Return an array all of whose bytes are in the file."""
     shape = shape if isinstance(shape, tuple) else (shape,)
     if not isinstance(kind, _Type) or not all(type(n) is int and n >= 0 for n in shape):
         raise ValueError("an array must have a shape and a type")
@@ -90,7 +90,7 @@ def _array(shape: Any, kind: Any, fortran: Any, data: Any) -> np.ndarray:
     array = np.frombuffer(bytes(data), kind.dtype) if data else np.empty(0, kind.dtype)
     array = array.reshape(shape, order="F" if fortran else "C").copy(order="K")
     if array.dtype.kind == "U":
-        array.tolist()  # raises where a number is no character
+        array.tolist()  # raises an error if a number is not a character
     return array
 
 
@@ -101,13 +101,13 @@ def _scalar(kind: Any, data: Any) -> Any:
 
 
 def _encode(text: Any, encoding: Any) -> bytes:
-    """Stand in for `_codecs.encode`, by which old protocols write bytes; others run zlib."""
+    """Replacement of `_codecs.encode`, with which old protocols write bytes; others run zlib."""
     if encoding != "latin1" or not isinstance(text, str):
         raise pickle.UnpicklingError(f"_codecs.encode to {str(encoding)[:40]!r}")
     return text.encode("latin1")
 
 
-#: All that a pickle of NumPy arrays, of NumPy 1 or 2, needs by name. None of it is NumPy's own.
+#: All names that a pickle of arrays of NumPy 1 or 2 needs. No value is NumPy's own.
 _ALLOWED = {
     ("numpy", "ndarray"): _StandIn(_Array),
     ("numpy", "dtype"): _StandIn(_Type),
@@ -125,7 +125,7 @@ _ALLOWED = {
 
 
 class _PlainUnpickler(pickle.Unpickler):
-    """Refuses every name but those of NumPy's arrays, and calls stand-ins for these."""
+    """Rejects every name except those of NumPy's arrays, and calls replacements for these."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _ALLOWED:
@@ -134,7 +134,7 @@ class _PlainUnpickler(pickle.Unpickler):
 
 
 def _plain(value: Any, made: dict[int, Any]) -> Any:
-    """Return a value with its arrays made; what the pickle has once is made once."""
+    """Return a value with its arrays created; an object shared in the pickle is created once."""
     if value is None or isinstance(value, str | bytes | bytearray | int | float | np.generic):
         return value
     if id(value) not in made:
@@ -152,11 +152,11 @@ def _plain(value: Any, made: dict[int, Any]) -> Any:
 
 
 def read_plain_pickle(path: Path) -> Any:
-    """Return the object of a .npy file that holds one.
+    """Return the object of a .npy file that contains one object.
 
     Raises:
-        GraspError: If the file is not one, is too large, or its object is of anything but plain
-            values.
+        GraspError: If the file is not such a file, is too large, or its object contains anything
+            but plain values.
     """
     try:
         with path.open("rb") as file:
@@ -164,7 +164,7 @@ def read_plain_pickle(path: Path) -> Any:
         if len(data) > MOST_BYTES:
             raise GraspError(f"{path}: must be at most {MOST_BYTES:,} bytes, got more")
 
-        # One element, and that a Python object.
+        # The file must have one element, which is a Python object.
         stream = io.BytesIO(data)
         shape, dtype = npy_header(stream)
         if dtype.hasobject and shape == ():

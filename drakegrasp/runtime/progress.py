@@ -21,25 +21,26 @@ from rich.progress import (
 from rich.table import Column
 from rich.text import Text
 
-#: Window of the speed estimate [s]: a task may take a minute, and workers come and go.
+#: Window of the speed estimate [s]: a task may take a minute, and the number of workers changes.
 SPEED_SECONDS = 600.0
-#: Width of a terminal from which the figures fit on the same line [characters].
+#: Width of a terminal [characters] from which on the figures fit on the same line.
 ONE_LINE = 150
-#: Width of everything but the bar, and the least and the largest width of the bar [characters].
+#: Width of everything except the bar, and the smallest and largest width of the bar [characters].
 _BESIDES_BAR, _LEAST_BAR, _MOST_BAR = 70, 6, 24
 
 
 class Report(Protocol):
-    """Called by long work to report its progress."""
+    """Called by long computations to report their progress."""
 
     def __call__(self, done: int, total: int, *, found: int = 0, **figures: int) -> None:
         """Report that `done` of `total` steps are done.
 
         Args:
-            done: Number of steps that are done.
+            done: Number of finished steps.
             total: Number of all steps.
-            found: Number of those in `done` that were done before; they do not count as speed.
-            figures: More numbers to show, by what they count.
+            found: Number of steps in `done` that were already done; they do not count for the
+                speed.
+            figures: Further numbers to show, by the name of what they count.
         """
 
 
@@ -98,7 +99,7 @@ def _text(template: str) -> TextColumn:
 def progress_bar(title: str, unit: str, *, show: bool = True) -> Iterator[Report]:
     """Show a progress bar on standard error while the block runs; yield its `Report`.
 
-    Where standard error is no terminal only the last state is printed: logs stay short.
+    If standard error is not a terminal, only the last state is printed, so logs stay short.
     """
     if not show:
         yield silent
@@ -110,9 +111,9 @@ def progress_bar(title: str, unit: str, *, show: bool = True) -> Iterator[Report
 
     def report(done: int, total: int, *, found: int = 0, **figures: int) -> None:
         nonlocal before
-        bar.start()  # not before: an error before the first report is then the only output
+        bar.start()  # not earlier: so an error before the first report is the only output
         text = " ".join(f"{value} {name}" for name, value in figures.items())
-        if found > before:  # the clock starts again: these steps took no time
+        if found > before:  # restart the clock, since these steps took no time
             bar.reset(task, total=total, completed=done, figures=text)
             before = found
         else:
