@@ -1,9 +1,9 @@
 """Links of a hand as bodies of MuJoCo: inertia, collision shapes and their contacts.
 
-In: a hand that Drake has read. Out: bodies, added to a specification; or the hand alone as an MJCF,
-whose world is the palm link: for tools that move the root themselves. In it each joint that a motor
-moves has a position actuator, coupled joints follow. The root has no joint; joints that a preshape
-keeps are none.
+In: a hand that Drake has read. Out: bodies that are added to a specification; or the hand by itself
+as an MJCF whose world is the palm link, for tools that move the root themselves. In this MJCF each
+joint that a motor moves has a position actuator, and coupled joints follow. The root has no joint,
+and the joints of the preshape do not exist.
 """
 
 from __future__ import annotations
@@ -34,24 +34,27 @@ from drakegrasp.hand.parsing import add_model, joint_axis, joint_slides, moving_
 from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.wavefront import hull_text
 
-#: Bytes; only those that are needed are touched. By default MuJoCo takes some 14 MB, and leaves
-#: contacts out where that is too little, as with a hand deep in an object of many convex parts.
+#: Memory of MuJoCo [bytes]; only what is needed is touched. By default MuJoCo takes about 14 MB,
+#: and
+#: leaves contacts out if that is too little, e.g. for a hand deep in an object of many convex
+#: parts.
 MEMORY = 256_000_000
 #: Time step [s].
 TIME_STEP = 0.002
 #: Time constant [s] and damping ratio of contacts, joint limits and couplings: the stiffest that
-#: MuJoCo allows is two steps. Its default of 20 ms lets a finger penetrate by more than 1 mm.
+#: MuJoCo allows is two steps. With its default of 20 ms a finger would penetrate by more than 1 mm.
 STIFF = (2.0 * TIME_STEP, 1.0)
-#: Impedance of joint limits and couplings, near that of a rigid constraint: a finger's limit then
-#: gives way by less than 0.01 degrees under its largest load.
+#: Impedance of joint limits and couplings, close to that of a rigid constraint: a finger's limit
+#: then yields by less than 0.01 degrees under its largest load.
 RIGID = (0.999, 0.9999, 0.001, 0.5, 2.0)
 #: Torsion radius of a fingertip's patch in Drake [m]: the median of 336 patches of the Barrett Hand
 #: on built-in objects (pipelines/measurements/torsion_radius.py).
 TORSION_RADIUS = 0.0029
 
 
-#: A joint of Drake that moves in MuJoCo, the body of its link, and attributes of `add_joint`: its
-#: name, kind and limits, and where it is in the body's frame.
+#: A joint of Drake that moves in MuJoCo, the body of its link, and the arguments of `add_joint`:
+#: its
+#: name, kind and limits, and its position in the body's frame.
 MovingJoint: TypeAlias = tuple[Joint, mujoco.MjsBody, dict[str, Any]]
 
 
@@ -75,16 +78,17 @@ def add_links(
     *,
     touches: tuple[int, int],
 ) -> Iterator[MovingJoint]:
-    """Add the links of a hand; yield each joint that moves, which the caller adds to its body.
+    """Add the links of a hand; yield each moving joint, which the caller adds to its body.
 
-    A joint of the preshape does not exist in MuJoCo: its body stands where the joint would put it.
+    A joint of the preshape does not exist in MuJoCo; its body has the pose that the joint would
+    give it.
 
     Args:
-        spec: To which shapes are added.
+        spec: Specification to which shapes are added.
         hand: The hand.
-        parent: The body to which the palm link is fixed.
-        friction: Coefficient of the hand's contacts.
-        touches: With what its shapes collide: `contype` and `conaffinity`, bits of MuJoCo's masks.
+        parent: Body to which the palm link is fixed.
+        friction: Coefficient of friction of the hand's contacts.
+        touches: `contype` and `conaffinity` of the hand's shapes, bits of MuJoCo's collision masks.
     """
     # Drake reads the model.
     plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
@@ -119,7 +123,7 @@ def add_links(
 
 
 def _fixed_motion(joint: Joint, hand: Hand) -> RigidTransform:
-    """Return the motion of a joint that is fixed, or keeps its position in the hand's preshape."""
+    """Return the motion X_FM of a joint that is fixed, or that the hand's preshape sets."""
     if not moving_joint(joint):
         return joint.X_FM()
     position, axis = hand.preshape.get(joint.name(), 0.0), joint_axis(joint)
@@ -129,7 +133,7 @@ def _fixed_motion(joint: Joint, hand: Hand) -> RigidTransform:
 
 
 def add_couplings(spec: mujoco.MjSpec, hand: Hand) -> None:
-    """Let each coupled joint follow the closing joint of the finger whose motor moves it."""
+    """Couple each coupled joint to the closing joint of the finger whose motor moves it."""
     for i in hand.motor_fingers:
         for coupling in hand.followers(i):
             spec.add_equality(
@@ -151,10 +155,10 @@ def quaternion(R: Array) -> Array:
 
 
 def pair_friction(coefficient: float) -> list[float]:
-    """Return what MuJoCo calls the friction of a geom, for a pair's coefficient of friction.
+    """Return MuJoCo's friction values of a geom for a coefficient of friction of a pair.
 
-    These are the coefficients of sliding and of turning about the normal, and of rolling, which
-    contacts here do not have. That of turning is torque per normal force [m], so it depends on the
+    These are coefficients of sliding, of torsion about the normal, and of rolling, which contacts
+    here do not have. The torsional one is torque per normal force [m], so it depends on the
     coefficient of the pair.
     """
     return [coefficient, coefficient * TORSION_RADIUS, 0.0]
@@ -203,7 +207,7 @@ def _shape(
 ) -> tuple[mujoco.mjtGeom, list[float], str]:
     """Return MuJoCo's kind, size and mesh of a shape of the hand; meshes are added to the model.
 
-    MuJoCo has these primitives as well; the corners of `hand.shapes` only approximate them.
+    MuJoCo has the same primitives, which the corners of `hand.shapes` would only approximate.
     """
     shape, kinds = inspector.GetShape(geometry), mujoco.mjtGeom
     if isinstance(shape, Box):
@@ -221,19 +225,19 @@ def _shape(
 
 
 def set_inertia(body: mujoco.MjsBody, mass: float, com: Array, central: Array) -> None:
-    """Give a body its mass [kg], centre of mass (3,) [m] and central inertia (3, 3) [kg m^2]."""
+    """Set a body's mass [kg], centre of mass (3,) [m] and central inertia (3, 3) [kg m^2]."""
     body.explicitinertial = True
     body.mass, body.ipos = mass, com
     body.fullinertia = central[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
 
-#: Gain [N m/rad] and largest torque [N m] of each motor, damping [N m s/rad] and inertia of rotors
-#: [kg m^2]: those of the Shadow Hand of DexGraspBench (assets/hand/shadow/right_hand.xml). Joints
-#: that slide have them by `description.SLIDE`.
+#: Gain [N m/rad] and maximum torque [N m] of each motor, damping [N m s/rad], and inertia of rotors
+#: [kg m^2]: those of the Shadow Hand of DexGraspBench (assets/hand/shadow/right_hand.xml). For
+#: sliding joints they are converted with `description.SLIDE`.
 GAIN, TORQUE, DAMPING, ARMATURE = 5.0, 3.0, 0.05, 2e-4
-#: Links touch all that has MuJoCo's usual masks, and not each other.
+#: Links touch everything with MuJoCo's default masks, but not each other.
 _TOUCHES = (1, 0)
-#: Friction of a model that is not told another.
+#: Default friction of a model.
 _FRICTION = 1.0
 #: Folder of the meshes, beside the MJCF.
 MESHES = "meshes"
@@ -242,11 +246,11 @@ MESHES = "meshes"
 def make_hand_model(hand: Hand, friction: float = _FRICTION) -> mujoco.MjSpec:
     """Return a hand as a specification of MuJoCo; its assets are the meshes that it names.
 
-    Its joints are in the order of its positions.
+    The joints are in the order of the hand's positions.
 
     Args:
         hand: The hand.
-        friction: Coefficient of its contacts.
+        friction: Coefficient of friction of the hand's contacts.
     """
     spec = mujoco.MjSpec()
     spec.modelname = hand.name
@@ -266,13 +270,14 @@ def make_hand_model(hand: Hand, friction: float = _FRICTION) -> mujoco.MjSpec:
                 forcelimited=True,
                 forcerange=[-TORQUE / unit, TORQUE / unit],
             )
-            # As numbers: the word `position` of a newer MuJoCo is none to the benchmark's.
+            # As numbers, since the benchmark's MuJoCo does not know the word `position` of newer
+            # ones.
             gain = GAIN / unit**2
             motor.biastype = mujoco.mjtBias.mjBIAS_AFFINE
             motor.gainprm[0], motor.biasprm[1] = gain, -gain
     add_couplings(spec, hand)
 
-    # Corners become mesh files, which other tools can read.
+    # Corners are converted to mesh files, which other tools can read.
     texts = {}
     for number, mesh in enumerate(spec.meshes):
         mesh.file = f"link_{number}.obj"

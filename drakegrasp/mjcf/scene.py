@@ -1,8 +1,8 @@
 """Object, table and hand as a model of MuJoCo, for the attempts of a build.
 
-In: a prepared object, a hand and the configuration. Out: a compiled `MujocoScene`. MuJoCo collides
-convex shapes only, so the object is cut into convex parts. Masses, inertias, joints, shapes and
-friction are those that Drake simulates. Needs the extra `[peer]`.
+In: a prepared object, a hand and the configuration. Out: a compiled `MujocoScene`. MuJoCo only
+collides convex shapes, so the object is divided into convex parts. Masses, inertias, joints, shapes
+and friction are those that Drake simulates. Needs the extra `[peer]`.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from drakegrasp.mjcf.links import (
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.files import write_atomic
 
-#: Largest concavity of a convex part over the object's size, the seed, and the largest number of a
-#: part's corners.
+#: Largest concavity of a convex part over the object's size, the seed, and the largest number of
+#: corners of a part.
 SETTINGS = {"threshold": 0.02, "seed": 0, "max_convex_hull": 64}
 
 
@@ -49,11 +49,11 @@ def convex_parts(model: ObjectModel) -> list[Array]:
 
 
 def kept_convex_parts(model: ObjectModel, keep: Path) -> list[Array]:
-    """Return the convex parts of an object, which a folder keeps: cutting takes many seconds.
+    """Return the convex parts of an object, cached in a folder, since dividing takes many seconds.
 
     Args:
         model: The object.
-        keep: The folder, made with the first object. A file that holds no parts is written again.
+        keep: The folder, created with the first object. A file without valid parts is rewritten.
 
     Raises:
         OSError: If the folder cannot be written.
@@ -61,7 +61,7 @@ def kept_convex_parts(model: ObjectModel, keep: Path) -> list[Array]:
     path = keep / f"{_digest(model)}.npz"
     try:
         return _read_parts(path)
-    except Exception:  # missing, or damaged in any way: it can be made again
+    except Exception:  # missing, or damaged in any way: it can be computed again
         parts = convex_parts(model)
 
     # The parts are read in the order in which they are written.
@@ -75,7 +75,7 @@ def _read_parts(path: Path) -> list[Array]:
     """Return the parts in a file.
 
     Raises:
-        Exception: Of any kind, if it is missing or holds something else.
+        Exception: Of any kind, if the file is missing or holds something else.
     """
     with np.load(io.BytesIO(read_content(path)), allow_pickle=False) as content:
         parts = [content[f"arr_{k}"] for k in range(len(content.files))]
@@ -90,7 +90,7 @@ def _is_part(corners: Array) -> bool:
 
 
 def _digest(model: ObjectModel) -> str:
-    """Return 32 hex digits that name all that decides an object's parts."""
+    """Return 32 hex digits that identify everything that determines an object's parts."""
     digest = hashlib.sha256(repr((SETTINGS, metadata.version("coacd"))).encode())
     for array in (model.collision_vertices, model.collision_faces):
         digest.update(repr((array.shape, array.dtype.str)).encode())
@@ -98,17 +98,16 @@ def _digest(model: ObjectModel) -> str:
     return digest.hexdigest()[:32]
 
 
-#: Friction is this much stiffer than the normal direction, and is solved again until it is exact
-#: (`noslip`): MuJoCo's regularized friction lets what is held creep.
+#: Friction is stiffer than the normal direction by this factor, and is solved again until it is
+#: exact (`noslip`): with MuJoCo's regularized friction a held object creeps.
 FRICTION_STIFFNESS, NOSLIP_ITERATIONS = 10.0, 20
-#: Gain of the fingers' speed [N m s/rad]; for those that slide it follows from
-#: `description.SLIDE`.
+#: Gain of the fingers' speed [N m s/rad]; for sliding fingers it follows from `description.SLIDE`.
 FINGER_DAMPING = 5.0
-#: Mass [kg] and inertia [kg m^2] of the bodies that carry the wrist, and a small inertia of the
+#: Mass [kg] and inertia [kg m^2] of the bodies that support the wrist, and a small inertia of the
 #: rotors [kg m^2] that keeps joints stable.
 CARRIER_MASS, CARRIER_INERTIA, ARMATURE = 0.01, 1e-5, 2e-4
-#: Inertia that is added to what no contact may move [kg, kg m^2]: the wrist, which follows its path
-#: exactly, and the object while the hand closes.
+#: Inertia [kg, kg m^2] that is added to bodies that no contact may move: the wrist, which follows
+#: its path exactly, and the object while the hand closes.
 IMMOVABLE = 1e4
 #: Bits of MuJoCo's collision masks.
 _HAND, _OBJECT, _TABLE = 1, 2, 4
@@ -117,11 +116,11 @@ _ON_HAND = (_HAND, _OBJECT | _TABLE)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SpreadJoint:
-    """A joint that an attempt sets and locks: it is no joint of the model, its body is turned.
+    """A joint that an attempt sets and locks: the model has no such joint, but its body is turned.
 
     Attributes:
         body: Name of the body.
-        axis: Of the joint, (3,), unit, in the body's frame.
+        axis: Axis of the joint, (3,), unit, in the body's frame.
         quaternion: Orientation of the body at angle zero, (4,), in its parent's frame.
     """
 
@@ -177,7 +176,7 @@ def _add_table(spec: mujoco.MjSpec, config: Config) -> None:
         friction=pair_friction(config.physics.friction_table),
         solref=STIFF,
         condim=4,
-        # Its friction decides, not the larger one of the pair.
+        # The table's friction is used, not the larger one of the pair.
         priority=1,
     )
 
@@ -239,7 +238,7 @@ def _add_wrist(spec: mujoco.MjSpec) -> mujoco.MjsBody:
 
 
 def _add_drives(spec: mujoco.MjSpec, hand: Hand) -> None:
-    """Add each motor, with a limited torque, and the joints that follow it."""
+    """Add each motor with its limited torque, and the joints that follow the motor."""
     for i in hand.motor_fingers:
         finger, unit = hand.fingers[i], float(hand.closing_unit[i])
         spec.joint(finger.closing_joint).armature = finger.rotor_inertia * finger.gear_ratio**2

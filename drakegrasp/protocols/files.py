@@ -1,8 +1,9 @@
 """Grasps and objects as DexGraspBench stores them.
 
-In: a .npy file with postures and the pose of an object, and the object's folder, which may be a
-stranger's. Out: `StoredGrasps`, the `GraspMotion` of one, and an `ObjectFolder`. Such a file is a
-pickle; only arrays, numbers, texts and containers are read from it, and no code runs.
+In: a .npy file with postures and the pose of an object, and the object's folder, which may come
+from an untrusted source. Out: `StoredGrasps`, the `GraspMotion` of one grasp, and an
+`ObjectFolder`. Such a file is a pickle; only arrays, numbers, texts and containers are read from
+it, and no code is run.
 """
 
 from __future__ import annotations
@@ -24,29 +25,30 @@ from drakegrasp.runtime.plain_pickle import npy_header, read_plain_pickle
 
 #: Keys of the postures, in the order of `GraspMotion`.
 POSTURES = {"pregrasp": "pregrasp_qpos", "grasp": "grasp_qpos", "squeeze": "squeeze_qpos"}
-#: A hand farther from the object is a mistake of units [m].
+#: If the hand is farther from the object than this [m], the units are wrong.
 FAR = 10.0
 _ORIGIN = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StoredGrasps:
-    """The n grasps of a file, on one object, with a hand of m joints.
+    """The n grasps of a file on one object, with a hand of m joints.
 
-    A pose is a position [m] and a quaternion (w, x, y, z); those of hand and object have one frame.
+    A pose is a position [m] and a quaternion (w, x, y, z); the poses of hand and object share a
+    frame.
 
     Attributes:
-        postures: (n, 7 + m), pose of the hand's root and joints, by "grasp", and "pregrasp" and
-            "squeeze" if the file has them.
-        object_pose: (n, 7), of the object; none is the origin.
+        postures: (n, 7 + m), pose of the hand's root and joint positions, by "grasp", and by
+            "pregrasp" and "squeeze" if the file has them.
+        object_pose: (n, 7), pose of the object; the origin if the file has none.
         object_path: Folder of the object.
-        object_scale: (n,), its scale; NaN if the file does not say.
-        joints: (m,), their names; None if the file does not say.
-        exported: Whether drakegrasp wrote the file. Then the object lies on the table, and the rest
-            may be known:
-        hand, preshape: Names; empty if the file does not say.
-        trial_id: The trial that the sample was.
-        start: (m,), the joints from which the fingers closed.
+        object_scale: (n,), scale of the object; NaN if the file does not state it.
+        joints: (m,), names of the joints; None if the file does not state them.
+        exported: Whether drakegrasp wrote the file. Then the object is on the table, and the
+            following values may be known:
+        hand, preshape: Names; empty if the file does not state them.
+        trial_id: Id of the sample's trial.
+        start: (m,), joint positions from which the fingers closed.
         conditions: (3,), friction of hand and table, and mass [kg].
     """
 
@@ -64,7 +66,7 @@ class StoredGrasps:
 
 
 def is_grasp_file(path: Path) -> bool:
-    """Return whether a .npy file holds Python objects, as such files do, and no numbers."""
+    """Return whether a .npy file contains Python objects, as such files do, instead of numbers."""
     try:
         with path.open("rb") as file:
             return bool(npy_header(file)[1].hasobject)
@@ -73,10 +75,10 @@ def is_grasp_file(path: Path) -> bool:
 
 
 def read_grasp_file(path: Path) -> StoredGrasps:
-    """Return the grasps of a file; their numbers may still be none of a grasp.
+    """Return the grasps of a file; their numbers may still be invalid.
 
     Raises:
-        DataError: If the file has none.
+        DataError: If the file does not contain grasps.
     """
     content = read_dictionary(path)
     for key in ("grasp_qpos", "obj_path"):
@@ -87,7 +89,7 @@ def read_grasp_file(path: Path) -> StoredGrasps:
     if any(each.shape != grasp.shape for each in postures.values()):
         raise DataError("the postures must have equal lengths")
 
-    # Of the object.
+    # Pose and scale of the object.
     count = len(grasp)
     poses = _rows({"obj_pose": _ORIGIN, **content}, "obj_pose")
     if poses.shape not in ((1, 7), (count, 7)):
@@ -107,7 +109,7 @@ def read_grasp_file(path: Path) -> StoredGrasps:
 
 
 def _of_export(content: Mapping[str, Any], joints: int) -> dict[str, Any]:
-    """Return what a file of ours says of its sample, as far as it does."""
+    """Return what an exported file of ours states about its sample."""
     found: dict[str, Any] = {n: str(content[n]) for n in ("hand", "preshape") if n in content}
     if "trial_id" in content:
         trial = content["trial_id"]
@@ -126,7 +128,7 @@ def one_motion(grasps: StoredGrasps) -> GraspMotion:
     """Return the motion of the one grasp of a file.
 
     Raises:
-        DataError: If there are more, a posture is missing, or the numbers cannot be a grasp's.
+        DataError: If there are several grasps, a posture is missing, or the numbers are not valid.
     """
     if len(grasps.object_pose) != 1:
         raise DataError(f"grasp_qpos must be a vector, got {len(grasps.object_pose)} of them")
@@ -140,10 +142,10 @@ def one_motion(grasps: StoredGrasps) -> GraspMotion:
 
 
 def inner_path(path: str) -> Path:
-    """Return a path that does not leave the folder of the objects.
+    """Return a path that stays within the folder of the objects.
 
     Raises:
-        DataError: If it does.
+        DataError: If the path leaves the folder.
     """
     if Path(path).is_absolute() or ".." in Path(path).parts or "\0" in path:
         raise DataError(f"obj_path must be a path within the folder of the objects, got {path!r}")
@@ -154,7 +156,7 @@ def read_dictionary(path: Path) -> dict[str, Any]:
     """Return the dictionary of a file.
 
     Raises:
-        DataError: If the file has none, or other things than arrays, numbers and texts.
+        DataError: If the file has no dictionary, or anything except arrays, numbers and texts.
     """
     try:
         content = read_plain_pickle(path)
@@ -173,7 +175,7 @@ def _numbers(content: Mapping[str, Any], key: str) -> Array:
 
 
 def _rows(content: Mapping[str, Any], key: str) -> Array:
-    """Return vectors that begin with a pose, (n, 7 or more)."""
+    """Return vectors (n, 7 or more), each of which begins with a pose."""
     rows = np.atleast_2d(_numbers(content, key))
     if rows.ndim != 2 or not len(rows) or rows.shape[1] < 7:
         raise DataError(f"{key} must be rows of 7 numbers or more, got {rows.shape}")
@@ -190,7 +192,7 @@ def _names(value: Any) -> tuple[str, ...] | None:
 
 
 def _unit(vector: Array, key: str) -> Array:
-    """Return a vector whose quaternion is of length 1."""
+    """Return a vector with its quaternion normalised to length 1."""
     if not np.isfinite(vector).all():
         raise DataError(f"{key} must be finite numbers, got others")
     length = np.linalg.norm(vector[3:7])
@@ -199,7 +201,7 @@ def _unit(vector: Array, key: str) -> Array:
     return np.concatenate([vector[:3], vector[3:7] / length, vector[7:]])
 
 
-#: Where the parts and the volume are.
+#: Paths of the parts and of the volume within the folder of an object.
 PARTS, INFO = "urdf/meshes", "info/simplified.json"
 
 
@@ -209,8 +211,8 @@ class ObjectFolder:
 
     Attributes:
         parts: Wavefront files, sorted by name.
-        scale: By which their coordinates are multiplied.
-        volume: Of the scaled object [m^3].
+        scale: Factor by which their coordinates are multiplied.
+        volume: Volume of the scaled object [m^3].
         digest: 16 digits of the SHA-256 of the parts and the volume.
     """
 
@@ -224,8 +226,8 @@ def read_object_folder(folder: Path, scale: float) -> ObjectFolder:
     """Return the object of a folder.
 
     Args:
-        folder: Of DexGraspBench's layout.
-        scale: Of the object.
+        folder: Folder in DexGraspBench's layout.
+        scale: Scale of the object.
 
     Raises:
         DataError: If the folder has no parts, or its volume cannot be read.
@@ -245,7 +247,7 @@ def read_object_folder(folder: Path, scale: float) -> ObjectFolder:
     if not (math.isfinite(unit) and unit > 0.0):
         raise DataError(f"{folder / INFO}: the volume must be positive, got {unit}")
 
-    # What the object is, whatever its folder is called.
+    # The digest identifies the object, whatever the name of its folder.
     text = hashlib.sha256()
     for part in parts:
         text.update(part.read_bytes())

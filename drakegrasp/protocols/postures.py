@@ -1,7 +1,7 @@
 """Verdicts on stored postures under a protocol, one line of JSON each.
 
-In: grasp files of DexGraspBench's format, the MJCF of a hand and a protocol by name. Out: a verdict
-per file, in order. A file that is no grasp has a verdict, too: `invalid`.
+In: grasp files in DexGraspBench's format, the MJCF of a hand, and a protocol by name. Out: one
+verdict per file, in order. A file that is not a valid grasp gets the verdict `invalid`.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ if TYPE_CHECKING:
 
 #: Significant digits of the numbers in JSON.
 DIGITS = 6
-#: Scenes that a process keeps: files of an object follow each other.
+#: Number of scenes that a process caches: files of one object follow each other.
 _SCENES = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class PostureTrials:
-    """What the trials of many files have in common; plain data for any process.
+    """What the trials of many files share; plain data for any process.
 
     Attributes:
-        protocol: Its stored name.
-        code: Text of the file of a user's own protocol.
+        protocol: Stored name of the protocol.
+        code: Text of the file of a user-defined protocol.
         hand: MJCF of the hand.
-        objects: Folder to which the paths of objects in the files are relative.
+        objects: Folder to which the object paths in the files are relative.
     """
 
     protocol: str
@@ -57,34 +57,35 @@ class PostureTrials:
         return found
 
 
-#: What a trial measured, and 16 digits of the SHA-256 of hand and object.
+#: Verdict of a trial, and 16 digits of the SHA-256 of hand and object.
 PostureResult: TypeAlias = tuple[PostureVerdict, dict[str, str]]
 
 
 def verify_postures(
     files: Sequence[Path | str], trials: PostureTrials, execute: Executor = run_here
 ) -> Iterator[PostureResult]:
-    """Yield the verdicts on files, in their order, each with the digests of hand and object.
+    """Yield the verdicts on files in order, each with the digests of hand and object.
 
     Args:
-        files: Of DexGraspBench's format; a text says why a row is not a grasp.
-        trials: From `prepare_trials`.
-        execute: Runs the trials.
+        files: Files in DexGraspBench's format; a text instead of a path says why a row is not a
+            valid grasp.
+        trials: Result of `prepare_trials`.
+        execute: Executor of the trials.
 
     Raises:
         HandError, MeshError, DataError: If the hand or an object cannot be used.
-        ConfigError: If a user's own protocol cannot be run.
+        ConfigError: If a user-defined protocol cannot be run.
     """
     return in_order(execute)(_verify_one, [(path, trials) for path in files])
 
 
 def prepare_trials(name: str, hand: Path, objects: Path) -> PostureTrials:
-    """Return the trials of a protocol; everything but the files is checked here.
+    """Return the trials of a protocol; everything except the files is checked here.
 
     Args:
-        name: Of a protocol in the registry, or `FILE.py:NAME`.
+        name: Name of a protocol in the registry, or `FILE.py:NAME`.
         hand: MJCF of the hand.
-        objects: Folder to which the paths of objects in the files are relative.
+        objects: Folder to which the object paths in the files are relative.
 
     Raises:
         ConfigError: If there is no such protocol, or it does not run in MuJoCo.
@@ -142,12 +143,12 @@ def _scene(
 
 
 def describe(protocol: Protocol, stored: str) -> dict[str, Any]:
-    """Return what a result says of a protocol: name, source and numbers."""
+    """Return the description of a protocol for a result: name, source and numbers."""
     return {"protocol": stored, "source": protocol.source, "numbers": protocol.numbers()}
 
 
 def json_line(index: int, file: Path | str, result: PostureResult, trials: PostureTrials) -> str:
-    """Return a result as a line of strict JSON; what was not measured is null."""
+    """Return a result as a line of strict JSON; values that were not measured are null."""
     verdict, digests = result
     line = {
         "index": index,
@@ -162,12 +163,12 @@ def json_line(index: int, file: Path | str, result: PostureResult, trials: Postu
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what makes a verdict."""
+    """Return the versions of the packages that affect a verdict."""
     return {name: metadata.version(name) for name in ("drakegrasp", "mujoco")}
 
 
 def _plain(value: Any) -> Any:
-    """Return a value of a protocol, which may be a user's own, as one of JSON."""
+    """Return a value of a protocol, possibly a user-defined one, as a JSON value."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, Mapping):

@@ -1,10 +1,11 @@
 """What a protocol is: numbers, their source, and a trial from which a verdict follows.
 
-In: the numbers of a field's benchmark. Out: `MujocoProtocol`, the base of those that run in MuJoCo,
-and of a user's own; the protocols by name. A trial moves the hand through three postures (pregrasp,
-grasp, squeeze), each a `GraspMotion` in the order of the hand's MJCF, and then pushes the object or
-lifts it. MuJoCo is loaded with the scene only: a `scene` here is a `protocols.scene.ProtocolScene`.
-Each class says what a paper would say of it.
+In: the numbers of a benchmark of the field. Out: `MujocoProtocol`, the base class of protocols that
+run in MuJoCo, including user-defined ones; the protocols by name. A trial moves the hand through
+three postures (pregrasp, grasp, squeeze), which form a `GraspMotion` in the joint order of the
+hand's MJCF, and then pushes the object or lifts it. MuJoCo is loaded only with the scene; a `scene`
+here is a `protocols.scene.ProtocolScene`. The docstring of each class describes its protocol as a
+paper would.
 """
 
 from __future__ import annotations
@@ -27,15 +28,15 @@ AXES = ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GraspMotion:
-    """Three postures of a hand with n joints, and where the object is.
+    """Three postures of a hand with n joints, and the pose of the object.
 
     A posture is the pose of the MJCF's root in {W}, as position [m] and quaternion (w, x, y, z),
-    then the joint positions [rad or m] in the order of the MJCF.
+    followed by the joint positions [rad or m] in the order of the MJCF.
 
     Attributes:
-        pregrasp: (7 + n,), where the trial begins.
-        grasp: (7 + n,), where the fingers meet the object.
-        squeeze: (7 + n,), the command with which they press.
+        pregrasp: (7 + n,), posture at the start of the trial.
+        grasp: (7 + n,), posture in which the fingers meet the object.
+        squeeze: (7 + n,), commanded posture with which the fingers press.
         object_pose: (7,), position and quaternion of the object in {W}.
     """
 
@@ -47,16 +48,16 @@ class GraspMotion:
 
 @dataclass(frozen=True, kw_only=True)
 class PostureVerdict:
-    """What a trial measured.
+    """Result and measurements of a trial.
 
     Attributes:
         success: Whether every rule of the protocol is met.
-        reason: "" of a success, else the rule that is not: `penetration` at the start, `moved`,
-            `turned`, `diverged` (the simulation), or `invalid` with what is wrong.
-        moved: Distance of the object from where it should be, when the trial ended [m].
-        turned: Its angle from there [rad].
+        reason: "" for a success, else the rule that is not met: `penetration` at the start,
+            `moved`, `turned`, `diverged` (the simulation), or `invalid` with an explanation.
+        moved: Distance of the object from its goal when the trial ended [m].
+        turned: Angle of the object from its goal [rad].
         penetration: Deepest contact of hand and object at the start [m].
-        push: Number of the push in which the trial ended, None if there was none.
+        push: Number of the push in which the trial ended; None if there was no push.
     """
 
     success: bool
@@ -68,33 +69,35 @@ class PostureVerdict:
 
 
 class MujocoProtocol:
-    """A protocol that runs in MuJoCo; without changes the numbers of DexGraspBench.
+    """A protocol that runs in MuJoCo; unless changed, its numbers are those of DexGraspBench.
 
-    A protocol of your own is a subclass with a name, a source and other numbers, or with another
+    A user-defined protocol is a subclass with a name, a source and other numbers, or with another
     `run`.
 
     Attributes:
-        name: By which it is asked for.
-        source: Where the numbers are from: a repository and its commit, or a paper.
-        mass: Of the object [kg]; None: from its density.
-        density: [kg/m^3], in place of the mass.
+        name: Name of the protocol.
+        source: Source of the numbers: a repository and its commit, or a paper.
+        mass: Mass of the object [kg]; None: from its density.
+        density: Density of the object [kg/m^3], instead of the mass.
         friction: Coefficient of sliding, and torque about the normal per normal force [m].
-        time_step: [s].
-        noslip_iterations, impratio: Of MuJoCo's solver, whose cone is elliptic.
-        solref, solimp: Of the hand's contacts, see MuJoCo's documentation.
-        joint_margin: Distance from a joint's limit at which MuJoCo begins to hold it [rad or m].
-        position_gain, velocity_gain: Of every actuator; those of the MJCF if None.
-        stage: How often the command changes on the way from posture to posture, and the time steps
-            in between.
+        time_step: Time step of the simulation [s].
+        noslip_iterations, impratio: Settings of MuJoCo's solver, whose friction cone is elliptic.
+        solref, solimp: Settings of the hand's contacts, see MuJoCo's documentation.
+        joint_margin: Distance from a joint's limit at which MuJoCo begins to enforce the limit [rad
+            or m].
+        position_gain, velocity_gain: Gains of every actuator; those of the MJCF if None.
+        stage: Number of changes of the command from one posture to the next, and number of time
+            steps after each change.
         acceleration: Force of a push over the object's mass [m/s^2].
-        directions: Of the pushes in {W}, unit vectors.
-        push: How often a push is judged, and the time steps in between; it ends early when the
-            object has gone.
-        lift: By how much the hand is raised [m]; None of a protocol that pushes.
-        max_penetration: Deepest contact allowed at the start, of hand and object and within the
-            hand [m]; None if it is not asked.
-        max_moved: The object must be nearer to where it should be [m].
-        max_turned: Its angle from there must be smaller [rad]; None if it is not asked.
+        directions: Directions of the pushes in {W}, unit vectors.
+        push: Number of times that a push is judged, and number of time steps before each judgement;
+            a push ends early if the object is lost.
+        lift: Height by which the hand is raised [m]; None for a protocol that pushes.
+        max_penetration: Deepest allowed contact at the start, of hand and object and within the
+            hand [m]; None if it is not checked.
+        max_moved: The distance of the object from its goal must be below this [m].
+        max_turned: The angle of the object from its goal must be below this [rad]; None if it is
+            not checked.
     """
 
     simulator = "mujoco"
@@ -121,7 +124,7 @@ class MujocoProtocol:
     max_turned: float | None = float(np.deg2rad(15.0))
 
     def object_mass(self, volume: float) -> float:
-        """Return the mass of an object of a volume [m^3] in [kg]."""
+        """Return the mass [kg] of an object with a given volume [m^3]."""
         return self.density * volume if self.mass is None else self.mass  # type: ignore[operator]
 
     def run(self, scene: Any, motion: GraspMotion) -> PostureVerdict:
@@ -131,7 +134,7 @@ class MujocoProtocol:
             scene: Hand and object with the numbers of this protocol.
             motion: The grasp.
         """
-        # A hand that begins deep in the object, or in itself, has failed.
+        # The grasp fails if the hand starts deep in the object or in itself.
         scene.reset(motion.pregrasp, motion.object_pose)
         penetration, within_hand = scene.penetrations()
         if self.max_penetration is not None and (
@@ -147,7 +150,7 @@ class MujocoProtocol:
         return replace(verdict, penetration=penetration)
 
     def judge_pushes(self, scene: Any, motion: GraspMotion, goal: Array) -> PostureVerdict:
-        """Return the verdict on an object that each push finds as the trial began."""
+        """Return the verdict on an object that starts each push as it started the trial."""
         verdict = PostureVerdict(success=False)
         for number, direction in enumerate(self.directions):
             scene.reset(motion.pregrasp, motion.object_pose)
@@ -161,7 +164,7 @@ class MujocoProtocol:
         return verdict
 
     def judge_lift(self, scene: Any, motion: GraspMotion, goal: Array) -> PostureVerdict:
-        """Return the verdict on an object that weighs from the start and is lifted."""
+        """Return the verdict on an object that has weight from the start and is lifted."""
         raised, height = motion.squeeze.copy(), np.array([0.0, 0.0, self.lift])
         raised[:3] += height
         self.apply(scene, np.array([0.0, 0.0, -1.0]))
@@ -170,7 +173,7 @@ class MujocoProtocol:
         return self.judge(scene, np.concatenate([goal[:3] + height, goal[3:]]))
 
     def squeeze(self, scene: Any, motion: GraspMotion) -> None:
-        """Move the hand from the pregrasp to the grasp and on to the squeeze."""
+        """Move the hand from the pregrasp to the grasp, and then to the squeeze."""
         scene.move(motion.pregrasp, motion.grasp, *self.stage)
         scene.move(motion.grasp, motion.squeeze, *self.stage)
 
@@ -179,7 +182,7 @@ class MujocoProtocol:
         scene.push(self.acceleration * scene.mass * direction)
 
     def judge(self, scene: Any, goal: Array) -> PostureVerdict:
-        """Return the verdict on where the object is now; it should be in a pose (7,)."""
+        """Return the verdict on the current pose of the object; `goal` is the desired pose (7,)."""
         moved, turned = displacement(goal, scene.object_pose())
         reason = ""
         if scene.diverged or not np.isfinite([moved, turned]).all():
@@ -191,7 +194,7 @@ class MujocoProtocol:
         return PostureVerdict(success=not reason, reason=reason, moved=moved, turned=turned)
 
     def numbers(self) -> dict[str, Any]:
-        """Return all numbers by name, for a result."""
+        """Return all numbers of the protocol by name, for a result."""
         names = [n for cls in reversed(type(self).__mro__) for n in inspect.get_annotations(cls)]
         return {n: getattr(self, n) for n in names if n not in ("name", "source")}
 
@@ -199,7 +202,7 @@ class MujocoProtocol:
 def displacement(one: Array, other: Array) -> tuple[float, float]:
     """Return the distance [m] and the angle [rad] between two poses (7,).
 
-    A quaternion that has gone round by a whole turn is one turn away, as in DexGraspBench.
+    A quaternion and its negative are one turn apart, as in DexGraspBench.
     """
     cosine = float(np.clip(one[3:] @ other[3:], -1.0, 1.0))
     return float(np.linalg.norm(other[:3] - one[:3])), 2.0 * float(np.arccos(cosine))
@@ -212,11 +215,11 @@ DEXONOMY = "github JYChen18/Dexonomy, commit d561ff9 (2026-03-26), dexonomy/conf
 class Lift:
     """The object rests on a table under gravity; the hand closes on it and lifts it.
 
-    The fingers close on the object, which is held in place, until they stop. Then it is freed, and
-    the wrist moves on a path of limited speed and acceleration to 0.60 m above the table, where it
-    holds still. The grasp holds if every fingertip still touches the object there and the object
-    does not touch the table. Mass, friction and the lift are those of the configuration, which the
-    result names; by default 1 kg and 0.71.
+    The fingers close on the object, which is held in place, until they stop. Then the object is
+    released, and the wrist moves on a path of limited speed and acceleration to 0.60 m above the
+    table, where it stops. The grasp holds if every fingertip still touches the object there and the
+    object does not touch the table. Mass, friction and the lift are those of the configuration,
+    which the result names; the defaults are 1 kg and 0.71.
     """
 
     simulator = "drake"
@@ -224,7 +227,7 @@ class Lift:
     source = "drakegrasp, docs/explanation/physics.md"
 
     def numbers(self) -> dict[str, Any]:
-        """Return nothing: the numbers are those of the configuration."""
+        """Return nothing, since the numbers are those of the configuration."""
         return {}
 
 
@@ -232,12 +235,12 @@ class DexGraspBench(MujocoProtocol):
     """Pushes along six axes without gravity, of DexGraspBench (BODex, Chen et al., ICRA 2025).
 
     An object of 0.1 kg meets a hand with a coefficient of friction of 0.6 (torsional 0.02) in
-    MuJoCo. The hand is welded to a moving frame, starts in the pregrasp, and goes to the grasp and
-    on to the squeeze in 0.4 s each. Then a force of mass times 10 m/s^2 acts on the object's centre
-    of mass for 2 s, along -x, +x, -y, +y, -z and +z of the world, each from the start anew. The
-    grasp succeeds if the object stays within 5 cm and 15 degrees of its first pose in all six, and
-    no contact at the start is deeper than 1 cm. Gains and force limits are those of the hand's
-    MJCF: 5 N m/rad and 3 N m in the benchmark's.
+    MuJoCo. The hand is welded to a moving frame, starts in the pregrasp, and moves to the grasp and
+    then to the squeeze in 0.4 s each. Then a force of mass times 10 m/s^2 acts on the object's
+    centre of mass for 2 s, along -x, +x, -y, +y, -z and +z of the world; each push begins from the
+    start again. The grasp succeeds if the object stays within 5 cm and 15 degrees of its first pose
+    in all six, and no contact at the start is deeper than 1 cm. Gains and force limits are those of
+    the hand's MJCF; in that of the benchmark they are 5 N m/rad and 3 N m.
     """
 
     name = "dexgraspbench"
@@ -247,10 +250,10 @@ class DexGraspBench(MujocoProtocol):
 class DexGraspBenchTabletop(MujocoProtocol):
     """A lift by 10 cm from a table, of DexGraspBench with `setting=tabletop`.
 
-    As `dexgraspbench`, with a plane at z = 0. A force of mass times 10 m/s^2 along -z acts on the
-    object from the start, while the hand goes from pregrasp to grasp to squeeze and, in another
-    0.4 s, 10 cm up. The grasp succeeds if the object is then within 5 cm and 15 degrees of its
-    first pose raised by 10 cm.
+    As `dexgraspbench`, but with a plane at z = 0. A force of mass times 10 m/s^2 along -z acts on
+    the object from the start, while the hand moves from pregrasp to grasp to squeeze and then, in
+    another 0.4 s, 10 cm up. The grasp succeeds if the object is then within 5 cm and 15 degrees of
+    its first pose raised by 10 cm.
     """
 
     name = "dexgraspbench-tabletop"
@@ -262,13 +265,14 @@ class DexonomyHard(MujocoProtocol):
     """Pushes along six axes with half the friction, of Dexonomy (Chen et al., RSS 2025), `hard`.
 
     An object of 0.1 kg meets a hand with a coefficient of friction of 0.3 (torsional 0.002) in
-    MuJoCo, without iterations against slip and with impratio 1. From pregrasp to grasp to squeeze
-    it takes 0.1 s each. Then the object's weight (9.8 m/s^2) acts at its centre of mass for 2 s,
-    along +x, -x, +y, -y, +z and -z, each from the start anew. The grasp succeeds if the object
-    stays within 5 cm and 15 degrees in all six. How deep the hand begins is not asked.
+    MuJoCo, without noslip iterations and with impratio 1. Each move, from pregrasp to grasp and
+    from grasp to squeeze, takes 0.1 s. Then the object's weight (9.8 m/s^2) acts at its centre of
+    mass for 2 s, along +x, -x, +y, -y, +z and -z; each push begins from the start again. The grasp
+    succeeds if the object stays within 5 cm and 15 degrees in all six. The penetration at the start
+    is not checked.
 
-    These are the numbers of the comment on `hard` in the configuration. The code of the commit
-    halves the friction, but keeps 2 iterations and impratio 10: `dexonomy-hard-as-run`.
+    These are the numbers of the comment on `hard` in the configuration. The code of that commit
+    halves the friction, but keeps 2 noslip iterations and impratio 10: `dexonomy-hard-as-run`.
     """
 
     name = "dexonomy-hard"
@@ -286,14 +290,14 @@ class DexonomyHard(MujocoProtocol):
     max_penetration = None
 
     def apply(self, scene: Any, direction: Array) -> None:
-        """Push with the weight that the model has, where the centre of mass is now."""
+        """Push with the weight of the modelled object, at the present centre of mass."""
         scene.push_where_it_is(self.acceleration * scene.modelled_mass * direction)
 
 
 class DexonomyHardAsRun(DexonomyHard):
-    """`dexonomy-hard` with the solver's settings that the code of the commit has.
+    """`dexonomy-hard` with the solver's settings in the code of the commit.
 
-    2 iterations against slip, and impratio 10.
+    These are 2 noslip iterations and impratio 10.
     """
 
     name = "dexonomy-hard-as-run"
@@ -305,18 +309,20 @@ Protocol = Lift | MujocoProtocol
 
 
 def find_protocol(name: str, code: Mapping[str, str] | None = None) -> tuple[Protocol, str]:
-    """Return a protocol, and the name that a result keeps of it.
+    """Return a protocol, and its name as stored in a result.
 
     Args:
-        name: Of the registry, or `FILE.py:NAME` of a user's own; a subclass of `MujocoProtocol`
-            that is made without arguments.
-        code: Text of the file by stored names, for a worker that has no such file.
+        name: Name in the registry, or `FILE.py:NAME` of a user-defined protocol: a subclass of
+            `MujocoProtocol` whose constructor takes no arguments.
+        code: Text of the file by stored names, for a worker that does not have the file.
 
     Returns:
-        The protocol; and its name, of a user's own with 16 digits of the file's SHA-256.
+        The protocol, and its name; for a user-defined protocol with 16 digits of the file's
+        SHA-256.
 
     Raises:
-        ConfigError: If there is none of that name, or the user's own cannot be imported or made.
+        ConfigError: If the name is unknown, or the user-defined protocol cannot be imported or
+            constructed.
     """
     stored = name
     if ":" not in name:
@@ -325,7 +331,7 @@ def find_protocol(name: str, code: Mapping[str, str] | None = None) -> tuple[Pro
             raise ConfigError(f"protocol must be one of {known}, or FILE.py:NAME, got {name!r}")
         found = registry.find("protocols", name)
     else:
-        # A user's own comes from a file that is given now, never from a dataset.
+        # A user-defined protocol comes from a file that is given now, never from a dataset.
         if code is None:
             stored, text = read_class(name)
             code = {stored: text}

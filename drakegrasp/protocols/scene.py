@@ -1,8 +1,8 @@
 """Hand and object in MuJoCo, with the numbers of a protocol.
 
-In: the MJCF of a hand, an object's convex parts and a protocol. Out: a `ProtocolScene`, which is
-reset, moved, pushed and measured. The hand's root is welded to a body that moves as it is told, as
-DexGraspBench does it (`src/util/hand_util.py`). Needs the extra `[peer]`.
+In: the MJCF of a hand, an object's convex parts and a protocol. Out: a `ProtocolScene`, which can
+be reset, moved, pushed and measured. The hand's root is welded to a body that moves on command, as
+in DexGraspBench (`src/util/hand_util.py`). Needs the extra `[peer]`.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from drakegrasp.mjcf.links import make_spec
 from drakegrasp.protocols.files import ObjectFolder
 from drakegrasp.protocols.protocol import MujocoProtocol
 
-#: Before the names of what comes from the hand's MJCF.
+#: Prefix of the names that come from the hand's MJCF.
 HAND = "hand-"
-#: Impedance of the weld that moves the hand, and where the scale of its torques is in its data.
+#: Impedance of the weld that moves the hand, and index of the scale of its torques in its data.
 _WELD, _TORQUE_SCALE = (0.9, 0.95, 0.001, 0.5, 2.0), 10
-#: Settings of the solver that a protocol has.
+#: Settings of the solver that the protocol determines.
 _SETTINGS = (*("timestep", "integrator", "disableflags", "cone", "noslip_iterations", "impratio"),)
 #: Half extents of the table's plane, which has no edge, and the spacing of its grid.
 _PLANE = (0.0, 0.0, 1.0)
-#: What MuJoCo warns of when it begins again from its rest, or leaves contacts out.
+#: Warnings with which MuJoCo restarts from its rest state, or leaves contacts out.
 _DIVERGED = (
     mujoco.mjtWarning.mjWARN_CONTACTFULL,
     mujoco.mjtWarning.mjWARN_CNSTRFULL,
@@ -42,17 +42,17 @@ class ProtocolScene:
     """A hand of n joints and an object, under a protocol's rules.
 
     Attributes:
-        joints: Number of the hand's joint positions, n.
-        mass: Of the object, as the protocol says [kg].
-        modelled_mass: Of the object in the model [kg]: it differs where parts overlap.
+        joints: Number n of the hand's joint positions.
+        mass: Mass of the object [kg], as the protocol specifies it.
+        modelled_mass: Mass of the object in the model [kg]; it differs if parts overlap.
     """
 
     def __init__(self, protocol: MujocoProtocol, hand: Path, thing: ObjectFolder) -> None:
         """Build the scene.
 
         Args:
-            protocol: The numbers.
-            hand: MJCF of the hand; its world is the hand's root.
+            protocol: The protocol, with its numbers.
+            hand: MJCF of the hand; its world body is the hand's root.
             thing: The object.
 
         Raises:
@@ -71,7 +71,7 @@ class ProtocolScene:
             geom.condim = 4
         spec.add_key()
 
-        # The file names of the object were checked, so what is wrong here is wrong with the hand.
+        # The object's files were checked, so an error here is due to the hand.
         try:
             self._model = spec.compile()
         except ValueError as error:
@@ -83,7 +83,7 @@ class ProtocolScene:
         self._commands = self._command_matrix()
 
     def _command_matrix(self) -> Array:
-        """Return the commands per joint position, (actuators, n)."""
+        """Return the matrix (actuators, n) from joint positions to commands."""
         m, d = self._model, self._data
         mujoco.mj_resetDataKeyframe(m, d, 0)
         mujoco.mj_forward(m, d)
@@ -94,7 +94,7 @@ class ProtocolScene:
         return matrix[:, 6:-6]
 
     def reset(self, posture: Array, object_pose: Array) -> None:
-        """Put hand (7 + n,) and object (7,) at rest in their poses; nothing pushes."""
+        """Place hand (7 + n,) and object (7,) at rest in their poses, without a push."""
         m, d = self._model, self._data
         m.key_qpos[0] = np.concatenate([posture, object_pose])
         m.key_ctrl[0] = self._commands @ posture[7:]
@@ -103,13 +103,13 @@ class ProtocolScene:
         mujoco.mj_forward(m, d)
 
     def move(self, start: Array, end: Array, changes: int, steps: int) -> None:
-        """Command the hand from a posture (7 + n,) to another.
+        """Command the hand from one posture (7 + n,) to another.
 
         Args:
-            start: Where the command begins.
-            end: Where it ends.
-            changes: How often it changes, by equal amounts.
-            steps: Time steps after each change.
+            start: Posture at which the command begins.
+            end: Posture at which the command ends.
+            changes: Number of changes of the command, by equal amounts.
+            steps: Number of time steps after each change.
         """
         shares = np.linspace(0.0, 1.0, changes + 1)
         p = np.linspace(start[:3], end[:3], changes + 1)
@@ -123,7 +123,7 @@ class ProtocolScene:
             self.step(steps)
 
     def step(self, steps: int) -> None:
-        """Simulate time steps."""
+        """Simulate a number of time steps."""
         mujoco.mj_step(self._model, self._data, steps)
 
     @property
@@ -132,13 +132,13 @@ class ProtocolScene:
         return any(self._data.warning[kind].number > 0 for kind in _DIVERGED)
 
     def push(self, force: Array) -> None:
-        """Let a force (3,) [N] act on the object's centre of mass until the next reset."""
+        """Apply a force (3,) [N] at the object's centre of mass until the next reset."""
         self._data.xfrc_applied[self._object, :3] = force
 
     def push_where_it_is(self, force: Array) -> None:
-        """Let a force (3,) [N] act on the point where the centre of mass is now.
+        """Apply a force (3,) [N] at the present position of the centre of mass.
 
-        Its torque about the object's origin stays as it is when the object moves.
+        Its torque about the object's origin does not change when the object moves.
         """
         m, d = self._model, self._data
         d.qfrc_applied[:] = 0.0
@@ -153,7 +153,7 @@ class ProtocolScene:
     def penetrations(self) -> tuple[float, float]:
         """Return the deepest contacts of the object, and of the hand with itself or the table [m].
 
-        Nought where nothing touches.
+        A value is zero if nothing touches.
         """
         bodies, d = self._model.geom_bodyid, self._data
         with_object, others = [0.0], [0.0]
@@ -164,10 +164,10 @@ class ProtocolScene:
 
 
 def _read_hand(path: Path) -> mujoco.MjSpec:
-    """Return the MJCF of a hand, whose meshes have absolute paths.
+    """Return the MJCF of a hand, with absolute paths of its meshes.
 
     Raises:
-        HandError: If it cannot be read.
+        HandError: If the MJCF cannot be read.
     """
     try:
         hand = mujoco.MjSpec.from_file(str(path))
@@ -181,13 +181,13 @@ def _read_hand(path: Path) -> mujoco.MjSpec:
 
 
 def _add_hand(spec: mujoco.MjSpec, protocol: MujocoProtocol, path: Path) -> None:
-    """Add the hand, free in space, and the body that moves it."""
+    """Add the hand, free in space, and the body that moves the hand."""
     hand = _read_hand(path)
-    # The protocol's settings hold, not the file's; MuJoCo warns where the two differ.
+    # The protocol's settings replace those of the file; MuJoCo warns if the two differ.
     for name in _SETTINGS:
         setattr(hand.option, name, getattr(spec.option, name))
 
-    # What the protocol says of contacts, joints and motors.
+    # Settings of the protocol for contacts, joints and motors.
     for geom in hand.geoms:
         geom.solimp[:3], geom.solref[:2] = protocol.solimp, protocol.solref
     for joint in hand.joints if protocol.joint_margin else ():
@@ -220,7 +220,7 @@ def _add_object(spec: mujoco.MjSpec, thing: ObjectFolder, density: float) -> Non
     """Add the object, free in space, as the last body.
 
     Raises:
-        MeshError: If a part is no mesh.
+        MeshError: If a part is not a mesh.
     """
     body = spec.worldbody.add_body(name="object")
     body.add_freejoint(name="obj_freejoint")
@@ -232,7 +232,7 @@ def _add_object(spec: mujoco.MjSpec, thing: ObjectFolder, density: float) -> Non
 
 
 def _refuse_no_mesh(path: Path) -> None:
-    """Refuse a file that MuJoCo cannot read as a mesh."""
+    """Raise an error if MuJoCo cannot read a file as a mesh."""
     alone = mujoco.MjSpec()
     alone.add_mesh(name="part", file=str(path.resolve()))
     alone.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="part")

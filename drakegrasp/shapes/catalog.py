@@ -1,13 +1,13 @@
 """The built-in objects: everyday things of drawn sizes, so that a dataset needs no meshes.
 
 `CLASSES` is the table of 64 classes: a function, and for each of its parameters the range from
-which a value is drawn, a whole number of steps, so a draw is equal on every machine. An object is a
-class, an index from 1 and a seed. Its name is `<number>_<class>_<index>`. The same index and seed
-give the same object, however many others there are. `export_builtin` writes the meshes as Wavefront
-files, the same bytes every time.
+which a value is drawn. Values are whole numbers of steps, so a draw is equal on every machine. An
+object is a class, an index from 1 and a seed; its name is `<number>_<class>_<index>`. The same
+class, index and seed produce the same object, however many other objects there are.
+`export_builtin` writes the meshes as Wavefront files, with the same bytes every time.
 
-Sizes are our own, chosen for a hand of the Barrett's size: it spans 0.24 m and its pads reach
-about 0.11 m ahead of the palm. A class that a smaller hand needs otherwise is a row to copy.
+Sizes are our own, chosen for a hand of the Barrett's size, which spans 0.24 m and whose pads reach
+about 0.11 m ahead of the palm. If a smaller hand needs another size of a class, copy its row.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from drakegrasp.seeding import Stream, object_key
 from drakegrasp.shapes import garden, home, kitchen, toys
 from drakegrasp.shapes.solids import DECIMALS
 
-#: Of the built-in objects, which are part of the package.
+#: Licence of the built-in objects, which are part of the package.
 LICENCE = "BSD-3-Clause"
 
 #: Steps per unit: lengths in 0.1 mm, angles in 0.1 degrees, and whole numbers.
@@ -39,10 +39,10 @@ _STEPS = {"mm": 10, "deg": 10, "-": 1}
 
 @dataclass(frozen=True)
 class Range:
-    """From where to where a parameter is drawn, both ends included.
+    """Range from which a parameter is drawn; both ends are included.
 
     Attributes:
-        low, high: In `unit`.
+        low, high: Ends of the range, in `unit`.
         unit: "mm", "deg", or "-" for a number of pieces.
     """
 
@@ -65,7 +65,7 @@ class Range:
         return f"{self.low:g} to {self.high:g}{unit}"
 
 
-#: Ranges of a length [mm], of an angle [deg], of a number of pieces.
+#: Ranges of a length [mm], of an angle [deg], and of a number of pieces.
 mm, deg, pieces = (partial(Range, unit=unit) for unit in _STEPS)
 
 
@@ -74,9 +74,9 @@ class ObjectClass:
     """A class of built-in objects.
 
     Attributes:
-        number: Its place in the table, from 1.
-        shape: Returns a mesh [m] for values of the parameters; its name is that of the class.
-        parameters: Their ranges, by name.
+        number: Position of the class in the table, from 1.
+        shape: Function from the parameters to a mesh [m]; its name is the name of the class.
+        parameters: Ranges of the parameters, by name.
     """
 
     number: int
@@ -90,7 +90,7 @@ class ObjectClass:
 
     @property
     def meaning(self) -> str:
-        """What the shape is, in words."""
+        """Description of the shape, in words."""
         return (self.shape.__doc__ or "").partition("\n")[0].removeprefix("Return ").rstrip(".")
 
 
@@ -187,8 +187,8 @@ class BuiltinObject:
     """One drawn object.
 
     Attributes:
-        object_class: Its class.
-        index: Its number among the objects of the class, from 1.
+        object_class: Class of the object.
+        index: Number of the object among the objects of the class, from 1.
         seed: Seed of the draw.
     """
 
@@ -213,7 +213,7 @@ class BuiltinObject:
 
 
 def draw_builtin(config: BuiltinConfig | None = None) -> list[BuiltinObject]:
-    """Return the built-in objects of a configuration, the default's if None, class by class."""
+    """Return the built-in objects of a configuration, class by class; the default's if None."""
     config = config or BuiltinConfig()
     return [
         BuiltinObject(object_class=object_class, index=index, seed=config.seed)
@@ -223,7 +223,7 @@ def draw_builtin(config: BuiltinConfig | None = None) -> list[BuiltinObject]:
 
 
 def builtin_object(name: str, *, seed: int = 0) -> BuiltinObject:
-    """Return the built-in object of a name such as "1_mug_2".
+    """Return the built-in object with a name such as "1_mug_2".
 
     Raises:
         MeshError: If there is no such class; the message lists the classes.
@@ -248,18 +248,18 @@ def export_builtin(
     config: BuiltinConfig | None = None,
     progress: Report = silent,
 ) -> list[Path]:
-    """Write built-in objects as `<name>.obj` and return the paths, in the order asked for.
+    """Write built-in objects as `<name>.obj` and return the paths, in the requested order.
 
-    A file appears whole or not at all, and holds the same bytes every time.
+    A file appears completely or not at all, and has the same bytes every time.
 
     Args:
-        directory: Where to write; made if it is missing.
-        names: Which objects; all of the configuration by default.
-        config: How many of each class, and the seed of their sizes; the defaults if None.
-        progress: Is told how many meshes there are.
+        directory: Directory to write to; created if it is missing.
+        names: Names of the objects; all objects of the configuration by default.
+        config: Number of objects of each class, and the seed of their sizes; the defaults if None.
+        progress: Called with the number of written meshes and the number of all meshes.
 
     Raises:
-        MeshError: If a name is unknown; nothing is written then.
+        MeshError: If a name is unknown; then nothing is written.
     """
     # Look up all names before anything is written.
     config = config or BuiltinConfig()
@@ -285,13 +285,13 @@ def builtin_sources(
     progress: Report = silent,
     only: Collection[str] = (),
 ) -> list[MeshSource]:
-    """Return the built-in objects as meshes in a folder, which is made, sorted by name.
+    """Return the built-in objects as meshes in a folder, which is created, sorted by name.
 
     Args:
         folder: The folder.
-        config: How many of each class, and the seed of their sizes.
-        progress: Is told how many meshes there are.
-        only: Names of the objects; all of the configuration if empty.
+        config: Number of objects of each class, and the seed of their sizes.
+        progress: Called with the number of written meshes and the number of all meshes.
+        only: Names of the objects; all objects of the configuration if empty.
     """
     names = sorted(set(only)) or None
     paths = export_builtin(folder, names, config=config, progress=progress)
@@ -300,7 +300,7 @@ def builtin_sources(
 
 
 def wavefront(mesh: trimesh.Trimesh) -> bytes:
-    """Return a mesh as Wavefront text; not trimesh's, which may change by release."""
+    """Return a mesh as Wavefront text; trimesh's own text may differ between its releases."""
     d = DECIMALS
     lines = [f"v {x:.{d}f} {y:.{d}f} {z:.{d}f}" for x, y, z in mesh.vertices.tolist()]
     lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]

@@ -1,7 +1,7 @@
 """Curves in the plane: corners and sizes in metres come in, evenly spaced points go out.
 
-A curve is a polyline. It is a profile (r, z) that `drakegrasp.shapes.solids` turns about z, or an
-outline (x, y) that it moves along a path.
+A curve is a polyline. It is either a profile (r, z) that `drakegrasp.shapes.solids` revolves about
+z, or an outline (x, y) that it moves along a path.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from scipy.interpolate import PchipInterpolator
 from drakegrasp.arithmetic import sin_cos_deg
 from drakegrasp.frames import Array
 
-#: Usual edge length where fingers touch [m]: below the width of a fingertip.
+#: Usual edge length where fingers touch [m], which is below the width of a fingertip.
 EDGE = 0.006
 
-#: Edge lengths of things with many parts, and of large flat sides [m].
+#: Edge lengths of objects with many parts, and of large flat sides [m].
 BROAD, LARGE = 1.3 * EDGE, 1.8 * EDGE
 
-#: Edges inside a cavity or below a foot are longer by this factor: no finger goes there.
+#: Edges inside a cavity or below a foot are longer by this factor, since no finger touches them.
 COARSE = 1.7
 
-#: Possible numbers of points of a ring: few, so that neighbouring rings mostly have the same.
+#: Possible numbers of points of a ring: few, so that neighbouring rings mostly have equal numbers.
 RING_SIZES = np.array([8, 12, 16, 24, 32, 48, 64])
 
-#: A piece of a curve begins where the last one ends if it is as near as that [m].
+#: A piece of a curve starts at the end of the previous piece if they are this close [m].
 MEETS = 1e-9
 
-#: How far from its ends an inset profile starts to follow the given one [m].
+#: Distance from its ends at which an inset profile starts to follow the original profile [m].
 OVERLAP = 0.001
 
 
@@ -46,17 +46,17 @@ def resample(points: npt.ArrayLike, step: float) -> Array:
 
 
 def spaced(step: float, *knots: float) -> Array:
-    """Return numbers (n,) from knot to knot, no more than `step` apart."""
+    """Return numbers (n,) from knot to knot with steps of at most `step`."""
     return resample([[knot] for knot in knots], step)[:, 0]
 
 
 def scaled(shares: npt.ArrayLike, *sizes: float) -> Array:
-    """Return points (n, d) whose coordinates are given as shares of the sizes (d,) [m]."""
+    """Return points (n, d) whose coordinates are given as fractions of the sizes (d,) [m]."""
     return np.asarray(shares, dtype=float) * sizes
 
 
 def joined(*pieces: npt.ArrayLike) -> Array:
-    """Return curves (n, d) as one; where one begins at the end of the last, this point is one."""
+    """Return curves (n, d) as one curve; a common end point of two pieces occurs once."""
     curve = np.asarray(pieces[0], dtype=float)
     for piece in pieces[1:]:
         points = np.asarray(piece, dtype=float)
@@ -85,7 +85,7 @@ def between(knots: npt.ArrayLike, at: npt.ArrayLike) -> Array:
 def inset(side: npt.ArrayLike, distance: float, *, floor: float) -> Array:
     """Return the profile `side` (n, 2) moved inwards by `distance` [m] and cut at z = `floor` [m].
 
-    `side` is a profile (r, z) of rising z. The result ends at the same height.
+    `side` is a profile (r, z) with rising z. The result ends at the same height.
     """
     fine = resample(side, 0.0005)
     height = fine[-1, 1]
@@ -99,13 +99,13 @@ def inset(side: npt.ArrayLike, distance: float, *, floor: float) -> Array:
 
 
 def bevelled(radius: float, height: float, bevel: float) -> list[tuple[float, float]]:
-    """Return corners (r, z) of an upright wall with a bevelled foot and head, off the axis."""
+    """Return the corners (r, z) of an upright wall with bevelled foot and head, off the axis."""
     foot = foot_and_wall(radius, height - bevel, bevel)
     return [*foot, (radius - bevel, height)]
 
 
 def foot_and_wall(radius: float, height: float, bevel: float) -> list[tuple[float, float]]:
-    """Return corners (r, z) of an upright wall with a bevelled foot alone."""
+    """Return the corners (r, z) of an upright wall with a bevelled foot only."""
     return [(radius - bevel, 0.0), (radius, bevel), (radius, height)]
 
 
@@ -115,25 +115,25 @@ def arch(
     """Return an arc (count, 3) of an ellipse of half-axes `a` and `b` [m] in the plane y = 0.
 
     Args:
-        a: Along x.
-        b: Along z.
-        x: Of its middle [m].
-        z: Of its middle [m].
-        degrees: Where it begins and ends.
-        count: Of points.
+        a: Half-axis along x [m].
+        b: Half-axis along z [m].
+        x: Coordinate of the centre [m].
+        z: Coordinate of the centre [m].
+        degrees: Angles at which the arc starts and ends [deg].
+        count: Number of points.
     """
     s, c = sin_cos_deg(np.linspace(*degrees, count))
     return np.column_stack([x + a * c, 0.0 * c, z + b * s])
 
 
 def ellipse(a: float, b: float, *, edge: float) -> Array:
-    """Return an ellipse (n, 2) of half-axes `a` and `b` [m], anticlockwise."""
+    """Return an ellipse (n, 2) with half-axes `a` and `b` [m], counter-clockwise."""
     angles = ring_angles(ring_size((a + b) / 2.0, edge))
     return np.column_stack([a * np.cos(angles), b * np.sin(angles)])
 
 
 def rounded_polygon(corners: npt.ArrayLike, radius: float, *, edge: float) -> Array:
-    """Return a convex polygon (n, 2), anticlockwise, with its corners rounded by `radius` [m]."""
+    """Return a convex polygon (n, 2), counter-clockwise, with corners rounded by `radius` [m]."""
     points = np.asarray(corners, dtype=float)
     outline = []
     for before, corner, after in zip(
@@ -160,7 +160,7 @@ def rounded_rectangle(width: float, depth: float, radius: float, *, edge: float)
 
 
 def ring_size(radius: float, edge: float) -> int:
-    """Return how many points a ring of `radius` [m] needs for edges of about `edge` [m]."""
+    """Return the number of points of a ring of `radius` [m] for edges of about `edge` [m]."""
     wanted = 2.0 * np.pi * radius / edge
     return int(RING_SIZES[np.argmin(np.abs(np.log(RING_SIZES / wanted)))])
 

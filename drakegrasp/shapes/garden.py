@@ -1,4 +1,4 @@
-"""Fruit and plants, tools and things of a yard.
+"""Fruit and plants, tools, and objects of a yard.
 
 One function per class: sizes come in, a watertight mesh goes out; see `drakegrasp.shapes.catalog`.
 """
@@ -44,7 +44,7 @@ from drakegrasp.shapes.solids import bar, cut, extrude, flat_base, fuse, revolve
 
 
 def apple(*, radius: float, height: float) -> Trimesh:
-    """Return an apple with a stem; `height` is without the stem."""
+    """Return an apple with a stem; `height` does not include the stem."""
     side = smooth(scaled([
         (0.0, 0.07), (0.18, 0.03), (0.36, 0.0), (0.72, 0.16), (0.95, 0.42), (1.0, 0.62),
         (0.88, 0.86), (0.5, 1.0), (0.2, 0.93), (0.0, 0.82),
@@ -53,7 +53,7 @@ def apple(*, radius: float, height: float) -> Trimesh:
 
 
 def pear(*, radius: float, neck_radius: float, height: float) -> Trimesh:
-    """Return a pear that stands on its wide end, with a stem; `height` is without the stem."""
+    """Return a pear with a stem that stands on its wide end; `height` excludes the stem."""
     side = smooth([
         (0.0, 0.04 * height), (0.35 * radius, 0.0), (0.85 * radius, 0.14 * height),
         (radius, 0.32 * height), (0.85 * radius, 0.5 * height), (neck_radius, 0.75 * height),
@@ -63,14 +63,14 @@ def pear(*, radius: float, neck_radius: float, height: float) -> Trimesh:
 
 
 def _with_stem(side: Array, low: tuple[float, ...], high: tuple[float, ...]) -> Trimesh:
-    """Return a fruit of a side (r, z) with a stem between two points (3,) [m]."""
+    """Return a fruit with a profile (r, z) and a stem between two points (3,) [m]."""
     stem = bar(low, high, ellipse(0.0025, 0.0025, edge=0.002))
     return stand(fuse(revolve(side), stem))
 
 
 def banana(*, bend_radius: float, angle: float, thickness: float) -> Trimesh:
-    """Return a bunch of three bananas, bent by `angle` about `bend_radius`, one on the others."""
-    # Side by side and halfway above, a little into each other; their stalks meet in a crown.
+    """Return a bunch of three bananas, bent by `angle` around `bend_radius`, one on two others."""
+    # Two bananas side by side and one on top, overlapping a little; their stalks meet in a crown.
     aside = 0.41 * thickness
     bunch = [
         moved(_single_banana(bend_radius + wider * thickness, angle, thickness), (0.0, y, z))
@@ -94,7 +94,7 @@ def _single_banana(bend_radius: float, angle: float, thickness: float) -> Trimes
         (1.0, 0.24),
     ], np.linspace(0.0, 1.0, len(theta)))  # fmt: skip
 
-    # Five soft edges, one face down; the underside stays on the table along the whole fruit.
+    # Five soft edges, with one face down; the underside is on the table along the whole fruit.
     half = thickness / 2.0
     turns = 2.0 * np.pi * np.arange(5) / 5.0 - np.pi / 2.0 + np.pi / 5.0
     corners = 1.18 * half * np.column_stack([np.cos(turns), np.sin(turns)])
@@ -105,7 +105,7 @@ def _single_banana(bend_radius: float, angle: float, thickness: float) -> Trimes
 
 
 def mushroom(*, cap: float, stalk: float, height: float) -> Trimesh:
-    """Return a mushroom: radii of its `cap` and its `stalk`."""
+    """Return a mushroom; `cap` and `stalk` are radii."""
     low = 0.56 * height
     foot = smooth([
         (1.15 * stalk, 0.0), (1.25 * stalk, 0.1 * height), (0.88 * stalk, 0.34 * height),
@@ -121,10 +121,10 @@ def mushroom(*, cap: float, stalk: float, height: float) -> Trimesh:
 
 
 def pumpkin(*, radius: float, height: float, ribs: int) -> Trimesh:
-    """Return a ribbed pumpkin with its stem; `height` is without the stem."""
+    """Return a ribbed pumpkin with a stem; `height` does not include the stem."""
     section = scalloped(radius, 0.13 * radius, ribs)
     s, c = sin_cos_deg(np.linspace(-90.0, 90.0, max(8, round(1.6 * height / EDGE)) + 1))
-    # Squarer than an ellipsoid, and dented at the top.
+    # It is squarer than an ellipsoid, and dented at the top.
     scales = np.maximum(c, 0.0) ** 0.72
     heights = height * (0.5 + 0.5 * np.sign(s) * np.abs(s) ** 1.1)
     heights = np.where(s > 0.0, heights - 0.12 * height * (1.0 - scales) ** 2, heights)
@@ -136,14 +136,14 @@ def pumpkin(*, radius: float, height: float, ribs: int) -> Trimesh:
 
 
 def cactus(*, pot: float, radius: float, height: float) -> Trimesh:
-    """Return a cactus with two arms in a `pot` of that radius at its rim."""
+    """Return a cactus with two arms in a pot; `pot` is the radius of the pot's rim."""
     rim, inside = 0.95 * pot, pot - 0.006
     bowl = lathe(resample([
         (0.72 * pot, 0.0), (0.9 * pot, rim - 0.016), (pot, rim - 0.015), (pot, rim),
         (inside, rim), (pot - 0.007, rim - 0.006),
     ], EDGE))  # fmt: skip
 
-    # The ribbed trunk, round at its top.
+    # The ribbed trunk, with a round top.
     section = scalloped(radius, 0.16 * radius, 8)
     s, c = sin_cos_deg(np.linspace(15.0, 90.0, 6))
     low, top = rim - 0.02, height - radius
@@ -162,13 +162,13 @@ def cactus(*, pot: float, radius: float, height: float) -> Trimesh:
 
 
 def hammer(*, length: float, head_length: float, head_thickness: float) -> Trimesh:
-    """Return a claw hammer that stands on its head, which is along y; `length` of its handle."""
+    """Return a claw hammer that stands on its head along y; `length` is that of the handle."""
     half, up = head_thickness / 2.0, (0.0, 0.0, 1.0)
     grip, scale = 0.013, ((0.0, 1.0), (0.3, 1.0), (0.55, 0.75), (1.0, 0.75))
     section = ellipse(0.85 * grip, grip, edge=EDGE)
     handle = bar((-length, 0.0, half), (0.0, 0.0, half), section, normal=up, scale=scale)
 
-    # The head: a claw on one side, which bends up, and a round face on the other.
+    # The head: a claw that bends up on one side, and a round face on the other.
     reach = head_length / 2.0
     y = np.linspace(reach, -reach, 60)
     bend = np.clip(-(y + 0.012), 0.0, None)
@@ -184,7 +184,7 @@ def hammer(*, length: float, head_length: float, head_thickness: float) -> Trime
 
 
 def screwdriver(*, handle: float, radius: float, shaft: float) -> Trimesh:
-    """Return a screwdriver that stands on its fluted `handle`, of that length as its `shaft`."""
+    """Return a screwdriver on its fluted `handle`; `handle` and `shaft` are lengths."""
     side = resample(scaled([
         (0.86, 0.0), (0.96, 0.03), (1.0, 0.12), (1.0, 0.6), (0.74, 0.78), (0.7, 0.88), (0.8, 0.96),
         (0.62, 1.0),
@@ -192,7 +192,7 @@ def screwdriver(*, handle: float, radius: float, shaft: float) -> Trimesh:
     profile = [(0.0, 0.0), (0.86 * 0.5, 0.0), *side, (0.3, handle), (0.0, handle)]
     grip = extrude(scalloped(radius, 0.13 * radius, 6), profile)
 
-    # The shaft, its end a flat blade.
+    # The shaft, which ends in a flat blade.
     steel = max(0.0045, 0.24 * radius)
     low, high, edge = handle - 0.01, handle + shaft, 0.8 * EDGE
     blade = pillar([
@@ -203,7 +203,7 @@ def screwdriver(*, handle: float, radius: float, shaft: float) -> Trimesh:
 
 
 def mallet(*, length: float, head_length: float, radius: float) -> Trimesh:
-    """Return a mallet that lies on its side: handle along -x, a round head along y."""
+    """Return a mallet that lies on its side, with its handle along -x and a round head along y."""
     grip, thin = 0.4 * radius + 0.004, 0.88 * radius
     half, band = head_length / 2.0, radius + 0.002
     side = smooth(
@@ -211,14 +211,14 @@ def mallet(*, length: float, head_length: float, radius: float) -> Trimesh:
     )
     head = [lathe(side, edge=BROAD)]
     head += [post(y - 0.006, y + 0.006, band) for y in (-0.62 * half, 0.62 * half)]
-    # The handle leans, so that the knob at its end lies on the table as the bands do.
+    # The handle is inclined, so that the knob at its end touches the table like the bands do.
     handle = rod((-length, 0.0, 1.06 * grip), (0.4 * radius, 0.0, band), grip, 0.8 * grip)
     knob = ball((-length, 0.0, 1.12 * grip), scaled((1.0, 1.15, 1.12), grip))
     return stand(fuse(*(moved(part, (0.0, 0.0, band), x=90.0) for part in head), handle, knob))
 
 
 def padlock(*, width: float, height: float, depth: float, shackle: float) -> Trimesh:
-    """Return a closed padlock: its body, and a `shackle` that reaches so far above it."""
+    """Return a closed padlock; `shackle` is the height of its shackle above the body."""
     radius = 0.085 * width + 0.001
     levels = [(-depth / 2.0, width, height), (depth / 2.0, width, height)]
     upright = pillar(levels, corner=0.2 * width, edge=BROAD)
@@ -236,7 +236,7 @@ def padlock(*, width: float, height: float, depth: float, shackle: float) -> Tri
 
 
 def watering_can(*, radius: float, height: float, spout: float) -> Trimesh:
-    """Return a watering can: a long `spout` with a rose towards +x, a handle at -x."""
+    """Return a watering can with a long `spout` and a rose at +x, and a handle at -x."""
     side = resample(scaled([(1.0, 0.0), (1.0, 0.82), (0.8, 1.0)], radius, height), BROAD)
     body, core = vessel(side, wall=0.005, floor=0.008, edge=BROAD)
     start = np.array([0.9 * radius, 0.0, 0.22 * height])
@@ -256,7 +256,7 @@ def watering_can(*, radius: float, height: float, spout: float) -> Trimesh:
 
 
 def bucket(*, top_radius: float, bottom_radius: float, height: float) -> Trimesh:
-    """Return a bucket with its bail up, in the plane y = 0."""
+    """Return a bucket with its bail up in the plane y = 0."""
     side = resample([(bottom_radius, 0.0), (top_radius, height)], BROAD)
     body = vessel(side, wall=0.005, floor=0.008, edge=BROAD)[0]
     inner, outer = top_radius - 0.002, top_radius + 0.003
@@ -265,7 +265,7 @@ def bucket(*, top_radius: float, bottom_radius: float, height: float) -> Trimesh
     ], edge=BROAD)  # fmt: skip
     hole = post(height - 0.05, height + 0.05, top_radius - 0.005 + 0.0005, edge=BROAD)
 
-    # The bail stands up, with a grip in its middle.
+    # The bail is up, with a grip at its centre.
     low, reach = height - 0.012, 0.95 * top_radius
     bail = arch(top_radius + 0.002, reach, z=low, degrees=(0.0, 180.0), count=40)
     x, top = top_radius + 0.001, low + reach
@@ -275,7 +275,7 @@ def bucket(*, top_radius: float, bottom_radius: float, height: float) -> Trimesh
 
 
 def traffic_cone(*, base: float, radius: float, height: float) -> Trimesh:
-    """Return a traffic cone: edge of its square `base`, `radius` of its foot."""
+    """Return a traffic cone; `base` is the edge of its square base, `radius` that of its foot."""
     tip, foot = 0.26 * radius, 0.012
     ridges = []
     for shares in ((0.34, 0.52), (0.68, 0.82)):
@@ -286,7 +286,7 @@ def traffic_cone(*, base: float, radius: float, height: float) -> Trimesh:
 
 
 def barrel(*, radius: float, bulge: float, height: float) -> Trimesh:
-    """Return a barrel with four hoops: `radius` of its ends, its middle wider by `bulge`."""
+    """Return a barrel with four hoops, `radius` at its ends and wider by `bulge` at its centre."""
     levels = np.linspace(0.0, 1.0, max(10, round(height / BROAD)) + 1)
     side = np.column_stack([radius + bulge * 4.0 * levels * (1.0 - levels), height * levels])
     low = height - 0.006
@@ -303,7 +303,7 @@ def barrel(*, radius: float, bulge: float, height: float) -> Trimesh:
 
 
 def garbage_bin(*, width: float, height: float) -> Trimesh:
-    """Return a bin on two wheels, its lid closed: front towards +x, wheels and bar at -x."""
+    """Return a closed bin on two wheels, with its front at +x and wheels and bar at -x."""
     depth, wheel, round_corner = 1.08 * width, 0.16 * width, 0.09 * width
     body = pillar([
         (0.0, 0.72 * depth, 0.74 * width, 0.05 * depth, 0.0), (height, depth, width, 0.0, 0.0),

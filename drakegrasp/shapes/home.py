@@ -1,4 +1,4 @@
-"""Things of a household and what people own or wear. Shoes point towards +x.
+"""Household objects and personal belongings. Shoes point to +x.
 
 One function per class: sizes come in, a watertight mesh goes out; see `drakegrasp.shapes.catalog`.
 """
@@ -49,7 +49,7 @@ LEATHER = 1.3 * EDGE
 
 
 def watertap(*, base: float, pipe: float, height: float, reach: float) -> Trimesh:
-    """Return a tap on its base: radii of `base` and `pipe`, a spout that reaches towards +x."""
+    """Return a tap with a spout of length `reach` to +x; `base` and `pipe` are radii."""
     bend = reach / 2.0
     top = height - bend - pipe
     bow = arch(bend, bend, x=bend, z=top, degrees=(180.0, 0.0), count=24)
@@ -74,7 +74,7 @@ def watertap(*, base: float, pipe: float, height: float, reach: float) -> Trimes
 
 
 def knob(*, rose: float, neck: float, radius: float, height: float) -> Trimesh:
-    """Return a door knob on its `rose`; all but the height are radii."""
+    """Return a door knob on its `rose`; all parameters except the height are radii."""
     rim = resample([(rose, 0.0), (rose, 0.007)], EDGE)
     side = smooth([
         (0.86 * rose, 0.011), (1.15 * neck, 0.016), (neck, 0.36 * height),
@@ -85,13 +85,13 @@ def knob(*, rose: float, neck: float, radius: float, height: float) -> Trimesh:
 
 
 def lamp(*, base: float, shade: float, height: float) -> Trimesh:
-    """Return a table lamp: radii of its `base` and of the rim of its `shade`."""
+    """Return a table lamp; `base` and `shade` are the radii of the base and of the shade's rim."""
     low, top, wall = 0.54 * height, 0.58 * shade, 0.005
     outer = resample([(shade, low), (top, height)], BROAD)
     inner = resample([(top - wall, height - 0.006), (shade - wall, low)], 1.5 * BROAD)
     cap = resample([(top, height), (0.0, height)], BROAD)
     ceiling = resample([(0.0, height - 0.006), inner[0]], 1.5 * BROAD)
-    # From the axis under the cap, down inside, up outside, to the axis.
+    # From the axis under the cap, down the inside, up the outside, to the axis.
     screen = revolve(joined(ceiling, inner, outer, cap), edge=BROAD)
     side = smooth([
         (0.86 * base, 0.013), (0.3 * base, 0.024), (0.15 * base + 0.003, 0.034),
@@ -105,7 +105,7 @@ def lamp(*, base: float, shade: float, height: float) -> Trimesh:
 
 
 def iron(*, length: float, width: float, height: float) -> Trimesh:
-    """Return a clothes iron on its sole, its tip towards +x, with a closed handle."""
+    """Return a clothes iron that stands on its sole, with its tip at +x and a closed handle."""
     t = np.linspace(0.0, 1.0, 200)
     nose = 0.5 * width * np.sqrt(1.0 - t**2.2)
     flank = smooth(scaled([(-0.4, 0.47), (-0.2, 0.5), (-0.05, 0.5)], length, width), EDGE / 4.0)
@@ -145,7 +145,7 @@ def hourglass(*, radius: float, waist: float, height: float) -> Trimesh:
 
 
 def bell(*, radius: float, body: float, handle: float) -> Trimesh:
-    """Return a hand bell that stands on its mouth: heights of its `body` and its `handle`."""
+    """Return a hand bell that stands on its mouth; `body` and `handle` are heights."""
     wall, neck = 0.006, 0.14 * radius + 0.003
     outer = smooth([
         (radius, 0.0), (0.9 * radius, 0.09 * body), (0.7 * radius, 0.3 * body),
@@ -158,7 +158,7 @@ def bell(*, radius: float, body: float, handle: float) -> Trimesh:
         (0.1 * radius, body + handle),
     ], EDGE)  # fmt: skip
 
-    # Hollow from below.
+    # The bell is hollow from below.
     inner = smooth([
         (0.0, 0.86 * body), (0.3 * radius, 0.82 * body), (0.58 * radius - wall, 0.55 * body),
         (0.7 * radius - wall, 0.28 * body), (radius - wall, 0.0),
@@ -183,15 +183,15 @@ def candlestick(*, foot_radius: float, stem_radius: float, height: float) -> Tri
 
 
 def book(*, width: float, length: float, thickness: float) -> Trimesh:
-    """Return a closed book that lies flat, its round spine along y at -x."""
+    """Return a closed book that lies flat, with its round spine along y at -x."""
     cover, inlay, bulge, edge = 0.004, 0.005, 0.008, 0.011
     x, y, hinge = width / 2.0, length / 2.0, 0.006 - width / 2.0
-    # The same number of pieces at every height, whatever their length.
+    # All outlines have the same number of points, whatever their length.
     sizes = [length, width, 0.0, bulge, length, bulge, 0.0, width]
     counts = [max(1, round(size / edge)) for size in sizes]
 
     def ring(z: float, *, setback: float = 0.0, scale: float = 1.0) -> Array:
-        """Return the outline at height `z`, the pages `setback` behind the cover's edge."""
+        """Return the outline at height `z`, with the pages `setback` behind the cover's edge."""
         level = 2.0 * z / thickness - 1.0
         back = -x - bulge * np.sqrt(1.0 - level**2)
         right, front = x - setback, y - setback
@@ -231,7 +231,7 @@ def flashlight(
 def dumbbell(
     *, length: float, head_width: float, head_length: float, grip_radius: float
 ) -> Trimesh:
-    """Return a dumbbell along x with six-sided heads of `head_width` between flats."""
+    """Return a dumbbell along x with hexagonal heads, `head_width` wide across their flats."""
     apothem = head_width / 2.0
     turns = 2.0 * np.pi * (np.arange(6) + 0.5) / 6.0
     corners = apothem / np.cos(np.pi / 6.0) * np.column_stack([np.cos(turns), np.sin(turns)])
@@ -250,7 +250,7 @@ def dumbbell(
 
 
 def camera(*, width: float, height: float, depth: float, lens: float) -> Trimesh:
-    """Return a camera that looks towards -y: its body, and `lens` the radius of its lens."""
+    """Return a camera that looks to -y; `lens` is the radius of its lens."""
     z, front = 0.46 * height, -depth / 2.0
     body = block((width, depth, height), (0.0, 0.0, height / 2.0), corner=0.009, edge=LARGE)
     place = (-0.38 * width, -0.42 * depth, 0.47 * height)
@@ -269,7 +269,7 @@ def camera(*, width: float, height: float, depth: float, lens: float) -> Trimesh
     ]
     mouth = rod((0.0, front - 0.028, z), (0.0, front - 0.060, z), 0.70 * lens)
 
-    # With a release button and a dial on top.
+    # A release button and a dial on top.
     low = height - 0.004
     button = post(low, height + 0.007, 0.0075, at=(-0.36 * width, -0.2 * depth))
     dial = post(low, height + 0.008, 0.012, at=(0.34 * width, 0.0))
@@ -277,7 +277,7 @@ def camera(*, width: float, height: float, depth: float, lens: float) -> Trimesh
 
 
 def alarm_clock(*, radius: float, depth: float) -> Trimesh:
-    """Return an alarm clock with two bells on top, its face towards -y."""
+    """Return an alarm clock with two bells on top and its face at -y."""
     z, face = 0.016 + radius, -depth / 2.0
     case = cut(
         rod((0.0, -face, z), (0.0, face, z), radius, edge=BROAD),
@@ -293,7 +293,7 @@ def alarm_clock(*, radius: float, depth: float) -> Trimesh:
         for x, y in ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
     ]
 
-    # Two bells on stalks, a hammer between them, and four feet.
+    # Two bells on stalks, with a hammer between them, and four feet.
     bells = [_bell_on_stalk(radius, z, side) for side in (1.0, -1.0)]
     top = z + 1.3 * radius
     hammer = [
@@ -308,12 +308,12 @@ def alarm_clock(*, radius: float, depth: float) -> Trimesh:
 
 
 def _bell_on_stalk(radius: float, z: float, side: float) -> Trimesh:
-    """Return a bell of an alarm clock of a `radius`, whose middle is at height `z` [m].
+    """Return a bell of an alarm clock.
 
     Args:
-        radius: Of the clock [m].
-        z: Of its middle [m].
-        side: 1 for the bell at +x, -1 for that at -x.
+        radius: Radius of the clock [m].
+        z: Height of the clock's centre [m].
+        side: 1 for the bell at +x, -1 for the bell at -x.
     """
     s, c = map(float, sin_cos_deg(60.0))
     ball_radii, below = scaled((0.42, 0.42, 0.36), radius), (0.0, 0.0, -0.5 * radius)
@@ -325,7 +325,7 @@ def _bell_on_stalk(radius: float, z: float, side: float) -> Trimesh:
 
 
 def hat(*, brim: float, crown: float, height: float) -> Trimesh:
-    """Return a top hat: radii of `brim` and `crown`; the brim is curled up at both sides."""
+    """Return a top hat with its brim curled up at both sides; `brim` and `crown` are radii."""
     wall = thick = 0.006
     top, wide = 1.06 * crown, crown + 0.002
     middle = (0.95 * crown - wall, 0.5 * height)
@@ -348,7 +348,7 @@ def hat(*, brim: float, crown: float, height: float) -> Trimesh:
 
 
 def comb(*, length: float, depth: float, spine: float, teeth: float, count: int) -> Trimesh:
-    """Return a wide comb that stands on its teeth: heights of `spine` and `teeth`."""
+    """Return a wide comb that stands on its teeth; `spine` and `teeth` are heights."""
     height = spine + teeth
     side = smooth([
         (-length / 2.0, 0.96 * teeth), (-0.47 * length, height - 0.005), (-0.3 * length, height),
@@ -364,10 +364,10 @@ def comb(*, length: float, depth: float, spine: float, teeth: float, count: int)
 
 
 def shoe(*, length: float, width: float, height: float) -> Trimesh:
-    """Return a laced shoe on its heel and sole; `height` of its collar."""
+    """Return a laced shoe on its heel and sole; `height` is that of its collar."""
     last = _last(length, width, 0.62 * height, height)
 
-    # Where the foot goes in, and what covers the instep.
+    # The opening for the foot, and the cover of the instep.
     middle = (0.0, 0.0, 0.0)
     hole = ball(middle, (0.24 * length, 0.29 * width, 0.5 * height), edge=LEATHER)
     opening = moved(hole, (-0.24 * length, 0.0, 1.18 * height), y=12.0)
@@ -400,8 +400,8 @@ def boot(*, length: float, width: float, height: float) -> Trimesh:
 
 
 def _last(length: float, width: float, instep: float, collar: float) -> Trimesh:
-    """Return the closed upper of a shoe: heights at the `instep` and at the `collar` [m]."""
-    # Along the foot: half widths and heights.
+    """Return the closed upper of a shoe; `instep` and `collar` are heights [m]."""
+    # Half widths and heights along the foot.
     along = np.linspace(-0.49, 0.49, round(length / LEATHER) + 1)
     half, rise = between([
         (-0.49, 0.24, 0.55), (-0.45, 0.34, 0.92), (-0.3, 0.38, 1.0), (-0.12, 0.38, 1.0),
@@ -410,7 +410,7 @@ def _last(length: float, width: float, instep: float, collar: float) -> Trimesh:
     ], along).T  # fmt: skip
     heights = np.where(along > 0.2, np.minimum(collar * rise, instep), collar * rise)
 
-    # Across it: a flat base, a rounded top.
+    # The cross section has a flat base and a rounded top.
     s, c = sin_cos_deg(np.linspace(0.0, 180.0, 15))
     roof = np.column_stack([np.sign(c) * np.abs(c) ** 0.6, 0.3 + 0.7 * s])
     across = np.vstack([[(0.0, 0.0), (0.5, 0.0), (0.96, 0.0)], roof, [(-0.96, 0.0), (-0.5, 0.0)]])
@@ -423,7 +423,7 @@ def _last(length: float, width: float, instep: float, collar: float) -> Trimesh:
 
 
 def _sole(length: float, width: float, thick: float) -> Trimesh:
-    """Return the sole of a shoe, `thick` [m], its heel apart from it by an arch."""
+    """Return the sole of a shoe, `thick` [m] thick, with an arch between heel and sole."""
     along = np.linspace(-0.505, 0.505, round(length / LEATHER) + 1)
     halves = between([
         (-0.505, 0.0), (-0.49, 0.24), (-0.42, 0.38), (-0.28, 0.42), (-0.05, 0.38), (0.2, 0.5),
@@ -438,7 +438,7 @@ def _sole(length: float, width: float, thick: float) -> Trimesh:
 
 
 def _slab(side: Array, depth: float) -> Trimesh:
-    """Return the space below a curve (n, 2) of points (x, z), down to z = 0, as a slab across y."""
+    """Return the space between a curve (n, 2) of points (x, z) and z = 0, as a slab across y."""
     y = np.linspace(-depth / 2.0, depth / 2.0, max(2, round(depth / LEATHER)) + 1)
     levels = max(2, round(float(side[:, 1].max()) / LEATHER)) + 1
     rings = []

@@ -1,4 +1,4 @@
-"""Things of a kitchen and of a shop: vessels, machines, what is bought packed.
+"""Objects from a kitchen and a shop: vessels, machines, packed goods.
 
 One function per class: sizes come in, a watertight mesh goes out; see `drakegrasp.shapes.catalog`.
 """
@@ -44,12 +44,12 @@ from drakegrasp.shapes.parts import (
 )
 from drakegrasp.shapes.solids import bar, cut, extrude, fuse, grid_box, revolve, solid, sweep
 
-#: Thickness of a wall, and of a thin one [m].
+#: Thicknesses of a usual wall and of a thin wall [m].
 WALL, THIN = 0.005, 0.0045
 
 
 def mug(*, radius: float, height: float, handle_reach: float, handle_radius: float) -> Trimesh:
-    """Return a hollow straight mug with a handle at +x; `handle_reach` is how far it stands out."""
+    """Return a hollow straight mug with a handle at +x that extends by `handle_reach`."""
     side = resample(foot_and_wall(radius, height, 0.004), EDGE)
     shell, core = vessel(side, wall=WALL, floor=0.007)
     reach = handle_reach - handle_radius + WALL / 2.0
@@ -108,7 +108,7 @@ def wineglass(
         (stem_radius, stem_height),
     ], EDGE)  # fmt: skip
 
-    # One outline, with longer edges inside.
+    # The outline of both, with longer edges inside.
     bottom = resample([inner[-1], (0.0, floor)], COARSE * EDGE)[1:]
     outside, inside = np.vstack([foot, stem[1:], outer[1:]]), np.vstack([inner, bottom])
     edges = np.repeat([EDGE, COARSE * EDGE], [len(outside), len(inside)])
@@ -134,7 +134,7 @@ def pitcher(
     handle = loop_handle(x, 0.3 * height, 0.85 * height, reach, handle_radius, edge=edge)
     body = fuse(shell, trimmed(handle, core))
 
-    # The lip: points near the rim on the far side move outwards, the wall with them.
+    # The lip: points near the rim on the far side move outwards together with the wall.
     x, y, z = body.vertices.T
     rise = np.clip((z / height - 0.7) / 0.3, 0.0, 1.0)
     pull = lip * rise**2 * np.exp(-((np.arctan2(y, -x) / 0.4) ** 2))
@@ -153,10 +153,10 @@ def saucepan(*, radius: float, height: float, handle_length: float) -> Trimesh:
 
 
 def funnel(*, radius: float, spout_radius: float, cone_height: float, height: float) -> Trimesh:
-    """Return a funnel, open at both ends, that stands on its wide end."""
+    """Return a funnel that is open at both ends and stands on its wide end."""
     neck = (spout_radius + 0.002, cone_height)
     outer = resample([(radius, 0.0), (radius, 0.008), neck, (spout_radius, height)], EDGE)
-    # Across a sloping wall the thickness is measured along r: wall / sin(slope).
+    # On a sloping wall the thickness is measured along r: wall / sin(slope).
     slope = np.arctan2(cone_height - 0.008, radius - spout_radius)
     step = THIN / np.sin(slope)
     inner = resample([
@@ -193,7 +193,7 @@ def toaster(*, length: float, width: float, height: float) -> Trimesh:
 
 
 def coffeemaker(*, width: float, depth: float, height: float) -> Trimesh:
-    """Return a coffee machine with its tank at -x and its jug in front, towards +x."""
+    """Return a coffee machine with its tank at -x and its jug in front, at +x."""
     tank = 0.36 * depth
     jug, floor, head = 0.36 * width, 0.020, 0.24 * height
     x, edge = 0.5 * depth - 0.42 * width, 2.0 * BROAD
@@ -220,7 +220,7 @@ def coffeemaker(*, width: float, depth: float, height: float) -> Trimesh:
 
 
 def teapot(*, radius: float, height: float, spout: float) -> Trimesh:
-    """Return a teapot with its lid on: spout towards +x by `spout`, handle at -x."""
+    """Return a teapot with a lid, a spout that extends by `spout` to +x, and a handle at -x."""
     knots = [(0.58, 0.0), (0.62, 0.03), (1.0, 0.42), (0.78, 0.76), (0.46, 0.86)]
     body = lathe(smooth(scaled(knots, radius, height), BROAD), edge=BROAD)
     rim = resample([(0.5 * radius, 0.84 * height), (0.5 * radius, 0.88 * height)], BROAD)
@@ -240,7 +240,7 @@ def teapot(*, radius: float, height: float, spout: float) -> Trimesh:
 
 
 def juicer(*, radius: float, rim: float, cone: float) -> Trimesh:
-    """Return a citrus juicer: a dish with a rim of height `rim`, and in it a ribbed `cone`."""
+    """Return a citrus juicer: a dish with a rim of height `rim` and a ribbed `cone` in it."""
     side = smooth(scaled([(0.7, 0.0), (0.92, 0.3), (1.0, 1.0)], radius, rim), BROAD)
     hollow = [(radius - WALL, rim), (0.86 * radius, 0.5 * rim), (0.62 * radius, 0.32 * rim)]
     inner = smooth(hollow, BROAD)
@@ -263,7 +263,7 @@ def juicer(*, radius: float, rim: float, cone: float) -> Trimesh:
 
 
 def pepper_mill(*, radius: float, waist: float, height: float) -> Trimesh:
-    """Return a turned pepper mill: `radius` of its foot, `waist` the radius at its narrowest."""
+    """Return a turned pepper mill; `radius` is that of its foot, `waist` its smallest radius."""
     side = smooth([
         (radius, 0.0), (radius, 0.1 * height), (0.82 * radius, 0.15 * height),
         (waist, 0.38 * height), (0.92 * radius, 0.6 * height), (0.8 * radius, 0.66 * height),
@@ -285,7 +285,7 @@ def can(*, radius: float, height: float) -> Trimesh:
 
 
 def bottle(*, radius: float, height: float, neck_radius: float) -> Trimesh:
-    """Return a closed bottle, solid, with a shoulder, a neck and a cap."""
+    """Return a closed solid bottle with a shoulder, a neck and a cap."""
     low, neck, cap = 0.58 * height, 0.78 * height, 0.9 * height
     wide = neck_radius + 0.003
 
@@ -300,7 +300,7 @@ def bottle(*, radius: float, height: float, neck_radius: float) -> Trimesh:
 
 
 def jar(*, radius: float, height: float, lid_radius: float, lid_height: float) -> Trimesh:
-    """Return a closed jar, solid: a body, a short neck and a lid."""
+    """Return a closed solid jar with a body, a short neck and a lid."""
     low, under = height - lid_height - 0.018, height - lid_height
     neck = min(lid_radius - 0.004, radius - 0.008)
 
@@ -322,7 +322,7 @@ def carton(*, width: float, height: float, roof: float) -> Trimesh:
         (0.0, width, width), (height, width, width), (height + roof, width, 0.008),
         (height + roof + fin, width, 0.008),
     ], corner=0.003, edge=LARGE)  # fmt: skip
-    # The gable's ends are folded inwards.
+    # The ends of the gable are folded inwards.
     fold = pillar([(height + 0.004, 0.0105, 0.86 * width), (height + 0.86 * roof, 0.024, 0.005)])
     folds = [moved(fold, (0.5 * side * width, 0.0, 0.0)) for side in SIDES]
     slope = np.degrees(np.arctan2(roof, 0.5 * width - 0.004))
@@ -332,7 +332,7 @@ def carton(*, width: float, height: float, roof: float) -> Trimesh:
 
 
 def spray_bottle(*, width: float, depth: float, height: float) -> Trimesh:
-    """Return a spray bottle, solid: an oval body, a neck, a head and a trigger towards +x."""
+    """Return a solid spray bottle with an oval body, a neck, a head and a trigger at +x."""
     edge, top, half = 0.007, 0.68 * height, width / 2.0
     neck, section = 0.013, rounded_rectangle(width, depth, 0.45 * depth, edge=edge)
     foot = [(0.0, 0.0), (0.5, 0.0), (0.94, 0.0), (1.0, 0.004)]
@@ -356,7 +356,7 @@ def spray_bottle(*, width: float, depth: float, height: float) -> Trimesh:
 
 
 def soap_dispenser(*, width: float, depth: float, height: float) -> Trimesh:
-    """Return a soap dispenser: an oval bottle and a pump whose spout points towards +x."""
+    """Return a soap dispenser: an oval bottle with a pump whose spout points to +x."""
     body = 0.64 * height
     bottle = pillar(scaled([
         (0.0, 0.94, 0.94), (0.3, 1.0, 1.0), (0.75, 1.0, 1.0), (0.93, 0.72, 0.76), (1.0, 0.42, 0.52),
@@ -374,7 +374,7 @@ def soap_dispenser(*, width: float, depth: float, height: float) -> Trimesh:
 
 
 def towel_roll(*, radius: float, height: float, core: float) -> Trimesh:
-    """Return a paper towel roll that stands, with an open `core` and a loose sheet at +y."""
+    """Return a standing paper towel roll with an open `core` and a loose sheet at +y."""
     outside = resample(bevelled(radius, height, 0.002), BROAD)
     inside = resample([(core, height), (core, 0.0)], 1.5 * BROAD)
     bottom = resample([(core, 0.0), (radius - 0.002, 0.0)], 2.0 * BROAD)[:-1]

@@ -1,7 +1,7 @@
-"""Parts of shapes: sizes and places in metres come in, watertight parts go out.
+"""Parts of shapes: sizes and positions in metres come in, watertight parts go out.
 
-A class of objects is a handful of these parts, made one by `drakegrasp.shapes.solids`.
-Parts overlap where they are to be joined.
+An object of a class consists of a few of these parts, combined by `drakegrasp.shapes.solids`. Parts
+that are to be joined overlap.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from drakegrasp.shapes.curves import (
 )
 from drakegrasp.shapes.solids import at_height, cut, extrude, fanned, revolve, skin, solid, sweep
 
-#: Signs of the two sides, and of the four corners, of what is symmetrical.
+#: Signs of the two sides, and of the four corners, of symmetrical shapes.
 SIDES = (-1.0, 1.0)
 CORNERS = tuple(product(SIDES, SIDES))
 
-#: Rings of a flat end, as shares of its outline: the triangles at the centre stay plump.
+#: Rings of a flat end, as fractions of its outline: the triangles at the centre stay well shaped.
 FLAT_END = (0.0, 0.5, 0.93)
 
-#: How far the edge of a flat end is bevelled [m].
+#: Bevel at the edge of a flat end [m].
 BEVEL = 0.0015
 
 
@@ -43,7 +43,7 @@ def lathe(side: npt.ArrayLike, *, edge: float = EDGE) -> trimesh.Trimesh:
     """Return the solid of revolution of a side (n, 2) of points (r, z) [m], closed at both ends.
 
     Args:
-        side: From the foot to the head.
+        side: Points from the foot to the head.
         edge: Edge length [m].
     """
     points = np.asarray(side, dtype=float)
@@ -56,7 +56,7 @@ def ball(centre: npt.ArrayLike, radii: npt.ArrayLike, *, edge: float = EDGE) -> 
     """Return an ellipsoid.
 
     Args:
-        centre: (3,) [m].
+        centre: Centre (3,) [m].
         radii: Half-axes (3,) [m], or the radius of a sphere.
         edge: Edge length [m].
     """
@@ -79,10 +79,10 @@ def rod(
     """Return a round bar, or a truncated cone, with bevelled ends.
 
     Args:
-        start: Middle (3,) of one end [m].
-        end: Middle (3,) of the other [m].
-        radius: At the start [m].
-        end_radius: At the end [m]; as at the start if None.
+        start: Centre (3,) of one end [m].
+        end: Centre (3,) of the other end [m].
+        radius: Radius at the start [m].
+        end_radius: Radius at the end [m]; that at the start if None.
         edge: Edge length [m].
     """
     p, q = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
@@ -105,7 +105,7 @@ def post(
     at: tuple[float, float] = (0.0, 0.0),
     edge: float = EDGE,
 ) -> trimesh.Trimesh:
-    """Return an upright `rod` from z = `low` to z = `high` [m] at the place `at` (x, y) [m]."""
+    """Return an upright `rod` from z = `low` to z = `high` [m] at the position `at` (x, y) [m]."""
     return rod((*at, low), (*at, high), radius, end_radius, edge=edge)
 
 
@@ -113,7 +113,7 @@ def tube(path: npt.ArrayLike, radius: npt.ArrayLike, *, edge: float = EDGE) -> t
     """Return a round bar along a curve, with flat ends.
 
     Args:
-        path: Points (k, 3) [m] about an edge length apart.
+        path: Points (k, 3) [m], about an edge length apart.
         radius: () or (k,) [m]; zero makes an end a point.
         edge: Edge length [m].
     """
@@ -123,7 +123,7 @@ def tube(path: npt.ArrayLike, radius: npt.ArrayLike, *, edge: float = EDGE) -> t
     tangents = np.gradient(points, arc_length(points), axis=0)
     tangents /= norm(tangents)[:, None]
 
-    # The section turns with the path and not about it.
+    # The section turns with the path, but not around it.
     across = _axes(tangents[0])[:, 0]
     rings = []
     for point, tangent, size in zip(points, tangents, radii, strict=True):
@@ -136,7 +136,7 @@ def tube(path: npt.ArrayLike, radius: npt.ArrayLike, *, edge: float = EDGE) -> t
 
 
 def hoop(path: Array, radius: float, *, edge: float) -> list[trimesh.Trimesh]:
-    """Return a round bar along a closed curve (k, 3), its last point its first, in two parts."""
+    """Return a round bar along a closed curve (k, 3), whose ends coincide, as two parts."""
     half = len(path) // 2
     return [tube(part, radius, edge=edge) for part in (path[: half + 2], path[half - 1 :])]
 
@@ -151,8 +151,8 @@ def block(
     """Return an upright box with rounded upright edges.
 
     Args:
-        size: (3,) along x, y and z [m].
-        centre: (3,) [m].
+        size: Size (3,) along x, y and z [m].
+        centre: Centre (3,) [m].
         corner: Radius of the upright edges [m].
         edge: Edge length [m].
     """
@@ -167,7 +167,7 @@ def pillar(
     """Return a solid of rounded rectangles, one above the other, with bevelled ends.
 
     Args:
-        levels: Rows (z, width, depth) or (z, width, depth, x, y) of rising z [m].
+        levels: Rows (z, width, depth) or (z, width, depth, x, y) with rising z [m].
         corner: Radius of the upright edges of the largest rectangle [m].
         edge: Edge length [m].
     """
@@ -177,7 +177,7 @@ def pillar(
     width, depth = rows[:, 1].max(), rows[:, 2].max()
     outline = rounded_rectangle(width, depth, corner, edge=edge) / [width, depth]
 
-    # The bevels: a little inwards at both ends.
+    # The bevels are a little inwards at both ends.
     rows = resample(rows, edge)
     first, last = rows[0].copy(), rows[-1].copy()
     rows[0, 0], rows[-1, 0] = first[0] + BEVEL, last[0] - BEVEL
@@ -198,10 +198,10 @@ def prism(
     """Return an outline raised from z = `low` to z = `high` [m], with bevelled ends.
 
     Args:
-        outline: (n, 2), closed, all of it seen from the origin [m].
+        outline: (n, 2), closed, with all of it visible from the origin [m].
         low: Height of the lower end [m].
         high: Height of the upper end [m].
-        top: Scale of the outline there.
+        top: Scale of the outline at the upper end.
         edge: Edge length [m].
     """
     section = np.asarray(outline, dtype=float)
@@ -216,12 +216,12 @@ def prism(
 
 
 def scalloped(radius: float, depth: float, count: int, *, edge: float = EDGE) -> Array:
-    """Return a closed outline (n, 2) with `count` round lobes, `depth` [m] deep between them.
+    """Return a closed outline (n, 2) with `count` round lobes and grooves `depth` [m] deep.
 
     Args:
-        radius: Of the tips of the lobes [m].
-        depth: Of the grooves [m].
-        count: Of lobes.
+        radius: Radius of the tips of the lobes [m].
+        depth: Depth of the grooves [m].
+        count: Number of lobes.
         edge: Edge length [m].
     """
     pieces = max(4, 2 * round(np.pi * radius / (count * edge)))
@@ -233,7 +233,7 @@ def scalloped(radius: float, depth: float, count: int, *, edge: float = EDGE) ->
 
 
 def moved(mesh: trimesh.Trimesh, offset: npt.ArrayLike, **turns: float) -> trimesh.Trimesh:
-    """Return a mesh turned about axes by angles, such as `x=90.0` [deg], then moved by (3,) [m]."""
+    """Return a mesh turned about axes by angles such as `x=90.0` [deg], then moved by (3,) [m]."""
     for axis, degrees in turns.items():
         mesh = rotated(mesh, axis, degrees)
     return solid(mesh.vertices + np.asarray(offset, dtype=float), mesh.faces)
@@ -261,13 +261,13 @@ def _axes(direction: Array) -> Array:
 def vessel(
     side: npt.ArrayLike, *, wall: float, floor: float, edge: float = EDGE
 ) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
-    """Return an open vessel and the core that its handles must keep clear of.
+    """Return an open vessel, and the core that its handles must not enter.
 
-    The core fills the cavity and half of the wall: what is cut by it ends inside the wall.
+    The core fills the cavity and half of the wall: a part that is cut by it ends inside the wall.
 
     Args:
         side: Outer profile (r, z) [m] from the foot, z = 0, to the rim.
-        wall: Thickness of the wall, across it [m].
+        wall: Thickness of the wall, perpendicular to it [m].
         floor: Thickness of the floor [m].
         edge: Edge length outside [m].
     """
@@ -292,10 +292,10 @@ def loop_handle(
     """Return a D-shaped handle in the plane y = 0, open towards -x.
 
     Args:
-        x: Where both ends lie, inside the body's wall [m].
+        x: Position of both ends, inside the body's wall [m].
         bottom: Height of the lower end's centre line [m].
         top: Height of the upper end's centre line [m].
-        reach: How far the centre line goes beyond `x` [m].
+        reach: Distance of the centre line's outermost point from `x` [m].
         radius: Half the thickness in the plane; the handle is 1.3 times as wide [m].
         edge: Edge length [m].
     """
@@ -310,6 +310,6 @@ def loop_handle(
 
 
 def trimmed(part: trimesh.Trimesh, core: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return the piece of a handle that lies outside the core, without crumbs."""
+    """Return the piece of a handle that is outside of the core, without small fragments."""
     pieces = cut(part, core).split(only_watertight=True)
     return max(pieces, key=lambda piece: piece.volume)

@@ -1,11 +1,11 @@
-"""Solids of curves, and what several solids make: watertight meshes [m] go out.
+"""Solids built from curves, and solids combined from others; the results are watertight meshes [m].
 
 `trimesh.creation` is not enough: its `revolve` puts the same number of vertices on every ring, so
 that a stem gets slivers where a rim gets good triangles, and its `extrude_polygon` needs Shapely.
 Here the number of vertices of a ring depends on its circumference.
 
-manifold3d, through trimesh, cuts triangles where surfaces meet, and leaves slivers there and long
-triangles in flat faces. Both are mended: they would cost contact patches for nothing. Nothing is
+manifold3d, through trimesh, cuts triangles where surfaces meet; it leaves slivers there, and long
+triangles in flat faces. Both are repaired, since they would only cost contact patches. Nothing is
 random.
 """
 
@@ -22,21 +22,21 @@ from drakegrasp.frames import Array
 from drakegrasp.mesh.surfaces import Faces, from_manifold, is_solid_surface, to_manifold
 from drakegrasp.shapes.curves import EDGE, arc_length, between, ellipse
 
-#: Vertices are rounded to this many decimals [m], in files too. This also hides the rounding
-#: errors by which machines differ.
+#: Number of decimals to which vertices are rounded [m], in files as well. This also hides the
+#: differences of rounding between machines.
 DECIMALS = 7
 
-#: A point nearer to the axis than this lies on it, and no edge is shorter [m].
+#: Points nearer to the axis than this are on it, and no edge is shorter than this [m].
 ON_AXIS = 1e-9
 
-#: Normal of a plane y = 0.
+#: Normal of the plane y = 0.
 ACROSS = (0.0, 1.0, 0.0)
 
 
 def solid(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> trimesh.Trimesh:
-    """Return a mesh with outward winding, rounded vertices and a canonical order of both.
+    """Return a mesh with outward winding, rounded vertices, and both in a canonical order.
 
-    The order depends on the shape alone, not on how a library numbered it.
+    The order depends only on the shape, not on the numbering by a library.
     """
     mesh = trimesh.Trimesh(
         np.round(np.asarray(vertices, dtype=float), DECIMALS) + 0.0, faces, process=False
@@ -47,7 +47,7 @@ def solid(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> trimesh.Trimesh:
     if mesh.volume < 0.0:
         mesh.invert()
 
-    # Sort the vertices, start each face at its lowest one, then sort the faces.
+    # Sort the vertices, start each face at its lowest vertex, then sort the faces.
     order = np.lexsort(mesh.vertices.T[::-1])
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
@@ -58,7 +58,7 @@ def solid(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices[order], ranked, process=False)
 
 
-# Of curves
+# From curves
 
 
 def revolve(
@@ -67,9 +67,9 @@ def revolve(
     """Return the solid of revolution about z of a profile (n, 2) of points (r, z) [m].
 
     Args:
-        profile: Outline from one point of the axis to another, or, if `closed`, a loop
-            off the axis. Its points become rings: see `resample` and `smooth`.
-        edge: Wanted edge length along a ring [m], one for all or one per point.
+        profile: Outline from one point of the axis to another, or, if `closed`, a loop off the
+            axis. Its points become rings, see `resample` and `smooth`.
+        edge: Desired edge length along a ring [m], one for all rings or one per point.
         closed: Whether the last ring is joined to the first.
     """
     points = np.asarray(profile, dtype=float)
@@ -88,14 +88,14 @@ def sweep(
     normal: npt.ArrayLike = ACROSS,
     scale: npt.ArrayLike = 1.0,
 ) -> trimesh.Trimesh:
-    """Return the solid of a section moved along a plane path, with flat ends.
+    """Return the solid of a section that moves along a plane path, with flat ends.
 
     Args:
         path: Points (k, 3) [m] in a plane.
-        section: Closed outline (n, 2) [m] round its origin: first coordinate in the plane
-            of the path, across it, second along `normal`.
+        section: Closed outline (n, 2) [m] around its origin: the first coordinate is in the plane
+            of the path, across it; the second is along `normal`.
         normal: Unit normal (3,) of the plane of the path.
-        scale: Factor on the section, (), (k,) or, one per coordinate of it, (k, 2).
+        scale: Factor on the section, (), (k,) or, with one per coordinate of the section, (k, 2).
             Zero makes an end a point.
     """
     points, outline = np.asarray(path, dtype=float), np.asarray(section, dtype=float)
@@ -126,8 +126,8 @@ def bar(
     """Return a straight bar with rounded ends.
 
     Args:
-        start: Point (3,) [m] in the middle of one end.
-        end: Point (3,) [m] in the middle of the other.
+        start: Centre (3,) [m] of one end.
+        end: Centre (3,) [m] of the other end.
         section: As for `sweep`.
         normal: As for `sweep`.
         scale: Thickness along the bar: pairs (fraction of the length, factor).
@@ -137,7 +137,7 @@ def bar(
     length = float(np.linalg.norm(q - p))
     along = np.linspace(0.0, 1.0, max(4, round(length / edge)) + 1)
     factor = between(scale, along)
-    # The end rings are smaller: a bevel instead of a sharp edge.
+    # The end rings are smaller, so that the ends have a bevel instead of a sharp edge.
     factor[[0, -1]] *= 0.8
     return sweep(p + along[:, None] * (q - p), section, normal=normal, scale=factor)
 
@@ -150,19 +150,19 @@ def extrude(section: npt.ArrayLike, profile: npt.ArrayLike) -> trimesh.Trimesh:
 
 
 def at_height(outline: Array, z: float, middle: npt.ArrayLike = (0.0, 0.0)) -> Array:
-    """Return an outline (n, 2) [m] as a ring (n, 3) at a height [m]; one point if it has no size.
+    """Return an outline (n, 2) [m] as a ring (n, 3) at a height; one point if it has no size.
 
     Args:
-        outline: Round its origin.
-        z: The height [m].
-        middle: Where its origin is, (2,) [m].
+        outline: Outline around its origin.
+        z: Height of the ring [m].
+        middle: Position of the outline's origin, (2,) [m].
     """
     flat = outline if outline.any() else outline[:1]
     return np.column_stack([flat + np.asarray(middle, dtype=float), np.full(len(flat), z)])
 
 
 def grid_box(extents: npt.ArrayLike, *, centre: npt.ArrayLike, edge: float) -> trimesh.Trimesh:
-    """Return a box of `extents` (3,) [m] round `centre` (3,) [m] whose faces are grids."""
+    """Return a box of `extents` (3,) [m] around `centre` (3,) [m] whose faces are grids."""
     size = np.asarray(extents, dtype=float)
     counts = np.maximum(1, np.round(size / edge).astype(int))
     vertices: list[Array] = []
@@ -185,12 +185,12 @@ def grid_box(extents: npt.ArrayLike, *, centre: npt.ArrayLike, edge: float) -> t
 
 
 def capped(rings: list[Array]) -> trimesh.Trimesh:
-    """Return the surface through rings (n_i, 3) of vertices [m], a fan at both ends."""
+    """Return the surface through rings (n_i, 3) of vertices [m], with a fan at both ends."""
     return skin(fanned(rings, np.array([ring.mean(axis=0) for ring in rings])))
 
 
 def fanned(rings: list[Array], centres: Array) -> list[Array]:
-    """Return rings (n_i, 3) with the centre (k, 3) [m] of each end that is no tip: a flat fan."""
+    """Return rings (n_i, 3) with the centre (k, 3) [m] of each end that is not a tip: a fan."""
     first = [centres[:1]] if len(rings[0]) > 1 else []
     last = [centres[-1:]] if len(rings[-1]) > 1 else []
     return [*first, *rings, *last]
@@ -199,10 +199,10 @@ def fanned(rings: list[Array], centres: Array) -> list[Array]:
 def skin(rings: list[Array], *, closed: bool = False) -> trimesh.Trimesh:
     """Return the surface through rings (n_i, 3) of vertices [m].
 
-    Rings begin at the same angle; a ring of one point is a tip.
+    All rings begin at the same angle; a ring of one point is a tip.
 
     Args:
-        rings: In order.
+        rings: Rings in order.
         closed: Whether the last ring is joined to the first.
     """
     points = np.concatenate(rings)
@@ -214,7 +214,7 @@ def skin(rings: list[Array], *, closed: bool = False) -> trimesh.Trimesh:
 
 
 def _zip_rings(a: list[int], b: list[int]) -> list[tuple[int, int, int]]:
-    """Return the triangles between two rings of vertex numbers, stepping on the one behind."""
+    """Return the triangles between two rings of vertex numbers; the ring behind steps next."""
     a_steps, b_steps = (len(ring) if len(ring) > 1 else 0 for ring in (a, b))
     faces = []
     i = j = 0
@@ -229,15 +229,17 @@ def _zip_rings(a: list[int], b: list[int]) -> list[tuple[int, int, int]]:
     return faces
 
 
-# What several solids make
+# Combined solids
 
-#: Triangles lower than this [m] are removed after a Boolean operation: their normals mean little.
+#: Triangles whose height is below this [m] are removed after a Boolean operation, since their
+#: normals are unreliable.
 SLIVER = 0.0005
 
-#: Four points nearer to one plane than this are in it [m]; files round to a tenth of it.
+#: Four points are in one plane if they are closer to it than this [m]; files round to a tenth of
+#: it.
 FLAT = 1e-6
 
-#: Passes at most over all slivers, or over all edges of flat faces; a seam needs some dozens.
+#: Maximum number of passes over all slivers, or over all edges of flat faces; a seam needs dozens.
 MAX_PASSES = 100
 
 
@@ -247,7 +249,7 @@ def fuse(*parts: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def cut(body: trimesh.Trimesh, *tools: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return a solid without the space of the tools."""
+    """Return a solid without the space that the tools occupy."""
     return _from_boolean(trimesh.boolean.difference([body, *tools], engine="manifold"))
 
 
@@ -265,18 +267,18 @@ def stand(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _from_boolean(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return the result of a boolean without the slivers along its seams."""
-    # A canonical order first, because the repairs below depend on the order.
+    """Return the result of a Boolean operation without the slivers along its seams."""
+    # Establish a canonical order first, because the repairs below depend on the order.
     tidy = solid(mesh.vertices, mesh.faces)
     if not is_solid_surface(np.asarray(tidy.faces)):
-        # Rounding has opened it at edges that are too short: those go first.
+        # Rounding has opened the surface at edges that are too short: remove these edges first.
         whole = to_manifold(np.asarray(mesh.vertices), np.asarray(mesh.faces)).as_original()
         tidy = solid(*from_manifold(whole.simplify(10.0**-DECIMALS)))
     points = np.array(tidy.vertices, dtype=float)
     faces = _even_out(points, np.array(tidy.faces, dtype=np.int64))
     refused: set[tuple[int, ...]] = set()
 
-    # The lowest slivers first, each away from what was mended in the same pass.
+    # The lowest slivers come first, each away from what was repaired in the same pass.
     for _ in range(MAX_PASSES):
         heights = _heights(points, faces)
         low = np.flatnonzero(heights < SLIVER)
@@ -298,9 +300,9 @@ def _from_boolean(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _mend(points: Array, faces: Faces, sliver: tuple[int, ...]) -> Faces | None:
-    """Return the faces without a sliver, None if it must stay; `points` may be moved.
+    """Return the faces without a sliver, or None if it must stay; `points` may be moved.
 
-    Its shortest edge is collapsed if that is short, else its longest is turned.
+    The sliver's shortest edge is collapsed if that is short, else its longest edge is flipped.
     """
     corners = points[list(sliver)]
     lengths = norm(np.roll(corners, -1, axis=0) - corners)
@@ -316,10 +318,10 @@ def _mend(points: Array, faces: Faces, sliver: tuple[int, ...]) -> Faces | None:
 
 
 def _even_out(points: Array, faces: Faces) -> Faces:
-    """Return the faces with edges turned in flat places, as in a Delaunay triangulation.
+    """Return the faces with edges flipped in flat places, as in a Delaunay triangulation.
 
-    An edge between two faces of one plane is turned if the angles opposite to it add up to more
-    than a half turn. Equal angles, as in grids, stay as they are.
+    An edge between two faces of one plane is flipped if the angles opposite to it add up to more
+    than half a turn. Equal angles, as in grids, are not changed.
     """
     for _ in range(MAX_PASSES):
         a, b, left, right, first, second = _edges(faces)
@@ -329,7 +331,7 @@ def _even_out(points: Array, faces: Faces) -> Faces:
         if not len(wanted):
             break
 
-        # The worst first, each face at most once in a pass; the new edge must be new.
+        # The worst edge comes first, each face at most once per pass; the flipped edge must be new.
         known = set(zip(np.minimum(a, b).tolist(), np.maximum(a, b).tolist(), strict=True))
         order = wanted[np.argsort(-np.round(excess[wanted], 6), kind="stable")]
         used: set[int] = set()
@@ -347,11 +349,11 @@ def _even_out(points: Array, faces: Faces) -> Faces:
 
 
 def _edges(faces: Faces) -> tuple[Faces, Faces, Faces, Faces, Faces, Faces]:
-    """Return the edges of a closed surface once each.
+    """Return the edges of a closed surface, each once.
 
     Returns:
-        Their ends a and b in the order of the first face, the vertices opposite to them in the
-        first and in the second face, and the two faces; (n,) each.
+        The ends a and b of the edges in the order of the first face, the vertices opposite to them
+        in the first and in the second face, and the two faces; (n,) each.
     """
     starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     opposite = np.roll(faces, -2, axis=1).ravel()
@@ -368,7 +370,7 @@ def _cotangent(points: Array, a: Faces, b: Faces, apex: Faces) -> Array:
 
 
 def _height_above(points: Array, a: Faces, b: Faces, left: Faces, right: Faces) -> Array:
-    """Return how far (n,) [m] `right` is from the plane of `a`, `b` and `left`."""
+    """Return the distance (n,) [m] of `right` from the plane of `a`, `b` and `left`."""
     normal = np.cross(points[b] - points[a], points[left] - points[a])
     above = np.abs(dot(points[right] - points[a], normal))
     return np.asarray(above / np.maximum(norm(normal), ON_AXIS**2))
@@ -382,15 +384,15 @@ def _heights(points: Array, faces: Faces) -> Array:
 
 
 def _normals(points: Array, faces: Faces) -> Array:
-    """Return normals (n, 3) of faces, as long as twice their area [m^2]."""
+    """Return normals (n, 3) of faces, each with the length of twice the face's area [m^2]."""
     p, q, r = np.moveaxis(points[faces], 1, 0)
     return np.asarray(np.cross(q - p, r - p))
 
 
 def _collapse(points: Array, faces: Faces, a: int, b: int) -> Faces | None:
-    """Return the faces with vertex `b` made one with `a`.
+    """Return the faces with vertex `b` merged into `a`.
 
-    None if that would pinch the surface, or fold it where the two meet halfway.
+    None if this would pinch the surface, or fold it when both meet at their midpoint.
     """
     around_a = set(faces[(faces == a).any(axis=1)].ravel().tolist())
     around_b = set(faces[(faces == b).any(axis=1)].ravel().tolist())
@@ -399,7 +401,7 @@ def _collapse(points: Array, faces: Faces, a: int, b: int) -> Faces | None:
     joined = np.where(faces == b, a, faces)
     kept = (joined != np.roll(joined, 1, axis=1)).all(axis=1)
 
-    # A face that turns over would cross its neighbours; a sliver may turn as it likes.
+    # A face that turns over would cross its neighbours; a sliver may turn over.
     touched = np.flatnonzero(kept & (joined == a).any(axis=1))
     touched = touched[_heights(points, faces[touched]) > SLIVER]
     met = points.copy()
@@ -409,14 +411,14 @@ def _collapse(points: Array, faces: Faces, a: int, b: int) -> Faces | None:
 
 
 def _flip(points: Array, faces: Faces, a: int, b: int) -> Faces | None:
-    """Return the faces with the edge from `a` to `b` turned, None if that does not help."""
+    """Return the faces with the edge from `a` to `b` flipped, or None if that does not help."""
     pair = np.flatnonzero((faces == a).any(axis=1) & (faces == b).any(axis=1))
     start, end, apex = (np.roll(faces[pair], -k, axis=1) for k in range(3))
     left, right = (int(apex[(start == p) & (end == q)][0]) for p, q in ((a, b), (b, a)))
     if ((faces == left).any(axis=1) & (faces == right).any(axis=1)).any():
         return None
 
-    # The new pair must be higher, and look the same way as the old one.
+    # The new pair must be higher, and face the same way as the old pair.
     turned = np.array([(a, right, left), (right, b, left)])
     before, after = (_heights(points, either).min() for either in (faces[pair], turned))
     whole = _normals(points, faces[pair]).sum(axis=0)

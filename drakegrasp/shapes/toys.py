@@ -1,4 +1,4 @@
-"""Toys, toy animals, which look towards +x, and a prize.
+"""Toys, toy animals that look to +x, and a trophy.
 
 One function per class: sizes come in, a watertight mesh goes out; see `drakegrasp.shapes.catalog`.
 """
@@ -38,12 +38,12 @@ from drakegrasp.shapes.parts import (
 )
 from drakegrasp.shapes.solids import at_height, cut, flat_base, fuse
 
-#: Edge length of the animals: they have many parts [m].
+#: Edge length of the animals, which have many parts [m].
 COAT = 1.25 * EDGE
 
 
 def chess_pawn(*, base: float, head: float, height: float) -> Trimesh:
-    """Return a chess pawn: radii of its `base` and its `head`."""
+    """Return a chess pawn; `base` and `head` are radii."""
     neck = height - 1.75 * head
     waist = [(0.8 * base, 0.022), (0.52 * base, 0.32 * neck), (0.42 * head, 0.86 * neck)]
     low, rim = 0.9 * neck, 0.95 * head
@@ -53,20 +53,20 @@ def chess_pawn(*, base: float, head: float, height: float) -> Trimesh:
 
 
 def chess_rook(*, base: float, top: float, height: float) -> Trimesh:
-    """Return a chess rook: radii of its `base` and its `top`, which has six battlements."""
+    """Return a chess rook with six battlements; `base` and `top` are radii."""
     low, inside = 0.77 * height, top - 0.30 * top
     waist = [(0.82 * base, 0.022), (0.74 * top, 0.45 * height), (0.72 * top, 0.68 * height)]
     neck = smooth([(0.78 * top, 0.71 * height), (top, low)], EDGE)
     crown = resample([(top, low), (top, height), (inside, height), (inside, 0.86 * height)], EDGE)
     side = joined(_plinth(base), smooth(waist, EDGE), neck, crown)
 
-    # Three cuts across leave six battlements.
+    # Three cuts across the top leave six battlements.
     gap = block((3.0 * top, 0.34 * top, 0.1), (0.0, 0.0, 0.88 * height + 0.05))
     return cut(lathe(side), *(rotated(gap, "z", 60.0 * k) for k in range(3)))
 
 
 def trophy(*, base: float, cup: float, height: float) -> Trimesh:
-    """Return a cup with two handles on a square pedestal: edge of `base`, radius of `cup`."""
+    """Return a cup with two handles on a square pedestal of edge `base`; `cup` is its radius."""
     foot, stem = 0.17 * height, 0.46 * height
     levels = [(0.0, base, base), (0.7 * foot, 0.94 * base, 0.94 * base)]
     plinth = pillar(levels, corner=0.003, edge=LARGE)
@@ -87,7 +87,7 @@ def trophy(*, base: float, cup: float, height: float) -> Trimesh:
 
 
 def house(*, width: float, depth: float, wall: float, roof: float) -> Trimesh:
-    """Return a toy house: heights of `wall` and `roof`, a door towards -y, a chimney."""
+    """Return a toy house with a door at -y and a chimney; `wall` and `roof` are heights."""
     eaves, front = 0.012, -depth / 2.0
     wide, deep = width + 2.0 * eaves, depth + eaves
     body = pillar([(0.0, width, depth), (wall + 0.004, width, depth)], corner=0.004, edge=LARGE)
@@ -107,7 +107,7 @@ def house(*, width: float, depth: float, wall: float, roof: float) -> Trimesh:
 
 
 def toy_car(*, length: float, width: float, wheel: float) -> Trimesh:
-    """Return a toy car that drives towards +x: `wheel` is the radius of its wheels."""
+    """Return a toy car that drives to +x; `wheel` is the radius of its wheels."""
     low, belt = 0.55 * wheel, 2.35 * wheel
     roof = belt + 0.24 * length
     body = pillar([
@@ -138,7 +138,7 @@ def toy_car(*, length: float, width: float, wheel: float) -> Trimesh:
 
 
 def rocket(*, radius: float, height: float, span: float) -> Trimesh:
-    """Return a toy rocket on four fins: `radius` of its hull, `span` of its fins from the axis."""
+    """Return a toy rocket of `radius` on four fins; `span` is their reach from the axis."""
     low = 0.10 * height
     hull = lathe(smooth([
         (0.62 * radius, low), (0.88 * radius, 0.24 * height), (radius, 0.45 * height),
@@ -146,7 +146,7 @@ def rocket(*, radius: float, height: float, span: float) -> Trimesh:
     ], EDGE))  # fmt: skip
     nozzle = post(0.05 * height, low + 0.006, 0.5 * radius, 0.36 * radius)
 
-    # Four fins, on which it stands, and a window.
+    # Four fins on which it stands, and a window.
     fin = pillar([
         (0.0, 0.24 * span, 0.009, 0.86 * span, 0.0),
         (0.05 * height, 0.42 * span, 0.009, 0.79 * span, 0.0),
@@ -161,13 +161,13 @@ def rocket(*, radius: float, height: float, span: float) -> Trimesh:
 
 
 def dice(*, size: float, pip: float) -> Trimesh:
-    """Return a die with its one on top: edge of the cube, radius of a `pip`."""
+    """Return a die with the one on top; `size` is the cube's edge, `pip` the radius of a pip."""
     cube = pillar(scaled([
         (0.0, 0.86, 0.86), (0.035, 0.95, 0.95), (0.11, 1.0, 1.0), (0.89, 1.0, 1.0),
         (0.965, 0.95, 0.95), (1.0, 0.86, 0.86),
     ], size, size, size), corner=0.12 * size, edge=BROAD)  # fmt: skip
 
-    # Where the pips of each face are, in its plane; opposite faces add up to seven.
+    # Positions of the pips of each face, in its plane; opposite faces add up to seven.
     half, a = size / 2.0, 0.25 * size
     middle, two = (0.0, 0.0), [(-a, -a), (a, a)]
     four, six = list(product((-a, a), repeat=2)), product((-a, a), (-a, 0.0, a))
@@ -179,7 +179,7 @@ def dice(*, size: float, pip: float) -> Trimesh:
         *((u, half, half + v) for u, v in (*four, middle)),
         *((u, v, 0.0) for u, v in six),
     ]
-    # Flat across their face; the one is larger.
+    # The pips are flat, and the one is larger.
     across = np.repeat([2, 1, 0, 0, 1, 2], [1, 2, 3, 4, 5, 6])
     radii = np.full((len(spots), 3), pip)
     radii[0] = 1.5 * pip
@@ -188,7 +188,7 @@ def dice(*, size: float, pip: float) -> Trimesh:
 
 
 def bowling_pin(*, radius: float, height: float) -> Trimesh:
-    """Return a bowling pin: `radius` of its belly."""
+    """Return a bowling pin; `radius` is that of its belly."""
     side = smooth(scaled([
         (0.66, 0.0), (0.72, 0.03), (1.0, 0.3), (0.72, 0.52), (0.42, 0.68), (0.44, 0.76),
         (0.56, 0.87), (0.42, 0.965), (0.14, 1.0),
@@ -201,7 +201,7 @@ def bowling_pin(*, radius: float, height: float) -> Trimesh:
 
 
 def _plinth(base: float) -> Array:
-    """Return the side (r, z) of the foot of a chessman."""
+    """Return the profile (r, z) of the foot of a chess piece."""
     return resample([
         (base - 0.002, 0.0), (base, 0.002), (base, 0.012), (0.88 * base, 0.016),
         (0.86 * base, 0.021),
@@ -209,7 +209,7 @@ def _plinth(base: float) -> Array:
 
 
 def bunny(*, body: float, head: float, ear: float) -> Trimesh:
-    """Return a sitting bunny: `body` and `head` are radii, `ear` is the length of its ears."""
+    """Return a sitting bunny; `body` and `head` are radii, `ear` is the length of its ears."""
     chin = 2.0 * body + 0.45 * head
     parts = [
         ball((0.0, 0.0, 1.02 * body), scaled((0.95, 0.85, 1.05), body), edge=COAT),
@@ -231,7 +231,7 @@ def bunny(*, body: float, head: float, ear: float) -> Trimesh:
 
 
 def toy_dog(*, length: float, height: float, girth: float) -> Trimesh:
-    """Return a standing dog: `length` of the trunk, `height` of the back, `girth` its radius."""
+    """Return a standing dog of trunk `length` and back `height`; `girth` is the trunk's radius."""
     leg, x, z = 0.36 * girth, 0.36 * length, height - girth
     front, back = (x, 0.0, z), (-x, 0.0, z)
     nose = (x + 1.05 * girth, 0.0, height + 0.65 * girth)
@@ -264,7 +264,7 @@ def toy_dog(*, length: float, height: float, girth: float) -> Trimesh:
 
 
 def snake(*, coil: float, thickness: float, neck: float) -> Trimesh:
-    """Return a coiled snake: radius of its `coil`, `thickness` of its body, height of its head."""
+    """Return a coiled snake; `coil` is the coil's radius, `neck` the height of its head."""
     half = thickness / 2.0
     upper = 2.3 * half
 
@@ -273,7 +273,7 @@ def snake(*, coil: float, thickness: float, neck: float) -> Trimesh:
         circle = radius * np.column_stack([np.cos(angles), np.sin(angles)])
         return fuse(*hoop(at_height(circle, z), size, edge=COAT))
 
-    # The tail lies beside the coil, the neck rises out of it.
+    # The tail is beside the coil; the neck rises out of the coil.
     knots = [(-0.2, -1.0, 1.0), (0.45, -1.02, 0.95), (1.05, -1.25, 0.7), (1.55, -1.1, 0.4)]
     tail = smooth(scaled(knots, coil, coil, half), COAT)
     rise = smooth([
@@ -296,7 +296,7 @@ def snake(*, coil: float, thickness: float, neck: float) -> Trimesh:
 
 
 def rubber_duck(*, length: float, head: float) -> Trimesh:
-    """Return a rubber duck: `length` of its trunk, `head` the radius of its head."""
+    """Return a rubber duck; `length` is that of its trunk, `head` the radius of its head."""
     a = length / 2.0
     b, c = 0.74 * a, 0.6 * a
     poll = (0.42 * a, 0.0, 1.55 * c + 0.75 * head)
@@ -308,7 +308,7 @@ def rubber_duck(*, length: float, head: float) -> Trimesh:
         ball(poll, scaled((1.0, 0.95, 0.97), head), edge=COAT),
     ]
 
-    # The bill, wide and flat, its two halves apart at the tip; eyes and wings.
+    # The bill is wide and flat, with its halves apart at the tip; then eyes and wings.
     bill = ball((0.45 * head, 0.0, 0.0), scaled((0.62, 0.5, 0.15), head), edge=0.7 * COAT)
     for tilt, z in ((-10.0, 0.02), (12.0, -0.2)):
         parts.append(moved(bill, (poll[0] + 0.72 * head, 0.0, poll[2] + z * head), y=tilt))
