@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Unpack
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.connect import Workers, dashboard_line, has_dashboard, joined
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
+from drakegrasp.cluster.wire import by_wire
 from drakegrasp.config import Config, continued
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import claim_directory, release_directory
@@ -34,6 +35,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import carry_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
+from drakegrasp.runtime.executor import Executor
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.scoring.benchmark import NAME, PRESET, write_objects
 from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
@@ -181,7 +183,8 @@ def build_on(
         client = stack.enter_context(cluster)
         if show and has_dashboard() and client.dashboard_link:
             sys.stderr.write(f"{dashboard_line(client)}\n")
-        stack.enter_context(admitted_workers(client, config))
+        meshes = [source.path for source in sources or ()]
+        travels = stack.enter_context(admitted_workers(client, config, out, meshes))
 
         # The built-in objects become mesh files of the dataset.
         if sources is None:
@@ -189,7 +192,10 @@ def build_on(
                 sources = builtin_sources(out / BUILTIN_FOLDER, config.builtin, report, only)
         sources = [source for source in sources if not only or source.name in only]
 
-        execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
+        on_workers = DaskExecutor(client, resubmissions=RESUBMISSIONS)
+        execute: Executor = on_workers
+        if travels:
+            execute = stack.enter_context(by_wire(on_workers, client, out))
         return build_locked(
             sources,
             out,
@@ -198,7 +204,7 @@ def build_on(
             dead=dead,
             postures=postures,
             part=part,
-            pool=execute.pool,
+            pool=on_workers.pool,
             show=show,
         )
 

@@ -1,29 +1,59 @@
 """Which workers may do the work: checked at the start of a build, and when a worker joins later.
 
-In: a Dask client. Out: workers that give the results of this machine. A worker that cannot render a
-test image is closed. One with several threads, or with another version of Drake, drakegrasp or the
-hand, is refused: at the start with an error, later by closing it before its first task.
+In: a Dask client. Out: workers that give the results of this machine, and whether they see the
+files of the dataset. A worker that cannot render a test image is closed. One with several threads,
+or with another version of Drake, drakegrasp or the hand, is refused: at the start with an error,
+later by closing it before its first task. Where one of them does not see the files, or none is
+there yet, the files of all travel over the network, see `drakegrasp.cluster.wire`.
 """
 
 from __future__ import annotations
 
 import os
+import secrets
 import socket
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from distributed import Client, Scheduler, Worker, WorkerPlugin
 
 from drakegrasp.cluster.connect import SATURATION, SILENCE_SECONDS, WORKER_ENVIRONMENT
 from drakegrasp.config import Config
-from drakegrasp.dataset.manifest import REQUIRED_VERSIONS, installed_versions
-from drakegrasp.errors import MachineError, printable
+from drakegrasp.dataset.manifest import REQUIRED_VERSIONS, installed_versions, package_versions
+from drakegrasp.errors import MachineError, counted, printable
+from drakegrasp.runtime.files import probe_folder, temporary_name
 from drakegrasp.vision.probe_image import probe_image
 
 #: Topic of the messages from workers that join later.
 _TOPIC = "drakegrasp-admission"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shared:
+    """What a worker must see to work in a dataset's directory itself.
+
+    Attributes:
+        probe: File that the client wrote there.
+        text: What is in it.
+        files: Others that must be there, as a mesh.
+    """
+
+    probe: Path
+    text: str
+    files: Sequence[Path]
+
+    def is_seen(self) -> bool:
+        """Return whether this process sees the files, and can write in the directory."""
+        try:
+            probe_folder(self.probe.parent)
+            same = self.probe.read_text(encoding="utf-8") == self.text
+        except OSError:
+            return False
+        return same and all(path.is_file() for path in self.files)
 
 
 class Admission(WorkerPlugin):  # type: ignore[misc]
@@ -31,20 +61,29 @@ class Admission(WorkerPlugin):  # type: ignore[misc]
 
     name = "drakegrasp-admission"
 
-    def __init__(self, config: Config, hosts: frozenset[str]) -> None:
+    def __init__(
+        self, config: Config, hosts: frozenset[str], shared: Shared | None, *, travels: bool
+    ) -> None:
         """Know what is fit.
 
         Args:
             config: Of the build.
             hosts: Names of the machines that are known to render.
+            shared: What it must see, if anything.
+            travels: Whether it gets the hand's files from the client.
         """
-        self._config, self._hosts = config, hosts
-        self._versions = installed_versions(config)
+        self._config, self._hosts, self._shared = config, hosts, shared
+        self._travels, self._versions = travels, installed_versions(config)
 
     def setup(self, worker: Worker) -> None:
         """Check and set up the worker; Dask calls this before it gives it any task."""
         os.environ.update(WORKER_ENVIRONMENT)  # for a worker that was started by hand
-        fault = unfitness(worker.state.nthreads, installed_versions(self._config), self._versions)
+        fault = None
+        if self._shared is not None and not self._shared.is_seen():
+            fault = f"must see {self._shared.probe.parent} like those at the start"
+        if fault is None:
+            known = package_versions() if self._travels else installed_versions(self._config)
+            fault = unfitness(worker.state.nthreads, {**self._versions, **known}, self._versions)
         if fault is None and _host() not in self._hosts:
             fault = _image_fault()
         if fault is not None:
@@ -54,40 +93,80 @@ class Admission(WorkerPlugin):  # type: ignore[misc]
 
 
 @contextmanager
-def admitted_workers(client: Client, config: Config) -> Iterator[None]:
+def admitted_workers(
+    client: Client, config: Config, out: Path | None = None, meshes: Sequence[Path] = ()
+) -> Iterator[bool]:
     """Refuse workers that are not fit for the work; check those that join while the block runs.
+
+    Yields whether the files of the dataset must travel, because a worker does not see them.
 
     Args:
         client: Of the cluster.
         config: Its hand is among the versions that must agree.
+        out: Directory of the dataset; None for work that needs none.
+        meshes: Files elsewhere that workers read.
 
     Raises:
         MachineError: If a worker that is there has several threads, or another version of
             drakegrasp, Drake or the hand, or none of them can render.
     """
-    # Refuse what the user must change.
-    versions = installed_versions(config)
-    theirs = client.run(installed_versions, config)
-    for address, threads in client.nthreads().items():
-        fault = unfitness(threads, theirs.get(address, versions), versions)
-        if fault is not None:
-            raise MachineError(f"worker {address}: {fault}")
+    with _shared(out, meshes) as shared:
+        travels = shared is not None and _must_travel(client, shared)
 
-    # Do without machines that cannot render, if there are others.
-    hosts = _rendering_hosts(client)
+        # Refuse what the user must change. A hand that travels is the client's.
+        versions = installed_versions(config)
+        theirs = client.run(package_versions) if travels else client.run(installed_versions, config)
+        for address, threads in client.nthreads().items():
+            fault = unfitness(threads, {**versions, **theirs.get(address, {})}, versions)
+            if fault is not None:
+                raise MachineError(f"worker {address}: {fault}")
 
-    # Set what this program can change: for the workers that are there and for later ones.
-    client.run_on_scheduler(_saturate)
-    client.subscribe_topic(_TOPIC, _print_message)
+        # Do without machines that cannot render, if there are others.
+        hosts = _rendering_hosts(client)
+
+        # Set what this program can change: for the workers that are there and for later ones.
+        client.run_on_scheduler(_saturate)
+        client.subscribe_topic(_TOPIC, _print_message)
+        try:
+            later = Admission(config, hosts, None if travels else shared, travels=travels)
+            client.register_plugin(later)
+            yield travels
+        finally:
+            # A scheduler of the user's lives on; its later workers are not ours to check.
+            with suppress(Exception):
+                client.unsubscribe_topic(_TOPIC)
+            with suppress(Exception):
+                client.unregister_worker_plugin(Admission.name)
+
+
+@contextmanager
+def _shared(out: Path | None, meshes: Sequence[Path]) -> Iterator[Shared | None]:
+    """Yield what workers must see, with a file of random text in a dataset's directory."""
+    if out is None:
+        yield None
+        return
+    # One of each folder stands for the others.
+    files = {path.parent: path for path in meshes}
+    probe, text = temporary_name(out / "probe"), secrets.token_hex(16)
     try:
-        client.register_plugin(Admission(config, hosts))
-        yield
+        probe.write_text(text, encoding="utf-8")
+        yield Shared(probe=probe, text=text, files=tuple(files.values()))
     finally:
-        # A scheduler of the user's lives on; its later workers are not ours to check.
-        with suppress(Exception):
-            client.unsubscribe_topic(_TOPIC)
-        with suppress(Exception):
-            client.unregister_worker_plugin(Admission.name)
+        probe.unlink(missing_ok=True)
+
+
+def _must_travel(client: Client, shared: Shared) -> bool:
+    """Return whether files must travel to the workers; if so, say why."""
+    seen = list(client.run(shared.is_seen).values())
+    if seen and all(seen):
+        return False
+    what = "there is no worker yet"
+    if seen:
+        blind = seen.count(False)
+        see = f"do{'es' * (blind == 1)} not see {shared.probe.parent} and the meshes"
+        what = f"{blind} of {counted(len(seen), 'worker')} {see}"
+    sys.stderr.write(f"{what}: files travel over the network\n")
+    return True
 
 
 def unfitness(threads: int, theirs: Mapping[str, str], ours: Mapping[str, str]) -> str | None:

@@ -291,8 +291,12 @@ def finger_names(config: Config) -> dict[str, bool]:
 
 def installed_versions(config: Config) -> dict[str, str]:
     """Return all versions that may change a result: those of packages, and the hand's hash."""
-    packages = {name: metadata.version(name) for name in VERSIONED}
-    return {**packages, "hand": hand_digest(config.hand_source)}
+    return {**package_versions(), "hand": hand_digest(config.hand_source)}
+
+
+def package_versions() -> dict[str, str]:
+    """Return the versions of all packages that may change a result."""
+    return {name: metadata.version(name) for name in VERSIONED}
 
 
 def other_version(then: Mapping[str, str], now: Mapping[str, str]) -> str | None:

@@ -36,6 +36,16 @@ def plan_path(out: Path, name: str) -> Path:
     return out / "objects" / f"{_file_name(name)}.plan.h5"
 
 
+def object_files(out: Path, name: str) -> tuple[Path, Path]:
+    """Return the paths of both files of an object."""
+    return model_path(out, name), plan_path(out, name)
+
+
+def places(out: Path, *paths: Path) -> dict[str, Path]:
+    """Return those of some files in a dataset's directory that are there, by their places."""
+    return {path.relative_to(out).as_posix(): path for path in paths if path.is_file()}
+
+
 def shards_folder(out: Path, name: str) -> Path:
     """Return the folder of an object's shards."""
     return out / "shards" / _file_name(name)

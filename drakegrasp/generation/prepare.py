@@ -13,9 +13,10 @@ import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh
-from drakegrasp.dataset.paths import model_path
+from drakegrasp.dataset.paths import model_path, object_files, places
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared, save_prepared
 from drakegrasp.errors import DrakegraspError, MachineError, MeshError
+from drakegrasp.hand.folder import hand_places, moved_hand
 from drakegrasp.objects.model import prepare_object
 from drakegrasp.objects.sources import MeshSource, file_frame
 from drakegrasp.runtime.environment import one_thread, release_memory
@@ -56,6 +57,31 @@ class PrepareTask:
     postures: Attempts | None = None
     restartable: bool
 
+    def reads(self) -> dict[str, Path]:
+        """Return the mesh, the hand, and what an earlier run has left, see `FileTask`."""
+        own = places(self.out, *object_files(self.out, self.source.name), self.journal)
+        return {self._mesh_place: self.source.path, **hand_places(self.config), **own}
+
+    def writes(self) -> tuple[str, ...]:
+        """Return the places of the object's files and of the journal."""
+        files = *object_files(self.out, self.source.name), self.journal
+        return tuple(path.relative_to(self.out).as_posix() for path in files)
+
+    def moved(self, folder: Path) -> PrepareTask:
+        """Return the task in a directory with copies of the files."""
+        source = replace(self.source, path=folder / self._mesh_place)
+        return replace(self, out=folder, source=source, config=moved_hand(self.config, folder))
+
+    @property
+    def journal(self) -> Path:
+        """Path of the journal, see `drakegrasp.runtime.journal`."""
+        return model_path(self.out, self.source.name).with_suffix(".journal")
+
+    @property
+    def _mesh_place(self) -> str:
+        # Messages name the file.
+        return f"meshes/{self.mesh_sha256[:16]}/{self.source.path.name}"
+
 
 @one_thread
 def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
@@ -83,7 +109,7 @@ def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
             "mesh_sha256": task.mesh_sha256,
             "config_hash": config.simulation_hash(),
         }
-        with open_journal(model_path(out, name).with_suffix(".journal"), identity) as journal:
+        with open_journal(task.journal, identity) as journal:
             verdict = journal.verdict(PREPARE)
             if verdict is not None:
                 # More memory may help, so the next build tries again.

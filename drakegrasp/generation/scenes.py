@@ -8,7 +8,7 @@ appears when it is complete, and nothing else changes. Its bytes do not depend o
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from drakegrasp.dataset.hdf5 import AnyArray, create_field, packed_chunk, write_
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manifest
 from drakegrasp.dataset.opening import SCENE_TABLES, open_samples
-from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
+from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE, object_files, places
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.scenes import GRASPS_FOLLOW_FROM, count_scenes, grasps_of_trials
 from drakegrasp.dataset.schema import (
@@ -43,6 +43,7 @@ from drakegrasp.errors import ConfigError
 from drakegrasp.frames import make_pose, pack_pose, rotation_about
 from drakegrasp.generation.attempts import find_attempt
 from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.folder import hand_places, moved_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.parsing import position_order
 from drakegrasp.hand.settings import override_config
@@ -112,7 +113,7 @@ def make_scenes_locked(
     joints = manifest.joints or position_order(hand.model, hand.palm_link)
     manifest = replace(manifest, config=config, joints=joints)
     trials = Trials(out)
-    tasks = _tasks(out, manifest, trials)
+    tasks, count = _tasks(out, manifest, trials), len(manifest.objects)
 
     rows, tables = Counter[str](), dict[str, list[Columns]]()
     with disk_full_named(out), atomic_hdf5(out / SCENES_FILE) as file:
@@ -121,13 +122,13 @@ def make_scenes_locked(
         file.attrs.update(origin_attributes(*origin))
         file.attrs.update({"near": config.scenes.near, "far": config.scenes.far})
         file.attrs.update({key: trials.attributes[key] for key in ("signature", "shards")})
-        progress(0, len(tasks))
+        progress(0, count)
         for done, (own, images) in enumerate(in_order(execute)(make_scenes_of, tasks), start=1):
             _write_images(file, images, rows["views"], config)
             for group, columns in own.items():
                 tables.setdefault(group, []).append(_numbered(group, columns, rows))
             rows.update({group: len(next(iter(of.values()))) for group, of in own.items()})
-            progress(done, len(tasks))
+            progress(done, count)
         for group, parts in tables.items():
             _write_table(file, group, parts)
         counts = count_scenes(file)
@@ -147,8 +148,8 @@ def _with_scenes(config: Config, overrides: Sequence[str]) -> Config:
     return override_config(config, overrides)
 
 
-def _tasks(out: Path, manifest: Manifest, trials: Trials) -> list[SceneTask]:
-    """Return a task per object, in the order of the dataset."""
+def _tasks(out: Path, manifest: Manifest, trials: Trials) -> Iterator[SceneTask]:
+    """Yield a task per object, in the order of the dataset."""
     columns = trials.columns(("object", "outcome", "time_close"))
     weights = np.full(len(trials), np.nan)
     sample_split = np.full(len(trials), len(SPLITS))
@@ -166,18 +167,17 @@ def _tasks(out: Path, manifest: Manifest, trials: Trials) -> list[SceneTask]:
         for i in range(len(manifest.objects))
     ]
     splits = split_objects(manifest, present)
-    return [
-        SceneTask(
+    for i, entry in enumerate(manifest.objects):
+        ids = np.flatnonzero(closed & (columns["object"] == i))
+        yield SceneTask(
             out=out,
             name=entry.name,
             split=splits[i],
             config=manifest.config_of(entry.name),
             joints=manifest.joints,
-            trial_ids=(ids := np.flatnonzero(closed & (columns["object"] == i))),
+            trials={**trials[ids].columns(GRASPS_FOLLOW_FROM)},
             weights=weights[ids],
         )
-        for i, entry in enumerate(manifest.objects)
-    ]
 
 
 def split_objects(manifest: Manifest, present: Sequence[set[int]]) -> list[int]:
@@ -272,7 +272,7 @@ class SceneTask:
         split: Of its scenes, an index into SPLITS.
         config: Of the object.
         joints: Names of the hand's joints, in the order of the files.
-        trial_ids: (n,), rows of trials.hdf5 of its closed hands.
+        trials: Columns GRASPS_FOLLOW_FROM of trials.hdf5 (n rows), of its closed hands.
         weights: (n,), of those that are samples, NaN of others.
     """
 
@@ -281,8 +281,23 @@ class SceneTask:
     split: int
     config: Config
     joints: Sequence[str]
-    trial_ids: npt.NDArray[np.int64]
+    trials: Columns
     weights: Array
+
+    def reads(self) -> dict[str, Path]:
+        """Return the prepared object and the hand, see `FileTask`."""
+        return {
+            **hand_places(self.config),
+            **places(self.out, *object_files(self.out, self.name)),
+        }
+
+    def writes(self) -> tuple[str, ...]:
+        """Return nothing: the scenes are the result."""
+        return ()
+
+    def moved(self, folder: Path) -> SceneTask:
+        """Return the task in a directory with copies of the files."""
+        return replace(self, out=folder, config=moved_hand(self.config, folder))
 
 
 @one_thread
@@ -427,9 +442,8 @@ _VIEW_CONDITIONS = {f.name for f in VIEW_FIELDS if f.of}
 
 def _grasps(task: SceneTask, prepared: PreparedObject, X_TO: Array) -> Columns:
     """Return the rows of /grasps, scene by scene in the order of the attempts."""
-    trials = Trials(task.out)[task.trial_ids].columns(GRASPS_FOLLOW_FROM)
-    order = np.argsort(trials["resting"], kind="stable")
-    trials = {name: values[order] for name, values in trials.items()}
+    order = np.argsort(task.trials["resting"], kind="stable")
+    trials = {name: values[order] for name, values in task.trials.items()}
     scene = trials["resting"]
     columns = grasps_of_trials(trials, X_TO[scene], task.weights[order])
     stored = {f.name for f in stored_fields(SCENE_GRASP_FIELDS, certified=task.config.certified)}

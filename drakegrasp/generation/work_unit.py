@@ -29,7 +29,7 @@ from drakegrasp.dataset.assembly.survey import (
     survey_tasks,
 )
 from drakegrasp.dataset.manifest import Manifest
-from drakegrasp.dataset.paths import shards_folder
+from drakegrasp.dataset.paths import object_files, places, shards_folder
 from drakegrasp.dataset.schema import HOLD_FIELDS, LOOK_FIELDS
 from drakegrasp.dataset.shards import Shard, ShardHeader, read_trials, write_shard
 from drakegrasp.errors import DataError, MachineError
@@ -46,6 +46,7 @@ from drakegrasp.generation.attempts import (
     trial_setup,
     try_attempt,
 )
+from drakegrasp.hand.folder import hand_places, moved_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread, timed, trim_memory
 from drakegrasp.runtime.files import disk_full_named
@@ -103,6 +104,20 @@ class WorkUnit:
     refined: bool = True
     likely_tested: bool = False
     restartable: bool = False
+
+    def reads(self) -> dict[str, Path]:
+        """Return the prepared object, the hand, and the journal if there is one, see `FileTask`."""
+        files = *object_files(self.out, self.header.object_name), self.header.journal_path(self.out)
+        return {**hand_places(self.config), **places(self.out, *files)}
+
+    def writes(self) -> tuple[str, ...]:
+        """Return the places of the shard and of the journal."""
+        files = self.header.path(self.out), self.header.journal_path(self.out)
+        return tuple(path.relative_to(self.out).as_posix() for path in files)
+
+    def moved(self, folder: Path) -> WorkUnit:
+        """Return the unit in a directory with copies of the files."""
+        return replace(self, out=folder, config=moved_hand(self.config, folder))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ import posixpath
 import re
 import shutil
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -354,6 +354,25 @@ def carried_hand(out: Path, hand: str, digest: str) -> CarriedHand | None:
     own = hand == f"{HAND_FOLDER}/{path.name}"
     named = not any(sign in hand for sign in "/\\\0") and os.path.lexists(path)
     return CarriedHand(path=path, digest=digest) if own or named else None
+
+
+def hand_places(config: Config) -> dict[str, Path]:
+    """Return the files of the hand that a dataset carries, by their places in its directory."""
+    carried = config.hand_source
+    if not isinstance(carried, CarriedHand):
+        return {}
+    folder = carried.path.parent
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {f"{HAND_FOLDER}/{path.relative_to(folder).as_posix()}": path for path in files}
+
+
+def moved_hand(config: Config, folder: Path) -> Config:
+    """Return a configuration whose hand is a copy in another directory, at `hand_places`."""
+    carried = config.hand_source
+    if not isinstance(carried, CarriedHand):
+        return config
+    path = folder / HAND_FOLDER / carried.path.name
+    return config.with_hand(config.hand, replace(carried, path=path))
 
 
 def carry_hand(out: Path, config: Config, known: str | None = None) -> Config:

@@ -21,7 +21,8 @@ from functools import partial
 from itertools import islice
 from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for
-from typing import Protocol, TypeVar
+from pathlib import Path
+from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.runtime.environment import available_cores
@@ -40,6 +41,23 @@ class Executor(Protocol):
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
         """Yield function(item) for every item; items are taken only when workers become free."""
+
+
+@runtime_checkable
+class FileTask(Protocol):
+    """A task that works on files of a dataset; a worker that does not see them gets copies.
+
+    Places are paths within a directory, with slashes.
+    """
+
+    def reads(self) -> dict[str, Path]:
+        """Return the files that it reads and that are there, by their places."""
+
+    def writes(self) -> tuple[str, ...]:
+        """Return the places of the files that it writes or removes."""
+
+    def moved(self, folder: Path) -> Self:
+        """Return the task in a directory that holds the files at their places."""
 
 
 @dataclass
@@ -91,6 +109,17 @@ def _numbered(function: Callable[[T], R], item: tuple[int, T]) -> tuple[int, R]:
     """Return the number of an item and its result."""
     number, argument = item
     return number, function(argument)
+
+
+def task_of(item: Any) -> Any:
+    """Return the task in an item of an executor, which `in_order` has given a number."""
+    return item[1] if isinstance(item, tuple) else item
+
+
+def moved_item(item: Any, folder: Path) -> Any:
+    """Return an item whose task is a `FileTask` in a directory with copies of the files."""
+    task = task_of(item).moved(folder)
+    return (item[0], task) if isinstance(item, tuple) else task
 
 
 def count_workers(workers: int | None) -> int:

@@ -1,0 +1,122 @@
+"""A process beside a Dask worker that calls functions: it may die, and the worker does not.
+
+In: a pickled function and its item, a `FileTask`. Out: the pickled result. Where workers see no
+file of the dataset, the journal of a task (`drakegrasp.runtime.journal`) is in the worker's own
+directory. So the worker must outlive the process that dies: it starts another one, which finds the
+journal and goes on.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import select
+import signal
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import psutil
+
+from drakegrasp.errors import MachineError
+from drakegrasp.runtime.executor import moved_item
+
+#: Time between two looks at the memory of the process [s].
+LOOK_SECONDS = 0.1
+
+
+class ApartError(Exception):
+    """The process died."""
+
+
+class ProcessApart:
+    """A process that does one call after the other until it dies or is closed.
+
+    Its caches, as of scenes, last from call to call.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Start the process.
+
+        Args:
+            folder: Holds copies of the files that tasks read.
+        """
+        self._connection, theirs = Pipe()
+        with theirs:
+            number = theirs.fileno()
+            command = [sys.executable, "-m", __name__, str(number), str(folder)]
+            self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=[number])
+
+    def call(self, request: bytes, memory: float) -> bytes:
+        """Return what a request gives.
+
+        Args:
+            request: A pickled function and its item.
+            memory: Most memory of the process [byte]; above it is killed, as a nanny would.
+
+        Raises:
+            ApartError: If the process died.
+            Exception: What the function raised.
+        """
+        try:
+            self._connection.send_bytes(request)
+            while not self._connection.poll(LOOK_SECONDS):
+                with suppress(psutil.Error):
+                    if psutil.Process(self._process.pid).memory_info().rss > memory:
+                        self._process.kill()
+            failed, content = pickle.loads(self._connection.recv_bytes())
+        except (EOFError, OSError):
+            self.close()
+            raise ApartError from None
+        if failed:
+            raise pickle.loads(content)
+        return bytes(content)
+
+    def close(self) -> None:
+        """End the process."""
+        self._connection.close()
+        self._process.kill()
+        self._process.wait()
+
+
+def main(connection: Connection, folder: Path) -> None:
+    """Do what the worker asks for, until it closes the connection."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the client stops, and its workers with it
+    threading.Thread(target=_end_with, args=[connection.fileno()], daemon=True).start()
+    with suppress(EOFError, ConnectionError):
+        while True:
+            connection.send_bytes(pickle.dumps(_answer(connection.recv_bytes(), folder)))
+
+
+def _answer(request: bytes, folder: Path) -> tuple[bool, bytes]:
+    """Return whether a call failed, and its pickled result or error."""
+    try:
+        function, item = pickle.loads(request)
+        return False, pickle.dumps(function(moved_item(item, folder)))
+    except Exception as error:
+        return True, _pickled_error(error)
+
+
+def _pickled_error(error: Exception) -> bytes:
+    try:
+        content = pickle.dumps(error)
+        pickle.loads(content)
+    except Exception:
+        return pickle.dumps(MachineError(f"{type(error).__name__}: {error}"))
+    return content
+
+
+def _end_with(descriptor: int) -> None:
+    """End this process when the worker is gone, whatever it does then."""
+    poll = select.poll()
+    poll.register(descriptor, 0)
+    poll.poll()
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main(Connection(int(sys.argv[1])), Path(sys.argv[2]))

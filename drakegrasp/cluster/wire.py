@@ -1,0 +1,293 @@
+"""Tasks for workers that do not see the files of the dataset: bytes go there, and bytes come back.
+
+In: an executor on Dask, and tasks that name the files which they read and write (`FileTask`). Out:
+their results, and the files, written here as the task would have written them there.
+
+The client sends the content of a file to the scheduler once, under its SHA-256, while tasks that
+need it are on the way. A worker gets it from there when it lacks it, and keeps the files of its
+last tasks in its own directory. The task runs in a process beside the worker, in a folder with
+copies of the files: whatever kills that process leaves the worker alone, which starts another one.
+Its journal lies in that folder, so a step that kills its process is found as where workers see the
+dataset. What is lost with a worker is done again by another one, from the beginning.
+
+Functions whose items are no such tasks read what only this machine has: they run here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import secrets
+import shutil
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import chain, count, islice
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import dask
+from distributed import Client, Variable, Worker, get_worker
+from distributed.utils import sync
+
+from drakegrasp.cluster.apart import ApartError, ProcessApart
+from drakegrasp.errors import MachineError
+from drakegrasp.runtime.executor import Executor, FileTask, processes, task_of
+from drakegrasp.runtime.files import write_atomic
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+#: A worker keeps the files of so many of its last tasks.
+KEPT_TASKS = 8
+#: Time that the scheduler may take to send a file [s].
+FETCH_SECONDS = 300
+#: Deaths in one task after which the machine must be at fault.
+MOST_DEATHS = 400
+#: Share of a worker's memory that it and the process beside it may use.
+_TERMINATE = "distributed.worker.memory.terminate"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parcel:
+    """A task on its way to a worker.
+
+    Attributes:
+        number: Of the task.
+        build: Names what is sent by one client.
+        call: Pickled function and item.
+        files: SHA-256 of the files that it reads, by their places.
+        writes: Places of the files that it writes or removes.
+    """
+
+    number: int
+    build: str
+    call: bytes
+    files: Mapping[str, str]
+    writes: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Delivery:
+    """What comes back.
+
+    Attributes:
+        number: Of the task.
+        result: Pickled.
+        files: Content of those that it wrote, by their places.
+    """
+
+    number: int
+    result: bytes
+    files: Mapping[str, bytes]
+
+
+# Here
+
+
+@contextmanager
+def by_wire(execute: Executor, client: Client, out: Path) -> Iterator[Executor]:
+    """Yield an executor whose tasks work on copies of a dataset's files.
+
+    Args:
+        execute: Runs tasks on workers.
+        client: Of these workers.
+        out: Directory of the dataset, which this process alone sees.
+    """
+    build = secrets.token_hex(8)
+    with processes() as here:
+        try:
+            yield _Wire(execute, here, client, out, build)
+        finally:
+            with suppress(Exception):  # the workers may be gone
+                client.run(leave, build)
+
+
+class _Wire:
+    """An `Executor` that sends what tasks read and writes what they wrote."""
+
+    def __init__(
+        self, execute: Executor, here: Executor, client: Client, out: Path, build: str
+    ) -> None:
+        self._execute, self._here = execute, here
+        self._client, self._out, self._build = client, out, build
+        # Digests by what says that a file changed; how many tasks on their way need each content.
+        self._digests: dict[tuple[Any, ...], str] = {}
+        self._uses = Counter[str]()
+
+    def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield function(item) of every item; the files of a result are there before it."""
+        items = iter(items)
+        first = list(islice(items, 1))
+        if not (first and isinstance(task_of(first[0]), FileTask)):
+            yield from self._here(function, chain(first, items))
+            return
+
+        sent, numbers = dict[int, Parcel](), count()
+
+        def parcels() -> Iterator[Parcel]:
+            for item in chain(first, items):
+                parcel = self._packed(next(numbers), function, item)
+                sent[parcel.number] = parcel
+                yield parcel
+
+        deliveries = self._execute(do_parcel, parcels())
+        try:
+            for delivery in deliveries:
+                self._write(sent[delivery.number].writes, delivery.files)
+                self._release(sent.pop(delivery.number))
+                yield pickle.loads(delivery.result)
+        finally:
+            cast(Any, deliveries).close()
+            for parcel in sent.values():
+                self._release(parcel)
+
+    def _packed(self, number: int, function: Callable[[T], R], item: T) -> Parcel:
+        task = cast(FileTask, task_of(item))
+        return Parcel(
+            number=number,
+            build=self._build,
+            call=pickle.dumps((function, item)),
+            files={place: self._offer(path) for place, path in task.reads().items()},
+            writes=task.writes(),
+        )
+
+    def _offer(self, path: Path) -> str:
+        """Have the scheduler keep a file for one task more; return its SHA-256."""
+        status = path.stat()
+        key = path, status.st_ino, status.st_size, status.st_mtime_ns
+        digest = self._digests.get(key)
+        if digest is None or not self._uses[digest]:
+            content = path.read_bytes()
+            digest = self._digests[key] = hashlib.sha256(content).hexdigest()
+            if not self._uses[digest]:
+                self._variable(digest).set(content)
+        self._uses[digest] += 1
+        return digest
+
+    def _release(self, parcel: Parcel) -> None:
+        """Have the scheduler forget the files that no other task on its way needs."""
+        for digest in parcel.files.values():
+            self._uses[digest] -= 1
+            if not self._uses[digest]:
+                with suppress(OSError):  # the scheduler may be gone, and the files with it
+                    self._variable(digest).delete()
+
+    def _variable(self, digest: str) -> Variable:
+        return Variable(_name(self._build, digest), client=self._client)
+
+    def _write(self, places: Iterable[str], files: Mapping[str, bytes]) -> None:
+        """Write the files at some places, and remove those that are not there."""
+        for place in places:
+            if place in files:
+                write_atomic(self._out / place, files[place])
+            else:
+                (self._out / place).unlink(missing_ok=True)
+
+
+def _name(build: str, digest: str) -> str:
+    return f"drakegrasp-{build}-{digest}"
+
+
+# At a worker
+
+
+class _Copies:
+    """A worker's folder with copies of files, and the process that works there."""
+
+    def __init__(self, folder: Path, build: str) -> None:
+        self.build = build
+        self._folder = folder
+        self._digests: dict[str, str] = {}
+        self._recent = deque[Mapping[str, str]](maxlen=KEPT_TASKS)
+        self._process: ProcessApart | None = None
+        self._closed = False
+
+    def do(self, parcel: Parcel, worker: Worker) -> Delivery:
+        """Do a task; start the process again when it dies."""
+        self._bring(parcel.files, worker)
+        for _ in range(MOST_DEATHS):
+            if self._closed:
+                break
+            self._process = self._process or ProcessApart(self._folder)
+            try:
+                result = self._process.call(parcel.call, _memory(worker))
+            except ApartError:
+                self._process = None
+                continue
+            return Delivery(number=parcel.number, result=result, files=self._taken(parcel.writes))
+        raise MachineError("workers died again and again")
+
+    def _bring(self, files: Mapping[str, str], worker: Worker) -> None:
+        """Get the files that are missing; remove those of tasks long ago."""
+        self._recent.append(files)
+        for place in self._digests.keys() - set().union(*self._recent):
+            (self._folder / place).unlink(missing_ok=True)
+            del self._digests[place]
+        for place, digest in files.items():
+            if self._digests.get(place) != digest:
+                write_atomic(self._folder / place, _fetched(self.build, digest, worker))
+                self._digests[place] = digest
+
+    def _taken(self, places: Iterable[str]) -> dict[str, bytes]:
+        """Return the files at some places, and remove them."""
+        found = {}
+        for place in places:
+            path = self._folder / place
+            if path.is_file():
+                found[place] = path.read_bytes()
+                path.unlink()
+            self._digests.pop(place, None)
+        return found
+
+    def close(self) -> None:
+        """End the process, and remove the folder."""
+        self._closed = True
+        if self._process is not None:
+            self._process.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+#: Of the build that this worker worked for last.
+_copies: _Copies | None = None
+
+
+def do_parcel(parcel: Parcel) -> Delivery:
+    """Do a task on a worker; call it in its thread.
+
+    Raises:
+        MachineError: If the process beside it dies again and again.
+        Exception: What the function raised.
+    """
+    global _copies
+    worker = get_worker()
+    if _copies is None or _copies.build != parcel.build:
+        leave()
+        _copies = _Copies(Path(worker.local_directory) / f"drakegrasp-{parcel.build}", parcel.build)
+    return _copies.do(parcel, worker)
+
+
+def leave(build: str | None = None) -> None:
+    """Forget the files of a build on this worker, or of any build if None."""
+    global _copies
+    if _copies is not None and build in (None, _copies.build):
+        _copies.close()
+        _copies = None
+
+
+def _fetched(build: str, digest: str, worker: Worker) -> bytes:
+    """Return a file by its SHA-256 from the scheduler."""
+    name = _name(build, digest)
+    found = sync(worker.loop, worker.scheduler.variable_get, name=name, timeout=FETCH_SECONDS)
+    content: bytes = found["value"]
+    if hashlib.sha256(content).hexdigest() != digest:
+        raise MachineError(f"a file came from the scheduler with other bytes ({digest[:16]})")
+    return content
+
+
+def _memory(worker: Worker) -> float:
+    """Return the memory that a process beside the worker may use [byte]."""
+    limit, share = worker.memory_manager.memory_limit, dask.config.get(_TERMINATE)
+    own = worker.monitor.proc.memory_info().rss
+    return limit * share - own if limit and share else float("inf")
