@@ -27,6 +27,7 @@ from drakegrasp.runtime.executor import moved_item
 
 #: Time between two looks at the memory of the process [s].
 LOOK_SECONDS = 0.1
+_NAME = "drakegrasp.cluster.apart"
 
 
 class ApartError(Exception):
@@ -48,8 +49,10 @@ class ProcessApart:
         self._connection, theirs = Pipe()
         with theirs:
             number = theirs.fileno()
-            command = [sys.executable, "-m", __name__, str(number), str(folder)]
-            self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=[number])
+            command = [sys.executable, "-P", "-m", _NAME, str(number), str(folder)]
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, pass_fds=[number], cwd=folder
+            )
 
     def call(self, request: bytes, memory: float) -> bytes:
         """Return what a request gives.

@@ -96,22 +96,18 @@ def by_wire(execute: Executor, client: Client, out: Path) -> Iterator[Executor]:
         out: Directory of the dataset, which this process alone sees.
     """
     build = secrets.token_hex(8)
-    with processes() as here:
-        try:
-            yield _Wire(execute, here, client, out, build)
-        finally:
-            with suppress(Exception):  # the workers may be gone
-                client.run(leave, build)
+    try:
+        yield _Wire(execute, client, out, build)
+    finally:
+        with suppress(Exception):  # the workers may be gone
+            client.run(leave, build)
 
 
 class _Wire:
     """An `Executor` that sends what tasks read and writes what they wrote."""
 
-    def __init__(
-        self, execute: Executor, here: Executor, client: Client, out: Path, build: str
-    ) -> None:
-        self._execute, self._here = execute, here
-        self._client, self._out, self._build = client, out, build
+    def __init__(self, execute: Executor, client: Client, out: Path, build: str) -> None:
+        self._execute, self._client, self._out, self._build = execute, client, out, build
         # Digests by what says that a file changed; how many tasks on their way need each content.
         self._digests: dict[tuple[Any, ...], str] = {}
         self._uses = Counter[str]()
@@ -121,7 +117,8 @@ class _Wire:
         items = iter(items)
         first = list(islice(items, 1))
         if not (first and isinstance(task_of(first[0]), FileTask)):
-            yield from self._here(function, chain(first, items))
+            with processes() as here:
+                yield from here(function, chain(first, items))
             return
 
         sent, numbers = dict[int, Parcel](), count()
@@ -197,8 +194,8 @@ class _Copies:
     """A worker's folder with copies of files, and the process that works there."""
 
     def __init__(self, folder: Path, build: str) -> None:
-        self.build = build
-        self._folder = folder
+        self.build, self._folder = build, folder
+        folder.mkdir()
         self._digests: dict[str, str] = {}
         self._recent = deque[Mapping[str, str]](maxlen=KEPT_TASKS)
         self._process: ProcessApart | None = None

@@ -1,0 +1,282 @@
+"""Workers that do not see the dataset give the same files, whatever dies."""
+
+from __future__ import annotations
+
+import filecmp
+import itertools
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from distributed import Client, LocalCluster, Worker
+from helpers import builds
+from helpers.builds import FAST
+from helpers.file_tasks import Join, join
+from helpers.tiers import in_second_tier
+
+from drakegrasp import build_dataset
+from drakegrasp.cluster import wire
+from drakegrasp.cluster.admission import admitted_workers
+from drakegrasp.cluster.apart import ProcessApart
+from drakegrasp.cluster.connect import connect
+from drakegrasp.cluster.executor import DaskExecutor
+from drakegrasp.cluster.wire import by_wire
+from drakegrasp.config import Config
+from drakegrasp.errors import MachineError
+from drakegrasp.generation.pipeline import BuildReport, build
+from drakegrasp.hand.settings import load_config
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import WorkerPool, in_order, run_here
+from drakegrasp.runtime.journal import VARIABLE
+
+pytestmark = pytest.mark.cluster
+
+#: One attempt, which gives a sample, and the scenes of its object.
+SAMPLE = [
+    *FAST,
+    "candidates.method=above",
+    "candidates.max=1",
+    "candidates.standoffs=[0.042]",
+    "physics.friction_hand=1.5",
+    "scenes.when=assembled",
+    "scenes.views=1",
+]
+#: Every kind of step of a unit: also a palm pose about that of the sample, and certificates.
+EVERY_STEP = [
+    *SAMPLE,
+    "refine.children=1",
+    "refine.generations=1",
+    "certify.repeats=1",
+    "certify.share=1",
+]
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Client]:
+    with (
+        LocalCluster(
+            n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+@pytest.fixture
+def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A directory that the process beside a worker does not see: its own one is another."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(builds.__file__).parent.parent))
+    monkeypatch.chdir(tmp_path)
+    return Path("/proc/self/cwd/out")
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("box")
+    trimesh.creation.box([0.06, 0.05, 0.12]).export(folder / "1_box_a.obj")
+    return folder
+
+
+def put(out: Path, count: int) -> None:
+    """Write the files that tasks read."""
+    (out / "in").mkdir(parents=True)
+    (out / "in/common").write_text("common")
+    for number in range(count):
+        (out / f"in/{number}").write_text(str(number))
+
+
+def assert_same_files(a: Path, b: Path) -> None:
+    """Two datasets have the same files, byte for byte, but for the log of the build."""
+    assert names_in(a) == names_in(b)
+    _, other, _ = filecmp.cmpfiles(a, b, names_in(a) - {"log.jsonl"}, shallow=False)
+    assert other == []
+
+
+def names_in(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def test_files_go_once_and_results_come_back(
+    client: Client, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put(out, 12)
+    (out / "old").write_text("")
+    fetched, fetch = list[str](), wire._fetched
+    monkeypatch.setattr(wire, "_fetched", lambda *args: fetched.append(args[1]) or fetch(*args))
+    tasks = [Join(out=out, number=number) for number in range(12)]
+    with by_wire(DaskExecutor(client), client, out) as execute:
+        assert list(in_order(execute)(join, tasks)) == list(range(12))
+        (copies,) = Path(next(iter(client.run(local_directory).values()))).glob("drakegrasp-*")
+        assert len(list(copies.glob("in/*"))) == 1 + wire.KEPT_TASKS
+        assert not list(copies.glob("out/*"))
+    assert not copies.exists()
+    assert [(out / f"out/{i}").read_text() for i in range(12)] == [f"common {i}" for i in range(12)]
+    assert not (out / "old").exists()
+    assert len(fetched) == len(set(fetched)) == 13
+    assert client.run_on_scheduler(variables) == []
+
+
+def local_directory(dask_worker: Worker) -> str:
+    return str(dask_worker.local_directory)
+
+
+def variables(dask_scheduler: object) -> list[str]:
+    """Return the names of what the scheduler keeps."""
+    return list(dask_scheduler.extensions["variables"].variables)  # type: ignore[attr-defined]
+
+
+def test_process_that_dies_is_started_again_but_not_for_ever(
+    client: Client, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put(out, 2)
+    monkeypatch.setattr(wire, "MOST_DEATHS", 3)
+    with by_wire(DaskExecutor(client), client, out) as execute:
+        assert list(execute(join, [Join(out=out, number=0, deaths=2)])) == [0]
+        with pytest.raises(MachineError, match="again and again"):
+            list(execute(join, [Join(out=out, number=1, deaths=3)]))
+
+
+def test_error_of_a_task_is_raised_here_and_nothing_is_kept(client: Client, out: Path) -> None:
+    put(out, 1)
+    (out / "in/-1").write_text("")
+    with by_wire(DaskExecutor(client), client, out) as execute:
+        with pytest.raises(ValueError, match="-1 < 0"):
+            list(execute(join, [Join(out=out, number=-1), Join(out=out, number=0)]))
+        assert client.run_on_scheduler(variables) == []
+        # Other items stay here.
+        assert list(execute(abs, [-1])) == [1]
+
+
+def test_process_that_takes_too_much_memory_is_killed(tmp_path: Path, out: Path) -> None:
+    process = ProcessApart(tmp_path)
+    with pytest.raises(wire.ApartError):
+        process.call(b"", memory=1.0)
+    process.close()
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("settings", [SAMPLE, in_second_tier(EVERY_STEP)])
+def test_every_kind_of_task_gives_the_same_bytes(
+    client: Client, meshes: Path, out: Path, tmp_path: Path, settings: list[str]
+) -> None:
+    config, here = load_config(overrides=settings), tmp_path / "here"
+    build(find_meshes(meshes), here, config, run_here, show=False)
+    build_by_wire(client, meshes, out, config)
+    assert_same_files(here, out)
+    with h5py.File(out / "trials.hdf5") as file:
+        assert file["trials/outcome"][0] == Outcome.SUCCESS
+        assert (file["trials/child"][:] > 0).any() == bool(config.refine.children)
+
+
+def build_by_wire(client: Client, meshes: Path, out: Path, config: Config) -> BuildReport:
+    with by_wire(DaskExecutor(client), client, out) as execute:
+        sources = find_meshes(meshes)
+        return build(sources, out, config, execute, pool=WorkerPool(), show=False)
+
+
+@pytest.mark.nightly
+@pytest.mark.sim
+def test_attempt_that_crashes_its_process_costs_itself_alone(
+    client: Client, meshes: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, here = load_config(overrides=FAST), tmp_path / "here"
+    build(find_meshes(meshes), here, config, run_here, show=False)
+    monkeypatch.setenv(VARIABLE, "crash:1_box_a:3:1")
+    build_by_wire(client, meshes, out, config)
+    with h5py.File(here / "trials.hdf5") as one, h5py.File(out / "trials.hdf5") as other:
+        expected, found = (file["trials/outcome"][:] for file in (one, other))
+    crashed = found == Outcome.CRASHED
+    assert np.flatnonzero(crashed).tolist() == [10]
+    assert (found == expected)[~crashed].all()
+    assert not list(out.rglob("*.journal"))
+
+
+@pytest.mark.nightly
+@pytest.mark.sim
+def test_client_that_stopped_goes_on_and_a_killed_worker_changes_nothing(
+    meshes: Path,
+    out: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """The workers have another working directory, so they do not see the dataset."""
+    config, here = load_config(overrides=FAST), tmp_path / "here"
+    build(find_meshes(meshes), here, config, run_here, show=False)
+    monkeypatch.chdir(meshes)
+    with connect(workers=2) as client:
+        monkeypatch.chdir(tmp_path)
+
+        def build_by_workers() -> BuildReport:
+            return build_dataset(meshes, out, config=config, client=client, show=False)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(wire._Wire, "_write", stop_after(3, wire._Wire._write))
+            with pytest.raises(KeyboardInterrupt):
+                build_by_workers()
+        done = len(list(out.glob("shards/*/*.h5")))
+        assert 0 < done < 6
+        pids = list(client.run(os.getpid).values())
+        with monkeypatch.context() as patch:
+            killing = kill_after(1, pids[0], wire._Wire._packed)
+            patch.setattr(wire._Wire, "_packed", killing)
+            report = build_by_workers()
+        assert (report.reused, report.simulated) == (done, 6 - done)
+        assert pids[0] not in client.run(os.getpid).values()
+    assert_same_files(here, out)
+    line = f"2 of 2 workers do not see {out} and the meshes: files travel over the network"
+    assert capfd.readouterr().err.splitlines() == [line, line]
+
+
+def stop_after(count: int, function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that is interrupted after some calls."""
+    calls = itertools.count(1)
+
+    def stopping(*args: Any) -> Any:
+        result = function(*args)
+        if next(calls) == count:
+            raise KeyboardInterrupt
+        return result
+
+    return stopping
+
+
+def kill_after(count: int, pid: int, function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that kills a process half a second after some calls."""
+    calls = itertools.count(1)
+
+    def killing(*args: Any) -> Any:
+        if next(calls) == count:
+            threading.Timer(0.5, os.kill, [pid, signal.SIGKILL]).start()
+        return function(*args)
+
+    return killing
+
+
+@pytest.mark.nightly
+def test_worker_that_joins_later_must_see_what_the_others_do(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with (
+        connect(workers=1) as client,
+        admitted_workers(client, load_config(), tmp_path) as travels,
+    ):
+        assert not travels
+        (probe,) = tmp_path.iterdir()
+        probe.unlink()
+        client.cluster.scale(2)
+        line, end = f"must see {tmp_path} like those at the start", time.monotonic() + 120
+        said = ""
+        while line not in said and time.monotonic() < end:
+            time.sleep(0.1)
+            said += capfd.readouterr().err
+    assert line in said
