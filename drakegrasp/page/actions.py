@@ -1,7 +1,7 @@
-"""What a person can do on a page: decide, and have an attempt run again.
+"""Actions of a person on a page: deciding, and running an attempt again.
 
-In: the directory of a dataset. Out: `reject.json`, on disk at all times, and recordings in a folder
-that is removed at the end.
+In: the directory of a dataset. Out: `reject.json`, which is always up to date on disk, and
+recordings in a folder that is removed at the end.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ from drakegrasp.dataset.rejections import (
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import lock_file, open_own
 
-#: Who writes `reject.json` holds this file; it goes when the decision is written.
+#: A process that writes `reject.json` locks this file, and removes it when the decision is written.
 LOCK_NAME = f".{FILE_NAME}.lock"
-#: How long a decision waits for those of other inspections [s]; each takes milliseconds.
+#: Time [s] that a decision waits for those of other inspections, each of which takes milliseconds.
 PATIENCE = 10.0
-#: Pages whose decisions can be undone, and the decisions of each.
+#: Number of pages whose decisions can be undone, and number of decisions of each page.
 KEPT_PAGES, KEPT_DECISIONS = 100, 1000
 
 
-#: An attempt, and what was decided of it before and after.
+#: An attempt, its decision before, and its decision after.
 _Step = tuple[AttemptKey, str, str]
 
 
 class Undo(NamedTuple):
-    """What came of withdrawing a decision.
+    """Result of withdrawing a decision.
 
     Attributes:
         key: The attempt.
-        decision: What is decided now.
-        done: Whether it was withdrawn; not if somebody has decided otherwise since.
+        decision: The present decision on the attempt.
+        done: Whether the decision was withdrawn; False if another decision was made since.
     """
 
     key: AttemptKey
@@ -57,16 +57,16 @@ class Undo(NamedTuple):
 
 
 class DecisionFile:
-    """`reject.json` of a dataset, written anew with every decision.
+    """`reject.json` of a dataset, rewritten with every decision.
 
-    It is read before each change, and locked until the change is written, so that nothing is lost
-    that another inspection or a person writes.
+    The file is read before each change, and locked until the change is written, so that no decision
+    of another inspection or a person is lost.
 
     Args:
         out: Directory of the dataset.
 
     Raises:
-        DataError: If there is such a file that cannot be read.
+        DataError: If the file exists and cannot be read.
     """
 
     def __init__(self, out: Path) -> None:
@@ -76,7 +76,7 @@ class DecisionFile:
         self.read()
 
     def read(self) -> Decisions:
-        """Return the decisions as they are on disk.
+        """Return the decisions on disk.
 
         Raises:
             DataError: If the file cannot be read.
@@ -84,17 +84,17 @@ class DecisionFile:
         return read_decisions(self._path)
 
     def decide(self, key: AttemptKey, decision: str, page: str = "") -> Decisions:
-        """Write a decision and return all that there are then.
+        """Write a decision and return all decisions including it.
 
         Args:
             key: The attempt.
-            decision: `rejected`, `kept`, or empty text to withdraw what was decided.
-            page: Which page decides, for `undo`.
+            decision: `rejected`, `kept`, or empty text to withdraw the decision.
+            page: The page that decides, for `undo`.
 
         Raises:
-            ValueError: If it is not a decision.
-            DataError: If the file is something else by now.
-            OSError: If it cannot be written.
+            ValueError: If the text is not a decision.
+            DataError: If the file is no longer a list of rejections.
+            OSError: If the file cannot be written.
         """
         with self._lock, _held(self._path.with_name(LOCK_NAME)):
             decisions = self.read()
@@ -106,13 +106,13 @@ class DecisionFile:
             return changed
 
     def undo(self, page: str = "") -> Undo | None:
-        """Withdraw the last decision of a page; None if none is left.
+        """Withdraw the last decision of a page; None if there is none left.
 
-        What was decided otherwise since, by another page or inspection, stays.
+        If another page or inspection has decided differently since, that decision stays.
 
         Raises:
-            DataError: If the file is something else by now.
-            OSError: If it cannot be written.
+            DataError: If the file is no longer a list of rejections.
+            OSError: If the file cannot be written.
         """
         with self._lock, _held(self._path.with_name(LOCK_NAME)):
             steps = self._steps_of(page)
@@ -138,11 +138,11 @@ class DecisionFile:
 def _held(path: Path) -> Iterator[None]:
     """Hold the kernel's lock on a file while the block runs, and remove it at the end.
 
-    On a file system without locks the block runs without.
+    On a file system without locks the block runs without a lock.
 
     Raises:
-        DataError: If another process holds it for long.
-        OSError: If it cannot be made.
+        DataError: If another process holds the lock for a long time.
+        OSError: If the file cannot be created.
     """
     file = _take(path)
     try:
@@ -153,12 +153,12 @@ def _held(path: Path) -> Iterator[None]:
 
 
 def _take(path: Path) -> FileIO:
-    """Return the lock file, which is ours now."""
+    """Return the lock file, locked by this process."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         file = FileIO(open_own(path, os.O_RDWR | os.O_CREAT), "r+")
         try:
-            # Who held it before may have removed it after we opened it.
+            # The previous holder may have removed the file after this process opened it.
             if lock_file(file) is not False and os.path.samestat(
                 path.stat(), os.fstat(file.fileno())
             ):
@@ -172,16 +172,16 @@ def _take(path: Path) -> FileIO:
     )
 
 
-#: Longest time that a replay may take [s].
+#: Time limit of a replay [s].
 TIMEOUT = 300.0
 
 
 class Rerun(NamedTuple):
-    """What running an attempt again gave.
+    """Result of running an attempt again.
 
     Attributes:
-        same: Whether each value is the stored one, bit for bit.
-        text: What `replay` says of it, a line per value that differs.
+        same: Whether each value equals the stored one, bit for bit.
+        text: Output of `replay`, one line per value that differs.
     """
 
     same: bool
@@ -191,7 +191,7 @@ class Rerun(NamedTuple):
 class Recordings:
     """Recordings of this inspection, in a folder that is removed at its end.
 
-    A replay runs in a process of its own: its memory and its crashes are not the server's.
+    A replay runs in its own process, so its memory and its crashes do not affect the server.
 
     Args:
         out: Directory of the dataset.
@@ -204,20 +204,20 @@ class Recordings:
         self._found: dict[str, Rerun] = {}
 
     def make(self, label: str, trial: int) -> Rerun:
-        """Run a trial again, keep its recording, and return how it compares.
+        """Run a trial again, store its recording, and return how its values compare.
 
         Args:
-            label: Of the attempt.
-            trial: Its row in trials.hdf5.
+            label: Label of the attempt.
+            trial: Row of the attempt in trials.hdf5.
 
         Raises:
-            DataError: If it cannot be run again; the reason is the last line of `replay`.
+            DataError: If the trial cannot be run again; the reason is the last line of `replay`.
         """
         code = "from drakegrasp.cli.main import run; run()"
-        # -P: a module in the current folder must not stand for one of Python's.
+        # -P: a module in the current folder must not replace one of Python's.
         arguments = ["replay", "--trial", str(trial)]
         command = [sys.executable, "-P", "-c", code, *arguments]
-        # One at a time: each takes a core for some seconds.
+        # One at a time, since each takes a core for some seconds.
         with self._lock:
             if self._folder is None:
                 self._folder = Path(tempfile.mkdtemp(prefix="drakegrasp-inspect-"))
@@ -238,14 +238,15 @@ class Recordings:
                 reason = (done.stderr.strip().splitlines() or ["no recording was written"])[-1]
                 raise DataError(f"trial {trial} cannot be run again: {reason}")
 
-            # Exit code 1 with a recording: values differ, and the recording shows what is now. The
-            # last line is the recording's path.
+            # Exit code 1 with a recording means that values differ; the recording shows the new
+            # run.
+            # The last line is the recording's path.
             lines = done.stdout.strip().splitlines()[:-1]
             self._found[label] = Rerun(same=done.returncode == 0, text="\n".join(lines))
             return self._found[label]
 
     def read(self, label: str) -> bytes | None:
-        """Return the recording of an attempt, or None if none was made."""
+        """Return the recording of an attempt, or None if there is none."""
         if self._folder is None:
             return None
         path = self._path(label)
@@ -257,7 +258,7 @@ class Recordings:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def _path(self, label: str) -> Path:
-        """Return the path of a recording; only labels are names."""
+        """Return the path of a recording, whose name consists of the label's safe characters."""
         assert self._folder is not None
         safe = "".join(c for c in label if c in "0123456789abcdef-")
         return self._folder / f"{safe}.html"

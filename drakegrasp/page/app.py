@@ -1,8 +1,8 @@
-"""The web application: addresses, and what keeps other sites and machines out.
+"""The web application: its addresses, and its protection against other sites and machines.
 
 Every answer forbids scripts, styles and requests other than to the server itself. The Host header
-must name this machine, so a foreign name that resolves to it (DNS rebinding) gets nothing. What
-changes a file is a POST with the token of this run, which only our own pages know.
+must name this machine, so a foreign name that resolves to this machine (DNS rebinding) gets
+nothing. Files are only changed by a POST with the token of this run, which only our own pages know.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from drakegrasp.page.scenes import Scenes
 from drakegrasp.pictures.style import colour_png, strip_png
 
 ASSETS = Path(__file__).parent / "static"
-#: Names of this machine that a browser may have asked for.
+#: Names of this machine that a browser may have requested.
 HOSTS = ("127.0.0.1", "localhost")
 TOKEN_HEADER = "x-drakegrasp-token"
 HEADERS = {
@@ -59,15 +59,15 @@ HEADERS = {
 }
 #: A standalone SVG has inline styles only.
 PLOT_POLICY = "default-src 'none'; style-src 'unsafe-inline'"
-#: A recording holds its own scripts; it runs without access to this server or any other.
+#: A recording contains its own scripts; it runs without access to this server or any other.
 RECORDING_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' data: blob:; style-src "
     "'unsafe-inline'; img-src data: blob:; connect-src data: blob:; worker-src blob:; "
     "sandbox allow-scripts"
 )
-#: Longest text that a POST may have [B].
+#: Maximum size of a POST [B].
 MAX_BODY = 4096
-#: Selections that are kept in memory, and attempts in all of them together: four bytes each.
+#: Maximum number of cached selections, and of all attempts in them, at four bytes each.
 KEPT_SELECTIONS, KEPT_PLACES = 16, 10_000_000
 Params: TypeAlias = Mapping[str, str]
 
@@ -77,11 +77,11 @@ class Inspection:
 
     Args:
         out: Directory of the dataset.
-        results: File of the verdicts on predictions for its rows, if there is one.
+        results: File of the verdicts on predictions for the dataset's rows, if there is one.
 
     Raises:
-        DataError: If the directory holds no dataset, its `reject.json` or the verdicts cannot be
-            read, or the verdicts are not of this dataset.
+        DataError: If the directory contains no dataset, if its `reject.json` or the verdicts cannot
+            be read, or if the verdicts belong to another dataset.
     """
 
     def __init__(self, out: Path, results: Path | None = None) -> None:
@@ -103,16 +103,16 @@ class Inspection:
         return self.catalog.current()
 
     def site(self) -> Site:
-        """Return where the pages are; scenes may be made while they are looked at."""
+        """Return where the pages are; scenes may be created while the pages are open."""
         scened = os.path.lexists(self._scenes.path)
         return Site(predicted=self._results is not None, scened=scened)
 
     def table(self, kind: type[Gallery]) -> Gallery:
-        """Return a table as it is now.
+        """Return the present state of a table.
 
         Raises:
-            HTTPException: If there is none.
-            DataError: If its file cannot be read, or is not of this dataset.
+            HTTPException: If there is no such table.
+            DataError: If its file cannot be read, or belongs to another dataset.
         """
         snapshot, site = self.snapshot(), self.site()
         if kind is Scenes:
@@ -127,7 +127,7 @@ class Inspection:
         return Attempts(snapshot, self.decisions.read(), self.token)
 
     def select(self, table: Gallery, query: Query) -> Places:
-        """Return the rows that a query selects; the last selections of attempts are remembered."""
+        """Return the rows that a query selects; the last selections of attempts are cached."""
         if not isinstance(table, Attempts):
             return table.select(query)
         key = (query.params(page=1), table.decisions if query["decision"] else None)
@@ -149,15 +149,15 @@ class Inspection:
         return places
 
     def warm_up(self) -> None:
-        """Load what the first page would have to wait for."""
-        # The hand loads Drake, the first picture Matplotlib, the first page its templates.
+        """Load everything that the first page would have to wait for."""
+        # The hand loads Drake, the first picture Matplotlib, and the first page its templates.
         _ = self.hand.links
         image, mask = np.zeros((4, 2, 2), np.float32), np.zeros((2, 2), np.uint8)
         strip_png(image, mask, far=1.0)
         _gallery(Attempts, self, "", {})
 
 
-# Answers: pages, pictures and meshes, by what stands for {name} in their addresses.
+# Answers: pages, pictures and meshes, by the {name} in their addresses.
 
 
 def _gallery(kind: type[Gallery], inspection: Inspection, name: str, params: Params) -> Response:
@@ -222,10 +222,10 @@ def _recording(inspection: Inspection, name: str, params: Params) -> Response:
 
 
 def _there(found: Any, noun: str) -> Any:
-    """Return what was found.
+    """Return `found` unless it is None.
 
     Raises:
-        HTTPException: If there is no such thing.
+        HTTPException: If it is None.
     """
     if found is None:
         raise HTTPException(404, f"there is no such {noun}")
@@ -233,7 +233,7 @@ def _there(found: Any, noun: str) -> Any:
 
 
 Answer: TypeAlias = Callable[[Inspection, str, Params], Response]
-#: What each address shows: galleries and rows of tables, plots, and what pages are made of.
+#: Function that answers each address: galleries and rows of tables, plots, and parts of pages.
 PAGES: dict[str, Answer] = {
     **{kind.HOME: partial(_gallery, kind) for kind in (Attempts, Predictions, Scenes)},
     **{f"/{kind.ROW}/{{name}}": partial(_row, kind) for kind in (Attempts, Predictions, Scenes)},
@@ -247,10 +247,10 @@ PAGES: dict[str, Answer] = {
 
 
 def answer(inspection: Inspection, address: str) -> Response:
-    """Return what PAGES has for an address without a query.
+    """Return the answer to an address without a query, by the function in PAGES.
 
     Raises:
-        HTTPException: If there is no such thing.
+        HTTPException: If there is no such address.
     """
     for pattern, found in PAGES.items():
         match = re.fullmatch(pattern.replace(".", r"\.").replace("{name}", "([^/]+)"), address)
@@ -303,7 +303,7 @@ def _record(inspection: Inspection, content: dict[str, Any]) -> Response:
 
 
 def _tab(content: dict[str, Any]) -> str:
-    """Return which page of a browser sends a request: its decisions are undone together."""
+    """Return the browser page that sends a request; decisions are undone per page."""
     return str(content.get("page", ""))[:64]
 
 
@@ -352,7 +352,7 @@ def make_app(inspection: Inspection) -> Starlette:
 
 
 class SecurityHeaders:
-    """Adds HEADERS to every answer that does not have them."""
+    """Adds the HEADERS to every answer that lacks them."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -371,7 +371,7 @@ class SecurityHeaders:
 
 
 async def _content(request: Request, token: str) -> dict[str, Any]:
-    """Return the JSON of a POST that has the token."""
+    """Return the JSON of a POST, which must have the token."""
     given = request.headers.get(TOKEN_HEADER, "")
     if not secrets.compare_digest(given.encode(), token.encode()):
         raise HTTPException(403, "the token must be that of this page; load it again")
@@ -390,7 +390,7 @@ async def _content(request: Request, token: str) -> dict[str, Any]:
 
 
 def _error(request: Request, error: Exception) -> Response:
-    """Return an error as JSON to a script, and as a page to a person."""
+    """Return an error as JSON for a script, or as a page for a person."""
     status, text = 400 if isinstance(error, DataError) else 500, str(error)
     if isinstance(error, HTTPException):
         status, text = error.status_code, str(error.detail)

@@ -1,4 +1,4 @@
-"""The attempts of a dataset on the page: which are shown, their cards, and the page of one."""
+"""The attempts of a dataset on the page: which ones are shown, their cards, and their pages."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ from drakegrasp.page.looks import (
 )
 from drakegrasp.table import AnyArray
 
-#: Features of an attempt that can be filtered and sorted by, as people read them.
+#: Features of an attempt for filtering and sorting, with their display.
 QUANTITIES = {
     "suspicion": Shown("suspicion", digits=2),
     "force": Shown("largest force", "N"),
     "p_hold": Shown("p_hold: share of disturbed repeats that would be samples", digits=2),
     **{part.name: part.shown for part in PARTS},
 }
-#: Choices of the split that say more than their values: all samples, and what is no sample.
+#: Texts of two choices of the split: all samples, and all attempts that are not samples.
 SPLIT_NAMES = {"samples": "any sample", "none": "no sample"}
-#: What no success is removed by, see `Removal`: what filters keep is called samples.
+#: The removal that no success has: successes kept by the filters are called samples.
 KEPT = ("removal", Removal.KEPT.label)
-#: Reasons of suspicion that a card names, and the share from which on it names one.
+#: Maximum number of reasons of suspicion on a card, and the smallest part that is a reason.
 REASONS, REASON_SHARE = 2, 0.75
 
 
@@ -52,8 +52,8 @@ class Attempts(Gallery):
 
     Args:
         snapshot: State of the files.
-        decisions: What was rejected and kept.
-        token: With which a page decides; empty if it cannot.
+        decisions: Attempts that were rejected and kept.
+        token: Token with which a page decides; empty if it cannot.
     """
 
     HOME, ROW, NOUN = "/", "grasp", "attempt"
@@ -83,11 +83,11 @@ class Attempts(Gallery):
         self.table = snapshot.table
 
     def column(self, name: str) -> AnyArray:
-        """Return a column (n,), a feature among them, or the order of the rows."""
+        """Return a column (n,), which may be a feature or the order of the rows."""
         return self.snapshot.feature(name) if name in QUANTITIES else super().column(name)
 
     def matches(self, name: str, value: str) -> npt.NDArray[np.bool_]:
-        """Return which attempts (n,) have what can be chosen."""
+        """Return which attempts (n,) have a value of a choice."""
         if name == "decision":
             return self._decided(value)
         if name == "split" and value in SPLIT_NAMES:
@@ -95,7 +95,7 @@ class Attempts(Gallery):
         return super().matches(name, value)
 
     def options(self, name: str) -> Mapping[str, str]:
-        """Return what the form offers: decisions, and else what occurs."""
+        """Return the options of a field of the form: all decisions, else values that occur."""
         found = super().options(name)
         if name == "decision":
             found = {value: value for value in self.CHOICES[name]}
@@ -108,20 +108,20 @@ class Attempts(Gallery):
         return self.snapshot.label(i)
 
     def find(self, label: str) -> int | None:
-        """Return the place of the attempt of a label, or None if there is none."""
+        """Return the index of the attempt with a label, or None if there is none."""
         return self.snapshot.find(label)
 
     # Decisions.
 
     def counts(self) -> dict[str, int]:
-        """Return how many attempts are rejected, and kept, and how many rejected are samples."""
+        """Return the numbers of rejected attempts, kept attempts, and rejected samples."""
         rejected, kept, samples = self.decisions.rejected, self.decisions.kept, 0
         if rejected:
             samples = int((self._decided("rejected") & (self.snapshot.table.split != NONE)).sum())
         return {"rejected": len(rejected), "kept": len(kept), "samples": samples}
 
     def _decided(self, decision: str) -> npt.NDArray[np.bool_]:
-        """Return which (n,) are rejected, kept, or still open; only successes are decided."""
+        """Return which attempts (n,) are rejected, kept, or open; only successes are decided."""
         snapshot, decisions = self.snapshot, self.decisions
         keys = {"rejected": decisions.rejected, "kept": decisions.kept}.get(
             decision, decisions.rejected | decisions.kept
@@ -140,9 +140,9 @@ class Attempts(Gallery):
         return found
 
     def _decisions(self) -> dict[str, Any]:
-        """Return how much is decided, and the command that takes rejected grasps out, as values.
+        """Return counts of decisions, and the command that removes rejected grasps, as values.
 
-        Filters of the user's own are given to it again: a dataset has their names alone.
+        The command names user-defined filters again, since a dataset stores only their names.
         """
         snapshot = self.snapshot
         out = snapshot.out
@@ -156,14 +156,14 @@ class Attempts(Gallery):
             "assembled": snapshot.assembled,
         }
 
-    # What pages say.
+    # Contents of pages.
 
     def identity(self, i: int) -> dict[str, Any]:
         """Return how people name an attempt, see `name_of`."""
         return {**super().identity(i), "number": name_of(self.snapshot, i)}
 
     def summary(self, query: Query, chosen: Places) -> dict[str, Any]:
-        """Return what the gallery shows besides its cards."""
+        """Return the content of the gallery besides its cards."""
         snapshot = self.snapshot
         return {
             "title": snapshot.out.name or str(snapshot.out),
@@ -174,8 +174,8 @@ class Attempts(Gallery):
         }
 
     def cards(self, shown: Places) -> list[dict[str, Any]]:
-        """Return what the cards of attempts say."""
-        # Only the columns of the dots are read, and no images: a page must be quick.
+        """Return the content of the cards of attempts."""
+        # Read only the columns that the dots need, and no images: a page must be fast.
         snapshot, cards = self.snapshot, []
         rows = read_rows(snapshot, shown.tolist(), THUMBNAIL)
         for i, row in zip(shown.tolist(), rows, strict=True):
@@ -198,12 +198,12 @@ class Attempts(Gallery):
         return cards
 
     def row(self, i: int, hand: HandView) -> dict[str, Any]:
-        """Return what the page of an attempt says.
+        """Return the content of an attempt's page.
 
         Raises:
-            DataError: If a file was replaced meanwhile.
+            DataError: If a file was replaced in the meantime.
         """
-        # Its row, and where both cameras see its contacts.
+        # The row of the attempt, and where both cameras see its contacts.
         snapshot = self.snapshot
         (row,) = read_rows(snapshot, [i])
         outcome, trial = Outcome(int(snapshot.table.outcome[i])), snapshot.trial_id(i)
@@ -237,7 +237,7 @@ class Attempts(Gallery):
 
 
 def name_of(snapshot: Snapshot, i: int) -> str:
-    """Return how people name an attempt: its trial id, or its palm pose before there is one."""
+    """Return how people name an attempt: by trial id, or by palm pose if it has no id yet."""
     trial, key = snapshot.trial_id(i), snapshot.key(i)
     if trial is not None:
         return f"trial {trial}"
@@ -246,12 +246,12 @@ def name_of(snapshot: Snapshot, i: int) -> str:
 
 
 def _text(snapshot: Snapshot, name: str, i: int) -> str:
-    """Return a feature of an attempt as people read it."""
+    """Return a feature of an attempt as text."""
     return QUANTITIES[name].text(snapshot.value(name, i))
 
 
 def words_of(snapshot: Snapshot, i: int) -> list[str]:
-    """Return the words that describe an attempt: how it holds, its split or why it is no sample."""
+    """Return words about an attempt: how it holds, and its split or why it is not a sample."""
     table = snapshot.table
     words = []
     if table.held[i]:
@@ -271,7 +271,7 @@ def _reasons(snapshot: Snapshot, i: int) -> list[str]:
     """Return the largest parts of an attempt's suspicion, as text."""
     shares = [(snapshot.value(part.name, i) / part.scale, part.name) for part in PARTS]
     large = sorted((s for s in shares if s[0] >= REASON_SHARE), reverse=True)[:REASONS]
-    # A contact without a normal has no angle of it: an infinite share.
+    # A contact without a normal has no normal angle, so this part is infinite.
     return [
         f"{QUANTITIES[name].title}{'' if np.isfinite(share) else ':'} {_text(snapshot, name, i)}"
         for share, name in large
@@ -279,7 +279,7 @@ def _reasons(snapshot: Snapshot, i: int) -> list[str]:
 
 
 def _parts(row: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the parts of an attempt's suspicion with their shares."""
+    """Return the parts of an attempt's suspicion, with their values divided by their scales."""
     found = suspicion({name: np.asarray(value)[None] for name, value in row.items()})
     parts = []
     for part in PARTS:
@@ -299,7 +299,7 @@ def _parts(row: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return further numbers of an attempt as names and texts: what no other part shows."""
+    """Return further numbers of an attempt as names and texts, which are not shown elsewhere."""
     key, rules = snapshot.key(i), snapshot.config.candidates
     s, standoffs = key.standoff_index, rules.standoffs
     standoff = f"{1e3 * standoffs[s]:.0f} mm" if s < len(standoffs) else str(s)
@@ -320,7 +320,7 @@ def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, s
 
 
 def _bears(row: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return how much disturbance an attempt tolerates; nothing if not tried."""
+    """Return how much disturbance an attempt tolerates; empty if it was not repeated."""
     probability, half = row["p_hold_probability"], row["p_hold_half_step"]
     if np.isnan(probability):
         return []
@@ -334,7 +334,7 @@ def _bears(row: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _certificate(snapshot: Snapshot, i: int) -> list[tuple[str, str]]:
-    """Return how robust a success is; nothing where that was not tried."""
+    """Return how robust a success is; empty if this was not measured."""
     if not snapshot.table.held[i]:
         return []
     found, lines = read_certificate(snapshot, i), []
@@ -348,7 +348,7 @@ def _certificate(snapshot: Snapshot, i: int) -> list[tuple[str, str]]:
 
 
 def _pose_lines(name: str, row: dict[str, Any]) -> list[str]:
-    """Return palm poses and joints of an attempt as lines of JSON to copy, as far as it got."""
+    """Return the available palm poses and joints of an attempt as lines of JSON to copy."""
     values: dict[str, Any] = {"object": name}
     for key in ("X_TO", "X_OG", "closed_q", "X_OG_lifted", "lifted_q"):
         value = unpack_pose(row[key]) if key.startswith("X_") else row[key]
@@ -359,7 +359,7 @@ def _pose_lines(name: str, row: dict[str, Any]) -> list[str]:
 
 
 def _fingers(row: dict[str, Any]) -> list[list[str]]:
-    """Return a row per finger: forces, depths, areas, fit to the mesh; a dash for no value."""
+    """Return a row per finger: forces, depths, areas, fit to the mesh; a dash if there is none."""
 
     def text(value: Any, factor: float, digits: int) -> str:
         return f"{factor * value:.{digits}f}" if np.isfinite(value) else "–"

@@ -1,9 +1,9 @@
-"""What is in a dataset's directory now, read again when its files change.
+"""The present content of a dataset's directory, read again when its files change.
 
-A `Snapshot` is one state of the files. It is never changed: a request works on one snapshot to its
-end, whatever a build writes meanwhile. Its attempts are columns in memory, what filters and sorting
-need: some twenty bytes per attempt and fifty more where the hand closed. Images and poses stay in
-the files.
+A `Snapshot` is one state of the files. It is never changed: a request uses one snapshot to its end,
+whatever a build writes in the meantime. Its attempts are columns in memory with what filters and
+sorting need: about twenty bytes per attempt, and fifty more if the hand closed. Images and poses
+stay in the files.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.table import AnyArray, Table, join
 
 Found = TypeVar("Found")
-#: Quantities that can be filtered and sorted by, besides the parts of the suspicion.
+#: Quantities for filtering and sorting, besides the parts of the suspicion.
 EXTRA = ("suspicion", "force", "p_hold")
 FEATURES = (*EXTRA, *(part.name for part in PARTS))
-#: What tells an attempt from all others.
+#: Columns that identify an attempt.
 IDENTITY = ("object", "candidate", "standoff_index", "child")
-#: Further columns that features follow from.
+#: Further columns from which features are computed.
 _READ = ("closed_f_Q_O", "p_hold_samples", "p_hold_repeats")
-#: Columns that the table of attempts has as they are, and their types.
+#: Columns that the table of attempts copies, and their types.
 _KEPT: dict[str, type[np.generic]] = {
     "object": np.int32,
     "candidate": np.int32,
@@ -62,22 +62,22 @@ _KEPT: dict[str, type[np.generic]] = {
     "precision": np.bool_,
     "stable": np.bool_,
 }
-#: While a build runs, its new shards are looked for this often [s].
+#: Interval [s] at which new shards are listed while a build runs.
 LISTING_PERIOD = 5.0
-#: Damaged shards that are named.
+#: Maximum number of damaged shards that are named.
 NAMED = 3
 
 
-#: What is kept of n attempts, in the order of the dataset's rows. First n rows with the columns
-#: _KEPT and `held`: `removal` is NONE for what is no success or where none is decided, `split` for
-#: what is no sample. Then a row for each attempt whose hand closed: `place` (m,) int32 in the
-#: table, rising, and FEATURES as float32, NaN where an attempt did not get so far, and infinite
-#: where a contact has no normal.
+#: Columns of n attempts in memory, in the order of the dataset's rows. First a table of n rows with
+#: the columns _KEPT and `held`; `removal` is NONE for an attempt that is not a success or not yet
+#: decided, `split` is NONE for one that is not a sample. Then a table with a row for each attempt
+#: whose hand closed: `place` (m,) int32, rising indices into the first table, and FEATURES as
+#: float32, NaN if an attempt ended before, and infinite if a contact has no normal.
 Kept: TypeAlias = tuple[Table, Table]
 
 
 def read_attempts(trials: Trials) -> Kept:
-    """Return the columns of attempts, which are read block by block.
+    """Return the columns of attempts for memory, read block by block.
 
     Raises:
         DataError: If a file cannot be read.
@@ -87,7 +87,7 @@ def read_attempts(trials: Trials) -> Kept:
 
 
 def _join(parts: Sequence[Kept]) -> Kept:
-    """Return parts, one at least, one after the other as one."""
+    """Return one or more parts joined to one, in order."""
     tables, few = zip(*parts, strict=True)
     starts = np.cumsum([0, *(table.count for table in tables)]).tolist()
     moved = [
@@ -98,8 +98,8 @@ def _join(parts: Sequence[Kept]) -> Kept:
 
 
 def _columns_of(columns: Mapping[str, AnyArray]) -> Kept:
-    """Return what is kept of a block of attempts."""
-    # Most attempts never close the hand: only those that do have numbers.
+    """Return the columns of a block of attempts for memory."""
+    # Most attempts never close the hand; only those that do have features.
     (closed,) = np.nonzero(np.isfinite(columns["time_close"]))
     few = {name: values[closed] for name, values in columns.items()}
     doubts = suspicion(few)
@@ -114,7 +114,7 @@ def _columns_of(columns: Mapping[str, AnyArray]) -> Kept:
         "p_hold": np.where(repeats > 0, few["p_hold_samples"] / np.maximum(repeats, 1), np.nan),
     }
 
-    # What a contact without a normal has no value of counts as the largest share: as infinite.
+    # A value that a contact without a normal lacks counts as the largest part, so it is infinite.
     values = {
         name: np.where(np.isnan(v) & np.isfinite(doubts.shares[name]), np.inf, v)
         for name, v in doubts.values.items()
@@ -126,7 +126,7 @@ def _columns_of(columns: Mapping[str, AnyArray]) -> Kept:
 
 
 def _wanted_rows(table: Table, wanted: int | None) -> tuple[int, int | None]:
-    """Return how many attempts of a shard an object needs, and the grasps it wants after them.
+    """Return how many attempts of a shard an object needs, and how many grasps it wants after them.
 
     Assembly takes the same rows: with `max_grasps` they end with the last wanted grasp.
 
@@ -146,16 +146,16 @@ class Snapshot:
 
     Attributes:
         out: Directory of the dataset.
-        config: Its configuration.
-        config_hash: Hash of what decides a shard, as its files have it.
-        own_hashes: That of each object with a seed of its own, by its name.
-        names, classes: Of the objects, by their number.
+        config: Configuration of the dataset.
+        config_hash: Hash of the settings that determine a shard, as the files have it.
+        own_hashes: The same hash for each object with its own seed, by name.
+        names, classes: Names and classes of the objects, by number.
         meshes: Hashes of the objects' meshes, hexadecimal.
-        trials: The attempts, in their files.
-        table, closed: What is kept of them in memory, see `Kept`.
-        assembled: Whether the attempts are rows of trials.hdf5; else they are of shards.
-        stamps: Of the assembled files; shards never change.
-        missing: What is not there, in sentences.
+        trials: The attempts in their files.
+        table, closed: Columns of the attempts in memory, see `Kept`.
+        assembled: Whether the attempts are rows of trials.hdf5; otherwise they are in shards.
+        stamps: Stamps of the assembled files; shards never change.
+        missing: What is missing, in sentences.
     """
 
     out: Path
@@ -174,9 +174,9 @@ class Snapshot:
 
     @cached_property
     def codes(self) -> tuple[str, ...]:
-        """A code of each object for addresses: of configuration, mesh and name.
+        """A code of each object for addresses, from configuration, mesh and name.
 
-        Its number would be that of another object as soon as there are more of them.
+        Its number is not used, since it changes when objects are added.
         """
         identities = zip(self.meshes, self.names, strict=True)
         texts = (json.dumps([self.config_hash, *identity]) for identity in identities)
@@ -188,7 +188,7 @@ class Snapshot:
         return {code: number for number, code in enumerate(self.codes)}
 
     def feature(self, name: str) -> npt.NDArray[np.float32]:
-        """Return a feature of all attempts (n,); NaN where an attempt has no value."""
+        """Return a feature of all attempts (n,); NaN for an attempt without a value."""
         values = np.full(self.table.count, np.nan, dtype=np.float32)
         values[self.closed.place] = self.closed[name]
         return values
@@ -200,28 +200,28 @@ class Snapshot:
         return float(self.closed[name][k]) if there else float("nan")
 
     def key(self, i: int) -> AttemptKey:
-        """Return the identity of an attempt by its place in the table."""
+        """Return the identity of an attempt by its index in the table."""
         number, *rest = (int(self.table[name][i]) for name in IDENTITY)
         return AttemptKey(self.names[number], *rest)
 
     def label(self, i: int) -> str:
         """Return the identity of an attempt for addresses: `9f86d081884c-345-2`.
 
-        A refined one has its number in the family behind: `9f86d081884c-345-2-7`.
-        The files of a later state have the same label for it, and for no other attempt.
+        A refined attempt has its number in the family at the end: `9f86d081884c-345-2-7`. In a
+        later state of the files, an attempt has the same label, which no other attempt has.
         """
         key, code = self.key(i), self.codes[self.table.object[i]]
         return f"{code}-{key.candidate}-{key.standoff_index}" + f"-{key.child}" * bool(key.child)
 
     def find(self, label: str) -> int | None:
-        """Return the place of the attempt of a label, or None if there is none."""
+        """Return the index of the attempt with a label, or None if there is none."""
         code, *numbers = label.split("-")
         if len(numbers) not in (2, 3) or not all(n.isascii() and n.isdecimal() for n in numbers):
             return None
         return self._place(self.numbers.get(code), *map(int, numbers))
 
     def find_key(self, key: AttemptKey) -> int | None:
-        """Return the place of an attempt by its identity, or None if it is not there."""
+        """Return the index of an attempt by its identity, or None if it does not exist."""
         number = self.names.index(key.object) if key.object in self.names else None
         return self._place(number, key.candidate, key.standoff_index, key.child)
 
@@ -238,11 +238,11 @@ class Snapshot:
         return int(found[0]) if len(found) else None
 
     def trial_id(self, i: int) -> int | None:
-        """Return the row of an attempt in trials.hdf5, or None before there is one."""
+        """Return the row of an attempt in trials.hdf5, or None if it is not there yet."""
         return i if self.assembled else None
 
     def refuse_replaced(self) -> None:
-        """Refuse what was just read if a file was replaced while it was being read.
+        """Raise an error if a file was replaced while it was being read.
 
         Raises:
             DataError: If a file was replaced.
@@ -253,7 +253,7 @@ class Snapshot:
 
 
 class Catalog:
-    """The files of a dataset, as they are now.
+    """The files of a dataset in their present state.
 
     Args:
         out: Directory of the dataset.
@@ -268,7 +268,7 @@ class Catalog:
         self._parts: dict[ShardHeader, tuple[TrialPart, Kept]] = {}
         self._stamps: dict[Path, Stamp] = {}
         self._listed = -LISTING_PERIOD
-        # The assembled files, if there are any, and the manifest of a build that is not in them.
+        # The assembled files, if there are any, and the manifest of a build not yet in them.
         self._assembled: Snapshot | None = None
         self._manifest: Manifest | None = None
         self._snapshot: Snapshot | None = None
@@ -278,7 +278,7 @@ class Catalog:
         """Return the state of the files.
 
         Raises:
-            DataError: If they cannot be read.
+            DataError: If the files cannot be read.
         """
         with self._lock:
             stamps = {self.out / n: stamp(self.out / n) for n in (*ASSEMBLED_FILES, FILE_NAME)}
@@ -292,14 +292,14 @@ class Catalog:
             return self._snapshot
 
     def _read_files(self, stamps: Mapping[Path, Stamp]) -> None:
-        """Read the assembled files, and the manifest of a build that is not in them."""
+        """Read the assembled files, and the manifest of a build not yet in them."""
         assembled = stamps[self.out / TRIALS_FILE] is not None
         self._assembled, self._manifest = None, None
         try:
             self._manifest = read_manifest(self.out)
         except DataError:
             if not assembled:
-                raise  # else the files are all that there is
+                raise  # else the assembled files are enough
         if assembled:
             self._parts.clear()
             self._assembled, signature = _read_assembled(self.out, self._manifest, stamps)
@@ -307,7 +307,7 @@ class Catalog:
                 self._manifest = None
 
     def _list_shards(self) -> Snapshot:
-        """Return the state of the files with the shards that are there."""
+        """Return the state of the files with the existing shards."""
         before, manifest, assembled = self._snapshot, self._manifest, self._assembled
         if assembled is None:
             assert manifest is not None
@@ -324,7 +324,7 @@ class Catalog:
 
     def _read_shards(self, manifest: Manifest) -> Snapshot:
         """Return the state of a build that runs or was stopped."""
-        # Shards never change: only new ones are read. Those of objects that are gone are dropped.
+        # Shards never change, so only new ones are read; those of removed objects are dropped.
         entries = manifest.objects
         numbers = {entry.name: i for i, entry in enumerate(entries)}
         objects = {
@@ -342,7 +342,7 @@ class Catalog:
                 damaged.append(header.path(self.out).relative_to(self.out))
         self._parts = parts
 
-        # The number of an object is its place in this manifest, which may have grown.
+        # The number of an object is its position in this manifest, which may have grown.
         wanted: dict[str, int | None] = dict.fromkeys(numbers, manifest.config.max_grasps)
         cut, rows = [], []
         for header, (part, (table, closed)) in parts.items():
@@ -384,7 +384,7 @@ class Watched(Generic[Found]):
 
     Args:
         path: The file.
-        read: Reads it, with its stamp, for a state of the dataset.
+        read: Function that reads the file, given its stamp and a state of the dataset.
     """
 
     def __init__(self, path: Path, read: Callable[[Path, Stamp, Snapshot], Found]) -> None:
@@ -394,10 +394,10 @@ class Watched(Generic[Found]):
         self._known: tuple[Snapshot, Stamp, Found] | None = None
 
     def current(self, snapshot: Snapshot) -> Found:
-        """Return what the file holds, for a state of the dataset.
+        """Return the content of the file for a state of the dataset.
 
         Raises:
-            DataError: If the file cannot be read, or is not of this dataset.
+            DataError: If the file cannot be read, or belongs to another dataset.
         """
         with self._lock:
             now = stamp(self.path)
@@ -407,9 +407,9 @@ class Watched(Generic[Found]):
 
 
 def find_model(out: Path, name: str) -> Path | None:
-    """Return the file of an object's meshes, or None if it is not there.
+    """Return the file of an object's meshes, or None if it does not exist.
 
-    A stranger's dataset may hold names that no file can have; they are shown as they are.
+    An untrusted dataset may contain names that are not valid names of files; they are only shown.
     """
     path = model_path(out, name) if is_name(name) else None
     return path if path is not None and path.is_file() else None
@@ -420,7 +420,7 @@ def _read_assembled(
 ) -> tuple[Snapshot, str]:
     """Return the state of a dataset with a trials.hdf5, and the signature of its manifest then.
 
-    Nothing but that file has to be there.
+    No other file is required.
     """
     # Objects and configuration.
     trials = Trials(out, any_name=True)
@@ -436,7 +436,7 @@ def _read_assembled(
         tuple(trials.objects[key].tolist()) for key in ("name", "class_name", "mesh_sha256")
     )
 
-    # What else there is.
+    # What is missing.
     missing = [
         f"{name} is not there: images come from the shards, if they are."
         for name in DATA_FILES.values()
@@ -466,7 +466,7 @@ def _read_assembled(
 
 
 def _own_hashes(manifest: Manifest | None) -> dict[str, str]:
-    """Return what `Snapshot.own_hashes` is; nothing if the files are all that there is."""
+    """Return `Snapshot.own_hashes`; empty if there is no manifest."""
     if manifest is None:
         return {}
     return {
@@ -477,8 +477,8 @@ def _own_hashes(manifest: Manifest | None) -> dict[str, str]:
 
 
 def _count_newer(state: Snapshot, manifest: Manifest) -> int:
-    """Return how many work units are done that are not in the assembled files."""
-    # Each object's last palm pose in the files, and whether it has all grasps that it wants.
+    """Return the number of finished work units that are not in the assembled files."""
+    # Each object's last palm pose in the files, and whether it has all the grasps that it wants.
     table, count = state.table, len(state.names)
     last = np.full(count, -1, dtype=np.int32)
     np.maximum.at(last, table.object, table.candidate)
@@ -495,8 +495,8 @@ def _count_newer(state: Snapshot, manifest: Manifest) -> int:
 
 
 def _done_headers(out: Path, manifest: Manifest) -> Iterator[ShardHeader]:
-    """Yield the work units whose shards are there, in the order of the dataset's rows."""
-    # One listing per object: a look at each file of a large build takes seconds.
+    """Yield the work units whose shards exist, in the order of the dataset's rows."""
+    # One listing per object, since checking each file of a large build takes seconds.
     folder, names = None, frozenset[str]()
     for header in manifest.headers():
         path = header.path(out)

@@ -1,8 +1,8 @@
-"""One gallery shows a table of rows, and one page shows a row of it.
+"""A gallery shows a table of rows, and a page shows one row of the table.
 
-In: what an address asks for. Out: HTML. Each table is a `Gallery`: it says by what it is filtered
-and sorted, and what its cards and pages hold. Jinja escapes every value; no page holds a script or
-a style of its own, so the strictest content security policy fits.
+In: the query of an address. Out: HTML. Each table is a `Gallery`, which defines how it is filtered
+and sorted, and the contents of its cards and pages. Jinja escapes every value; no page contains its
+own script or style, so the strictest content security policy can be used.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from drakegrasp.pictures.style import FINGER_COLOURS, PREDICTED, REACHED, TRUE
 from drakegrasp.table import AnyArray, Table
 
 Places: TypeAlias = npt.NDArray[np.int32]
-#: Least and largest value; None for no limit.
+#: Smallest and largest value; None for no limit.
 Limits: TypeAlias = tuple[float | None, float | None]
-#: Cards on a page of a gallery.
+#: Number of cards on a page of a gallery.
 PAGE = 24
-#: What numbers in columns stand for, by the names of the columns.
+#: Codes of the numbers in columns, by the names of the columns.
 CODES: Mapping[str, Mapping[str, int]] = {
     "outcome": {outcome.label: outcome.value for outcome in Outcome},
     "split": {split: number for number, split in enumerate(SPLITS)},
@@ -40,7 +40,7 @@ CODES: Mapping[str, Mapping[str, int]] = {
 
 
 def _shown(value: Any) -> Any:
-    """Return a value of a template as it is shown: texts without control characters."""
+    """Return a value of a template for display: texts without control characters."""
     return printable(value) if type(value) is str else value
 
 
@@ -60,13 +60,14 @@ TEMPLATES.globals["counted"] = counted
 
 @dataclass(frozen=True, kw_only=True)
 class Site:
-    """Where pages are: at a server, or files that open without one.
+    """Location of the pages: at a server, or as files that open without a server.
 
     Attributes:
-        predicted, scened: Whether there are pages of predictions, and of scenes.
-        up: Of files, from the page to the folder of all: empty, or "../"; None for a server.
-        grasps: Of files, the addresses of the grasps that have a page.
-        asked: The addresses that pages asked for.
+        predicted, scened: Whether there are pages of predictions, and pages of scenes.
+        up: For files, the path from the page to the common folder: empty, or "../"; None for a
+            server.
+        grasps: For files, the addresses of the grasps that have a page.
+        asked: The addresses that pages have requested.
     """
 
     predicted: bool = False
@@ -81,7 +82,7 @@ class Site:
         return self.up is not None
 
     def at(self, address: str) -> str:
-        """Return where a page finds an address of the server; empty if it is not there."""
+        """Return where a page finds an address of the server; empty if there is no such file."""
         path = address.partition("?")[0]
         if self.up is None or not path:
             return address
@@ -92,9 +93,9 @@ class Site:
 
 
 def file_of(path: str) -> str:
-    """Return the file of an address: without a server a query has no effect.
+    """Return the file of an address; the query of the address has no effect without a server.
 
-    A mesh is a script that holds it, since a page of a file may read no file.
+    A mesh becomes a script that contains it, since a page opened as a file may not read files.
     """
     name = path.strip("/") or "index"
     if name.endswith(".json"):
@@ -103,18 +104,18 @@ def file_of(path: str) -> str:
 
 
 def render(name: str, site: Site, **values: Any) -> str:
-    """Return a page of a template."""
+    """Return the page of a template."""
     return TEMPLATES.get_template(name).render(site=site, **values)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Query:
-    """What a gallery is asked for.
+    """Query of a gallery.
 
     Attributes:
-        values: By the names of parameters; an empty text asks for anything.
-        ranges: Least and largest value of quantities, in the units that are shown.
-        default: Values that an address need not say.
+        values: Values by the names of parameters; an empty text means any value.
+        ranges: Smallest and largest value of quantities, in the units that are shown.
+        default: Default values, which an address need not contain.
     """
 
     values: Mapping[str, str]
@@ -128,14 +129,14 @@ class Query:
 
     @property
     def ascending(self) -> bool:
-        """Whether the smallest come first."""
+        """Whether the smallest values come first."""
         return self["order"] == "up"
 
     def params(self, **changes: object) -> str:
-        """Return the query as part of an address, with some values changed; defaults are left out.
+        """Return the query as part of an address, with some values changed and without defaults.
 
         Args:
-            changes: Values by the names of the parameters.
+            changes: New values by the names of the parameters.
         """
         bounds = {
             f"{bound}_{name}": f"{value:g}"
@@ -151,18 +152,19 @@ class Gallery(ABC):
     """A table whose rows have cards and pages.
 
     Attributes:
-        HOME, ROW: Address of its gallery, and folder of the addresses of its rows; the templates
+        HOME, ROW: Address of the gallery, and folder of the addresses of its rows; the templates
             are `gallery_ROW.html` and `ROW.html`.
-        NOUN: What a row is.
-        CHOICES: By the names of parameters, what can be asked for besides a class and an object.
+        NOUN: Name of a row.
+        CHOICES: By the names of parameters, the values that can be chosen, besides class and
+            object.
         SELECTS: Titles of the fields of the form, in order.
-        QUANTITIES: Numbers that can be filtered and sorted by, as people read them.
-        RANGES: Those with a range among the filters.
-        SORTS: Orders with their titles, that of the first page first.
-        OUTCOME: The outcome that is asked for unless another is.
+        QUANTITIES: Numbers for filtering and sorting, with their display.
+        RANGES: Names of the quantities with a range among the filters.
+        SORTS: Orders with their titles; the first is the default.
+        OUTCOME: Outcome that is selected by default.
         snapshot: State of the dataset.
-        table: The rows: `object` (n,), numbers of their objects; columns of CODES; a truth for each
-            other choice; QUANTITIES in SI; and what else they are sorted by.
+        table: The rows: `object` (n,), numbers of their objects; columns of CODES; a column of bool
+            for each other choice; QUANTITIES in SI; and further columns for sorting.
     """
 
     HOME: ClassVar[str]
@@ -183,38 +185,38 @@ class Gallery(ABC):
 
     @abstractmethod
     def find(self, label: str) -> int | None:
-        """Return the row of a label, or None if there is none."""
+        """Return the row with a label, or None if there is none."""
 
     @abstractmethod
     def summary(self, query: Query, chosen: Places) -> dict[str, Any]:
-        """Return what the gallery says besides its cards."""
+        """Return the content of the gallery besides its cards."""
 
     @abstractmethod
     def cards(self, shown: Places) -> list[dict[str, Any]]:
-        """Return what the cards of rows say."""
+        """Return the content of the cards of rows."""
 
     @abstractmethod
     def row(self, i: int, hand: HandView) -> dict[str, Any]:
-        """Return what the page of a row says.
+        """Return the content of a row's page.
 
         Raises:
-            DataError: If a file was replaced meanwhile.
+            DataError: If a file was replaced in the meantime.
         """
 
-    # What tables may have another way of.
+    # Methods that a table may override.
 
     def column(self, name: str) -> AnyArray:
-        """Return a column (n,), or the order of the rows in a table without a column of it."""
+        """Return a column (n,), or the order of the rows if the table has no such column."""
         return self.table[name] if name in self.table else np.arange(self.table.count)
 
     def matches(self, name: str, value: str) -> npt.NDArray[np.bool_]:
-        """Return which rows (n,) have what can be chosen."""
+        """Return which rows (n,) have a value of a choice."""
         if name in CODES:
             return np.asarray(self.table[name] == CODES[name][value])
         return self.table[value] if value in self.table else np.zeros(self.table.count, dtype=bool)
 
     def options(self, name: str) -> Mapping[str, str]:
-        """Return what the form offers of a choice, with its text: what occurs in the table."""
+        """Return the options of a choice in the form, with their texts: values that occur."""
         there = set(self.table)
         if name in CODES:
             used = np.unique(self.table[name])
@@ -222,7 +224,7 @@ class Gallery(ABC):
         return {v: v.replace("_", " ") for v in self.CHOICES[name] if v in there}
 
     def identity(self, i: int) -> dict[str, Any]:
-        """Return how people name a row: its object's name and class."""
+        """Return how people name a row: by its object's name and class."""
         number = self.table.object[i]
         return {"title": self.snapshot.names[number], "class_name": self.snapshot.classes[number]}
 
@@ -230,12 +232,12 @@ class Gallery(ABC):
 
     @classmethod
     def query(cls, params: Mapping[str, str] | None = None) -> Query:
-        """Return what an address asks for.
+        """Return the query of an address.
 
         Raises:
-            DataError: If a value cannot be asked for.
+            DataError: If a value is not valid.
         """
-        # Texts that must be one of a few; names of objects may be any.
+        # Texts that must be one of a few values; names of objects may be any text.
         params = params or {}
         for name, allowed in {**cls.CHOICES, "sort": cls.SORTS, "order": ("up", "down")}.items():
             if params.get(name, "") not in ("", *allowed):
@@ -254,11 +256,11 @@ class Gallery(ABC):
         return Query(values=values, ranges=ranges, default=default)
 
     def select(self, query: Query) -> Places:
-        """Return the rows that a query asks for, in its order.
+        """Return the rows that a query selects, in its order.
 
-        Those without a value of what is sorted by come last; ties are in the order of the rows.
+        Rows without a value of the sorted quantity come last; ties are in the order of the rows.
         """
-        # The filters; what has no value is in no range.
+        # The filters; a row without a value is in no range.
         own = zip(self.snapshot.names, self.snapshot.classes, strict=True)
         asked = query["object"], query["class"]
         wanted = [all(a in ("", b) for a, b in zip(asked, names, strict=True)) for names in own]
@@ -284,15 +286,16 @@ class Gallery(ABC):
         """Return the gallery.
 
         Args:
-            query: What is asked for; a page beyond the last is the last.
-            chosen: All rows that it selects, in order.
-            site: Files hold all cards, and each what a script filters and sorts by.
+            query: The query; a page number beyond the last page means the last page.
+            chosen: All rows that the query selects, in order.
+            site: Location of the pages; a file contains all cards, with the values for its script
+                to filter and sort by.
         """
         pages = max(1, -(-len(chosen) // PAGE))
         page = min(int(query.values["page"]), pages)
         shown = chosen if site.static else chosen[(page - 1) * PAGE : page * PAGE]
 
-        # The cards, each with where it leads.
+        # The cards, each with the address of its page.
         cards = self.cards(shown)
         values = self._values(shown) if site.static else [{}] * len(cards)
         for i, card, own in zip(shown.tolist(), cards, values, strict=True):
@@ -320,14 +323,14 @@ class Gallery(ABC):
         """Return the page of a row.
 
         Args:
-            i: Its number.
-            query: What next and previous go through.
-            chosen: All rows that it selects, in order.
-            site: Where the other pages are.
-            hand: Of the dataset.
+            i: Number of the row.
+            query: The query whose rows next and previous step through.
+            chosen: All rows that the query selects, in order.
+            site: Location of the other pages.
+            hand: Hand of the dataset.
 
         Raises:
-            DataError: If a file was replaced meanwhile.
+            DataError: If a file was replaced in the meantime.
         """
         values = self.row(i, hand)
         scene, place = values["scene"], np.flatnonzero(chosen == i)
@@ -357,7 +360,7 @@ class Gallery(ABC):
         )
 
     def _values(self, shown: Places) -> list[dict[str, str]]:
-        """Return what a page without a server filters and sorts rows by: numbers, and words."""
+        """Return the numbers and words by which a page without a server filters and sorts."""
         columns = {}
         for name in (
             *self.QUANTITIES,
@@ -384,9 +387,9 @@ class Gallery(ABC):
         return self.HOME + f"?{params}" * bool(params)
 
     def _form(self, query: Query, site: Site) -> dict[str, Any]:
-        """Return the fields of the form of filters and order; files hold one outcome alone."""
+        """Return the fields of the form for filters and order; files have a single outcome."""
         names = {"object": self.snapshot.names, "class": sorted(set(self.snapshot.classes))}
-        # What is chosen from a list.
+        # Fields with a list of options.
         selects = []
         for name, title in self.SELECTS.items():
             known = {n: n for n in names[name]} if name in names else self.options(name)
@@ -395,7 +398,7 @@ class Gallery(ABC):
             if not (any_ and site.static):
                 selects.append((name, title, [(any_, "any", not query[name]), *options]))
 
-        # Numbers between two bounds.
+        # Numbers between two limits.
         ranges = []
         for name in self.RANGES:
             bounds = query.ranges.get(name, (None, None))
@@ -412,7 +415,7 @@ class Gallery(ABC):
 
 
 def _number(params: Mapping[str, str], name: str) -> float | None:
-    """Return a number of an address, None without one."""
+    """Return a number from an address; None if it has none."""
     text = params.get(name, "").strip()
     if not text:
         return None

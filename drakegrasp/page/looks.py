@@ -1,9 +1,9 @@
-"""What pages show of single rows: numbers, images with their contacts, and the 3D view.
+"""Contents of pages for single rows: numbers, images with their contacts, and the 3D view.
 
-In: attempts, read from the files when asked for, and the hand. The 3D view is plain lists for JSON.
-Everything in it is in {T}, on the object in its resting pose: what was lifted is moved back with
-the object, as in the dataset's `_held` fields, so that a slip in the hand shows as another place of
-the hand.
+In: attempts, which are read from the files when requested, and the hand. The 3D view consists of
+plain lists for JSON. Everything in it is in {T}, with the object in its resting pose: lifted hands
+are moved back with the object, as in the dataset's `_held` fields, so that a slip in the hand is
+visible as a different pose of the hand.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from drakegrasp.page.catalog import Snapshot, find_model
 from drakegrasp.pictures.style import HIDDEN
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, intrinsics, project
 
-#: Object meshes that are kept in memory.
+#: Maximum number of object meshes in memory.
 KEPT_MESHES = 32
 #: Columns that the dots on a thumbnail need.
 THUMBNAIL = ("X_TO", "X_OG", "X_C0C", "closed_p_OQ", "closed_nhat_Q_O")
@@ -52,13 +52,13 @@ class Look(NamedTuple):
 
 
 class Dot(NamedTuple):
-    """A contact on an image: its pixel, and that of the tip of its normal.
+    """A contact on an image.
 
     Attributes:
-        finger: In grasp order.
+        finger: Number of the finger, in grasp order.
         u, v: Pixel of the contact.
         tip_u, tip_v: Pixel of the tip of its normal.
-        hidden: Whether the object hides it.
+        hidden: Whether the object hides the contact.
     """
 
     finger: int
@@ -72,15 +72,15 @@ class Dot(NamedTuple):
 def read_rows(
     snapshot: Snapshot, places: Sequence[int], names: Sequence[str] | None = None
 ) -> list[dict[str, Any]]:
-    """Return what `/trials` says of attempts.
+    """Return the rows of attempts in `/trials`.
 
     Args:
         snapshot: State of the files.
-        places: Of the attempts in the table.
-        names: Of the columns; all but those of the whole dataset if None.
+        places: Indices of the attempts in the table.
+        names: Names of the columns; if None, all except those of the whole dataset.
 
     Raises:
-        DataError: If a file was replaced meanwhile.
+        DataError: If a file was replaced in the meantime.
     """
     own = [f.name for f in TRIAL_FIELDS if f.name not in ASSEMBLED_FIELDS]
     columns = snapshot.trials[places].columns(names or own)
@@ -92,10 +92,10 @@ def read_rows(
 def read_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
     """Return the images of an attempt, or None if there are none.
 
-    A sample's are in the data file. Those of other successes are in their shard.
+    The images of a sample are in the data file; those of other successes are in their shard.
 
     Raises:
-        DataError: If a file was replaced meanwhile.
+        DataError: If a file was replaced in the meantime.
     """
     try:
         if snapshot.table.split[i] != NONE:
@@ -109,7 +109,7 @@ def read_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
 
 
 def look_source(snapshot: Snapshot, i: int, camera: str) -> str:
-    """Return in words which file `read_look` reads."""
+    """Return the name of the file that `read_look` reads, in words."""
     is_there = (snapshot.out / DATA_FILES[camera]).is_file()
     if snapshot.table.split[i] != NONE and is_there:
         return DATA_FILES[camera]
@@ -127,18 +127,18 @@ def _sample_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
 
 
 def _shard_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
-    # The end of a shard's name is that of the object's poses.
+    # The name of a shard ends with the end of the object's palm poses.
     key, number = snapshot.key(i), snapshot.table.object[i]
     *_, unit = snapshot.config.unit_ranges(key.candidate + 1)
-    # More palm poses continue in a shard of another end; the names sort by their ends.
+    # If palm poses are added, they continue in a shard with another end; names sort by their ends.
     path = max(shards_folder(snapshot.out, key.object).glob(f"{unit.start:07d}-*.h5"))
     due = snapshot.own_hashes.get(key.object, snapshot.config_hash), snapshot.meshes[number]
     with open_hdf5(path) as file:
-        # A shard of another configuration or mesh has other attempts.
+        # A shard of another configuration or mesh contains other attempts.
         if (file.attrs["config_hash"], file.attrs["mesh_sha256"]) != due:
             return None
 
-        # The row of the attempt in its shard, then that of its images.
+        # The row of the attempt in its shard, then the row of its images.
         trials, looks = file["trials"], file["looks"]
         here = trials["candidate"][:] == key.candidate
         here &= trials["standoff_index"][:] == key.standoff_index
@@ -158,13 +158,14 @@ def contact_dots(
     *,
     contacts: tuple[Array, Array] | None = None,
 ) -> list[Dot]:
-    """Return where a camera sees contacts; those behind it are left out.
+    """Return where a camera sees contacts; contacts behind the camera are left out.
 
     Args:
-        snapshot: With the configuration of the cameras.
-        row: With the columns THUMBNAIL.
+        snapshot: State of the files, with the configuration of the cameras.
+        row: Row with the columns THUMBNAIL.
         camera: `oto` or `otm`.
-        look: Its images, which tell what the object hides; without them nothing is hidden.
+        look: Images of the camera, which show what the object hides; without them nothing is
+            hidden.
         contacts: Points and normals (k, 3) in {O}; those of the row after closing if None.
     """
     # The contacts and the tips of their normals in {C}.
@@ -176,7 +177,7 @@ def contact_dots(
     p_CQ, nhat_Q_C = transform_points(X_CO, p_OQ), rotate_vectors(X_CO, nhat_Q_O)
 
     def is_hidden(finger: int, u: float, v: float) -> bool:
-        # Something nearer is seen at the pixel of the contact, as on contact sheets.
+        # A contact is hidden if something nearer is seen at its pixel, as on contact sheets.
         if look is None:
             return False
         last = look.image.shape[-1] - 1
@@ -193,14 +194,15 @@ def dots_of(
     near: float,
     is_hidden: Callable[[int, float, float], bool],
 ) -> list[Dot]:
-    """Return contacts (k, 3) in {C} as dots; those that are not before the near plane are left out.
+    """Return contacts (k, 3) in {C} as dots, without those that are not beyond the near plane.
 
     Args:
         K: (3, 3), camera matrix [px].
-        p_CQ: (k, 3), points [m]; NaN where there is none.
-        nhat_Q_C: (k, 3), normals; their tips are at `ARROW` times them.
+        p_CQ: (k, 3), points [m]; NaN if there is none.
+        nhat_Q_C: (k, 3), normals; their tips are at the distance `ARROW`.
         near: Near plane [m].
-        is_hidden: Whether the camera does not see a finger's contact, which it has at u, v [px].
+        is_hidden: Function of a finger and its pixel u, v that returns whether its contact is
+            hidden.
     """
     p_CE, dots = p_CQ + ARROW * np.nan_to_num(nhat_Q_C), []
     for finger, (point, tip) in enumerate(zip(p_CQ, p_CE, strict=True)):
@@ -211,10 +213,10 @@ def dots_of(
 
 
 def read_certificate(snapshot: Snapshot, i: int) -> dict[str, float]:
-    """Return how robust a success is, by the names of CERTIFICATE_FIELDS; NaN if not certified.
+    """Return the certificate of a success, by the names of CERTIFICATE_FIELDS; NaN if it has none.
 
     Raises:
-        DataError: If a file was replaced meanwhile.
+        DataError: If a file was replaced in the meantime.
     """
     group, key = ("successes", "trial_id") if snapshot.assembled else ("looks", "row")
     part, row = snapshot.trials.part_of(i)
@@ -229,7 +231,7 @@ def read_certificate(snapshot: Snapshot, i: int) -> dict[str, float]:
 
 
 class HandView:
-    """The hand of a dataset for the 3D view; Drake is loaded when it is first asked.
+    """The hand of a dataset for the 3D view; Drake is loaded when the hand is first needed.
 
     Args:
         config: Configuration of the dataset.
@@ -240,7 +242,7 @@ class HandView:
         self._lock = threading.Lock()
         self._scene: Any = None
         self._surfaces: dict[str, bytes] = {}
-        #: Why there is no hand to show, in words; empty if there is one.
+        #: Why the hand cannot be shown, in words; empty if it can.
         self.problem = ""
 
     def load(self) -> None:
@@ -264,18 +266,18 @@ class HandView:
         return tuple(self._surfaces)
 
     def surface(self, number: int) -> bytes:
-        """Return what is shown of a link, see `pictures.still_scene`.
+        """Return the shapes of a link as JSON, see `pictures.still_scene`.
 
         Raises:
-            IndexError: If there is no link of that number.
+            IndexError: If there is no link with this number.
         """
         link = self.links[number]  # first, since it may load them
         return self._surfaces[link]
 
     def poses(self, X_TG: Array, q: Array | None, spread: float) -> list[list[float]]:
-        """Return the poses of the links, column by column as for three.js; none without a hand.
+        """Return the poses of the links, column by column as for three.js; empty without a hand.
 
-        A dataset that was made with other files of the hand may have another number of joints.
+        A dataset that was built with other files of the hand may have another number of joints.
 
         Args:
             X_TG: (4, 4), pose of the palm.
@@ -304,10 +306,10 @@ def attempt_scene(
     Args:
         snapshot: State of the files.
         i: Place of the attempt in the table.
-        row: All its columns.
-        hand: Of the dataset.
+        row: Row with all columns of the attempt.
+        hand: Hand of the dataset.
     """
-    # The start always; closed and lifted as far as the attempt got.
+    # The start is always shown; closed and lifted only if the attempt reached them.
     X_TO, spread = unpack_pose(row["X_TO"]), float(row["spread"])
     start = hand.poses(multiply(X_TO, unpack_pose(row["X_OG"])), None, spread)
     states = {"start": {"links": start, "contacts": []}} | hand_states(row, X_TO, hand)
@@ -317,12 +319,12 @@ def attempt_scene(
 def hand_states(
     row: Mapping[str, Any], X_TO: Array, hand: HandView, kind: str = ""
 ) -> dict[str, Any]:
-    """Return the states `closed` and `lifted` of a 3D view, as far as a row got.
+    """Return the states `closed` and `lifted` of a 3D view, as far as a row reached them.
 
     Args:
-        row: Of the dataset or of verdicts; one of verdicts may lack columns.
+        row: Row of the dataset or of verdicts; a row of verdicts may lack columns.
         X_TO: (4, 4), resting pose of the object.
-        hand: Of the dataset.
+        hand: Hand of the dataset.
         kind: See `contacts_of`.
     """
     states = {}
@@ -343,10 +345,10 @@ def make_scene(
 
     Args:
         snapshot: State of the files.
-        number: Of the object.
-        X_TO: (4, 4), its pose.
-        states: By their names, each with the poses of the links and the contacts.
-        hand: Of the dataset.
+        number: Number of the object.
+        X_TO: (4, 4), pose of the object.
+        states: States by name, each with the poses of the links and the contacts.
+        hand: Hand of the dataset.
     """
     return {
         "object": _columns(X_TO),
@@ -361,13 +363,13 @@ def make_scene(
 def contacts_of(
     row: Mapping[str, Any], when: str, X_TO: Array, kind: str = ""
 ) -> list[dict[str, Any]]:
-    """Return the contacts of a row in {T}; none if it lacks them.
+    """Return the contacts of a row in {T}; empty if the row lacks them.
 
     Args:
-        row: Of the dataset or of verdicts.
-        when: The prefix of the names of its columns.
+        row: Row of the dataset or of verdicts.
+        when: Prefix of the names of the columns.
         X_TO: (4, 4), resting pose of the object.
-        kind: Of the contacts, as the view distinguishes them; only the kind `force` has forces.
+        kind: Kind of the contacts in the view; only the kinds "" and `force` have forces.
     """
     points, normals, forces = (row.get(f"{when}{name}") for name in ("p_OQ", "nhat_Q_O", "f_Q_O"))
     if kind not in ("", "force") and points is not None:
@@ -381,7 +383,7 @@ def contacts_of(
 def contacts_in_table(
     p_OQ: Array, nhat_Q_O: Array, f_Q_O: Array, X_TO: Array
 ) -> list[dict[str, Any]]:
-    """Return contacts (k, 3) in {T} as JSON types; a finger that does not touch has none."""
+    """Return contacts (k, 3) in {T} as JSON types, without fingers that do not touch."""
     p_TQ = transform_points(X_TO, p_OQ)
     nhat_T, f_T = (rotate_vectors(X_TO, vectors) for vectors in (nhat_Q_O, f_Q_O))
     return [
@@ -392,12 +394,12 @@ def contacts_in_table(
 
 
 def _columns(X: Array) -> list[float]:
-    """Return a pose as sixteen numbers, column by column, to a micrometre and a microradian."""
+    """Return a pose as sixteen numbers, column by column, rounded to six decimals."""
     return [round(value, 6) for value in X.T.ravel().tolist()]
 
 
 def object_surface(snapshot: Snapshot, number: int) -> bytes | None:
-    """Return what is shown of an object by its number, see `pictures.still_scene`.
+    """Return the surface of an object as JSON by its number, see `pictures.still_scene`.
 
     It is None if there is no file of the object's meshes.
 
@@ -410,7 +412,7 @@ def object_surface(snapshot: Snapshot, number: int) -> bytes | None:
 
 @lru_cache(maxsize=KEPT_MESHES)
 def _read_surface(path: Path, modified: int) -> bytes:
-    """Return what is shown of an object's file; one written at another time [ns] is read again."""
+    """Return the surface in an object's file, which is read again if modified later [ns]."""
     from drakegrasp.objects.model import load_object
     from drakegrasp.pictures.still_scene import object_json
 

@@ -21,7 +21,7 @@ from drakegrasp.pictures.style import svg_bytes
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Plots by name, with what they show.
+#: Plots by name, with descriptions.
 PLOTS = {
     "outcomes": "How the attempts ended.",
     "removals": "What became of the successes: samples, or the filter that removed them.",
@@ -31,7 +31,7 @@ PLOTS = {
     "quantity is stands on the page of a grasp.",
 }
 _LOCK = threading.Lock()
-#: What was drawn of states of the files that are still in use.
+#: Plots that were drawn for states of the files that are still in use.
 _DRAWN: WeakKeyDictionary[Snapshot, dict[str, bytes]] = WeakKeyDictionary()
 
 
@@ -51,8 +51,8 @@ def plots_values(snapshot: Snapshot) -> dict[str, Any]:
 
 
 def plot_svg(snapshot: Snapshot, name: str) -> bytes:
-    """Return one of PLOTS as SVG."""
-    # Matplotlib's settings belong to the process: one plot at a time.
+    """Return one of the PLOTS as SVG."""
+    # Matplotlib's settings are global to the process, so plots are drawn one at a time.
     with _LOCK:
         drawn = _DRAWN.setdefault(snapshot, {})
         if name not in drawn:
@@ -70,7 +70,7 @@ def _draw(snapshot: Snapshot, name: str) -> Figure:
         counts = np.bincount(decided, minlength=1 + max(Removal))
         return draw_codes(counts, Removal.KEPT, "successes")[0]
 
-    # The others tell held grasps, and the better ones of these, apart.
+    # The other plots distinguish held grasps, and the better ones among these.
     held, size = table.held, len(snapshot.names)
     groups = {"held": held, "precision": table.precision, "stable": table.stable}
     if name == "objects":

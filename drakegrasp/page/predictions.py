@@ -1,8 +1,8 @@
 """Predictions and their verdicts on the page, with the rows of the dataset that they are for.
 
-In: the HDF5 file that `drakegrasp verify --out` writes, and a snapshot of the dataset. What filters
-and sorting need is in memory; all else of a verdict is read when a page shows it. A field that the
-file lacks reads as without a value.
+In: the HDF5 file that `drakegrasp verify --out` writes, and a snapshot of the dataset. The values
+that filters and sorting need are in memory; all other values of a verdict are read when a page
+shows them. A field that the file lacks is read as without a value.
 """
 
 from __future__ import annotations
@@ -51,45 +51,45 @@ from drakegrasp.table import Table
 #: Group of the verdicts in a result file, and their fields.
 GROUP = "grasps"
 FIELDS: Mapping[str, Field] = {field.name: field for field in VERIFICATION_FIELDS}
-#: What a verdict cannot do without; a file may lack any other field.
+#: Fields that a verdict must have; a file may lack any other field.
 NEEDED = ("object", "outcome", "p_OQ", "nhat_Q_O")
 _MAY_LACK = tuple(replace(field, optional=field.name not in NEEDED) for field in FIELDS.values())
-#: Numbers of a verdict as people read them; of several contacts the largest.
+#: Numbers of a verdict with their display; for several contacts the largest is shown.
 NUMBERS = {field.name: field.shown for field in FIELDS.values() if field.shown is not None}
-#: Those that the dataset's own trial has as well.
+#: Numbers that the dataset's own trial has as well.
 _BOTH = {field.name for field in TRIAL_FIELDS if field.shown == NUMBERS.get(field.name, 0)}
-#: Numbers of a prediction that can be filtered and sorted by.
+#: Numbers of a prediction for filtering and sorting.
 QUANTITIES = {
     "contact_error": NUMBERS["contact_error"],
     "normal_error": NUMBERS["normal_error"],
     "true_error": Shown("asked to true", "mm"),
     **{name: NUMBERS[name] for name in ("surface_distance", "slip", "turn", "smallest_friction")},
 }
-#: Those on cards.
+#: Quantities on cards.
 _CARD = ("contact_error", "true_error", "slip", "turn")
-#: Words of a verdict on a grasp that is held; and all, to filter by.
+#: Words of a verdict on a held grasp; and all words, for filtering.
 WORDS = ("held", "success", "precision", "stable", "sample")
 VERDICTS = ("fails", *WORDS, "held_any")
-#: Kinds of contacts with the columns of a verdict that hold them.
+#: Kinds of contacts, and the columns of a verdict that contain them.
 _CONTACTS = {"asked": ("p_OQ", "nhat_Q_O"), "reached": ("closed_p_OQ", "closed_nhat_Q_O")}
 #: Fields of a verdict that its card needs.
 ON_CARDS = ("reason", *(name for names in _CONTACTS.values() for name in names))
-#: Width of the part of an image that is shown over that of its marks, and the least share of it.
+#: Width of the shown part of an image over that of its marks, and the smallest shown fraction.
 LOOSE, LEAST_SHOWN = 1.7, 0.4
 #: The largest force of a fingertip.
 _FORCE = Shown("largest force after closing", "N")
 
 
 class Predictions(Gallery):
-    """n predictions, in the order of the result file.
+    """The n predictions of a result file, in order.
 
     Args:
         path: The result file.
-        read_at: Its stamp.
+        read_at: Stamp of the file.
         snapshot: State of the dataset.
 
     Raises:
-        DataError: If the file cannot be read, or is not of this dataset.
+        DataError: If the file cannot be read, or belongs to another dataset.
     """
 
     HOME, ROW, NOUN = "/predictions", "prediction", "prediction"
@@ -120,15 +120,15 @@ class Predictions(Gallery):
             there = [n for n in (*VERDICTS, *QUANTITIES, "p_OQ") if n in group and n != "held"]
             columns = {name: group[name][:] for name in there}
 
-        # The largest of the contacts; another hand may have another number of fingers.
+        # The largest value of the contacts; another hand may have another number of fingers.
         p_OQ, held = columns.pop("p_OQ"), outcome == Outcome.SUCCESS
         self._places = self.rows.trial_id
         true = snapshot.trials[self._places.tolist()]["closed_p_OQ"]
         columns["true_error"] = norm(p_OQ - true) if p_OQ.shape == true.shape else None
         largest = {name: _largest(columns.pop(name, None), len(held)) for name in QUANTITIES}
 
-        # The worst are those that fail, and of these those whose hand reached no contact; then the
-        # distance of asked from reached contacts decides, brought below 1.
+        # The worst predictions are those that fail, and among these those whose hand reached no
+        # contact; then the distance of predicted from reached contacts decides, mapped to below 1.
         error = largest["contact_error"]
         share = np.where(np.isnan(error), 1.0, error / (1.0 + error))
         self.table = Table(
@@ -143,11 +143,11 @@ class Predictions(Gallery):
         )
 
     def label(self, i: int) -> str:
-        """Return the name of a prediction in addresses: its number in the file."""
+        """Return the name of a prediction in addresses, which is its number in the file."""
         return str(i)
 
     def find(self, label: str) -> int | None:
-        """Return the number of the prediction of a label, or None if there is none."""
+        """Return the number of the prediction with a label, or None if there is none."""
         there = label.isascii() and label.isdecimal() and len(label) < 10
         return int(label) if there and int(label) < self.table.count else None
 
@@ -155,11 +155,11 @@ class Predictions(Gallery):
         """Return fields of some predictions; None for a field that the file lacks.
 
         Args:
-            numbers: Of the predictions.
-            names: Of the fields.
+            numbers: Numbers of the predictions.
+            names: Names of the fields.
 
         Raises:
-            DataError: If the file was replaced meanwhile, or is damaged.
+            DataError: If the file was replaced in the meantime, or is damaged.
         """
         rows, back = np.unique(np.asarray(numbers, dtype=np.int64), return_inverse=True)
         with opened(self._path, "a result file of drakegrasp verify", again=True) as file:
@@ -170,15 +170,15 @@ class Predictions(Gallery):
             columns = {name: _column(file[GROUP], FIELDS[name], rows) for name in names}
         return [{n: None if v is None else v[k] for n, v in columns.items()} for k in back]
 
-    # What pages say.
+    # Contents of pages.
 
     def identity(self, i: int) -> dict[str, Any]:
-        """Return how people name a prediction, its object and its row."""
+        """Return how people name a prediction: its number, object and row."""
         row = f"row {self.rows.row[i]} of {self.rows.split}"
         return {**super().identity(i), "number": f"prediction {i}", "row": row}
 
     def summary(self, query: Query, chosen: Places) -> dict[str, Any]:
-        """Return what the gallery says besides its cards."""
+        """Return the content of the gallery besides its cards."""
         out = self.snapshot.out
         return {
             "title": self._path.name,
@@ -189,7 +189,7 @@ class Predictions(Gallery):
         }
 
     def cards(self, shown: Places) -> list[dict[str, Any]]:
-        """Return what the cards of predictions say."""
+        """Return the content of the cards of predictions."""
         snapshot, camera = self.snapshot, self.rows.camera
         places, cards = self._places[shown].tolist(), []
         rows, verdicts = read_rows(snapshot, places, THUMBNAIL), self.read(shown.tolist(), ON_CARDS)
@@ -212,12 +212,12 @@ class Predictions(Gallery):
         return cards
 
     def row(self, i: int, hand: HandView) -> dict[str, Any]:
-        """Return what the page of a prediction says.
+        """Return the content of a prediction's page.
 
         Raises:
-            DataError: If a file was replaced meanwhile.
+            DataError: If a file was replaced in the meantime.
         """
-        # The verdict, the row, and where both cameras see the contacts; first that of the file.
+        # The verdict, the row, and where both cameras see the contacts, first the file's camera.
         snapshot, at, size = self.snapshot, int(self._places[i]), self.snapshot.config.camera.size
         (verdict,), (row,) = self.read([i]), read_rows(snapshot, [at])
         views = []
@@ -266,7 +266,7 @@ class Predictions(Gallery):
     def _numbers(
         self, i: int, verdict: Mapping[str, Any], row: Mapping[str, Any]
     ) -> list[tuple[str, str, str | None]]:
-        """Return lines of title, the prediction's value and the row's own, None if it has none."""
+        """Return lines of title, the prediction's value, and the row's value or None."""
         lines: list[tuple[str, str, str | None]] = []
         for name, shown in (QUANTITIES | NUMBERS).items():
             other = shown.text(row[name]) if name in _BOTH else None
@@ -280,7 +280,7 @@ class Predictions(Gallery):
         self, i: int, verdict: Mapping[str, Any], row: Mapping[str, Any], hand: HandView
     ) -> dict[str, Any]:
         """Return the 3D view: the hand as it was tried, and the dataset's own grasp."""
-        # Everything is on the object in the resting pose of the row.
+        # Everything is shown with the object in the resting pose of the row.
         X_TO = unpack_pose(row["X_TO"])
         marks = [
             *contacts_of(row, "closed_", X_TO, "true"),
@@ -288,7 +288,7 @@ class Predictions(Gallery):
             *contacts_of(verdict, "closed_", X_TO, "reached"),
         ]
 
-        # The hand as far as the trial got, and that of the dataset.
+        # The hand in the stages that the trial reached, and the hand of the dataset's grasp.
         states = hand_states(verdict, X_TO, hand, "force")
         states["dataset's grasp"] = hand_states(row, X_TO, hand, "force")["closed"]
         for state in states.values():
@@ -297,7 +297,7 @@ class Predictions(Gallery):
 
 
 def result_file(path: Path) -> Path:
-    """Return the HDF5 file of the name that `--out` was given, or of that of its JSON lines."""
+    """Return the HDF5 file for the path given to `--out`, or for that of its JSON lines."""
     beside = path.with_suffix(".h5")
     lines = path.suffix.lower() in (".jsonl", ".json") or not path.is_file()
     return beside if lines and beside.is_file() else path
@@ -307,7 +307,7 @@ def _matched(path: Path, file: h5py.File, snapshot: Snapshot, names: list[str]) 
     """Return the rows of the dataset that a result file is for.
 
     Raises:
-        DataError: If it does not say so, or they are those of another dataset.
+        DataError: If the file does not state its rows, or they belong to another dataset.
     """
     again = "give the predictions to drakegrasp verify --dataset again"
     rows = read_predicted_rows(file)
@@ -316,7 +316,7 @@ def _matched(path: Path, file: h5py.File, snapshot: Snapshot, names: list[str]) 
     if not snapshot.assembled or rows.shards != snapshot.trials.attributes.get("shards"):
         raise DataError(f"{path}: must be for {snapshot.out} as it is now, got another; {again}")
 
-    # Rows that exist, of the objects that the verdicts name.
+    # The rows must exist, and have the objects that the verdicts name.
     ids = rows.trial_id
     there = len(ids) == len(rows.row) == len(names) and bool(
         ((ids >= 0) & (ids < snapshot.table.count)).all()
@@ -335,7 +335,7 @@ def _column(group: h5py.Group, field: Field, rows: npt.NDArray[np.int64]) -> Any
 
 
 def _largest(values: Any, count: int = 1) -> Array:
-    """Return the largest value (n,) of each row; NaN where it has none."""
+    """Return the largest value (n,) of each row; NaN if a row has no value."""
     if values is None:
         return np.full(count, np.nan)
     flat = np.asarray(values, dtype=np.float64).reshape(count, -1)
@@ -352,7 +352,7 @@ def _window(
     """Return the square of an image that shows its marks: left, top, and width [px].
 
     Args:
-        marks: By kind.
+        marks: Marks by kind.
         size: Width of the image [px].
         wide: Whether to show the whole image.
     """

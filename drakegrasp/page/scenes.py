@@ -1,4 +1,4 @@
-"""Scenes to train on, on the page: the scenes.hdf5 of a dataset, with its other files."""
+"""Scenes for training, on the page: the scenes.hdf5 of a dataset, with its other files."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from drakegrasp.pictures.style import REACHED, TRUE
 from drakegrasp.table import Table
 
 Rows = npt.NDArray[np.int64]
-#: Palms that the 3D view shows, and how many of these with the hand; lines of the table.
+#: Maximum number of palms in the 3D view, number of these with a hand, and lines of the table.
 PALMS, HANDS, LINES = 100, 8, 100
 #: Length of the line along +Gz from a palm's origin on an image [m].
 PALM = 0.06
-#: What the label of a grasp says of it: the word, its look, and the colour of its palm.
+#: Display of a grasp by its labels: the word, its style class, and the colour of its palm.
 HOLDS, FAILS, UNKNOWN = (
     ("holds", "held", TRUE),
     ("fails", "failed", REACHED),
@@ -38,12 +38,12 @@ class Scenes(Gallery):
     """All scenes of a dataset.
 
     Args:
-        path: Their file.
-        read_at: Its stamp.
+        path: Path of scenes.hdf5.
+        read_at: Stamp of the file.
         snapshot: State of the other files.
 
     Raises:
-        DataError: If the file cannot be read, or is not of this dataset.
+        DataError: If the file cannot be read, or belongs to another dataset.
     """
 
     HOME, ROW, NOUN = "/scenes", "scene", "scene"
@@ -69,7 +69,7 @@ class Scenes(Gallery):
         if others := set(data.names) - set(snapshot.names):
             raise DataError(f"{path}: must be of objects of {snapshot.out}, got {min(others)}")
 
-        # How many grasps there are in each, are tested, hold, are samples; and the views.
+        # Numbers of grasps in each scene, of tested and held ones, of samples, and of views.
         of = {name: grasps["scene"][grasps[name]] for name in ("sample", "held", "tested")}
         of |= {"grasps": grasps["scene"], "views": views["scene"]}
         numbers = np.array([snapshot.names.index(name) for name in data.names], dtype=np.int32)
@@ -88,7 +88,7 @@ class Scenes(Gallery):
         return self._labels[i]
 
     def find(self, label: str) -> int | None:
-        """Return the number of the scene of a label, or None if there is none."""
+        """Return the number of the scene with a label, or None if there is none."""
         return self._labels.index(label) if label in self._labels else None
 
     def views(self, scene: int) -> Rows:
@@ -96,27 +96,27 @@ class Scenes(Gallery):
         return np.flatnonzero(self.data.tables["views"]["scene"] == scene)
 
     def grasps(self, scene: int) -> Rows:
-        """Return the rows of a scene's grasps: samples, others that hold, that fail, untested."""
+        """Return the rows of a scene's grasps: samples, then other held ones, failed, untested."""
         grasps, rows = self.data.tables["grasps"], self.data.rows_in(scene)
         sample, held, tested = (grasps[name][rows] for name in ("sample", "held", "tested"))
         return rows[np.argsort(-(4 * sample + 2 * held + 1 * tested), kind="stable")]
 
-    # What pages say.
+    # Contents of pages.
 
     def identity(self, i: int) -> dict[str, Any]:
-        """Return how people name a scene, and how many grasps it has."""
+        """Return how people name a scene, and its numbers of grasps."""
         counts = {name: int(values[i]) for name, values in self.table.items()}
         split, resting = SPLITS[counts["split"]], counts["resting"]
         return {**super().identity(i), "split": split, "resting": resting, "counts": counts}
 
     def summary(self, query: Query, chosen: Places) -> dict[str, Any]:
-        """Return what the gallery says besides its cards."""
+        """Return the content of the gallery besides its cards."""
         out = self.snapshot.out
         views = int(self.table.views[chosen].sum())
         return {"title": out.name or str(out), "views": views}
 
     def cards(self, shown: Places) -> list[dict[str, Any]]:
-        """Return what the cards of scenes say, with the views that see their grasps best."""
+        """Return the content of the cards of scenes, with the views that show their grasps best."""
         cards = []
         for i in shown.tolist():
             drawn, best = self._drawn(i), 0
@@ -126,7 +126,7 @@ class Scenes(Gallery):
         return cards
 
     def row(self, i: int, hand: HandView) -> dict[str, Any]:
-        """Return what the page of a scene says."""
+        """Return the content of a scene's page."""
         grasps, drawn = self.grasps(i), self._drawn(i)
         trials = self.data.tables["grasps"]["trial_id"]
         return {
@@ -140,12 +140,12 @@ class Scenes(Gallery):
         }
 
     def _drawn(self, i: int) -> int | None:
-        """Return the row of the grasp that is drawn into the views: the best, if it holds."""
+        """Return the row of the grasp drawn into the views: the best one, or None if it fails."""
         grasps, held = self.grasps(i), self.data.tables["grasps"]["held"]
         return int(grasps[0]) if len(grasps) and held[grasps[0]] else None
 
     def _seen(self, i: int, k: int, drawn: int | None) -> dict[str, Any]:
-        """Return a view of a scene, the k-th, and where it sees a grasp's palm and contacts."""
+        """Return the k-th view of a scene, and where it sees a grasp's palm and contacts."""
         view = int(self.views(i)[k])
         dots, palm = [], []
         if drawn is not None:
@@ -156,7 +156,7 @@ class Scenes(Gallery):
             )
             visible, near = grasps["visible"][row], self.data.near
             dots = dots_of(K, p_CQ, nhat, near, lambda finger, u, v: not visible[finger])
-            # A dot with a line as well, in the place of a contact.
+            # The palm is drawn like a contact: a dot with a line.
             along = PALM / ARROW * X_CG[None, :3, 2]
             palm = dots_of(K, X_CG[None, :3, 3], along, near, lambda finger, u, v: False)
         return {
@@ -168,7 +168,7 @@ class Scenes(Gallery):
         }
 
     def _visible(self, i: int, grasps: Rows) -> npt.NDArray[np.bool_]:
-        """Return which views (v,) see the contacts (v, g, k) of some of its grasps (g,)."""
+        """Return which contacts (v, g, k) of some grasps (g,) each view (v,) sees."""
         places, views = grasps - self.data.rows_in(i)[:1], self.views(i).tolist()
         return np.array([self.data.visible_in(view)[places] for view in views])
 
@@ -178,7 +178,7 @@ class Scenes(Gallery):
         seen = self._visible(i, grasps).sum(axis=0) if len(grasps) else np.zeros((0, 0))
         for row, views in zip(grasps.tolist(), seen.tolist(), strict=True):
             trial, sample = int(table["trial_id"][row]), table["sample"][row]
-            # As on the pages of grasps: how it holds, else why it does not.
+            # As on the pages of grasps: how well it holds, or else why it does not.
             words = [name for name in ("stable", "precision", "held") if table[name][row]][:1]
             words = words or [Outcome(int(table["outcome"][row])).label.replace("_", " ")]
             lines.append(
@@ -194,14 +194,14 @@ class Scenes(Gallery):
         return lines
 
     def _holds(self, row: int) -> tuple[str, str, str]:
-        """Return what the labels of a grasp say of it: HOLDS, FAILS or UNKNOWN."""
+        """Return the display of a grasp by its labels: HOLDS, FAILS or UNKNOWN."""
         table = self.data.tables["grasps"]
         if table["held"][row]:
             return HOLDS
         return FAILS if table["tested"][row] else UNKNOWN
 
     def _facts(self, i: int) -> list[tuple[str, str]]:
-        """Return lines of name and value of what lies on the table."""
+        """Return lines of name and value about what is on the table."""
         values = {name: column[i] for name, column in self.data.tables["scenes"].items()}
         x, y = unpack_pose(values["X_TO"][0])[:2, 3]
         return [
@@ -213,13 +213,13 @@ class Scenes(Gallery):
         ]
 
     def _scene(self, i: int, grasps: Rows, hand: HandView) -> dict[str, Any]:
-        """Return the 3D view: the hands of the best grasps, and more palms, in {T}."""
+        """Return the 3D view: the hands of the best grasps, and further palms, in {T}."""
         table = self.data.tables["grasps"]
         X_TO = unpack_pose(self.data.tables["scenes"]["X_TO"][i, 0])
         X_TG = unpack_pose(table["X_TG"][grasps].astype(float))
         known = np.isfinite(X_TG).all(axis=(1, 2)) & np.isfinite(table["q"][grasps]).all(axis=1)
 
-        # The hands of the best ones, with their contacts; the palms of more.
+        # The hands of the best grasps, with their contacts; the palms of more grasps.
         states, palms, rows = {}, [], grasps[known][:PALMS].tolist()
         for k, (row, X) in enumerate(zip(rows, X_TG[known], strict=False)):
             if k < HANDS:

@@ -1,4 +1,4 @@
-"""Serving an inspection on this machine, to this machine."""
+"""Serves an inspection on this machine, to this machine only."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from drakegrasp.errors import DataError
 from drakegrasp.page.app import Inspection, make_app
 
-#: The only address that is listened on.
+#: The only address that the server listens on.
 LOOPBACK = "127.0.0.1"
-#: Time that a request may take to come to its end [s].
+#: Time limit for a request to arrive completely [s].
 REQUEST_SECONDS = 30.0
 
 
@@ -36,15 +36,16 @@ def serve(
 
     Args:
         out: Directory of the dataset.
-        results: File of the verdicts on predictions for its rows, if there is one.
-        port: TCP port; 0 takes any that is free.
+        results: File of the verdicts on predictions for the dataset's rows, if there is one.
+        port: TCP port; 0 takes any free port.
         browser: Whether to open a browser.
-        announce: Is given the address as soon as it answers.
+        announce: Called with the address as soon as the server answers.
 
     Raises:
-        DataError: If there is no dataset, the verdicts are not of it, or the port is taken.
+        DataError: If there is no dataset, the verdicts belong to another dataset, or the port is
+            taken.
     """
-    # First what can be refused; the page must be quick from its first request on.
+    # Check everything first; the page must be fast from its first request on.
     inspection = Inspection(out, results)
     listener = listen(port)
     inspection.warm_up()
@@ -59,14 +60,14 @@ def serve(
 
 
 def server_config(app: Any) -> uvicorn.Config:
-    """Return how an ASGI app is served."""
+    """Return the server's configuration for an ASGI app."""
     return uvicorn.Config(app, http=_TimedProtocol, log_level="warning", access_log=False)
 
 
 class _TimedProtocol(H11Protocol):
-    """HTTP whose connections are closed if a request does not come to its end.
+    """HTTP that closes a connection if a request does not arrive completely in time.
 
-    uvicorn waits for the rest of a begun request for ever (0.54).
+    uvicorn (0.54) would wait for the rest of a request forever.
     """
 
     _deadline: asyncio.TimerHandle | None = None
@@ -82,7 +83,7 @@ class _TimedProtocol(H11Protocol):
         self._await_request()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Wait no more."""
+        """Stop waiting."""
         self._stop_waiting()
         super().connection_lost(exc)
 
@@ -95,7 +96,7 @@ class _TimedProtocol(H11Protocol):
             self._deadline.cancel()
 
     def _close_if_unfinished(self) -> None:
-        # A request that is complete is being answered.
+        # A complete request is being answered.
         if self.conn.their_state in (h11.IDLE, h11.SEND_BODY):
             self.transport.close()
 
@@ -104,7 +105,7 @@ def listen(port: int) -> socket.socket:
     """Return a socket that listens on the loopback address.
 
     Raises:
-        DataError: If the port is taken, or needs rights that we do not have.
+        DataError: If the port is taken, or needs rights that this process does not have.
     """
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -121,7 +122,7 @@ def listen(port: int) -> socket.socket:
 
 
 def has_screen() -> bool:
-    """Return whether a browser would open a window, and not take over the terminal."""
+    """Return whether a browser would open a window instead of taking over the terminal."""
     if sys.platform == "darwin":
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

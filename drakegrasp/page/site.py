@@ -1,7 +1,7 @@
-"""The pages as files that a browser opens without a server: the server's own, written to a folder.
+"""The pages as files that a browser opens without a server: the server's pages, in a folder.
 
 In: a dataset, and results of predictions for its rows. Out: `index.html` and all pages that it
-leads to, with the images, meshes and plots that they ask for. Decisions are shown and cannot be
+links to, with the images, meshes and plots that they need. Decisions are shown but cannot be
 changed.
 """
 
@@ -25,14 +25,14 @@ from drakegrasp.page.scenes import Scenes
 from drakegrasp.runtime.files import atomic_folder
 from drakegrasp.runtime.progress import Report, silent
 
-#: Grasps, and predictions, that are written at most: a browser must hold all cards at once.
+#: Maximum number of grasps and of predictions: a browser must hold all cards at once.
 MAX_GRASPS = 2000
-#: Scenes that are written at most: each has many images.
+#: Maximum number of scenes, each of which has many images.
 MAX_SCENES = 100
 
 
 class Written(NamedTuple):
-    """What was written.
+    """Summary of the written pages.
 
     Attributes:
         grasps: Number of successes with a page.
@@ -48,26 +48,27 @@ def write_site(
 ) -> Written:
     """Write the pages of a dataset's successes, of predictions and of scenes, as files.
 
-    Scenes that cannot be read are left out, and the pages say why.
+    Scenes that cannot be read are left out, and the pages state why.
 
     Args:
         out: Directory of the dataset.
-        folder: Where to write; it must be new or empty, and appears when it is complete.
-        results: File of the verdicts on predictions for its rows, if there is one.
-        progress: Called with the number of pages written and to write.
+        folder: Folder to write to; it must be new or empty, and appears when it is complete.
+        results: File of the verdicts on predictions for the dataset's rows, if there is one.
+        progress: Called with the number of written pages and the number of all pages.
 
     Raises:
-        DataError: If there is no dataset, it has no success, the verdicts are not of it, the folder
-            holds other files, or the dataset is assembled anew meanwhile.
+        DataError: If there is no dataset, if it has no success, if the verdicts belong to another
+            dataset, if the folder contains files, or if the dataset is assembled again in the
+            meantime.
     """
-    # Refuse what cannot be done before anything is written.
+    # Check everything before anything is written.
     files = _Files(out, results)
     if not files.rows[Attempts]:
         raise DataError(f"{out}: must hold at least one success to show, got none")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DataError(f"--static must be a new or empty directory, got {folder}")
 
-    # Pages of rows, then galleries, then what they all ask for.
+    # Write the pages of rows, then the galleries, then everything that these need.
     rows = [address for addresses in files.rows.values() for address in addresses]
     with atomic_folder(folder) as unfinished:
         shutil.copytree(ASSETS, unfinished / "static", ignore=shutil.ignore_patterns("__pycache__"))
@@ -81,22 +82,22 @@ def write_site(
 
 
 class _Files(Inspection):
-    """An inspection of one state of the files, whose pages are files.
+    """An inspection of one state of the files, whose pages become files.
 
     Attributes:
-        rows: Addresses of the rows that have a page, by table.
+        rows: For each table, addresses of the rows that have a page.
         successes: Number of all successes.
     """
 
     def __init__(self, out: Path, results: Path | None) -> None:
         super().__init__(out, results)
         self._state, self._site = self.catalog.current(), replace(super().site(), up="")
-        self.token = ""  # files decide nothing
+        self.token = ""  # no decisions on pages that are files
         self._chosen: dict[type[Gallery], Places] = {}
         self._written: set[str] = set()
         self.rows: dict[type[Gallery], list[str]] = {}
 
-        # The first rows of each table; what is left out is told on the gallery.
+        # The first rows of each table; the gallery states how many are left out.
         missing = self._state.missing
         self.successes = self._choose(Attempts, MAX_GRASPS)
         if self._site.predicted:
@@ -115,11 +116,11 @@ class _Files(Inspection):
         self._site = replace(self._site, scened=Scenes in self.rows, grasps=grasps)
 
     def snapshot(self) -> Snapshot:
-        """Return the state that is written."""
+        """Return the state of the files that the pages show."""
         return self._state
 
     def site(self) -> Site:
-        """Return where the page is that is written."""
+        """Return the position of the page that is being written."""
         return self._site
 
     def select(self, table: Gallery, query: Query) -> Places:
@@ -127,7 +128,7 @@ class _Files(Inspection):
         return self._chosen[type(table)]
 
     def write(self, folder: Path, addresses: Iterable[str]) -> None:
-        """Write what addresses show into a folder, once."""
+        """Write the pages of addresses into a folder, each once."""
         for address in addresses:
             if address in self._written:
                 continue
@@ -138,7 +139,7 @@ class _Files(Inspection):
             try:
                 content = bytes(answer(self, address).body)
             except HTTPException:
-                continue  # an image or a mesh that is not there
+                continue  # an image or a mesh that does not exist
             path = folder / file_of(address)
             if path.suffix == ".js":
                 content = b'window.drakegraspMeshes["%b"] = %b;\n' % (path.stem.encode(), content)
@@ -146,12 +147,12 @@ class _Files(Inspection):
             path.write_bytes(content)
 
     def write_asked(self, folder: Path) -> None:
-        """Write what the pages so far ask for, and what that asks for."""
+        """Write everything that the written pages need, and what that needs in turn."""
         while left := self._site.asked - self._written:
             self.write(folder, sorted(left))
 
     def _choose(self, kind: type[Gallery], most: int) -> int:
-        """Choose the rows of a table that have a page; return how many there are."""
+        """Choose the rows of a table that get a page; return the number of all rows."""
         table = self.table(kind)
         places = table.select(kind.query())
         self._chosen[kind] = places[:most]

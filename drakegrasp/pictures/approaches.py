@@ -1,7 +1,7 @@
-"""From where palms approach objects: directions, what they cover, rays over objects, and maps.
+"""Directions from which palms approach objects: coverage, rays around objects, and maps.
 
-Objects on the table are seen in parallel projection, in a view {V} whose axes point right, up and
-towards the reader. In: attempts of some objects. Out: figures. Needs matplotlib, not Drake.
+Objects on the table are drawn in parallel projection, in a view {V} whose axes point right, up and
+towards the reader. In: attempts at some objects. Out: figures. Needs matplotlib, but not Drake.
 """
 
 from __future__ import annotations
@@ -37,37 +37,37 @@ from drakegrasp.pictures.style import (
 
 #: A direction is covered if an approach is at most this far from it [deg].
 NEAR_DEG = 10.0
-#: Directions of the half sphere that are looked at.
+#: Number of directions of the half sphere that are tested.
 PROBES = 2000
-#: From where the reader looks: about the vertical from +x, and above the horizontal [rad].
+#: Direction of the reader: about the vertical from +x, and above the horizontal [rad].
 AZIMUTH, ELEVATION = np.deg2rad(-55.0), np.deg2rad(20.0)
 #: Direction of the light in the view: from the upper left and from the front.
 LIGHT = np.array([-0.48, 0.6, 0.64])
 OBJECT_COLOUR = np.array([0.70, 0.77, 0.86])
 #: Colours of a palm's approach, as in the paper, and of attempts that failed.
 APPROACH, FAILED = "#7B2FA8", "#B8BDC4"
-#: Rays and dots of a panel, at most.
+#: Maximum numbers of rays and dots in a panel.
 MAX_RAYS, MAX_DOTS = 300, 3000
-#: Heights above the table that have a circle on a map [deg].
+#: Elevations above the table that have a circle on a map [deg].
 CIRCLES_DEG = (60.0, 30.0, 0.0)
-#: Half the edge of a map: what comes from a little below the horizon is still on it.
+#: Half the edge of a map, which also shows directions slightly below the horizon.
 EXTENT = 1.24
-#: Edge of a picture or a map, spaces, caption and head [inch]; objects in a row.
+#: Edge of a picture or a map, spaces, caption and head [inch]; number of objects in a row.
 EDGE, GAP, BETWEEN, CAPTION, HEAD, ACROSS = 2.5, 0.05, 0.3, 0.28, 0.24, 2
 #: Width of a panel of rays, space beside it, height of its title and of a line of text [inch].
 PANEL, MARGIN, TITLE, LINE = 3.9, 0.12, 0.34, 0.2
 
 
 def approach_directions(X_TO: Array, X_OG: Array) -> Array:
-    """Return the unit directions (n, 3) in {T} from which palms (n, 4, 4) come: -Gz."""
+    """Return the unit directions (n, 3) in {T} from which palms (n, 4, 4) approach: -Gz."""
     return np.asarray(-X_OG[:, :3, 2] @ X_TO[:3, :3].T)
 
 
 def coverage(directions: Array) -> float:
-    """Return which share of the half sphere over the table lies near an approach.
+    """Return the fraction of the half sphere above the table that is near an approach.
 
-    Near is NEAR_DEG or less. The directions that are looked at lie on a spiral that gives each the
-    same area (Fibonacci lattice; Gonzalez 2010, Mathematical Geosciences 42).
+    A direction is near if the angle is at most NEAR_DEG. The tested directions are on a spiral that
+    represents equal areas (Fibonacci lattice; Gonzalez 2010, Mathematical Geosciences 42).
 
     Args:
         directions: (n, 3), unit, in {T}.
@@ -79,22 +79,22 @@ def coverage(directions: Array) -> float:
     radius = np.sqrt(1.0 - height**2)
     probes = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), height])
 
-    # The chord of the angle; a direction on the limit may not depend on rounding.
+    # The chord of the angle, enlarged so that a direction at the limit does not depend on rounding.
     chord = 2.0 * np.sin(np.deg2rad(NEAR_DEG) / 2.0) + 1e-9
     distance, _ = KDTree(directions).query(probes)
     return float(np.count_nonzero(distance <= chord)) / PROBES
 
 
 def map_directions(directions: Array) -> Array:
-    """Return the places (n, 2) of directions on Lambert's equal-area map about +Tz.
+    """Return the positions (n, 2) of directions on Lambert's equal-area map about +Tz.
 
-    Straight up is the origin, the horizon the unit circle, and what comes from below is outside of
-    it.
+    Straight up is the origin, the horizon is the unit circle, and directions from below are outside
+    of the circle.
 
     Args:
         directions: (n, 3), unit, in {T}.
     """
-    # Of the angle from +Tz: r = sqrt(2) sin(angle / 2) is 1 at the horizon.
+    # With the angle from +Tz, r = sqrt(2) sin(angle / 2), which is 1 at the horizon.
     across = np.hypot(directions[:, 0], directions[:, 1])
     r = np.sqrt(np.maximum(1.0 - directions[:, 2], 0.0))
     scale = np.divide(r, across, out=np.zeros_like(r), where=across > 1e-12)
@@ -103,18 +103,18 @@ def map_directions(directions: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectApproaches:
-    """An object, and from where it was approached.
+    """An object, and the directions from which it was approached.
 
     Attributes:
-        name: Of the object.
+        name: Name of the object.
         vertices, faces: (n, 3) in {O} [m] and (m, 3).
-        R_TO: (3, 3), how it rests.
-        attempts: Their number.
-        directions: (a, 3) in {T}, from which palms came that found no grasp; without those whose
-            palm ray misses.
-        rays: (s, 2, 3) in {O}, of the successes: from the palm's origin to the surface [m].
+        R_TO: (3, 3), orientation in which it rests.
+        attempts: Number of attempts.
+        directions: (a, 3) in {T}, directions of palms that found no grasp, without those whose palm
+            ray misses.
+        rays: (s, 2, 3) in {O}, rays of the successes from the palm's origin to the surface [m].
         successes: (s, 3) in {T}, directions of the successes.
-        groups: (s,), how each success holds: index into GROUPS.
+        groups: (s,), index into GROUPS of how each success holds.
     """
 
     name: str
@@ -129,17 +129,17 @@ class ObjectApproaches:
 
 
 def read_approaches(out: Path, name: str, config: Config) -> ObjectApproaches:
-    """Return from where an object was approached first, in the resting pose that held most.
+    """Return an object's approaches of the first round, in the resting pose with most successes.
 
     Args:
         out: Directory of the dataset.
-        name: Of the object.
-        config: Of the object, see `Manifest.config_of`.
+        name: Name of the object.
+        config: Configuration of the object, see `Manifest.config_of`.
 
     Raises:
         DataError: If a file is missing or damaged.
     """
-    # The attempts of the object at the pose in which most are held: a picture shows one pose.
+    # A picture shows one resting pose: that with the most held grasps.
     prepared = load_prepared(out, name, config)
     first = Trials(out).where(object_name=name, refined=False)
     resting, held = first["resting"], first["outcome"] == Outcome.SUCCESS
@@ -170,10 +170,10 @@ def read_approaches(out: Path, name: str, config: Config) -> ObjectApproaches:
 
 
 def approaches_figure(objects: Sequence[ObjectApproaches], *, left_out: int) -> Figure:
-    """Return a picture and a map per object.
+    """Return a figure with a picture and a map for each object.
 
     Args:
-        objects: What to draw, at least one.
+        objects: Objects to draw, at least one.
         left_out: Number of objects with successes that are not drawn.
     """
     # The page: blocks of a picture and a map, below a head with the legend.
@@ -208,7 +208,7 @@ def approaches_figure(objects: Sequence[ObjectApproaches], *, left_out: int) -> 
 
 
 def spread(count: int, most: int) -> npt.NDArray[np.int64]:
-    """Return which of `count` things to draw: evenly spaced ones, `most` at most."""
+    """Return the indices of at most `most` of `count` items, evenly spaced."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
 
 
@@ -222,14 +222,14 @@ def _draw_picture(axes: Axes, item: ObjectApproaches) -> None:
         draw_rays(axes, rays[groups == number], colour, width=0.8, opacity=0.85)
     draw_object(axes, triangles)
 
-    # A square about all of it.
+    # A square around everything.
     low, high = frame_of([triangles, rays])
     middle, half = (low + high) / 2.0, (high - low).max() / 2.0
     finish_view(axes, middle - half, middle + half)
 
 
 def _draw_map(axes: Axes, item: ObjectApproaches) -> None:
-    """Draw the map of directions: straight above in the middle, the horizon as a circle."""
+    """Draw the map of directions: straight up at the centre, the horizon as a circle."""
     for height in CIRCLES_DEG:
         radius = np.sqrt(1.0 - np.sin(np.deg2rad(height)))
         horizon = height == CIRCLES_DEG[-1]
@@ -241,7 +241,7 @@ def _draw_map(axes: Axes, item: ObjectApproaches) -> None:
     for place, text in (((EXTENT - 0.06, 0.0), "+Tx"), ((0.0, EXTENT - 0.06), "+Ty")):
         axes.text(*place, text, fontsize=7.5, color="#6A7078", ha="center", va="center", zorder=5)
 
-    # Failures are a ground of dots; successes stand on it.
+    # Failures are dots in the background; successes are drawn over them.
     failed = map_directions(item.directions[spread(len(item.directions), MAX_DOTS)])
     axes.plot(*failed.T, "o", color=FAILED, markersize=1.7, markeredgewidth=0.0, zorder=1,
               rasterized=len(failed) > 500)  # fmt: skip
@@ -264,21 +264,20 @@ def palm_poses_figure(
 ) -> Figure:
     """Return a figure of the approach rays of palm poses to a mesh, a panel per method.
 
-    Args:
-        vertices: Of the mesh, (n, 3) in {O} [m].
-        faces: Of the mesh, (m, 3).
-        rays: By title, (r, 2, 3): from the palm's origin to the surface, in {O} [m].
-        R_TO: (3, 3), how the object rests; as in its file if None.
-        captions: By the same titles, the text below a panel.
-        name: Of the object, for the last line.
+        vertices: Vertices of the mesh, (n, 3) in {O} [m].
+        faces: Faces of the mesh, (m, 3).
+        rays: Rays (r, 2, 3) by title, from the palm's origin to the surface, in {O} [m].
+        R_TO: (3, 3), orientation in which the object rests; as in its file if None.
+        captions: Text below a panel, by the same titles.
+        name: Object name, shown in the last line.
     """
-    # One scale for all panels, which shows every ray.
+    # One scale for all panels, with which every ray is visible.
     R_TO = np.eye(3) if R_TO is None else np.asarray(R_TO)
     triangles = triangles_in_view(vertices, faces, R_TO)
     seen = {title: ends @ (view_rotation() @ R_TO).T for title, ends in rays.items()}
     low, high = frame_of([triangles, *seen.values()])
 
-    # The page: panels side by side over their captions.
+    # The page: panels side by side, above their captions.
     captions = captions or {}
     lines = max((text.count("\n") + 1 for text in captions.values()), default=0)
     foot = LINE if name else 0.0
@@ -307,7 +306,7 @@ def palm_poses_figure(
 
 
 def view_rotation() -> Array:
-    """Return R_VT (3, 3) of the view {V}: its axes point right, up, and towards the reader."""
+    """Return R_VT (3, 3) of the view {V}, whose axes point right, up, and towards the reader."""
     out = np.array([np.cos(AZIMUTH), np.sin(AZIMUTH), 0.0])
     right, towards = np.cross([0.0, 0.0, 1.0], out), np.cos(ELEVATION) * out
     towards[2] = np.sin(ELEVATION)
@@ -315,11 +314,11 @@ def view_rotation() -> Array:
 
 
 def frame_of(shapes: Sequence[Array], *, border: float = 0.03) -> tuple[Array, Array]:
-    """Return the lower left and the upper right corner (2,) of points seen in the view [m].
+    """Return the lower left and the upper right corners (2,) of points seen in the view [m].
 
     Args:
         shapes: Arrays (..., 3) of points in {V}.
-        border: Of the picture, as a share of its size.
+        border: Border of the picture, as a fraction of its size.
     """
     points = np.concatenate([shape.reshape(-1, 3)[:, :2] for shape in shapes])
     low, high = points.min(axis=0), points.max(axis=0)
@@ -328,15 +327,15 @@ def frame_of(shapes: Sequence[Array], *, border: float = 0.03) -> tuple[Array, A
 
 
 def draw_object(axes: Axes, triangles: Array) -> None:
-    """Draw triangles (m, 3, 3) in {V}, shaded by one light; those that face away are left out."""
-    # The farthest first, so that nearer ones cover them.
+    """Draw triangles (m, 3, 3) in {V} with shading; triangles that face away are left out."""
+    # The farthest come first, so that nearer ones cover them.
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     front = np.flatnonzero(normals[:, 2] > 0.0)
     front = front[np.argsort(triangles[front, :, 2].mean(axis=1), kind="stable")]
 
-    # Thousands of triangles are drawn as pixels also in an SVG: else no program could open it.
-    # Edges close the seams.
+    # Thousands of triangles are rasterized even in an SVG, since no program could open it
+    # otherwise. Edges close the seams.
     shade = 0.55 + 0.45 * np.clip(normals[front] @ LIGHT, 0.0, 1.0)
     colours = np.outer(shade, OBJECT_COLOUR)
     axes.add_collection(
@@ -348,15 +347,15 @@ def draw_object(axes: Axes, triangles: Array) -> None:
 def draw_rays(
     axes: Axes, rays: Array, colour: str, *, width: float, opacity: float, through: float = 0.0
 ) -> None:
-    """Draw rays (n, 2, 3) in {V}: those behind the object's middle stand behind it.
+    """Draw rays (n, 2, 3) in {V}; rays behind the object's centre are drawn behind the object.
 
     Args:
-        axes: Where to draw.
+        axes: Axes to draw in.
         rays: The rays [m].
-        colour: Of the rays.
-        width: Of a ray [points].
-        opacity: Of a ray, 0 to 1.
-        through: That of what shines through the object.
+        colour: Colour of the rays.
+        width: Width of a ray [points].
+        opacity: Opacity of a ray, 0 to 1.
+        through: Opacity of a ray that shines through the object.
     """
     behind = rays[:, :, 2].mean(axis=1) < 0.0
     for part, order, alpha in (
@@ -371,17 +370,17 @@ def draw_rays(
 
 
 def finish_view(axes: Axes, low: Array, high: Array) -> None:
-    """Set what axes show, in equal scales [m]."""
+    """Set the range that axes show, with equal scales [m]."""
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     hide_ticks(axes)
 
 
 def triangles_in_view(vertices: Array, faces: npt.NDArray[np.int32], R_TO: Array) -> Array:
-    """Return the triangles (m, 3, 3) of a mesh in {V}, about the origin of {O} [m].
+    """Return the triangles (m, 3, 3) of a mesh in {V}, relative to the origin of {O} [m].
 
     Args:
         vertices: (n, 3) in {O} [m].
         faces: (m, 3).
-        R_TO: (3, 3), how the object rests.
+        R_TO: (3, 3), orientation in which the object rests.
     """
     return np.asarray((vertices @ (view_rotation() @ R_TO).T)[faces])

@@ -1,7 +1,7 @@
-"""Plots of numbers: of a whole dataset, and of a score card.
+"""Charts of numbers: of a whole dataset, and of a score card.
 
-In: counts and columns, or a card as `scoring.card` makes it. Out: figures. Names are drawn as they
-are: a dollar sign starts no formula.
+In: counts and columns, or a card that `scoring.card` has computed. Out: figures. Names are drawn
+literally: a dollar sign does not start a formula.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from drakegrasp.pictures.style import INK, PREDICTED, png_bytes, shortened
 #: Colours of grasps that are held, precision and stable (Okabe and Ito), and of failures.
 HELD, PRECISION, STABLE, FAILED = "#E69F00", "#56B4E9", "#009E73", "#9AA0A8"
 GROUPS = {"held": HELD, "precision": PRECISION, "stable": STABLE}
-#: Objects in a plot, at most: those with the most grasps.
+#: Maximum number of objects in a plot, which are those with the most grasps.
 MAX_OBJECTS = 60
-#: Bins of a histogram, and the share of the values that it shows: a few wild ones squeeze the rest.
+#: Bins of a histogram, and the fraction of the values that determines its range, since a few
+#: extreme values would squeeze the others.
 BINS, SHOWN = 40, 0.98
 #: Colours of the reference rows (Okabe and Ito: safe for the colour-blind); predictions are blue.
 _COLOURS = ("#000000", "#D55E00", "#999999", "#B9B9B9", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-#: Of predictions in the order of their sets.
+#: Colours of predictions, in the order of their sets.
 _OWN = (PREDICTED, "#56B4E9")
 #: Longest name of a set in the picture [characters].
 LONGEST = 28
@@ -40,11 +41,11 @@ NARROWEST = 7.6
 def draw_codes(
     counts: Sequence[int] | npt.NDArray[np.int64], first: Outcome | Removal, what: str
 ) -> tuple[Figure, dict[str, int]]:
-    """Return how many there are of each code that occurs, as bars and as numbers.
+    """Return the counts of each code that occurs, as a bar chart and as numbers.
 
     Args:
-        counts: By the codes.
-        first: The code that is wanted.
+        counts: Counts by code.
+        first: The desired code, which is shown first.
         what: What is counted, e.g. "attempts".
     """
     shown = [code for code in type(first) if counts[code] or code is first]
@@ -57,12 +58,12 @@ def draw_codes(
 def draw_counts(
     counts: Mapping[str, int], what: str, *, colours: Sequence[str] | None = None
 ) -> Figure:
-    """Return how many there are of each kind, as bars on a logarithmic scale.
+    """Return the counts of each kind as bars on a logarithmic scale.
 
     Args:
-        counts: Numbers by kind, in the order of the bars; the first is the one that is wanted.
+        counts: Counts by kind, in the order of the bars; the first kind is the desired one.
         what: What is counted, e.g. "attempts".
-        colours: Of the bars; that of the first is another if None.
+        colours: Colours of the bars; if None, the first differs from the others.
     """
     names, numbers = list(counts), np.array(list(counts.values()))
     figure = Figure(figsize=(8.0, 0.9 + 0.3 * len(names)), layout="constrained")
@@ -78,12 +79,12 @@ def draw_counts(
 
 
 def draw_objects(names: Sequence[str], counts: Mapping[str, Sequence[int]]) -> Figure:
-    """Return how many grasps each object has, and how well they hold.
+    """Return a chart of the number of grasps of each object, and of how well they hold.
 
     Args:
-        names: Of the objects.
-        counts: Numbers of grasps by object that are `held`, `precision` and `stable`; each is a
-            part of the one before.
+        names: Names of the objects.
+        counts: For each object the number of `held`, `precision` and `stable` grasps; each group is
+            a part of the previous one.
     """
     # The objects with the most grasps, the largest on top.
     held = np.array(counts["held"], dtype=int)
@@ -91,7 +92,7 @@ def draw_objects(names: Sequence[str], counts: Mapping[str, Sequence[int]]) -> F
     figure = Figure(figsize=(8.0, 1.1 + 0.22 * max(len(order), 1)), layout="constrained")
     axes = figure.add_subplot()
 
-    # Bars over one another: stable are precision, and precision are held.
+    # Bars over one another: stable grasps are precision grasps, and these are held.
     for group, colour in GROUPS.items():
         numbers = np.array(counts[group], dtype=int)[order]
         axes.barh(range(len(order)), numbers, color=colour, height=0.78, label=group)
@@ -108,11 +109,11 @@ def draw_distributions(
 ) -> Figure:
     """Return histograms of quantities of the held grasps, one panel each.
 
-    A panel ends where all but 2 % of the values are; what is beyond is counted in its last bin.
+    The range of a panel contains 98 % of the values; larger values are counted in its last bin.
 
     Args:
         quantities: Title with unit, and values (n,) of all held grasps.
-        groups: Which (n,) of them are in each group, by the names of GROUPS.
+        groups: Which grasps (n,) are in each group, by the names of GROUPS.
     """
     columns = 2
     rows = -(-len(quantities) // columns)
@@ -143,7 +144,7 @@ def _histogram(axes: Axes, title: str, values: Array, groups: Mapping[str, Array
 
 
 def _name_bars(axes: Axes, names: Sequence[str]) -> None:
-    """Name horizontal bars, the first on top."""
+    """Name horizontal bars, with the first one on top."""
     axes.set_yticks(range(len(names)))
     axes.set_yticklabels([name.replace("$", r"\$") for name in names], fontsize=9)
     axes.invert_yaxis()
@@ -151,7 +152,7 @@ def _name_bars(axes: Axes, names: Sequence[str]) -> None:
 
 
 def _plain(axes: Axes) -> None:
-    """Remove what says nothing from axes."""
+    """Remove lines without information from axes."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(color=INK, labelcolor=INK, labelsize=9)
     axes.xaxis.label.set_color(INK)
@@ -164,7 +165,7 @@ def _left_out(names: Sequence[str]) -> str | None:
 
 
 def card_picture(card: Mapping[str, Any], *, dpi: int = 150) -> bytes:
-    """Return a card as PNG, at a resolution [pixels per inch]."""
+    """Return a card as PNG with a resolution [pixels per inch]."""
     calibrated = {n: s["calibration"] for n, s in card["sets"].items() if s["calibration"]}
     protocol = card["settings"].get("protocol")
     columns = 1 + (protocol is None) + bool(calibrated)
@@ -196,7 +197,7 @@ def _colours(card: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _draw_headline(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, str]) -> None:
-    """Draw the headline of each set with its interval, and what is held beside it."""
+    """Draw the headline of each set with its interval, and a tick for what is held anywhere."""
     for i, (name, each) in enumerate(card["sets"].items()):
         value, low, high = (100.0 * each["measures"]["headline"][k] for k in _ENDS)
         axes.plot([low, high], [i, i], color=colours[name], linewidth=2.2, solid_capstyle="round")
@@ -242,7 +243,7 @@ def _draw_curves(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, str]
 def _draw_calibration(
     axes: Axes, groups: Mapping[str, Sequence[Mapping[str, float]]], colours: Mapping[str, str]
 ) -> None:
-    """Draw the share that counts against the stated confidence."""
+    """Draw the fraction that counts against the stated confidence."""
     for name, each in groups.items():
         stated = [group["confidence"] for group in each]
         shares = [100.0 * group["share"] for group in each]
@@ -256,7 +257,7 @@ def _draw_calibration(
 
 
 def _caption(figure: Figure, card: Mapping[str, Any]) -> None:
-    """Write what was scored under the picture."""
+    """Write below the picture what was scored."""
     where, protocol = card["dataset"], card["settings"].get("protocol")
     simulator = f"Drake {card['settings']['versions']['drake']}"
     if protocol is not None:

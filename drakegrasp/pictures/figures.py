@@ -1,7 +1,7 @@
 """All figures of a dataset as files: PNG, SVG, and their numbers as JSON.
 
-In: the directory of a dataset. Out: a folder of files; the same dataset gives the same bytes on the
-same machine.
+In: the directory of a dataset. Out: a folder of files; the same dataset produces the same bytes on
+the same machine.
 """
 
 from __future__ import annotations
@@ -46,29 +46,29 @@ from drakegrasp.runtime.progress import Report, silent
 
 #: Resolution of the pictures [pixels per inch].
 DPI = 150
-#: Objects in the figure of the approaches.
+#: Number of objects in the figure of the approaches.
 OBJECTS = 8
-#: The file of the numbers.
+#: Name of the file of the numbers.
 NUMBERS_FILE = "figures.json"
 #: Colour of the bars of samples.
 SAMPLES_COLOUR = "#5B6470"
-#: Columns of the quantities of `HeldGrasps`.
+#: Columns from which the quantities of `HeldGrasps` are computed.
 COLUMNS = (
     *("slip", "turn", "closed_f_Q_O", "lifted_f_Q_O", "lifted_penetration", "normal_angle"),
     *("precision", "stable"),
 )
-#: A figure, or the pages of one, with its numbers.
+#: A figure or the pages of a figure, with its numbers.
 Drawn: TypeAlias = tuple[Figure | list[Figure], Any]
 
 
 @dataclass(kw_only=True)
 class Written:
-    """What was written.
+    """Summary of the written figures.
 
     Attributes:
-        folder: Where.
-        names: Of the figures, each a PNG and an SVG.
-        left_out: Why a figure is missing, by its name.
+        folder: Folder of the files.
+        names: Names of the figures, each of which is a PNG and an SVG.
+        left_out: Reason why a figure is missing, by its name.
     """
 
     folder: Path
@@ -77,7 +77,7 @@ class Written:
 
 
 class HeldGrasps(NamedTuple):
-    """The successes of a dataset, h of them.
+    """The h successes of a dataset.
 
     Attributes:
         trial_ids: (h,), rows of `/trials`.
@@ -100,22 +100,22 @@ def write_figures(
 ) -> Written:
     """Write the figures of a dataset, each as PNG and SVG, and their numbers.
 
-    A figure that the dataset has nothing for is left out.
+    A figure for which the dataset has no data is left out.
 
     Args:
         out: Directory of a dataset.
-        folder: Where to write; files of the same names are replaced.
+        folder: Folder to write to; files with the same names are replaced.
         compare: A dataset of the same objects by the other sampler of palm poses.
         trial_id: The grasp whose phases are drawn; the first of those that hold best if None.
-        progress: Is told of each figure.
+        progress: Called after each figure.
 
     Raises:
-        DataError: If the directory holds no dataset, or `compare` or `trial_id` do not fit.
+        DataError: If the directory is not a dataset, or if `compare` or `trial_id` does not fit it.
         MachineError: If OpenGL failed and `trial_id` was given.
         OSError: If a file cannot be written.
     """
     held = read_held(out)
-    read_manifest(out)  # a damaged one is no reason to leave out a figure or two
+    read_manifest(out)  # a damaged manifest must raise an error and not just omit some figures
     funnel = count_funnel(out)
     drawings: dict[str, Callable[[], Drawn]] = {
         "palm_poses": lambda: samplers_figure(out, compare),
@@ -132,7 +132,7 @@ def write_figures(
     if not (out / SCENES_FILE).exists():
         del drawings["views"]  # most datasets have no scenes
 
-    # What was asked for by an option must be drawn; all else as far as there is something.
+    # Figures requested by an option must be drawn; all others only if there are data.
     asked = {"palm_poses": compare is not None, "phases": trial_id is not None}
     written, numbers = Written(folder=folder), {}
     for done, (name, draw) in enumerate(drawings.items(), start=1):
@@ -199,9 +199,9 @@ def _largest(values: npt.NDArray[Any]) -> Array:
 
 @contextmanager
 def _plain_style() -> Iterator[None]:
-    """Draw in matplotlib's own style, whatever the user's is, and without warnings of glyphs."""
+    """Draw in matplotlib's default style, whatever the user's is, and without glyph warnings."""
     with matplotlib.style.context("default"), warnings.catch_warnings():
-        # A name in another script is drawn as boxes; so it is a name, not a fault.
+        # A name in another script is drawn as boxes, which is not an error.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         warnings.filterwarnings("ignore", message="Matplotlib currently does not support")
         yield
@@ -209,7 +209,7 @@ def _plain_style() -> Iterator[None]:
 
 def _phases(out: Path, held: HeldGrasps, trial_id: int | None) -> Drawn:
     if trial_id is None:
-        # The first of the best group that is not empty.
+        # The first grasp of the best group that is not empty.
         groups = [held.groups[name] for name in ("stable", "precision", "held")]
         best = next((group for group in groups if group.any()), None)
         if best is None:

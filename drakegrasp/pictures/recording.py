@@ -1,8 +1,8 @@
 """Recordings: an attempt as a single HTML file that any browser plays.
 
-In: a function that runs a simulation. Out: its result, the same to the last bit as without a
-recording because the same code runs, and an HTML file that needs neither other files nor the
-network. An attempt that ends before it is simulated is shown at its start.
+In: a function that runs a simulation. Out: its result, which is equal to the last bit to that
+without a recording because the same code runs, and an HTML file that needs neither other files nor
+the network. An attempt that ends before it is simulated is shown at its start.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
 Result = TypeVar("Result")
 
-#: Meshcat's path of the object; everything below it moves with the object.
+#: Meshcat's path of the object; everything below this path moves with the object.
 OBJECT_PATH = "visualizer/object/object"
 #: Radius of a contact's dot, length and radius of the arrow along its normal [m].
 DOT, ARROW, SHAFT = 0.004, 0.03, 0.0012
-#: A text over the picture, in the lower left corner.
+#: Caption over the picture, in the lower left corner.
 CAPTION = (
     '<p style="position:fixed;left:1em;bottom:4em;z-index:9;max-width:34em;margin:0;'
     "padding:.6em .8em;font:14px/1.4 sans-serif;color:#222;background:#fffc;"
@@ -45,9 +45,9 @@ CAPTION = (
 )
 #: Length and radius of an arrow's head [m].
 HEAD, HEAD_RADIUS = 0.009, 0.0035
-#: Direction of the camera: azimuth from the palm's side, about the vertical, and elevation [rad].
+#: Direction of the camera: azimuth about the vertical from the palm's side, and elevation [rad].
 AZIMUTH, ELEVATION = np.deg2rad(50.0), np.deg2rad(20.0)
-#: Distance of the camera in radii of a ball around the whole lift; what the hand adds to that
+#: Distance of the camera in radii of a sphere around the whole lift; the hand's addition to this
 #: radius [m].
 DISTANCE, HAND_RADIUS = 1.15, 0.1
 
@@ -64,16 +64,16 @@ def record_attempt(
     is_visible: bool = True,
     caption: str = "",
 ) -> TrialRecord:
-    """Return the result of `trial.run_attempt`, and write a recording of it.
+    """Return the result of `trial.run_attempt`, and write a recording of the attempt.
 
     Args:
         model: The object.
-        X_TO: (4, 4), its resting pose in the table-top frame.
-        attempt: What to try.
+        X_TO: (4, 4), resting pose of the object in the table-top frame.
+        attempt: The attempt.
         config: Hand, physics, lift and limits.
-        path: The HTML file.
+        path: Path of the HTML file.
         p_OQ: (k, 3), predicted contacts to draw on the object, in {O} [m].
-        nhat_Q_O: (k, 3), their outward unit normals in {O}.
+        nhat_Q_O: (k, 3), outward unit normals of the contacts in {O}.
         is_visible: Whether the images of the grasp would make a sample.
         caption: Text in a corner.
 
@@ -108,14 +108,14 @@ def show_start(
     """Show object and hand at the start, and aim the camera.
 
     Args:
-        meshcat: Where to show them.
-        scene: Of the object and the hand.
+        meshcat: Meshcat that shows them.
+        scene: Scene of the object and the hand.
         X_TO: (4, 4), resting pose of the object in the table-top frame.
-        config: With the target of the lift.
+        config: Configuration with the target of the lift.
         X_OG: (4, 4), pose of the palm.
         spread: Angle of the spread joints [rad].
         closing: (k,), closing positions [rad or m]; the open hand if None.
-        q: (j,), positions of all joints, instead of both.
+        q: (j,), positions of all joints, instead of `spread` and `closing`.
     """
     X_WO = X_WT @ np.asarray(X_TO, dtype=float)
     reset_attempt(scene, X_WO, X_WO @ X_OG, spread=spread, closing=closing, q=q)
@@ -123,7 +123,7 @@ def show_start(
 
 
 def show_object(meshcat: Meshcat, scene: ObjectScene, X_TO: npt.ArrayLike, config: Config) -> None:
-    """Show the object alone at the start, and aim the camera; see `show_start`."""
+    """Show only the object at the start, and aim the camera; see `show_start`."""
     X_WO = X_WT @ np.asarray(X_TO, dtype=float)
     reset_object(scene, X_WO)
     scene.simulator.Initialize()
@@ -133,7 +133,7 @@ def show_object(meshcat: Meshcat, scene: ObjectScene, X_TO: npt.ArrayLike, confi
 def _aim_camera(
     meshcat: Meshcat, scene: ObjectScene, X_WO: Array, config: Config, *, side_W: Array
 ) -> None:
-    """Look from beside the palm, whose direction is side_W, far enough to see the whole lift."""
+    """Look from beside the palm, whose direction is `side_W`, so far that the lift is visible."""
     way = X_WT[:3, 3] + config.lift.p_TG - X_WO[:3, 3]
     radius = np.linalg.norm(way) / 2.0 + np.linalg.norm(scene.model.half_extents) + HAND_RADIUS
     azimuth = np.arctan2(side_W[1], side_W[0]) + AZIMUTH
@@ -143,11 +143,11 @@ def _aim_camera(
 
 
 def record_html(run: Callable[[Meshcat], Result], path: Path, caption: str = "") -> Result:
-    """Return the result of `run`, and write what it published; nothing is written if it raises.
+    """Return the result of `run`, and write what it published, unless it raises an error.
 
     Args:
-        run: Runs a simulation that publishes to the Meshcat it is given.
-        path: The HTML file.
+        run: Function that runs a simulation, which publishes to the given Meshcat.
+        path: Path of the HTML file.
         caption: Text in a corner.
 
     Raises:
@@ -166,7 +166,7 @@ def record_html(run: Callable[[Meshcat], Result], path: Path, caption: str = "")
             text = text.replace("<body>", f"<body>{CAPTION.format(escape(caption))}", 1)
         write_atomic(path, text.encode())
     finally:
-        # The diagram of `run` is in a reference cycle; Meshcat's port closes when it is collected.
+        # The diagram of `run` is in a reference cycle; collecting it closes Meshcat's port.
         del meshcat
         gc.collect()
     return result
@@ -175,34 +175,34 @@ def record_html(run: Callable[[Meshcat], Result], path: Path, caption: str = "")
 def _make_meshcat() -> Meshcat:
     """Return a Meshcat that only this machine can reach.
 
-    A Meshcat always starts a server, and only it can write the HTML. Under
-    `DRAKE_ALLOW_NETWORK=none`, which our workers set, its constructor raises; it is allowed here,
-    and nothing leaves the machine. Drake's announcement of the address is suppressed, because
-    nobody needs to open it.
+    A Meshcat always starts a server, and only a Meshcat can write the HTML. Under
+    `DRAKE_ALLOW_NETWORK=none`, which our workers set, its constructor raises an error; so the
+    network is allowed here, but nothing leaves the machine. Drake's announcement of the address is
+    suppressed, because nobody needs to open it.
     """
     logger = logging.getLogger("drake")
     level = logger.level
     logger.setLevel(logging.WARNING)
     try:
         with allow_network("meshcat"):
-            # Port 0 means any free port, so that several recordings can be made at once.
+            # Port 0 means any free port, so that several recordings can run at once.
             return Meshcat(MeshcatParams(host="localhost", port=0, show_stats_plot=False))
     finally:
         logger.setLevel(level)
 
 
 def draw_predicted(meshcat: Meshcat, p_OQ: Array | None, nhat_Q_O: Array | None) -> None:
-    """Draw a dot per contact on the object, with an arrow along its normal.
+    """Draw a dot for each contact on the object, with an arrow along its normal.
 
     Args:
-        meshcat: Where to draw.
+        meshcat: Meshcat to draw in.
         p_OQ: (k, 3), contacts in {O} [m]; nothing is drawn if None.
-        nhat_Q_O: (k, 3), their outward unit normals in {O}.
+        nhat_Q_O: (k, 3), outward unit normals of the contacts in {O}.
     """
     if p_OQ is None or nhat_Q_O is None:
         return
     colour = rgba(PREDICTED)
-    # A posture asks for no contacts.
+    # A posture has no predicted contacts.
     there = np.isfinite(p_OQ).all(axis=1)
     for i, (p, n) in enumerate(zip(p_OQ[there], nhat_Q_O[there], strict=True)):
         path = f"{OBJECT_PATH}/predicted/{i + 1}"

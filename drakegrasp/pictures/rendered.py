@@ -1,8 +1,8 @@
 """Pictures that Drake renders: a hand, the objects of an audit, and the phases of a grasp.
 
-In: a hand, the rows of an audit, or a dataset and the number of a trial, whose poses are those of
-trials.hdf5: nothing is simulated. Out: figures. As in `vision.rendering`, they must be made in one
-thread.
+In: a hand; the rows of an audit; or a dataset and the number of a trial, whose poses are those in
+trials.hdf5: nothing is simulated. Out: figures. As in `vision.rendering`, all pictures must be
+rendered in one thread.
 """
 
 from __future__ import annotations
@@ -71,16 +71,16 @@ from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.vision.camera import camera_pose_oto, intrinsics, unproject
 from drakegrasp.vision.rendering import build_renderer, drawn_mesh, render
 
-#: How far each panel's hand has closed, and what it is called.
+#: Fraction by which the hand has closed in each panel, and the title of the panel.
 PANELS = ((0.0, "open"), (0.5, "half closed"), (1.0, "closed"))
-#: Pads are drawn this far in front of the fingertip [m].
+#: Distance at which pads are drawn in front of the fingertip [m].
 PAD_LIFT = 4e-4
 #: Length and radius of the axes of the palm frame [m], and their colours.
 AXIS, AXIS_RADIUS = 0.05, 0.0012
-#: Length of those of other tools [m], and how much nearer to white their colours are.
+#: Length of the axes of other tools' frames [m], and the fraction of white in their colours.
 FOREIGN_AXIS, PALE = 0.12, 0.5
 AXIS_COLOURS = {"Gx": "#CC3333", "Gy": "#339933", "Gz": "#3355CC"}
-#: Lights of a hand: one at the camera and one from above, as in the images of a dataset.
+#: Lights for a hand: one at the camera and one from above, as in the images of a dataset.
 _TOWARDS = (("camera", [0.0, 0.0, 1.0], 0.6), ("world", [0.3, 0.4, -1.0], 0.7))
 LIGHTING = Lighting(
     name="hand",
@@ -89,33 +89,33 @@ LIGHTING = Lighting(
         for frame, direction, intensity in _TOWARDS
     ),
 )
-#: Edge of a panel of a hand [px] and its size in the figure [inch].
+#: Edge of a panel of a hand [px], and its size in the figure [inch].
 HAND_PIXELS, INCHES = 480, 2.4
-#: Room for the sign and the gap of a label in the legend [letters].
+#: Width of the marker and the gap of a label in the legend [letters].
 SPACE = 5
-#: Where the camera stands: beside the line along which fingers close, and above [rad].
+#: Direction of the camera: beside the line along which fingers close, and above [rad].
 AZIMUTH, ELEVATION = np.deg2rad(25.0), np.deg2rad(20.0)
-#: Objects in a row, the edge of a picture [inch], and its pixels.
+#: Number of objects in a row, the edge of a picture [inch], and its pixels.
 ACROSS, OBJECT, OBJECT_PIXELS = 8, 1.45, 220
-#: From where an object is seen, in the table-top frame: from the front right, from above.
+#: Direction from which an object is seen, in the table-top frame: from the front right, from above.
 TOWARDS_CAMERA = np.array([0.62, -0.62, 0.48])
-#: Vertical field of view [deg], and the share of it that an object's bounding sphere fills.
+#: Vertical field of view [deg], and the fraction of it that an object's bounding sphere fills.
 FIELD_DEG, FILL = 30.0, 0.95
 #: Colours of the status (Okabe and Ito: safe for the colour-blind).
 STATUS_COLOURS = {"fit": "#009E73", "repaired": "#B07A00", "refused": "#D55E00"}
-#: Characters of a name that fit above a picture, and of a reason in a line of an empty one.
+#: Characters of a name that fit above a picture, and of a reason that fit in a line of a picture.
 NAME, LINE = 24, 24
 #: Colours of the line of sight and of the field of view, as in the paper.
 SIGHT, FIELD = "#D81B9A", "#1F4FD8"
 #: How far the field of view is drawn [m].
 FIELD_DEPTH = 0.1
-#: Edge of a picture [px] and in the figure [inch]; space between them, for titles and legend.
+#: Edge of a picture [px] and in the figure [inch]; spaces between pictures, for titles and legend.
 PIXELS, EDGE, GAP, TITLE, LEGEND = 720, 4.0, 0.1, 0.56, 0.34
 #: Azimuths between the line of sight and the view, which shows it from the side [rad].
 SIDE_VIEWS = np.deg2rad([-105.0, -90.0, -75.0, -60.0, 60.0, 75.0, 90.0, 105.0])
-#: Edge of the table [m]: what is farther away is not in the light.
+#: Edge of the table [m]: the light does not reach farther.
 TABLE = 0.9
-#: Below this share of it along the vertical a line of sight has no azimuth.
+#: A line of sight has no azimuth if its horizontal part is below this.
 VERTICAL = 1e-3
 
 
@@ -127,14 +127,14 @@ def picture_hand(hand: Hand, png: Path, *, across: float) -> None:
 
     Args:
         hand: The hand.
-        png: The file.
-        across: Direction from which the fingers' opposition is seen best, about Gz from Gx [rad].
+        png: Path of the file.
+        across: Direction about Gz, from Gx, from which the fingers' opposition is seen best [rad].
 
     Raises:
         MachineError: If OpenGL failed.
         OSError: If the file cannot be written.
     """
-    # The palm frame is the world's; all panels have one camera.
+    # The palm frame is the world frame; all panels share one camera.
     scene = StillScene(hand, add=lambda plant, instance: _add_marks(plant, instance, hand))
     postures = [scene.positions(0.0, share * closed_positions(hand)) for share, _ in PANELS]
     outline = np.concatenate([_surface(scene, q) for q in postures])
@@ -167,7 +167,7 @@ def _colour(finger: int) -> str:
 
 def _add_marks(plant: MultibodyPlant, instance: ModelInstanceIndex, hand: Hand) -> None:
     """Add the pads to the fingertips, and the axes of the palm frame to the world."""
-    # The pads, a little in front of their surfaces.
+    # The pads, slightly in front of their surfaces.
     for i, (finger, pad) in enumerate(
         zip(hand.fingers, pad_surfaces(hand.model, hand.fingers), strict=True)
     ):
@@ -176,7 +176,7 @@ def _add_marks(plant: MultibodyPlant, instance: ModelInstanceIndex, hand: Hand) 
         colour = np.array(to_rgba(_colour(i)))
         plant.RegisterVisualGeometry(body, RigidTransform(), mesh, f"drakegrasp pad {i}", colour)
 
-    # The axes, and paler and longer ones of other tools' frames, which begin within the hand.
+    # The axes, and longer, paler axes of other tools' frames, whose origins are inside the hand.
     frames = {"": np.eye(4)} | {tool: invert_pose(hand.palm_in(tool)) for tool in hand.frames}
     for tool, X_GA in frames.items():
         length, pale = (FOREIGN_AXIS, PALE) if tool else (AXIS, 0.0)
@@ -191,7 +191,7 @@ def _add_marks(plant: MultibodyPlant, instance: ModelInstanceIndex, hand: Hand) 
 
 def _lifted(pad: Array) -> tuple[Array, Array]:
     """Return vertices and faces of a pad's triangles (t, 3, 3), in front of it and facing out."""
-    # The triangles of a hull have no order: draw each on both sides, one is hidden.
+    # The triangles of a hull have no orientation: draw each on both sides; one side is hidden.
     normals = np.cross(pad[:, 1] - pad[:, 0], pad[:, 2] - pad[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     both = np.concatenate([pad + PAD_LIFT * normals[:, None], pad - PAD_LIFT * normals[:, None]])
@@ -200,7 +200,7 @@ def _lifted(pad: Array) -> tuple[Array, Array]:
 
 
 def _surface(scene: StillScene, q: Array) -> Array:
-    """Move the hand's joints, and return points (n, 3) of its surface in {G} [m]."""
+    """Move the hand's joints, and return points (n, 3) of the hand's surface in {G} [m]."""
     scene.pose(Poses(X_WG=np.eye(4), q=q))
     points = link_points(scene.hand)
     return np.concatenate(
@@ -212,12 +212,12 @@ def _surface(scene: StillScene, q: Array) -> Array:
 
 
 def object_sheet(rows: Sequence[AuditRow], png: Path, *, progress: Report = silent) -> None:
-    """Draw the objects of an audit, as they stand in their files, each in its own scale.
+    """Draw the objects of an audit, oriented as in their files, each at its own scale.
 
     Args:
-        rows: Of the audit; a refused mesh has its reason in place of a picture.
-        png: The file to write.
-        progress: Is told of each object.
+        rows: Rows of the audit; a rejected mesh is shown by its reason instead of a picture.
+        png: Path of the file to write.
+        progress: Called after each object.
     """
     # The page.
     across = min(ACROSS, len(rows))
@@ -239,7 +239,7 @@ def object_sheet(rows: Sequence[AuditRow], png: Path, *, progress: Report = sile
             centred = {"ha": "center", "va": "center"}
             write_beside(axes, 0.5, 0.5, _wrapped(row.notes[0]), 4.6, **centred)
 
-        # Name, and status below it.
+        # The name, and the status below it.
         status = row.status + (" !" if row.warnings else "")
         write_beside(axes, 0.0, 1.135, shortened(row.name, NAME), 6.2)
         write_beside(axes, 0.0, 1.02, status, 6.2, color=STATUS_COLOURS[row.status])
@@ -248,8 +248,8 @@ def object_sheet(rows: Sequence[AuditRow], png: Path, *, progress: Report = sile
 
 
 def draw_object(model: ObjectModel) -> npt.NDArray[np.float32]:
-    """Return a picture (s, s, 3) of an object that stands as in its file, 0 to 1."""
-    # Far enough that the sphere around the object fills the picture.
+    """Return a picture (s, s, 3) in 0..1 of an object that is oriented as in its file."""
+    # The distance at which the sphere around the object fills the picture.
     radius = float(norm(model.half_extents))
     distance = radius / np.sin(np.deg2rad(FIELD_DEG) / 2.0) / FILL
     camera = CameraConfig(
@@ -265,7 +265,7 @@ def draw_object(model: ObjectModel) -> npt.NDArray[np.float32]:
 
 
 def _looking_along(z: Array) -> Array:
-    """Return the rotation (3, 3) of a camera that looks along z (3,), with world up in the image.
+    """Return the rotation (3, 3) of a camera that looks along z (3,), with world up at the top.
 
     Camera axes are OpenCV's: +x right, +y down, +z forward.
     """
@@ -275,7 +275,7 @@ def _looking_along(z: Array) -> Array:
 
 
 def _wrapped(text: str) -> str:
-    """Return a reason in lines that fit into a picture's place."""
+    """Return a reason in lines that fit into the space of a picture."""
     lines = [""]
     for word in text.split():
         if len(lines[-1]) + len(word) >= LINE and lines[-1]:
@@ -289,14 +289,14 @@ def _wrapped(text: str) -> str:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrialStages:
-    """A trial at its three stages, and the scene to render them in.
+    """A trial at its three stages, and the scene in which they are rendered.
 
     Attributes:
-        scene: Of the trial's object and hand.
-        place, close, lift: At the start, after closing, after the lift.
+        scene: Scene of the trial's object and hand.
+        place, close, lift: Poses at the start, after closing, and after the lift.
         model: The object.
-        config: Of the dataset.
-        row: Fields of `/trials` by name.
+        config: Configuration of the dataset.
+        row: Fields of the trial in `/trials`, by name.
     """
 
     scene: StillScene
@@ -308,7 +308,7 @@ class TrialStages:
     row: Mapping[str, Any]
 
     def normals(self, when: Literal["closed", "lifted"]) -> dict[str, tuple[Array, Array]]:
-        """Return tail and tip (3,) in {W} [m] of the normal at each contact, by Q and finger."""
+        """Return the tail and tip (3,) in {W} [m] of each contact's normal, by Q and finger."""
         X_WO = self.close.X_WO if when == "closed" else self.lift.X_WO
         p_WQ = transform_points(X_WO, self.row[f"{when}_p_OQ"])
         tips = p_WQ + ARROW * rotate_vectors(X_WO, self.row[f"{when}_nhat_Q_O"])
@@ -317,7 +317,7 @@ class TrialStages:
 
 
 def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> TrialStages:
-    """Return a trial that was lifted, ready to be rendered.
+    """Return a lifted trial, ready to be rendered.
 
     Args:
         out: Directory of the dataset.
@@ -355,7 +355,7 @@ def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> T
 
 
 def frustum(X_WC: Array, K: Array, size: int, depth: float) -> list[Array]:
-    """Return polylines (n, 3) in {W} around a camera's field of view, up to a depth [m]."""
+    """Return polylines (n, 3) in {W} of a camera's field of view, up to a depth [m]."""
     edge = size - 0.5
     pixels = np.array([[-0.5, -0.5], [edge, -0.5], [edge, edge], [-0.5, edge]])
     corners = transform_points(X_WC, unproject(K, pixels, np.full(4, depth)))
@@ -374,7 +374,7 @@ def phases_figure(out: Path, trial_id: int) -> Figure:
         DataError: If the trial does not exist, or ended before the lift.
         MachineError: If OpenGL failed.
     """
-    # The camera, where it took the images: before the hand closes.
+    # The camera at the pose in which it took the images, before the hand closes.
     trial = load_trial(out, trial_id, table_size=TABLE)
     camera = trial.config.camera
     X_TG = multiply(invert_pose(X_WT), trial.place.X_WG)
@@ -386,14 +386,14 @@ def phases_figure(out: Path, trial_id: int) -> Figure:
         FIELD: frustum(X_WC, intrinsics(camera), camera.size, FIELD_DEPTH),
     }
 
-    # What each picture says; that of the lift shows the table's middle as well.
+    # The texts of the pictures. The picture of the lift also shows the table's centre.
     force, slip = float(norm(trial.row["closed_f_Q_O"]).max()), 1e3 * float(trial.row["slip"])
     turn, table = np.rad2deg(float(trial.row["turn"])), X_WT[None, :3, 3]
     start = f"start\npalm {1e3 * standoff:.0f} mm from the surface"
     closed = f"closed\nlargest force of a fingertip {force:.0f} N"
     lifted = f"lifted\nslip {slip:.1f} mm, turn {turn:.1f}° in the hand"
 
-    # The same side of all three.
+    # All three pictures are from the same side.
     azimuth, elevation = _side(trial, X_WC)
     width, height = 3 * (EDGE + GAP) + GAP, TITLE + EDGE + LEGEND
     figure = new_page(width, height)
@@ -422,7 +422,7 @@ def phases_figure(out: Path, trial_id: int) -> Figure:
 
 def _side(trial: TrialStages, X_WC: Array) -> tuple[float, float]:
     """Return azimuth and elevation [rad] of the side view that sees the closed fingers best."""
-    # From straight above any side will do.
+    # If the camera looks straight down, any side is suitable.
     x, y, _ = X_WC[:3, 2]
     along = 0.0 if np.hypot(x, y) < VERTICAL else float(np.arctan2(y, x))
     X_WV = trial.scene.choose_view(trial.scene.outline(trial.close), azimuths=along + SIDE_VIEWS)
@@ -431,7 +431,7 @@ def _side(trial: TrialStages, X_WC: Array) -> tuple[float, float]:
 
 
 def _draw_phases_legend(figure: Figure, camera: CameraConfig) -> None:
-    """Draw what the colours are."""
+    """Draw the legend of the colours."""
     dots = [
         Line2D([], [], color=colour, marker="o", linestyle="none", markeredgecolor="white",
                markersize=8) for colour in FINGER_COLOURS[:3]

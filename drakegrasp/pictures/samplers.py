@@ -1,8 +1,8 @@
-"""The two samplers of palm poses compared: which approaches they try, and what they find.
+"""Comparison of the two samplers of palm poses: which approaches they try, and what they find.
 
-In: a dataset, and perhaps another of the same objects by the other sampler. Out: the paper's Figure
-2, palm poses of one object by both, and numbers. Without the other dataset the other sampler draws
-palm poses of that one object, which nobody has tried.
+In: a dataset, and optionally another of the same objects by the other sampler. Out: the paper's
+Figure 2, palm poses of one object by both samplers, and numbers. Without the other dataset, the
+other sampler draws palm poses of that one object, which were not tried.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from drakegrasp.simulation.candidates import Candidates, sample_candidates
 
 #: Names of the samplers in the configuration, in the order of the paper's figure, and in words.
 METHODS = {"normals": "along surface normals", "rotations": "global and local rotations"}
-#: Palm rays of a sampler in the figure.
+#: Number of palm rays of a sampler in the figure.
 RAYS = 220
 
 
@@ -68,9 +68,9 @@ class SamplerComparison(NamedTuple):
 
     Attributes:
         shown: The object that is drawn.
-        candidates: Its palm poses by method, METHODS.
-        standoff: The largest stand-off, from which its palm rays are drawn [m].
-        numbers: As they are written to JSON: of the object, and of all that both have.
+        candidates: The object's palm poses for each method of METHODS.
+        standoff: The largest stand-off, from which the palm rays are drawn [m].
+        numbers: Numbers for JSON: of this object, and of all objects in both datasets.
     """
 
     shown: PreparedObject
@@ -84,12 +84,12 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
 
     Args:
         out: Directory of a dataset.
-        other: That of one of the same objects by the other sampler, otherwise of the same
-            configuration.
+        other: Directory of a dataset of the same objects with the other sampler and otherwise the
+            same configuration.
 
     Raises:
-        DataError: If a file is missing, or the other dataset is of another configuration or has
-            none of the objects.
+        DataError: If a file is missing, or if the other dataset has another configuration or none
+            of the objects.
     """
     # The datasets by method.
     manifest = read_manifest(out)
@@ -106,7 +106,7 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
         datasets[_other_method(config)] = other
         _refuse_other_configuration(other, config)
 
-    # The objects that all have, and the one with the most successes.
+    # The objects that all datasets have, and the one with the most successes.
     funnels = {method: count_funnel(path) for method, path in datasets.items()}
     names = _common_objects(datasets, funnels)
     own = funnels[method]
@@ -151,9 +151,9 @@ def palm_rays(candidates: Candidates, standoff: float, count: int) -> Array:
     """Return the approach rays of the first palm poses, from a stand-off to the surface.
 
     Args:
-        candidates: Of the object, in drawing order, which is random.
-        standoff: Of the palm from the surface [m].
-        count: Most rays to return.
+        candidates: Candidates of the object in drawing order, which is random.
+        standoff: Stand-off of the palm from the surface [m].
+        count: Maximum number of rays to return.
 
     Returns:
         (n, 2, 3) in {O}: the palm's origin and the point on the surface [m].
@@ -165,13 +165,13 @@ def palm_rays(candidates: Candidates, standoff: float, count: int) -> Array:
 
 
 def _draw(prepared: PreparedObject, config: Config, method: str) -> Candidates:
-    """Return as many palm poses of the other method as a dataset of it would try."""
+    """Return as many palm poses of a method as a dataset with this method would try."""
     changed = config.candidates.model_copy(update={"method": method})
     return sample_candidates(prepared.model, prepared.X_TO, changed, config.seed)
 
 
 def _cover(prepared: PreparedObject) -> tuple[int, int, float]:
-    """Return how many palm poses there are, how many palm rays hit, and what these cover."""
+    """Return the number of palm poses, the number of palm rays that hit, and their coverage."""
     candidates = prepared.candidates
     hits = np.isfinite(candidates.distance)
     covered = coverage(approach_directions(prepared.X_TO, candidates.X_OG[hits]))
@@ -179,15 +179,15 @@ def _cover(prepared: PreparedObject) -> tuple[int, int, float]:
 
 
 def _numbers(covers: dict[str, tuple[int, int, float]], funnel: Funnel | None) -> dict[str, Any]:
-    """Return the numbers of a sampler on objects; None for what was not simulated.
+    """Return the numbers of a sampler on objects; None for numbers that were not simulated.
 
     Args:
-        covers: By object, see `_cover`.
-        funnel: Of the dataset; None if the palm poses were only drawn.
+        covers: Result of `_cover` by object.
+        funnel: Funnel of the dataset; None if the palm poses were only drawn.
     """
     attempts = successes = rate = None
     if funnel is not None:
-        # Where the simulator failed nothing is known of the palm pose.
+        # If the simulator failed, nothing is known of the palm pose.
         rows = [funnel.names.index(name) for name in covers]
         decided = [outcome for outcome in Outcome if not outcome.inconclusive]
         attempts = int(funnel.outcomes[np.ix_(rows, decided)].sum())
@@ -208,12 +208,12 @@ def _other_method(config: Config) -> str:
 
 
 def _refuse_other_configuration(other: Path, config: Config) -> None:
-    """Refuse a dataset that differs by more than the method of its palm poses.
+    """Raise an error if a dataset differs in more than the method of its palm poses.
 
     Raises:
         DataError: If it does.
     """
-    # What changes no attempt may differ.
+    # Settings that do not affect attempts may differ.
     wanted = config.candidates.model_copy(update={"method": _other_method(config)})
     mine = _settings(config.model_copy(update={"candidates": wanted}))
     theirs = _settings(read_manifest(other).config)
@@ -227,7 +227,7 @@ def _refuse_other_configuration(other: Path, config: Config) -> None:
 
 
 def _settings(config: Config) -> dict[str, Any]:
-    """Return what decides about attempts, by key: `hand`, `lift.hold_time`."""
+    """Return the settings that affect attempts, by key, e.g. `hand`, `lift.hold_time`."""
     settings: dict[str, Any] = {}
     for name, value in config.to_dict().items():
         if name not in (*POSTPROCESSING_KEYS, "unit_candidates"):
@@ -237,12 +237,12 @@ def _settings(config: Config) -> dict[str, Any]:
 
 
 def _common_objects(datasets: dict[str, Path], funnels: dict[str, Funnel]) -> list[str]:
-    """Return the names of the objects that all datasets have, of the same mesh, in order.
+    """Return the names of the objects that all datasets have with the same mesh, in order.
 
-    A manifest has more objects than the files while a build continues that adds some.
+    While a build that adds objects runs, a manifest has more objects than the files.
 
     Raises:
-        DataError: If there is none.
+        DataError: If there is no such object.
     """
     first, *others = (
         {
@@ -260,12 +260,12 @@ def _common_objects(datasets: dict[str, Path], funnels: dict[str, Funnel]) -> li
 
 
 def caption(of_object: Mapping[str, Any], of_all: Mapping[str, Any] | None, objects: int) -> str:
-    """Return what stands below a panel.
+    """Return the text below a panel.
 
     Args:
-        of_object: Numbers of the sampler on the object that is drawn, see `samplers`.
-        of_all: On all objects; None if it was only drawn.
-        objects: Their number.
+        of_object: Numbers of the sampler on the object that is drawn, see `_numbers`.
+        of_all: Numbers on all objects; None if the palm poses were only drawn.
+        objects: Number of all objects.
     """
     lines = [
         f"{of_object['palm_rays']:,} of {of_object['palm_poses']:,} palm rays meet the object",

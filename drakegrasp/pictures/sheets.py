@@ -1,6 +1,6 @@
-"""Sheets of samples: of a data file, of each class, and of scenes to train on.
+"""Sheets of samples: of a data file, of each class, and of scenes for training.
 
-In: a data file or scenes.hdf5. Out: figures. Needs matplotlib, not Drake.
+In: a data file or scenes.hdf5. Out: figures. Needs matplotlib, but not Drake.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from drakegrasp.vision.camera import project
 
 #: Samples per line of a sheet, and the edge of each of its images [inch].
 ACROSS, EDGE = 3, 1.12
-#: Classes on a page.
+#: Number of classes on a page.
 PER_PAGE = 24
-#: Of the sheet of scenes: scenes of a split, views of a scene, and the width of a view [inch].
+#: Sheet of scenes: scenes of each split, views of a scene, and the width of a view [inch].
 SCENES = {"train": 4, "valid": 1, "test": 2}
 VIEWS, WIDE = 4, 1.9
 #: Length of the line along +Gz from the palm's origin [m].
@@ -52,7 +52,7 @@ def draw_sheet(
     Its axes are colour, depth and mask of each sample in turn, then the colour bar.
 
     Args:
-        samples: What to draw, at least one.
+        samples: Samples to draw, at least one.
         K: (3, 3), camera matrix [px].
         far: Far plane of the camera [m].
         titles: Text above each sample; the name of its object if None.
@@ -68,7 +68,7 @@ def draw_sheet(
     height = lines * (EDGE + caption) + head + margin
     figure = new_page(width, height)
 
-    # The samples, all with the same scale of depths.
+    # The samples, all with the same depth scale.
     nearest = min(float(sample.image[3].min()) for sample in samples)
     for i, sample in enumerate(samples):
         line, column = divmod(i, across)
@@ -92,16 +92,16 @@ def draw_sheet(
 
 
 def class_sheets(path: Path) -> tuple[list[Figure], dict[str, int]]:
-    """Return pages with a sample of each class, and the trial of each class's sample.
+    """Return pages with a sample of each class, and the trial id of each of these samples.
 
-    Of each class the sample of the lowest trial is taken, as it is; classes are in the order of
-    their names.
+    The sample with the lowest trial id of each class is drawn, without further selection; the
+    classes are in the order of their names.
 
     Args:
         path: A data file.
 
     Raises:
-        DataError: If the file is no data file or holds no sample.
+        DataError: If the file is not a data file or contains no sample.
     """
     # The first sample of each class.
     first: dict[str, tuple[int, GraspDataset, int]] = {}
@@ -124,9 +124,10 @@ def class_sheets(path: Path) -> tuple[list[Figure], dict[str, int]]:
 
 
 def scene_views(path: Path) -> tuple[Figure, list[dict[str, int]]]:
-    """Return the sheet, and of each of its views the row of /views and the trial of the sample.
+    """Return the sheet of scenes, and for each view its row of /views and the sample's trial id.
 
-    Scenes are of different objects, evenly over their names. The sample is the first of its scene.
+    The scenes have different objects, evenly spaced in the order of names. The sample is the first
+    of its scene.
 
     Raises:
         DataError: If the file is missing or damaged, or has no scene with a sample.
@@ -164,7 +165,7 @@ def scene_views(path: Path) -> tuple[Figure, list[dict[str, int]]]:
 
 
 def _draw_view(axes: Axes, data: SceneDataset, view: int) -> tuple[int, str]:
-    """Draw a view with the first sample of its scene; return the trial and the object's name."""
+    """Draw a view with the first sample of its scene; return the trial id and the object's name."""
     images, grasps = data.images(view), data.grasps_in(view, frame="camera")
     row = int(np.argmax(grasps["sample"]))
     axes.imshow(images["rgb"], interpolation="nearest")
@@ -173,7 +174,7 @@ def _draw_view(axes: Axes, data: SceneDataset, view: int) -> tuple[int, str]:
     axes.plot(*palm.T, color=INK, linewidth=1.6)
     axes.plot(*palm[0], marker="s", markersize=4.0, color=INK)
 
-    # The contacts, hollow where the file says that the camera does not see them.
+    # The contacts; they are hollow if the file says that the camera does not see them.
     p_CQ, nhat = grasps["p_AQ"][row].astype(float), grasps["nhat_Q_A"][row].astype(float)
     for i in np.flatnonzero(np.isfinite(p_CQ).all(axis=1)).tolist():
         dot, end = project(K, np.array([p_CQ[i], p_CQ[i] + ARROW * nhat[i]]))

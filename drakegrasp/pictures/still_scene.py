@@ -1,15 +1,15 @@
-"""A still scene: a hand, alone or with an object on a table, posed and drawn.
+"""A still scene: a hand, by itself or with an object on a table, posed and drawn.
 
-In: a hand, an object's model if there is one, and `Poses`. Out: where the links are, which of them
-overlap, and pictures with their cameras, so that frames and contacts can be drawn over them.
-Nothing is simulated.
+In: a hand, an object's model if there is one, and `Poses`. Out: poses of the links, overlaps of
+links, and pictures with their cameras, so that frames and contacts can be drawn over them. Nothing
+is simulated.
 
 For the 3D view of a browser, links and objects are JSON: a list of parts, each with its `colour`
 "#rrggbb", `vertices` (n, 3) as float32 [m] and `faces` (m, 3) as uint32, both little-endian in
 base64. A link is in its own frame, an object in {O}.
 
 OpenGL starts with the first picture. As in `vision.rendering`, all pictures of a process must be
-made in one thread.
+rendered in one thread.
 """
 
 from __future__ import annotations
@@ -64,15 +64,15 @@ from drakegrasp.vision.rendering import BLANK, add_drawn_object
 FOV_Y_DEG = 26.0
 #: Viewpoints that `choose_view` tries: azimuths, and elevations above the horizontal [deg].
 AZIMUTHS_DEG, ELEVATIONS_DEG = range(0, 360, 20), (19.0, 28.0)
-#: Edge of the label images by which viewpoints are compared [px].
+#: Edge of the label images with which viewpoints are compared [px].
 TRIAL_SIZE = 120
-#: Pictures are rendered this many times larger and averaged: VTK alone leaves jagged edges.
+#: Pictures are rendered larger by this factor and averaged, since VTK alone leaves jagged edges.
 OVERSAMPLING = 2
-#: Space around the origins of the hand's links that the hand fills [m].
+#: Margin around the origins of the hand's links for the links' own size [m].
 MARGIN = 0.035
 BACKGROUND = np.array([0.95, 0.96, 0.97])
 TABLE_COLOUR = np.array([0.74, 0.70, 0.64, 1.0])
-#: Colour of links whose model names none: Drake's own is that of an object.
+#: Colour of links whose model specifies none; Drake's own default is the colour of an object.
 GREY = np.array([0.70, 0.71, 0.73, 1.0])
 TABLE_SIZE, TABLE_THICKNESS = 1.6, 0.1
 #: Edge of the shadow map [px].
@@ -84,8 +84,8 @@ class Lighting:
     """The lights of a picture.
 
     Attributes:
-        name: Each lighting has its own, which is that of Drake's render engine with these lights.
-        lights: In camera axes +X is right and +Y down. Spot lights cast shadows, others do not.
+        name: Unique name of the lighting, also of Drake's render engine with these lights.
+        lights: Lights; in camera axes +X is right and +Y down. Only spot lights cast shadows.
     """
 
     name: str
@@ -108,8 +108,9 @@ SHADOWS = Lighting(
         ),
     ),
 )
-#: For pictures of the lift, the last without shadows: seen from that light the table is far behind
-#: the object, and VTK's shadow map is then too coarse and draws spots on the object.
+#: For pictures of the lift. The last light has no shadows: seen from it, the table is far behind
+#: the
+#: object, so VTK's shadow map would be too coarse and draw spots on the object.
 NO_SHADOWS = Lighting(
     name="no shadows",
     lights=(
@@ -121,12 +122,12 @@ NO_SHADOWS = Lighting(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Poses:
-    """Where hand and object are.
+    """Poses of hand and object.
 
     Attributes:
         X_WG: (4, 4), pose of the palm.
         q: (j,), positions of the hand's joints [rad or m], in the order of the dataset's files.
-        X_WO: (4, 4), pose of the object; of no effect in a scene without one.
+        X_WO: (4, 4), pose of the object; ignored in a scene without one.
     """
 
     X_WG: Array
@@ -135,16 +136,17 @@ class Poses:
 
 
 class StillScene:
-    """A hand in Drake, alone or with an object on a table. Not for several threads at once.
+    """A hand in Drake, by itself or with an object on a table. Not thread-safe.
 
     Args:
         hand: The hand.
         model: The object; without one there is no table.
         table_size: Edge of the square table, whose top is at {T} [m].
-        add: Adds more shapes to the plant, which is not yet finalized, and to the hand in it.
+        add: Function that adds more shapes to the plant, before it is finalized, and to the hand's
+            model instance in it.
 
     Attributes:
-        hand, model: As given.
+        hand, model: The arguments.
         joints: Names of the hand's joints, in the order of the dataset's files.
         links: Names of the hand's links.
     """
@@ -157,7 +159,7 @@ class StillScene:
         table_size: float = TABLE_SIZE,
         add: Callable[[MultibodyPlant, ModelInstanceIndex], None] | None = None,
     ) -> None:
-        # The object, over a table.
+        # The object, above a table.
         builder = DiagramBuilder()
         plant, graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
         self._object: RigidBody | None = None
@@ -167,9 +169,9 @@ class StillScene:
             slab = Box(table_size, table_size, TABLE_THICKNESS)
             plant.RegisterVisualGeometry(plant.world_body(), X_WB, slab, "table", TABLE_COLOUR)
 
-        # The hand, welded by its palm to a frame whose pose is a parameter of the context: the palm
-        # can be put anywhere without a joint. Links of any name may be in the hand's model: ours
-        # must not be one of them.
+        # The hand's palm is welded to a frame whose pose is a parameter of the context, so the palm
+        # can be placed anywhere without a joint. The hand's model may contain links of any name, so
+        # our names must differ from these.
         instance = add_model(plant, hand.model)
         base = plant.GetBodyByName(hand.palm_link, instance)
         X_BG = RigidTransform(hand.X_BG)
@@ -184,7 +186,7 @@ class StillScene:
             add(plant, instance)
         plant.Finalize()
 
-        # The diagram with its one context.
+        # The diagram and its only context.
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
         self._plant, self._graph, self._instance = plant, graph, instance
@@ -205,7 +207,7 @@ class StillScene:
         return np.array([named[name] for name in self.joints])
 
     def pose(self, poses: Poses) -> None:
-        """Move hand and object."""
+        """Move hand and object to poses."""
         self._wrist.SetPoseInParentFrame(self._context, RigidTransform(poses.X_WG))
         self._plant.SetPositions(self._context, self._instance, np.asarray(poses.q, dtype=float))
         if self._object is not None:
@@ -216,9 +218,9 @@ class StillScene:
         return self._plant.EvalBodyPoseInWorld(self._context, self._body(link)).GetAsMatrix4()
 
     def shapes(self, link: str) -> tuple[SceneGraphInspector, list[GeometryId]]:
-        """Return the shapes that show a link, visual ones or else those of collisions.
+        """Return the shapes that show a link: its visual shapes, or else its collision shapes.
 
-        They come with the inspector that describes them. A link may have none.
+        They are returned with the inspector that describes them. A link may have no shape.
         """
         body = self._body(link)
         shapes = self._plant.GetVisualGeometriesForBody(body)
@@ -226,7 +228,7 @@ class StillScene:
         return self._graph.model_inspector(), list(shapes)
 
     def overlaps(self) -> Iterator[tuple[tuple[str, str], float]]:
-        """Yield the names of two links whose collision shapes overlap, and by how much [m]."""
+        """Yield the names of two links whose collision shapes overlap, and their overlap [m]."""
         query = self._query()
         for pair in query.ComputePointPairPenetration():
             frames = (query.inspector().GetFrameId(shape) for shape in (pair.id_A, pair.id_B))
@@ -239,7 +241,7 @@ class StillScene:
         Args:
             X_WC: (4, 4), pose of the camera.
             size: Width and height of the picture [px].
-            lighting: What lights it.
+            lighting: Lights of the picture.
 
         Raises:
             MachineError: If the picture is blank, which means that OpenGL failed.
@@ -259,7 +261,7 @@ class StillScene:
         return Picture(image=image, K=K, X_WC=X_WC)
 
     def seen(self, X_WC: Array, size: tuple[int, int]) -> npt.NDArray[np.bool_]:
-        """Return which pixels show each fingertip, and which the object if there is one.
+        """Return which pixels show each fingertip, and which show the object if there is one.
 
         Args:
             X_WC: (4, 4), pose of the camera.
@@ -279,14 +281,15 @@ class StillScene:
     ) -> Array:
         """Return the pose X_WC (4, 4) of a camera that sees given points and all fingertips.
 
-        A ring of viewpoints is tried. The best is the one whose least visible fingertip covers the
-        most pixels; among equals the one with the most pixels of fingertips and object.
+        A ring of viewpoints is tried. The best viewpoint is the one whose least visible fingertip
+        covers the most pixels; among equal ones, the one with the most pixels of fingertips and
+        object.
 
         Args:
             p_WA: (n, 3), points that must be in the picture [m].
-            fill: The camera's distance is divided by it; above 1 the points fill more of the
-                picture.
-            azimuths: Those to try [rad]; all around if None.
+            fill: Factor by which the camera's distance is divided; above 1 the points fill more of
+                the picture.
+            azimuths: Azimuths to try [rad]; all around if None.
         """
         azimuths = np.deg2rad(AZIMUTHS_DEG) if azimuths is None else azimuths
         best, most = np.eye(4), (-1, -1)
@@ -300,7 +303,7 @@ class StillScene:
         return best
 
     def outline(self, poses: Poses) -> Array:
-        """Move the scene, and return points (n, 3) in {W} that a picture of it must contain [m].
+        """Pose the scene, and return points (n, 3) in {W} that a picture must contain [m].
 
         They are the origins of the hand's links, and the corners of the object's bounding box.
         """
@@ -320,11 +323,11 @@ class StillScene:
         return self._plant.GetBodyFrameIdOrThrow(self._plant.world_body().index())
 
     def _camera(self, size: tuple[int, int], lighting: Lighting) -> ColorRenderCamera:
-        """Return a camera of a size (width, height) [px], with a render engine of the lights."""
-        # Engines are added when they are needed: a scene that is not drawn starts no OpenGL.
+        """Return a camera of a size (width, height) [px], whose render engine has the lights."""
+        # Engines are added when needed: a scene that is not drawn does not start OpenGL.
         context = self._graph.GetMyMutableContextFromRoot(self._root)
         if not self._graph.HasRenderer(context, lighting.name):
-            # Software OpenGL would start threads of its own.
+            # Software OpenGL would otherwise start its own threads.
             os.environ.setdefault("LP_NUM_THREADS", "0")
             require_render_memory()
             parameters = RenderEngineVtkParams(
@@ -341,15 +344,16 @@ class StillScene:
 
 
 def camera_pose(p_WA: Array, azimuth: float, elevation: float, *, fill: float = 1.0) -> Array:
-    """Return the pose X_WC (4, 4) of a camera that looks at the middle of points.
+    """Return the pose X_WC (4, 4) of a camera that looks at the centre of points.
 
     Args:
         p_WA: (n, 3), points that must be in the picture [m].
         azimuth: Direction of the camera about the vertical, from +x of {W} [rad].
-        elevation: Height of the camera above the horizontal [rad].
-        fill: The camera's distance is divided by it; above 1 the points fill more of the picture.
+        elevation: Angle of the camera above the horizontal [rad].
+        fill: Factor by which the camera's distance is divided; above 1 the points fill more of the
+            picture.
     """
-    # Far enough away for a ball around the points to fit into the field of view.
+    # The distance is large enough for a sphere around the points to fit into the field of view.
     middle = (p_WA.min(axis=0) + p_WA.max(axis=0)) / 2.0
     radius = np.linalg.norm(p_WA - middle, axis=1).max() + MARGIN
     distance = radius / np.sin(np.deg2rad(FOV_Y_DEG) / 2.0) / fill
@@ -374,15 +378,15 @@ def box_corners(model: ObjectModel) -> Array:
 
 
 def object_json(model: ObjectModel) -> bytes:
-    """Return the visual mesh of an object."""
+    """Return the visual mesh of an object, as JSON."""
     colour = object_colour(model.name)
     return json.dumps([_part(model.visual_vertices, model.visual_faces, colour)]).encode()
 
 
 def link_surfaces(scene: StillScene) -> dict[str, bytes]:
-    """Return what a hand's model shows of each link that has a shape, by the link's name.
+    """Return the surface of each link of a hand that has a shape as JSON, by the link's name.
 
-    A link without visual shapes is shown by those of collisions.
+    A link without visual shapes is shown by its collision shapes.
     """
     surfaces = {}
     for link in scene.links:
@@ -399,7 +403,7 @@ def link_surfaces(scene: StillScene) -> dict[str, bytes]:
 
 
 def _part(vertices: npt.ArrayLike, faces: npt.ArrayLike, colour: npt.ArrayLike) -> dict[str, str]:
-    """Return a part of one colour (3,), red, green and blue in 0..1."""
+    """Return a part with one colour (3,): red, green and blue in 0..1."""
     levels = np.rint(255.0 * np.asarray(colour)).astype(np.uint8)
     return {
         "colour": f"#{levels.tobytes().hex()}",
@@ -409,7 +413,7 @@ def _part(vertices: npt.ArrayLike, faces: npt.ArrayLike, colour: npt.ArrayLike) 
 
 
 def _colour(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
-    """Return the colour (3,) that the model gives a shape, else grey."""
+    """Return the colour (3,) of a shape in the model, or grey if it has none."""
     properties = inspector.GetProperties(geometry, Role.kIllustration)
     if properties is None or not properties.HasProperty("phong", "diffuse"):
         return GREY[:3]
@@ -418,8 +422,8 @@ def _colour(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
 
 
 def _mesh(inspector: SceneGraphInspector, geometry: GeometryId) -> Any:
-    """Return a shape as a mesh in its own frame; None for what cannot be drawn."""
-    # All of Drake's shapes are centred, along z.
+    """Return a shape as a mesh in its own frame; None if it cannot be drawn."""
+    # All of Drake's shapes are centred, with their axis along z.
     shape = inspector.GetShape(geometry)
     if isinstance(shape, Box):
         return trimesh.creation.box(shape.size())
@@ -436,7 +440,7 @@ def _mesh(inspector: SceneGraphInspector, geometry: GeometryId) -> Any:
 
 
 def _file_mesh(inspector: SceneGraphInspector, geometry: GeometryId, shape: Mesh | Convex) -> Any:
-    """Return the mesh of a file; its convex hull where trimesh cannot read the file."""
+    """Return the mesh of a file; its convex hull if trimesh cannot read the file."""
     source = shape.source()
     path = Path(str(source.path())) if source.is_path() else None
     if path is not None and path.is_file():

@@ -1,7 +1,7 @@
-"""What all figures share: colours, axes, legends, samples, and what is drawn over pictures.
+"""What all figures share: colours, axes, legends, samples, and marks over pictures.
 
-A contact is drawn where the camera matrix projects it: a dot in its finger's colour and a
-short arrow along the outward normal. The dot is hollow if the object hides the contact.
+A contact is drawn where the camera matrix projects it: a dot in its finger's colour and a short
+arrow along the outward normal. The dot is hollow if the object hides the contact.
 """
 
 from __future__ import annotations
@@ -28,26 +28,27 @@ from drakegrasp.frames import Array
 from drakegrasp.grasp import unpack_grasp
 from drakegrasp.vision.camera import Picture, project
 
-#: Colours of contacts: predicted, after closing, after the lift, those of the dataset's own grasp
-#: (Okabe and Ito: safe for the colour-blind).
+#: Colours of contacts: predicted, after closing, after the lift, and those of the dataset's own
+#: grasp (Okabe and Ito: safe for the colour-blind).
 PREDICTED, REACHED, LIFTED, TRUE = "#0072B2", "#D55E00", "#009E73", "#009E73"
 #: Colours of the fingers in grasp order (Okabe and Ito: safe for the colour-blind).
 FINGER_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00")
 #: Length of the arrows along the normals [m].
 ARROW = 0.03
-#: A contact farther than this behind the depth image counts as hidden [m]; fingertips are
+#: A contact that is farther than this behind the depth image counts as hidden [m]; fingertips are
 #: compressed by less.
 HIDDEN = 0.006
 #: Colour of text and lines.
 INK = "#333333"
 #: Distance of a label from its point [points].
 LABEL_REACH = 13.0
-#: Colours of depths; on thumbnails of pixels without depth, of the mask's background and object.
-#: What is nothing is transparent, and the object neither dark nor light: it is seen on any page.
+#: Colours of depths; on thumbnails also colours of pixels without depth, and of the mask's
+#: background and object. Empty pixels are transparent, and the object is neither dark nor light, so
+#: that it is visible on any page.
 DEPTHS = "viridis_r"
 NO_DEPTH = np.array([0, 0, 0, 0], dtype=np.uint8)
 MASK = np.array([[0, 0, 0, 0], [0x7D, 0x88, 0x96, 0xFF]], dtype=np.uint8)
-#: Least range of the depth colours [m].
+#: Smallest range of the depth colours [m].
 MIN_RANGE = 0.05
 
 
@@ -57,12 +58,12 @@ def draw_sample(
     """Draw colour, depth and mask of a sample, each with its contacts.
 
     Args:
-        axes: Three, for the three images.
-        sample: What to draw.
+        axes: Three axes for the three images.
+        sample: The sample.
         K: (3, 3), camera matrix [px].
         near: Depth of the brightest end of the colour scale [m].
         far: Far plane; pixels beyond it have no depth [m].
-        scale: Size of dots and lines; 1 suits images of about two inches.
+        scale: Size of dots and lines; 1 is suitable for images of about two inches.
     """
     colour, depth, mask = axes
     colour.imshow(np.moveaxis(sample.image[:3], 0, 2), interpolation="nearest")
@@ -77,8 +78,8 @@ def draw_contacts(axes: Axes, sample: Sample, K: Array, *, scale: float = 1.0) -
     """Draw the contacts of a sample over its image: a dot with an arrow per finger.
 
     Args:
-        axes: That show the image.
-        sample: With its grasp in {C}.
+        axes: Axes that show the image.
+        sample: The sample, with its grasp in {C}.
         K: (3, 3), camera matrix [px].
         scale: Size of dots and lines.
     """
@@ -92,26 +93,26 @@ def draw_contacts(axes: Axes, sample: Sample, K: Array, *, scale: float = 1.0) -
         # A finger that the grasp leaves out has no contact.
         if not sample.fingers[i]:
             continue
-        # Something nearer than the contact, at its pixel, hides it.
+        # A contact is hidden if something nearer is at its pixel.
         column, row = np.clip(np.rint(dot), 0, size - 1).astype(int)
         hidden = p_CQ[i, 2] > sample.image[3, row, column] + HIDDEN
         mark_contact(axes, i, dot, end, hidden=bool(hidden), scale=scale)
 
-    # Contacts outside the image must not change what the axes show.
+    # Contacts outside of the image must not change the range of the axes.
     frame_image(axes, *sample.mask.shape)
 
 
 def mark_contact(
     axes: Axes, finger: int, dot: Array, end: Array, *, hidden: bool, scale: float = 1.0
 ) -> None:
-    """Draw a contact at a pixel (2,), with an arrow along its normal to another.
+    """Draw a contact at a pixel (2,), with an arrow along its normal to another pixel.
 
     Args:
-        axes: That show the image.
+        axes: Axes that show the image.
         finger: Index of the finger.
-        dot: Where the arrow begins (2,) [px].
-        end: Where it ends (2,) [px].
-        hidden: Whether the camera does not see the contact: the dot is hollow.
+        dot: Start of the arrow (2,) [px].
+        end: End of the arrow (2,) [px].
+        hidden: Whether the camera does not see the contact; then the dot is hollow.
         scale: Size of dot and line.
     """
     # The arrow, then the dot over its tail.
@@ -137,7 +138,7 @@ def read_far(path: Path) -> float:
 
 
 def _depth_colours() -> Colormap:
-    """Return the colours of depths; that of pixels without depth is a light grey."""
+    """Return the colours of depths; pixels without depth are light grey."""
     # Pixels beyond the far plane are masked: they have no depth.
     return mpl.colormaps["viridis_r"].with_extremes(bad="#E3E6EA")
 
@@ -157,10 +158,10 @@ def draw_finger_legend(
     """Draw the legend of the fingers' colours.
 
     Args:
-        figure: Where to draw.
-        fingers: Their number.
-        corner: Upper left corner of the legend, as shares of the figure's width and height.
-        size: Of the text [points].
+        figure: Figure to draw in.
+        fingers: Number of fingers.
+        corner: Upper left corner of the legend, as fractions of the figure's width and height.
+        size: Size of the text [points].
     """
 
     def mark(colour: str, inside: str, edge: str, label: str) -> Line2D:
@@ -192,7 +193,7 @@ def new_page(width: float, height: float) -> Figure:
 
 
 def write_beside(axes: Axes, x: float, y: float, text: str, size: float, **more: Any) -> None:
-    """Write a text as it is, at shares of the width and the height of axes."""
+    """Write a text literally, at fractions of the width and the height of axes."""
     look = {"color": INK, "parse_math": False, **more}
     axes.text(x, y, text, transform=axes.transAxes, fontsize=size, **look)
 
@@ -213,14 +214,14 @@ def hide_ticks(axes: Axes) -> None:
 
 
 def frame_image(axes: Axes, height: int, width: int) -> None:
-    """Show an image's pixels and nothing else; pixel centres have whole coordinates."""
+    """Show only an image's pixels; pixel centres have integer coordinates."""
     axes.set_xlim(-0.5, width - 0.5)
     axes.set_ylim(height - 0.5, -0.5)
     hide_ticks(axes)
 
 
 def shortened(name: str, most: int) -> str:
-    """Return a name in at most so many characters; its end tells morphs of one mesh apart."""
+    """Return a name in at most `most` characters; the end distinguishes morphs of one mesh."""
     return name if len(name) <= most else f"{name[: most - 10]}…{name[-9:]}"
 
 
@@ -231,18 +232,18 @@ def save_figure(figure: Figure, png: Path, *, dpi: int) -> None:
 
 def png_bytes(figure: Figure, *, dpi: int) -> bytes:
     """Return a figure as PNG, at a resolution [pixels per inch]."""
-    # Without the writing software's version the same figure gives the same bytes.
+    # Without the version of the writing software, the same figure produces the same bytes.
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=dpi, format="png", metadata={"Software": None})
     return buffer.getvalue()
 
 
 def svg_bytes(figure: Figure, *, dpi: int = 72) -> bytes:
-    """Return a figure as SVG; the same figure gives the same bytes.
+    """Return a figure as SVG; the same figure produces the same bytes.
 
     Args:
         figure: The figure.
-        dpi: Resolution of what is pixels in it [pixels per inch].
+        dpi: Resolution of the parts that are rasterized [pixels per inch].
     """
     buffer = io.BytesIO()
     with mpl.rc_context({"svg.hashsalt": "drakegrasp"}):
@@ -253,7 +254,7 @@ def svg_bytes(figure: Figure, *, dpi: int = 72) -> bytes:
 def strip_png(image: npt.NDArray[np.float32], mask: npt.NDArray[np.uint8], *, far: float) -> bytes:
     """Return colour, depth and mask side by side as a PNG, (S, 3 S) pixels.
 
-    The colours of depth run from the nearest pixel of the image to the farthest before `far`.
+    The colours of depth range from the nearest pixel of the image to the farthest before `far`.
 
     Args:
         image: (4, S, S): R, G, B in 0..1 and depth [m].
@@ -277,7 +278,7 @@ def strip_png(image: npt.NDArray[np.float32], mask: npt.NDArray[np.uint8], *, fa
 
 
 def colour_png(colours: npt.NDArray[np.uint8]) -> bytes:
-    """Return colours (h, w, 3), with opacity (h, w, 4), as a PNG."""
+    """Return colours (h, w, 3), or colours with opacity (h, w, 4), as a PNG."""
     buffer = io.BytesIO()
     imsave(buffer, colours, format="png")
     return buffer.getvalue()
@@ -293,16 +294,16 @@ def draw_marks(
     labels: Mapping[str, Array] | None = None,
     obstacles: Sequence[Array] = (),
 ) -> None:
-    """Draw lines, points and arrows over a picture, and their names where there is room.
+    """Draw lines, points and arrows over a picture, and their names where there is space.
 
     Args:
-        axes: That show the picture.
-        picture: With its camera.
+        axes: Axes that show the picture.
+        picture: The picture with its camera.
         strokes: By colour, polylines (n, 3) in {W} [m].
         points: By name, points (3,) in {W} [m].
         arrows: By name, tail (3,) and tip (3,) in {W} [m], drawn in the colours of the fingers.
-        labels: By name, more points (3,) to be named.
-        obstacles: More points (n, 3) each in {W} that no name should cover.
+        labels: By name, further points (3,) to be named.
+        obstacles: Arrays (n, 3) of further points in {W} that no name should cover.
     """
     halo = [withStroke(linewidth=3.0, foreground="white")]
     for colour, lines in (strokes or {}).items():
@@ -322,7 +323,7 @@ def draw_marks(
         axes.plot(*picture.pixels(point[None])[0], "o", color=INK, markersize=6.0,
                   markeredgecolor="white", zorder=7)  # fmt: skip
 
-    # Names, placed where they cover none of the above.
+    # Names, placed where they do not cover any of these.
     named = {**(labels or {}), **points, **{name: start for name, (start, _) in arrows.items()}}
     drawn = [*obstacles, *(np.linspace(start, end, 4) for start, end in arrows.values())]
     anchors = {name: picture.pixels(p[None])[0] for name, p in named.items()}
@@ -330,21 +331,21 @@ def draw_marks(
 
 
 def show_image(axes: Axes, image: npt.NDArray[np.uint8]) -> None:
-    """Show an image whose pixel centres have whole coordinates."""
+    """Show an image with integer coordinates at the pixel centres."""
     axes.imshow(image, interpolation="antialiased")
     frame_image(axes, *image.shape[:2])
     axes.set_autoscale_on(False)
 
 
 def _draw_labels(axes: Axes, pixels: Mapping[str, Array], obstacles: Array) -> None:
-    """Write names beside points, each on the side with the most room.
+    """Write names beside points, each on the side with the most space.
 
     Args:
-        axes: That show the image.
-        pixels: By name, (2,), the point that is labelled [px].
-        obstacles: (n, 2), what labels should not cover [px].
+        axes: Axes that show the image.
+        pixels: By name, the labelled point (2,) [px].
+        obstacles: (n, 2), points that labels should not cover [px].
     """
-    # Distance of a label from its point, from points of the paper to pixels of the image.
+    # Distance of a label from its point, converted from points of the paper to pixels of the image.
     window = axes.get_window_extent()
     reach = LABEL_REACH * axes.figure.dpi / 72.0 * abs(np.ptp(axes.get_xlim())) / window.width
     angles = np.deg2rad(np.arange(0.0, 360.0, 30.0))
@@ -354,7 +355,7 @@ def _draw_labels(axes: Axes, pixels: Mapping[str, Array], obstacles: Array) -> N
     for name, pixel in pixels.items():
         places = pixel + reach * directions * [1.0 + 0.25 * len(name), 1.0]
         distances = np.linalg.norm(places[:, None] - taken[None], axis=2)
-        # The nearest obstacle counts most, the next two count as well.
+        # The nearest obstacle has the largest weight; the next two count as well.
         nearest = np.sort(distances, axis=1)[:, :3]
         place = places[np.argmax(nearest @ [4.0, 2.0, 1.0][: nearest.shape[1]])]
         taken = np.vstack([taken, place])
