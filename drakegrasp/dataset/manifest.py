@@ -81,7 +81,6 @@ def _refuse_unprintable(text: str) -> str:
 
 
 #: Key of the hash of all other keys.
-#: Key of the hash of all other keys.
 DIGEST = "sha256"
 #: Types of the values in a manifest; they are checked when a manifest is read.
 Axis = Annotated[str, Field(pattern=r"^[+-][xyz]$")]

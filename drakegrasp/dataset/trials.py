@@ -90,6 +90,9 @@ class Trials:
         objects: Columns of `/objects` by the names of the schema; texts are str.
         attributes: Attributes of trials.hdf5, e.g. `config` as JSON; empty if there is no such
             file.
+
+    Raises:
+        DataError: If the file is missing, damaged or differs from the schema.
     """
 
     def __init__(self, out: str | Path, *, any_name: bool = False) -> None:

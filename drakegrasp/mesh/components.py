@@ -27,8 +27,7 @@ from drakegrasp.mesh.surfaces import (
 )
 
 #: If two touching edges belong to one face, the faces between their new vertices still touch and
-#: are
-#: parted in a second turn; a third turn was never needed.
+#: are parted in a second turn; a third turn was never needed.
 MAX_PARTINGS = 4
 
 
@@ -66,8 +65,7 @@ def find_components(vertices: Array, faces: Faces, notes: list[str]) -> list[Com
     twins = pair_half_edges(vertices, faces, radial=True)
 
     # Corners that meet across a paired edge share a vertex. All other corners are separated, even
-    # if
-    # two components of the file touch at a single point.
+    # if two components of the file touch at a single point.
     halves = np.flatnonzero(twins >= 0)
     ends = half_edges(faces)
     start, end = halves, halves - halves % 3 + (halves + 1) % 3
@@ -220,8 +218,7 @@ def _pair_radially(vertices: Array, faces: Faces, halves: Faces, twins: Faces) -
     angles[angles >= 6.283185] = 0.0
 
     # Around the axis, the solid ends at a face whose half-edge has the axis' direction, and begins
-    # at
-    # a face with the opposite one. At equal angles the end comes first, so that components that
+    # at a face with the opposite one. At equal angles the end comes first, so that components that
     # share a wall stay two.
     turn = np.lexsort((~leaves, angles))
     depth = np.cumsum(np.where(leaves[turn], -1, 1))

@@ -79,9 +79,8 @@ def _triangle_hits(p: Array, z: Array, a: Array, b: Array, c: Array) -> Array:
 # Faces that cross
 
 #: An edge passes through a face if its ends are farther than this from the face's plane, on
-#: opposite
-#: sides, and the edge is farther than this from the face's edges, as a fraction of the diagonal.
-#: Surfaces that only touch do not cross, even if their vertices are rounded.
+#: opposite sides, and the edge is farther than this from the face's edges, as a fraction of the
+#: diagonal. Surfaces that only touch do not cross, even if their vertices are rounded.
 DEPTH = 2e-6
 #: Number of pairs of faces that are tested together.
 FACE_PAIRS = 1_000_000

@@ -208,8 +208,8 @@ MOST_FACES = 100_000
 #: Number of faces above which near vertices are first merged, to at most as many faces.
 MOST_DECIMATED = 300_000
 #: Edge of the cells in which vertices are merged: the first edge, as a fraction of the diagonal,
-#: and
-#: the factor from one try to the next. They are products, so that all machines have the same edges.
+#: and the factor from one try to the next. They are products, so that all machines have the same
+#: edges.
 FIRST_CELL, CELL_FACTOR = 1.0 / 8192.0, 1.25
 
 
@@ -257,7 +257,6 @@ def _cluster(vertices: Array, faces: Faces) -> Solid:
     scenes": vertices in the same cell of a grid are replaced by their mean. Here only vertices that
     are joined by edges within the cell are merged, so that two nearby sheets of surface stay
     separate.
-    within the cell do here, so that two sheets of surface that lie close to each other stay two.
     """
     low, cell = vertices.min(axis=0), FIRST_CELL * diagonal(vertices)
     while True:

@@ -85,8 +85,7 @@ def weld(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
 
     # A face that occurs twice is a copy, or the wall between two touching solids. The
-    # interpretation
-    # that leaves fewer edges with an odd number of faces is taken.
+    # interpretation that leaves fewer edges with an odd number of faces is taken.
     index, inverse, counts = _unique_faces(faces)
     if (counts > 1).any():
         once = faces[np.sort(index)]

@@ -33,8 +33,8 @@ ROUNDING = 1e-12
 #: Distance from the faces at which thin objects are checked, as a fraction of the diagonal.
 NEAR = 3e-4
 #: Fraction of its volume that a surface may enclose twice or backwards. This falsifies the mass
-#: properties, but not the surface that is touched (slots of real toasters are dents deeper than
-#: the wall).
+#: properties, but not the surface that is touched (slots of real toasters are dents deeper than the
+#: wall).
 MAX_OVERLAP = 0.05
 
 

@@ -35,8 +35,7 @@ from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.wavefront import hull_text
 
 #: Memory of MuJoCo [bytes]; only what is needed is touched. By default MuJoCo takes about 14 MB,
-#: and
-#: leaves contacts out if that is too little, e.g. for a hand deep in an object of many convex
+#: and leaves contacts out if that is too little, e.g. for a hand deep in an object of many convex
 #: parts.
 MEMORY = 256_000_000
 #: Time step [s].
@@ -53,8 +52,7 @@ TORSION_RADIUS = 0.0029
 
 
 #: A joint of Drake that moves in MuJoCo, the body of its link, and the arguments of `add_joint`:
-#: its
-#: name, kind and limits, and its position in the body's frame.
+#: its name, kind and limits, and its position in the body's frame.
 MovingJoint: TypeAlias = tuple[Joint, mujoco.MjsBody, dict[str, Any]]
 
 

@@ -51,8 +51,7 @@ SCALE, CURVE = (0.75, 1.5), (-0.25, 0.25)
 #: Smallest scale of the distance (that of the database).
 LEAST_SCALE = 0.25
 #: Longest edge of a surface to be morphed, as a fraction of the diagonal, and the number of faces
-#: up
-#: to which longer edges are split: a long straight edge would not bend.
+#: up to which longer edges are split: a long straight edge would not bend.
 BEND, MAX_FACES = 0.06, 4000
 #: If faces of a mesh pass through others, their number in a morph may be larger by this factor: the
 #: morph keeps the curves along which faces cross, but not which faces are there.

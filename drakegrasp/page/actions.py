@@ -239,8 +239,7 @@ class Recordings:
                 raise DataError(f"trial {trial} cannot be run again: {reason}")
 
             # Exit code 1 with a recording means that values differ; the recording shows the new
-            # run.
-            # The last line is the recording's path.
+            # run. The last line is the recording's path.
             lines = done.stdout.strip().splitlines()[:-1]
             self._found[label] = Rerun(same=done.returncode == 0, text="\n".join(lines))
             return self._found[label]

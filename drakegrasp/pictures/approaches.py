@@ -264,6 +264,7 @@ def palm_poses_figure(
 ) -> Figure:
     """Return a figure of the approach rays of palm poses to a mesh, a panel per method.
 
+    Args:
         vertices: Vertices of the mesh, (n, 3) in {O} [m].
         faces: Faces of the mesh, (m, 3).
         rays: Rays (r, 2, 3) by title, from the palm's origin to the surface, in {O} [m].

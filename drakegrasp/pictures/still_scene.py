@@ -109,8 +109,7 @@ SHADOWS = Lighting(
     ),
 )
 #: For pictures of the lift. The last light has no shadows: seen from it, the table is far behind
-#: the
-#: object, so VTK's shadow map would be too coarse and draw spots on the object.
+#: the object, so VTK's shadow map would be too coarse and draw spots on the object.
 NO_SHADOWS = Lighting(
     name="no shadows",
     lights=(

@@ -55,8 +55,7 @@ from drakegrasp.runtime.files import lock_file, temporary_name
 #: be the machine's fault.
 NATIVE_DEATHS = 2
 #: Number of successive exceeded time limits in one step after which the step is not tried again:
-#: one
-#: may be due to a suspended process.
+#: one may be due to a suspended process.
 HUNG_DEATHS = 2
 #: The wall-clock limit of a step is this multiple of its limit of computing time, for a machine
 #: with far more work than cores, but exceeds it by at most this much [s].

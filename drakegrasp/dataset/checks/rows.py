@@ -590,11 +590,11 @@ class Check:
     """A check while it runs.
 
     Attributes:
-        execute: Runs the tasks.
         execute: Executor of the tasks.
         report: Called with the number of finished rows and shards, and the number of all.
         total: Number of all rows and shards.
         done: Number of finished rows and shards.
+        findings: The violations.
     """
 
     execute: Executor
