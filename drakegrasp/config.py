@@ -1,9 +1,9 @@
-"""The configuration: inert, typed data with a unit and a default for every value.
+"""The configuration: typed data without behaviour, with a unit and a default for every value.
 
-The defaults are the paper's numbers, but for the split: `paper` states that of the paper. A preset
-or a user's YAML file states only what differs. Angles are in degrees here, where YAML is read, and
-have `_deg` in their names; everywhere else they are in radians. Use
-`drakegrasp.hand.settings.load_config` to get a configuration.
+The defaults are the paper's numbers, except for the split: the preset `paper` has the split of the
+paper. A preset or a user's YAML file states only the values that differ. Angles are in degrees in
+this module, because users write them in YAML, and their names end with `_deg`; everywhere else they
+are in radians. Use `drakegrasp.hand.settings.load_config` to get a configuration.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from drakegrasp.filters import LIMITS
 from drakegrasp.foreign_files import read_text
 from drakegrasp.yaml_text import parse_yaml
 
-#: Limits of every quantity, so that sums stay finite.
+#: Bounds of every quantity, so that sums stay finite.
 LARGEST, SMALLEST = 1e12, 1e-12
 #: Counts are stored in 32 bits, seeds in 64.
 MOST, MOST_SEED = 2**31 - 1, 2**64 - 1
@@ -75,34 +75,35 @@ Angles = Annotated[tuple[Number, ...], Field(min_length=1)]
 Licence = Annotated[str, Field(pattern=r"^[ -~]*[!-~][ -~]*$", max_length=200)]
 
 
-#: Characters of a wrong value that an error shows.
+#: Number of characters of a wrong value that an error message shows.
 LONGEST_SHOWN = 200
 
 
 @dataclass(frozen=True)
 class Decides:
-    """A mark of a field, `Annotated[Count, NO_SHARD]`: where its value counts.
+    """A mark of a field, such as `Annotated[Count, NO_SHARD]`, that tells where its value counts.
 
     Attributes:
-        files: Whether files of datasets say it, given its section and itself.
-        shards: Whether what files say decides what a shard holds, given these.
+        files: Function of the section and the value: whether files of datasets store the value.
+        shards: Function of the section and the value: whether a stored value affects the content of
+            shards.
     """
 
     files: Callable[[Any, Any], bool] = lambda section, value: True
     shards: Callable[[Any, Any], bool] = lambda section, value: True
 
 
-#: Of values that change no shard: they act on assembled shards, or only say where to stop.
+#: Mark of values that change no shard: they act on assembled shards, or only tell where to stop.
 NO_SHARD = Decides(shards=lambda section, value: False)
 
 
 def _told_unless(usual: Any) -> Decides:
-    """Return the mark of a field of which files say nothing where its value is the usual one."""
+    """Return the mark of a field that files omit if it has the usual value."""
     return Decides(files=lambda section, value: value != usual)
 
 
 def _counts_unless(usual: Any) -> Decides:
-    """Return the mark of a field without effect on shards where its value is the usual one."""
+    """Return the mark of a field that has no effect on shards if it has the usual value."""
     return Decides(shards=lambda section, value: value != usual)
 
 
@@ -110,7 +111,7 @@ class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     def tree(self, *, shards: bool = False) -> dict[str, Any]:
-        """Return the values that files say as plain JSON types, or only those that shards have."""
+        """Return the values that files store, or only those that affect shards, as JSON types."""
         tree = self.model_dump(mode="json")
         for name, field in type(self).model_fields.items():
             value = getattr(self, name)
@@ -134,13 +135,13 @@ class _Section(BaseModel):
 class ObjectConfig(_Section):
     """Mass and meshes of the objects."""
 
-    mass: Positive = 1.0  # [kg], the same for every object (paper, "Object representation")
-    max_collision_faces: Annotated[int, Field(ge=12)] = 3000  # that decimation may leave
-    # Drops, the first upright (paper), the others from random orientations; each different pose at
-    # rest is used.
+    mass: Positive = 1.0  # [kg], of every object (paper, "Object representation")
+    max_collision_faces: Annotated[int, Field(ge=12)] = 3000  # after decimation
+    # Number of drops, the first upright (paper), the others from random orientations; each distinct
+    # resting pose is used.
     resting_poses: Annotated[int, Field(ge=1, le=100)] = 1
-    min_diagonal: Positive = 0.01  # [m], a smaller bounding box diagonal is refused
-    max_diagonal: Positive = 2.0  # [m], a larger one is refused
+    min_diagonal: Positive = 0.01  # [m], smallest allowed diagonal of the bounding box
+    max_diagonal: Positive = 2.0  # [m], largest allowed diagonal of the bounding box
 
     @model_validator(mode="after")
     def _ordered(self) -> ObjectConfig:
@@ -155,14 +156,14 @@ class ObjectConfig(_Section):
 class BuiltinConfig(_Section):
     """The built-in objects in a build of `builtin`; ignored for mesh files.
 
-    With two objects of a class one trains and one tests.
+    With two objects of a class, one is for training and one for testing.
     """
 
     per_class: Annotated[int, Field(ge=1, le=10_000)] = 2  # objects of each of the 64 classes
-    seed: Seed = 0  # of the draw of their sizes, apart from the others
+    seed: Seed = 0  # of the draws of their sizes, independent of the other draws
 
 
-#: Longest coarse step that is allowed [s]; own choice, labels were measured with 24 ms.
+#: Longest coarse step that is allowed [s]: our choice; labels were measured with 24 ms.
 MAX_COARSE_STEP = 0.06
 
 
@@ -181,8 +182,8 @@ class PhysicsConfig(_Section):
     solver: Literal["lagged", "similar", "sap"] = "lagged"  # Drake's contact approximation
     contact_force: Positive = 0.05  # [N], a weaker contact does not count as one
     max_speed: Positive = 10.0  # [m/s], a faster object means that the simulation diverged
-    # [N] at the pad point of the strongest fingertip; motors that press harder are all weakened by
-    # one factor. Null: as strong as the hand file says.
+    # [N], largest force at the pad point of a fingertip: if one can exert more, all motors are
+    # weakened by one factor. Null: the strength of the hand file.
     finger_load: Annotated[Positive | None, _told_unless(None)] = None
 
     @model_validator(mode="after")
@@ -198,46 +199,46 @@ class PhysicsConfig(_Section):
 class SettleConfig(_Section):
     """Dropping the object on the table until it is at rest."""
 
-    drop_height: NonNegative = 0.3  # [m], of {O} above the table (paper); taller ones stand on it
+    drop_height: NonNegative = 0.3  # [m], of {O} above the table (paper); taller ones start on it
     max_time: Positive = 15.0  # [s] of simulation (released code)
     max_linear_speed: Positive = 1e-3  # [m/s], slower than this is at rest
     max_angular_speed: Positive = 1e-2  # [rad/s], slower than this is at rest
-    rest_time: Positive = 0.2  # [s], at rest for this long
+    rest_time: Positive = 0.2  # [s], for which the object must be at rest
     time_step: Annotated[float, Field(ge=1e-6, le=0.02)] = (
-        0.002  # [s]; longer ones tilt it in landing
+        0.002  # [s]; longer steps tilt objects in landing
     )
 
 
-#: Context of a validation: the values are those of a dataset.
+#: Validation context of values that are read from a dataset.
 _STORED = "stored"
-#: Name and digest of a class of the user's own, as `drakegrasp.registry` makes them.
+#: Name and digest of a user-defined class, as `drakegrasp.registry` writes them.
 _OWN_CLASS = re.compile(r"[^/\\:]+\.py:[A-Za-z_]\w*@[0-9a-f]{16}")
 
 
 def is_own_class(name: object) -> bool:
-    """Return whether a value of a setting names a class of the user's own, with its digest."""
+    """Return whether a value of a setting names a user-defined class, with its digest."""
     return isinstance(name, str) and _OWN_CLASS.fullmatch(name) is not None
 
 
 class _ExtensibleSection(_Section):
-    """A section that may name classes of the user's own."""
+    """A section that may name user-defined classes."""
 
     _code: dict[str, str] = PrivateAttr(default_factory=dict)
 
     @property
     def code(self) -> Mapping[str, str]:
-        """Text of their files by their names; it is written nowhere and read from no dataset."""
+        """Source texts of user-defined classes by name, never written to or read from a dataset."""
         return self._code
 
     def with_code(self, code: Mapping[str, str]) -> Self:
-        """Return the section with the texts of classes."""
+        """Return the section with the source texts of user-defined classes."""
         section = self.model_copy()
         section._code = dict(code)
         return section
 
 
 def _samplers(value: Any, info: ValidationInfo) -> str | tuple[str, ...]:
-    """Return the name of a sampler, or the names of those that take turns."""
+    """Return the name of a sampler, or the names of samplers that take turns."""
     names = value if isinstance(value, list | tuple) else [value]
     if not names or not all(_is_named("samplers", name, info) for name in names):
         known = ", ".join(registry.names("samplers"))
@@ -246,9 +247,9 @@ def _samplers(value: Any, info: ValidationInfo) -> str | tuple[str, ...]:
 
 
 def _is_named(kind: registry.Kind, name: object, info: ValidationInfo) -> bool:
-    """Return whether a value names a class of the user's own, or what the registry has.
+    """Return whether a value names a user-defined class or an entry of the registry.
 
-    What a dataset was made with need not be installed where it is read.
+    The extensions with which a dataset was built need not be installed where it is read.
     """
     if not isinstance(name, str):
         return False
@@ -257,7 +258,7 @@ def _is_named(kind: registry.Kind, name: object, info: ValidationInfo) -> bool:
 
 
 def _own_filters(value: Any, info: ValidationInfo) -> tuple[str, ...]:
-    """Return the names of the user's own filters; none for null."""
+    """Return the names of user-defined filters; an empty tuple for null."""
     names = value if isinstance(value, list | tuple) else [] if value is None else [value]
     if not all(_is_named("rules", name, info) for name in names):
         rules = ", ".join((*registry.names("rules"), "FILE.py:NAME"))
@@ -269,10 +270,11 @@ def _own_filters(value: Any, info: ValidationInfo) -> tuple[str, ...]:
 class CandidateConfig(_ExtensibleSection):
     """The palm poses that are tried."""
 
-    # Sampler, or a list of samplers that take turns; one that is named twice has two turns. One of
-    # the user's own is `file.py:Name`.
+    # Sampler, or a list of samplers that take turns; a sampler that is named twice gets two turns.
+    # A user-defined sampler is `file.py:Name`.
     method: Annotated[str | tuple[str, ...], BeforeValidator(_samplers)] = "rotations"
-    # Per object; more are thinned at random, by the seed (paper). A dataset may grow.
+    # Palm poses per object; if there are more, they are thinned at random with the seed (paper). A
+    # dataset may grow.
     max: Annotated[Count, NO_SHARD] = 10_000
     global_x_deg: Angles = tuple(range(0, 181, 30))  # paper, Table II
     global_y_deg: Angles = tuple(range(0, 360, 30))
@@ -280,14 +282,14 @@ class CandidateConfig(_ExtensibleSection):
     local_x_deg: Angles = tuple(range(0, 181, 20))
     local_y_deg: Angles = tuple(range(0, 360, 20))
     local_z_deg: Angles = tuple(range(0, 360, 45))
-    jitter_deg: NonNegative = 0.0  # each angle gets a whole number of degrees below this
-    # Digest of the postures that are tried instead of palm poses of samplers; `--postures` sets it.
+    jitter_deg: NonNegative = 0.0  # each angle gets a random whole number of degrees below this
+    # Digest of the postures that are tried instead of sampled palm poses; `--postures` sets it.
     postures: Annotated[
         Annotated[str, Field(pattern="^[0-9a-f]{16}$")] | None, _told_unless(None)
     ] = None
-    # [m] of the palm from the surface, an attempt each (paper); not given: the hand's own.
+    # [m] of the palm from the surface, one attempt each (paper); default: those of the hand.
     standoffs: Standoffs
-    # One is drawn per attempt (released code); not given: the hand's own.
+    # One is drawn per attempt (released code); default: those of the hand.
     spreads_deg: Annotated[
         tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(min_length=1)
     ]
@@ -299,28 +301,28 @@ class CandidateConfig(_ExtensibleSection):
 
 
 class RefineConfig(_Section):
-    """More palm poses close to those of samples (by the default filters).
+    """Additional palm poses close to those of samples (by the default filters).
 
-    A pose is moved by a normal draw along and about each axis of the palm.
+    A palm pose is displaced by normal draws along and about each axis of the palm.
     """
 
-    children: Annotated[int, Field(ge=0, le=100)] = 0  # of each sample; 0 switches it off
+    children: Annotated[int, Field(ge=0, le=100)] = 0  # of each sample; 0 switches refining off
     generations: Annotated[int, Field(ge=1, le=4)] = 1  # children of children, and so on
     shift: Positive = 0.0075  # [m], standard deviation along each axis of the palm
     turn_deg: Positive = 7.5  # standard deviation about each axis of the palm
-    # Share of the objects without any: those that a split by object tests first, where refined
-    # palm poses are no samples.
+    # Fraction of the objects without refined palm poses: the objects that a split by object selects
+    # first for testing, because refined palm poses of tested objects are not samples.
     spared: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
 
 
 class ScreenConfig(_Section):
     """Attempts that geometry decides without a simulation; see docs/explanation/screening.md."""
 
-    mode: Literal["on", "off"] = "on"  # "off" simulates every attempt, from the open hand
-    start_margin: Positive = 0.0025  # [m], deeper penetration at the start is a certain collision
+    mode: Literal["on", "off"] = "on"  # "off" simulates every attempt from the open hand
+    start_margin: Positive = 0.0025  # [m], deeper penetration at the start is a collision
     reach_margin: Positive = 0.0025  # [m], a fingertip that passes nearer than this may touch
-    block_margin: Positive = 0.005  # [m], contact stops every finger before it penetrates this far
-    clearance: Positive = 0.004  # [m], fingers start to close at this distance from what they meet
+    block_margin: Positive = 0.005  # [m], contact stops every finger before it penetrates deeper
+    clearance: Positive = 0.004  # [m], distance from the first contact at which fingers start
 
     @field_validator("mode", mode="before")
     @classmethod
@@ -333,22 +335,22 @@ class CloseConfig(_Section):
     """Closing the fingers on the static object."""
 
     max_time: Positive = 2.5  # [s], a little more than 140 degrees at 60 degrees per second
-    stop_speed: Positive = 0.01  # [rad/s, or 0.1 m/s], slower fingers have stopped
+    stop_speed: Positive = 0.01  # [rad/s, or 0.1 m/s], slower fingers count as stopped
     check_period: Positive = 0.1  # [s] of simulation between two checks
-    # [m], a hand that comes farther below the table's top while it closes or lifts is a
-    # `table_contact`. Null: not measured, as in datasets of versions without this key.
+    # [m], the outcome is `table_contact` if the hand is deeper below the table's top at any time of
+    # closing or lifting. Null: not measured, as in datasets of versions without this key.
     scrape_depth: Annotated[NonNegative | None, _told_unless(None)] = 5e-4
 
 
-#: Of what ends lifts early; without, hashes are as before there was a choice.
+#: Mark of settings that end lifts early; if unused, hashes are those of versions without them.
 _STOPS = Decides(shards=lambda lift, _: lift.stop_when != "never")
 
 
 class LiftConfig(_Section):
-    """Freeing the object and moving the wrist to the target."""
+    """Releasing the object and moving the wrist to the target."""
 
-    drive: Literal["worm", "torque", "locked"] | None = None  # of the fingers; None: the hand's own
-    release_time: NonNegative = 0.2  # [s], the object is free before the wrist moves
+    drive: Literal["worm", "torque", "locked"] | None = None  # None: that of the hand file
+    release_time: NonNegative = 0.2  # [s], from release to the motion of the wrist
     p_TG: Annotated[tuple[Number, ...], Field(min_length=3, max_length=3)] = (
         0.0,
         0.0,
@@ -358,44 +360,46 @@ class LiftConfig(_Section):
     max_acceleration: Positive = 1.0  # [m/s^2] of the wrist
     hold_time: NonNegative = 0.3  # [s] at the target before the final verdict
     check_period: Positive = 0.1  # [s] simulated between two checks, and up to a coarse step more
-    # "lost_sample" ends a lift, as `moved`, when the object moved more in the hand than the next
-    # two say at a check: no filter may then let such a grasp become a sample.
+    # "lost_sample" ends a lift, as `moved`, when the object has moved more in the hand than the
+    # next two limits at a check: filters must then have limits at least as strict.
     stop_when: Annotated[Literal["never", "lost_sample"], _STOPS] = "never"
-    # [m], of the object in the hand since it is free
+    # [m], of the object in the hand since its release
     stop_slip: Annotated[Positive, _STOPS] = 0.010
-    stop_turn_deg: Annotated[Positive, _STOPS] = 10.0  # of the object in the hand since it is free
-    # Closed hands with a smaller chance of a sample are not lifted, but for a tenth; 0: all are.
+    stop_turn_deg: Annotated[Positive, _STOPS] = 10.0  # of the object since its release
+    # Closed hands with a smaller predicted probability of a sample are not lifted, except for a
+    # tenth of them; 0: all are lifted.
     least_chance: Annotated[float, Field(ge=0.0, lt=1.0), _counts_unless(0.0)] = 0.0
-    # Nor are those whose otm depth image is flatter than this [m^2], but for the same tenth.
+    # Closed hands whose otm depth image has a smaller variance [m^2] are also not lifted, except
+    # for the same tenth.
     least_depth_variance: Annotated[NonNegative, _counts_unless(0.0)] = 0.0
 
 
-#: Of keys that older versions lack: files that say nothing of what attempts bear are as theirs.
+#: Mark of keys that older versions lack: files without certificates are equal to theirs.
 _CERTIFIED = Decides(files=lambda certify, _: certify.certified)
 
 
 class CertifyConfig(_Section):
-    """How much lifted attempts bear; see docs/explanation/physics.md."""
+    """How much disturbance lifted attempts tolerate; see docs/explanation/physics.md."""
 
-    repeats: NonNegativeCount = 0  # disturbed, of each attempt that is drawn; 0: none is drawn
-    # Probability that a sample (by the default filters) is drawn; null stores nothing, as it is of
+    repeats: NonNegativeCount = 0  # disturbed lifts of each selected attempt; 0: none
+    # Probability that a sample (by the default filters) is selected; null stores nothing, as in
     # datasets whose successes an older version certified.
     share: Annotated[Share | None, _CERTIFIED] = 1.0
-    # Probability that another lifted attempt is drawn.
+    # Probability that any other lifted attempt is selected.
     share_others: Annotated[Share, _CERTIFIED] = 0.0
-    # The same of a sample of an object that a split by object is likely to test or to validate
-    # with; the larger one counts.
+    # Probability that a sample is selected if a split by object is likely to use its object for
+    # testing or validation; the larger of this value and `share` is used.
     share_tested: Annotated[Share, _CERTIFIED] = 0.0
     palm_noise: NonNegative = 0.002  # [m], standard deviation along each axis of the palm
     palm_noise_deg: NonNegative = 1.0  # standard deviation about each axis of the palm
     friction_noise: NonNegative = 0.1  # standard deviation of the coefficient's logarithm
     mass_noise: NonNegative = 0.1  # standard deviation of the mass's logarithm
-    # Halvings to the least friction of successes; 0: it is not looked for.
+    # Bisection steps for the smallest friction of successes; 0: it is not determined.
     friction_steps: Annotated[int, Field(ge=0, le=16)] = 4
 
     @property
     def certified(self) -> bool:
-        """Whether files say how much attempts bear, see `schema.HOLD_FIELDS`."""
+        """Whether files store the disturbance that attempts tolerate (`schema.HOLD_FIELDS`)."""
         return self.repeats > 0 and self.share is not None
 
 
@@ -415,8 +419,8 @@ class CameraConfig(_Section):
         return self
 
 
-#: The light from above stays above the horizon [deg]: it usually comes 26.6 degrees from the
-#: vertical.
+#: Largest angle of the light from its usual direction, which is 26.6 degrees from the vertical, so
+#: that the light stays above the horizon [deg].
 MAX_LIGHT_ANGLE = 60.0
 
 
@@ -426,26 +430,26 @@ def _rising(limits: tuple[float, float]) -> tuple[float, float]:
     return limits
 
 
-#: Least and largest value of a uniform draw.
+#: Smallest and largest value of a uniform draw.
 Range = Annotated[tuple[Positive, Positive], AfterValidator(_rising)]
 
 
 class RandomizeConfig(_Section):
-    """What is drawn anew for each attempt; see docs/explanation/randomization.md.
+    """Conditions that are drawn for each attempt; see docs/explanation/randomization.md.
 
-    Null or 0 switches a draw off. The defaults are all off; what the preset `randomized` draws has
-    its sources there.
+    Null or 0 switches a draw off. By default all draws are off; that page lists the sources of the
+    preset `randomized`.
     """
 
-    object_colour: Share = 0.0  # of a random colour in the object's; 1: any colour
-    table_colour: Share = 0.0  # of a random colour in the table's
-    # At most, of the light from above from where it usually comes.
+    object_colour: Share = 0.0  # fraction of a random colour in the object's colour; 1: any
+    table_colour: Share = 0.0  # fraction of a random colour in the table's colour
+    # Largest angle between the light from above and its usual direction.
     light_angle_deg: Annotated[float, Field(ge=0.0, le=MAX_LIGHT_ANGLE)] = 0.0
     light_strength: Range | None = None  # factor of the light from above
     camera_shift: NonNegative = 0.0  # [m] at most, along each axis of the camera
     camera_turn_deg: Annotated[float, Field(ge=0.0, le=90.0)] = 0.0  # at most, about each axis
     depth_noise: Range | None = None  # [1/m], standard deviation of depth over depth squared
-    depth_baseline: NonNegative = 0.0  # [m], of the depth camera: where its projector is hidden
+    depth_baseline: NonNegative = 0.0  # [m], between the depth camera and its projector
     friction_hand: Range | None = None  # factor of the coefficient
     friction_table: Range | None = None  # factor of the coefficient
     mass: Range | None = None  # factor of the object's mass and inertia
@@ -454,16 +458,17 @@ class RandomizeConfig(_Section):
 class ScenesConfig(_Section):
     """The scenes of scenes.hdf5 and their cameras; see docs/how-to/train-on-scenes.md."""
 
-    # "assembled" makes the file whenever a dataset is assembled, "asked" for `drakegrasp scenes`.
+    # "assembled" writes the file whenever a dataset is assembled, "asked" only for `drakegrasp
+    # scenes`.
     when: Literal["asked", "assembled"] = "asked"
     place: NonNegative = 0.1  # [m] at most, of the object from T along each axis of the table
-    views: Annotated[int, Field(ge=1, le=1000)] = 16  # of a scene to train on
-    distance: Range = (0.4, 0.9)  # [m] of the camera from the point that it looks at
+    views: Annotated[int, Field(ge=1, le=1000)] = 16  # of a training scene
+    distance: Range = (0.4, 0.9)  # [m] of the camera from the point at which it looks
     elevation_deg: Annotated[
         tuple[Annotated[float, Field(ge=0.0, le=90.0)], Annotated[float, Field(ge=0.0, le=90.0)]],
         AfterValidator(_rising),
     ] = (20.0, 85.0)  # of the camera above that point
-    aim: NonNegative = 0.05  # [m] at most, of that point from the object along each axis
+    aim: NonNegative = 0.05  # [m] at most, of this point from the object along each axis
     roll_deg: Annotated[float, Field(ge=0.0, le=180.0)] = 15.0  # at most, about the line of sight
     width: Annotated[int, Field(ge=8, le=2048)] = 320  # [px]
     height: Annotated[int, Field(ge=8, le=2048)] = 240  # [px]
@@ -479,8 +484,8 @@ class ScenesConfig(_Section):
 
 
 class _Filters(_ExtensibleSection):
-    # "held" switches the rules of the hold off: every success that the filters of images and
-    # contacts keep.
+    # "held" switches off the rules on how well the object is held: every success that the filters
+    # of images and contacts keep becomes a sample.
     require: Literal["held", "limits"] = "limits"
 
     if TYPE_CHECKING:
@@ -505,7 +510,7 @@ def _filter_config() -> type[_Filters]:
         kind = _KINDS[limit.kind] | None if limit.off == "null" else _KINDS[limit.kind]
         told = _told_unless(limit.default) if limit.later else Decides()
         settings[name] = (Annotated[kind, told], limit.default)
-    # Filters of the user's own: `file.py:Name`, or the name of a rule of another package.
+    # User-defined filters: `file.py:Name`, or the name of a rule of another package.
     own = Annotated[tuple[str, ...], BeforeValidator(_own_filters), _told_unless(())]
     settings["own"] = (own, ())
     doc = "Which successes become samples, decided when the files are assembled; null: no limit."
@@ -521,15 +526,17 @@ else:
 class SplitConfig(_Section):
     """How the samples are split for training, validation and test; docs/reference/outcomes.md."""
 
-    # class: the paper's rule. object: whole objects are drawn. auto: by object where each class
-    # has one mesh and no class is named in `train_classes`, else by class.
+    # class: the paper's rule. object: whole objects are drawn. auto: by object if each class has
+    # one mesh and `train_classes` names no class, otherwise by class.
     by: Literal["auto", "class", "object"] = "auto"
-    # Of the objects; without effect by class, where one object of each class is tested.
+    # Fraction of the objects; without effect in a split by class, which tests one object of each
+    # class.
     test_fraction: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.15
-    # Of the objects; by class, of the samples that do not test.
+    # Fraction of the objects; in a split by class, fraction of the samples that are not for
+    # testing.
     valid_fraction: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
-    # By class: names of the classes that train, with their only object too; None: all with two or
-    # more.
+    # In a split by class: names of the classes that are used for training, even with a single
+    # object; None: all classes with two or more objects.
     train_classes: tuple[str, ...] | None = None
 
     @model_validator(mode="after")
@@ -547,47 +554,49 @@ class SplitConfig(_Section):
 class VerifyConfig(_Section):
     """How predicted grasps are tried and judged; see docs/how-to/verify-predictions.md."""
 
-    max_contact_error: Positive = 0.02  # [m], of a success's contacts from those asked for
-    open_margin_deg: Positive = 20.0  # by which fingers are opened first; 1 rad as 0.1 m of a slide
-    # Wrist poses that are simulated until one holds; 1: the best fit alone, which decides success.
+    max_contact_error: Positive = 0.02  # [m], between reached and requested contacts of a success
+    open_margin_deg: Positive = 20.0  # of opening the fingers first; 0.1 m of a slide is 1 rad
+    # Maximum number of wrist poses that are simulated until one holds; 1: only the best fit, which
+    # decides success.
     max_tries: Annotated[int, Field(ge=1, le=5)] = 5
 
 
-#: Palm poses in the first work unit of an object, and the most in one.
+#: Number of palm poses in the first work unit of an object, and the largest number in a unit.
 UNIT_CANDIDATES, LARGEST_UNIT = 50, 400
 
 
-#: A hand of the package.
+#: The default hand, one of the package.
 DEFAULT_HAND = "barrett"
 
 
 @dataclass(frozen=True, kw_only=True)
 class CarriedHand:
-    """A hand whose files lie in a dataset, which may be a stranger's.
+    """A hand whose files are in a dataset, which may be from others.
 
     Attributes:
-        path: Its hand file, in the folder that holds all its files.
-        digest: What the dataset says of them, see `drakegrasp.hand.folder.hand_digest`.
+        path: Path of its hand file, in the folder that holds all files of the hand.
+        digest: Digest of these files that the dataset states, see
+            `drakegrasp.hand.folder.hand_digest`.
     """
 
     path: Path
     digest: str
 
 
-#: What names a hand: one of the package, a hand file, or one that a dataset carries.
+#: Source of a hand: the name of a hand of the package, a hand file, or the hand of a dataset.
 HandSource = str | Path | CarriedHand
 
 
 class Config(_Section):
-    """Everything that decides what is in a dataset, except the meshes."""
+    """All settings that determine the content of a dataset, except the meshes."""
 
-    # A hand in drakegrasp/models, or a path to a hand's YAML; that of a dataset's own hand is
-    # relative to the dataset.
+    # Name of a hand in drakegrasp/models, or the path of a hand file; the path of a dataset's own
+    # hand is relative to the dataset.
     hand: str = DEFAULT_HAND
     seed: Seed = 0
-    # Candidates in a work unit; None: 50, growing up to 400.
+    # Number of candidates in a work unit; None: 50, growing up to 400.
     unit_candidates: Count | None = None
-    # [s] of computing (CPU time) before an attempt is a `timeout`
+    # [s] of CPU time after which an attempt is a `timeout`
     attempt_seconds: Annotated[Positive, NO_SHARD] = 60.0
     objects: ObjectConfig = ObjectConfig()
     builtin: BuiltinConfig = BuiltinConfig()
@@ -598,18 +607,19 @@ class Config(_Section):
     screen: ScreenConfig = ScreenConfig()
     close: CloseConfig = CloseConfig()
     lift: LiftConfig = LiftConfig()
-    # Without repeats its noise is not used.
+    # Without repeats the noise is not used.
     certify: Annotated[CertifyConfig, Decides(shards=lambda _, it: it.repeats)] = CertifyConfig()
     camera: CameraConfig = CameraConfig()
     randomize: Annotated[RandomizeConfig, _counts_unless(RandomizeConfig())] = RandomizeConfig()
     scenes: Annotated[ScenesConfig, NO_SHARD, _told_unless(ScenesConfig())] = ScenesConfig()
-    # Successes per object after which no more are tried.
+    # Number of successes of an object after which it is no longer tried.
     max_grasps: Annotated[Count | None, NO_SHARD] = None
-    # Samples, before the filter of outliers, after which no more is tried: of all objects, which
-    # share them in turns, and of each; an object may have fewer.
+    # Number of samples, before the filter of outliers, after which a build stops: of all objects
+    # together, which contribute in turns, and of each object. An object may have fewer.
     samples: Annotated[Count | None, NO_SHARD] = None
     samples_per_object: Annotated[Count | None, NO_SHARD] = None
-    # Palm poses in a row without a sample after which an object is given up for such a number.
+    # Number of consecutive palm poses without a sample after which an object is given up, if a
+    # number of samples is set.
     samples_patience: Annotated[Count, NO_SHARD] = 400
     filters: Annotated[FilterConfig, NO_SHARD] = FilterConfig()
     split: Annotated[SplitConfig, NO_SHARD] = SplitConfig()
@@ -618,11 +628,11 @@ class Config(_Section):
 
     @property
     def hand_source(self) -> str | CarriedHand:
-        """What to load the hand from: the dataset that carries it, or what `hand` names."""
+        """Source of the hand: the dataset that contains it, or the value of `hand`."""
         return self._carried or self.hand
 
     def with_hand(self, hand: str, source: HandSource | None = None) -> Config:
-        """Return the configuration with another hand, which a dataset carries if `source` does."""
+        """Return the configuration with another hand; `source` may be the hand of a dataset."""
         config = self.model_copy(update={"hand": hand})
         config._carried = source if isinstance(source, CarriedHand) else None
         return config
@@ -637,7 +647,7 @@ class Config(_Section):
                 f"got {self.filters.min_depth_variance}"
             )
 
-        # Or among the lifts that were ended.
+        # It may also be among the lifts that were ended early.
         if self.lift.stop_when == "never":
             return self
         if self.filters.require == "held":
@@ -657,28 +667,28 @@ class Config(_Section):
     def to_dict(self) -> dict[str, Any]:
         """Return the resolved values as plain JSON types.
 
-        What is marked with `Decides` leaves no trace where files do not say it. `parse_stored`
-        reads it.
+        Values whose mark `Decides` excludes them from files are omitted. `parse_stored` is the
+        inverse.
         """
         return self.tree()
 
     @property
     def certified(self) -> bool:
-        """Whether files say how much attempts bear, see `schema.HOLD_FIELDS`."""
+        """Whether files store the disturbance that attempts tolerate (`schema.HOLD_FIELDS`)."""
         return self.certify.certified
 
     @property
     def has_target(self) -> bool:
-        """Whether it says after how many samples to stop."""
+        """Whether a number of samples is set after which a build stops."""
         return self.samples is not None or self.samples_per_object is not None
 
     @property
     def code(self) -> Mapping[str, str]:
-        """Text of the files of the user's own classes, by their names."""
+        """Source texts of the files of user-defined classes, by name."""
         return {**self.candidates.code, **self.filters.code}
 
     def with_code(self, code: Mapping[str, str]) -> Config:
-        """Return the configuration with the texts of classes; each section keeps its own."""
+        """Return the configuration with source texts; each section keeps those of its classes."""
         named = (("candidates", self.candidates.methods), ("filters", self.filters.own))
         update = {
             key: getattr(self, key).with_code({n: code[n] for n in names if n in code})
@@ -689,9 +699,9 @@ class Config(_Section):
     def unit_ranges(self, candidates: int) -> Iterator[range]:
         """Yield the work units of an object, as ranges of its candidates.
 
-        The units of an object grow from 50 to 400 candidates: fewer files and tasks, and an object
-        that has enough grasps at once is not tried for long. Only the last one depends on the
-        number of candidates, so that a dataset can grow.
+        The units of an object grow from 50 to 400 candidates. So there are few files and tasks, and
+        an object that soon has enough grasps is not tried for a long time. Only the last unit
+        depends on the number of candidates, so that a dataset can grow.
 
         Args:
             candidates: Number of candidates of the object.
@@ -705,10 +715,11 @@ class Config(_Section):
             start += size
 
     def simulation_hash(self) -> str:
-        """Return the hash (16 hex digits) of every value that decides what a shard holds.
+        """Return the hash (16 hex digits) of all values that affect the content of shards.
 
-        Left out is what its mark says, see `Decides`. A hand's files count by their digest, which
-        is in the manifest's versions, and not by their folder.
+        The marks of the fields determine the omitted values, see `Decides`. The hash contains the
+        name of the hand file, but not its folder; the digest of the hand's files is in the
+        manifest's versions.
         """
         values = {**self.tree(shards=True), "hand": PurePath(self.hand).stem}
         canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
@@ -728,24 +739,24 @@ def preset_names() -> list[str]:
 
 
 def with_whole_lifts(config: Config) -> Config:
-    """Return a configuration that lifts each closed hand until it is certain whether it holds."""
+    """Return a configuration that lifts each closed hand until its result is certain."""
     lift = config.lift.model_copy(
         update={"stop_when": "never", "least_chance": 0.0, "least_depth_variance": 0.0}
     )
     return config.model_copy(update={"lift": lift})
 
 
-#: Samplers of the preset `fast` before it had `above`.
+#: Samplers of the preset `fast` in versions without the sampler `above`.
 _FAST_BEFORE = ("normals",) * 7 + ("rotations",)
 
 
 def continued(config: Config, known: Config) -> Config:
-    """Return the configuration with which a build continues a dataset: by the rules it began with.
+    """Return the configuration with which a build continues a dataset.
 
     Args:
-        config: Of the build. What it only has by default, or by the preset `fast`, gives way to
-            what the dataset began with.
-        known: Of the dataset.
+        config: Configuration of the build. Values that are only defaults, or only those of the
+            preset `fast`, are replaced by the values with which the dataset began.
+        known: Configuration of the dataset.
     """
     by_default = config.close.scrape_depth == CloseConfig().scrape_depth
     if known.close.scrape_depth is None and by_default:
@@ -763,7 +774,7 @@ def parse_config(tree: dict[str, Any], context: str | None = None) -> Config:
 
     Args:
         tree: The values.
-        context: `_STORED` if they are those of a dataset.
+        context: `_STORED` if the values are read from a dataset.
 
     Raises:
         ConfigError: See `load_config`.
@@ -785,10 +796,11 @@ def parse_config(tree: dict[str, Any], context: str | None = None) -> Config:
 
 
 def parse_stored(tree: Any) -> Config:
-    """Return the configuration that a file of a dataset holds, as JSON.
+    """Return the configuration that a file of a dataset stores as JSON.
 
-    Without `certify.share` it was written when successes were certified otherwise; without
-    `close.scrape_depth`, when hands might come below the table's top while they closed.
+    A configuration without `certify.share` is from a version that certified successes in another
+    way. One without `close.scrape_depth` is from a version that did not check whether hands came
+    below the table's top while they closed.
 
     Raises:
         ConfigError: See `load_config`.
@@ -802,12 +814,12 @@ def parse_stored(tree: Any) -> Config:
 
 
 def read_settings(source: str | Path) -> dict[str, Any]:
-    """Return the tree of values in a preset or a YAML file.
+    """Return the tree of values of a preset or a YAML file.
 
     Raises:
-        ConfigError: If there is no such preset or file, or it holds no mapping.
+        ConfigError: If there is no such preset or file, or its content is not a mapping.
     """
-    # A preset's name, or a path.
+    # The source is the name of a preset, or a path.
     preset = resources.files("drakegrasp") / "presets" / f"{source}.yaml"
     if isinstance(source, str) and source in preset_names():
         text, name = preset.read_text(encoding="utf-8"), source
@@ -823,7 +835,7 @@ def read_settings(source: str | Path) -> dict[str, Any]:
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigError(f"{path}: must be a readable UTF-8 file, got: {error}") from None
 
-    # The text must be a YAML mapping; an empty file is one without keys.
+    # The text must be a YAML mapping; an empty file counts as a mapping without keys.
     try:
         tree = parse_yaml(text)
     except yaml.YAMLError as error:
@@ -849,11 +861,11 @@ def apply_override(tree: dict[str, Any], text: str) -> None:
     """Set a value in a tree.
 
     Args:
-        tree: Is changed.
-        text: `"a.b=c"`, c read as YAML.
+        tree: Tree of values, which is modified.
+        text: `"a.b=c"`, where c is read as YAML.
 
     Raises:
-        ConfigError: If the text is of another form, or a section of the path is a value.
+        ConfigError: If the text has another form, or a section of the path is a value.
     """
     path, separator, value = text.partition("=")
     keys = path.strip().split(".")
@@ -872,12 +884,12 @@ def apply_override(tree: dict[str, Any], text: str) -> None:
 
 
 def describe_mistake(mistake: Any, *, whole: str, legal: str) -> str:
-    """Return one mistake in a YAML file as `path: must ..., got ...`.
+    """Return the description of a mistake in a YAML file, `path: must ..., got ...`.
 
     Args:
         mistake: An item of pydantic's `ValidationError.errors()`.
-        whole: What to call the top level, whose path is empty.
-        legal: What an unknown key must be instead, e.g. "a known key (seed, hand)".
+        whole: Name of the top level, whose path is empty.
+        legal: Description of legal keys, for unknown ones, e.g. "a known key (seed, hand)".
     """
     path = ".".join(str(part) for part in mistake["loc"]) or whole
     kind, context = mistake["type"], mistake.get("ctx", {})
@@ -905,7 +917,7 @@ def describe_mistake(mistake: Any, *, whole: str, legal: str) -> str:
 
 
 def _shown(value: Any) -> str:
-    """Return a value as errors show it, shortened; Python refuses to print huge integers."""
+    """Return the shortened value for an error message; Python cannot print huge integers."""
     try:
         return repr(value)[:LONGEST_SHOWN]
     except ValueError:
@@ -913,7 +925,7 @@ def _shown(value: Any) -> str:
 
 
 def _siblings(place: tuple[Any, ...]) -> list[str]:
-    """Return the known keys of the section that holds a path of the configuration."""
+    """Return the known keys of the section that contains a path of the configuration."""
     inside = len(place) > 1 and _is_section(place[0])
     section: Any = Config.model_fields[place[0]].annotation if inside else Config
     return list(section.model_fields)
@@ -925,10 +937,11 @@ FLAT_STANDOFFS = "candidates.standoffs=[0.095,0.1,0.105]"
 
 
 def ways_to_grasps(config: Config | None = None) -> str:
-    """Return what gives grasps of an object that has none, what helps most first.
+    """Return advice for an object without grasps, with the most helpful measure first.
 
     Args:
-        config: What it says already is left out; None: nothing is known.
+        config: Configuration of the build, whose settings are not proposed again; None if it is
+            unknown.
     """
     ways = []
     rules = None if config is None else config.candidates
