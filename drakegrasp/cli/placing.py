@@ -6,6 +6,7 @@ Whatever is wrong with the files or the options is a `GraspError`, `MeshError`, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from drakegrasp.exchange.contacts import HDF5_SUFFIXES, read_numbers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import find_mesh
-from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.attempts import Attempts, ranked
 from drakegrasp.simulation.placement import place_object
 from drakegrasp.verification.placing import (
     PlacedGrasp,
@@ -59,7 +60,7 @@ def place_requested(
         path = _dataset_of(request, postures)
         if path is None:
             return _place_on_mesh(request)
-        if postures and not has_rows(request.grasps):
+        if postures and request.split is None and not has_rows(request.grasps):
             return _place_on_objects(request, path)
         return _place_on_rows(request, path)
     except DataError as error:
@@ -102,8 +103,6 @@ def _posture_dataset(request: VerifyRequest) -> Path | None:
     if request.dataset is not None:
         given = {"units": request.units, "hand": request.hand, "config": request.config}
         _refuse_given("left out with postures and --dataset", **given)
-        if not has_rows(request.grasps):
-            _refuse_given("given with `row` in the postures", split=request.split)
     return request.dataset
 
 
@@ -135,7 +134,7 @@ def _place_on_mesh(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config, N
     if table.of_row is not None:
         raise GraspError("rows must be in a file of grasps for --dataset only, got rows")
     placed = place_on_object(
-        table,
+        _ranked(table, table.objects),
         place_object(request.mesh, units=request.units, config=config),
         frame=request.frame or "object",
         X_TC=None if request.camera is None else read_numbers(request.camera),
@@ -168,7 +167,7 @@ def _place_on_rows(
     )
     rows = choose_rows(data, _rows_of(request, table.of_row), len(table))
     placed = place_on_rows(
-        table,
+        _ranked(table, rows),
         data,
         rows,
         frame=request.frame or "camera",
@@ -194,6 +193,7 @@ def _place_on_objects(
     )
     _say_nameless(table)
     own = config if request.overrides else None
+    table = _ranked(table, table.objects)
     return place_on_dataset(table, out, own, overrides=request.overrides), config, None
 
 
@@ -253,6 +253,11 @@ def _of_object(request: VerifyRequest, name: str, hand: Hand) -> Attempts:
         raise GraspError(f"{path}: postures must be of {name}, the --object, got {listed(others)}")
     say(f"{path}: postures of {others[0]} are tried on {name}, the --object", err=True)
     return table
+
+
+def _ranked(table: Attempts, of: Sequence[str] | npt.NDArray[np.int64]) -> Attempts:
+    """Return a table with the ranks by the confidence that a file states, if it does."""
+    return table if table.confidence is None else ranked(table, of)
 
 
 def _say_nameless(table: Attempts) -> None:

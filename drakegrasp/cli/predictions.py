@@ -60,7 +60,8 @@ def verify(
     fingers.
 
     GRASPS may also be a file or a folder of postures, as for `build --postures`. They are tried on
-    --object, or on the objects of --dataset that the file names or gives by `row`.
+    --object, or on the objects of --dataset that the file names or gives by `row`; with --split on
+    the rows of their objects, as by `drakegrasp score`. Confidence that a file states ranks them.
 
     With a protocol other than lift, only the first wrist pose that fits the contacts is tried.
     GRASPS may then be a .npy file of DexGraspBench or a folder of such files, and --hand an MJCF
@@ -171,6 +172,8 @@ def _verify_by_lift(
         say(str(path))
     if not quiet:
         make_console(stderr=True).print(verdict_table(results))
+        if best := [result.held for result in results if result.rank == 0]:
+            say(f"{sum(best)} of {len(best)} grasps that are ranked first hold", err=True)
         for hint, count in count_hints(result.hints for result in results):
             say(f"{count} of {len(results)} grasps would fit much better: {hint}", err=True)
         if lost := sum(result.misplaced and not result.hints for result in results):

@@ -647,6 +647,12 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
     Field("held_any", "", "bool", "-", "-",
           "whether any of the wrist poses that were tried holds: an oracle's choice",
           of="held_any"),
+    Field("confidence", "", "float64", "-", "-",
+          "what the file of the grasps states; NaN: nothing", of="confidence",
+          shown=Shown("confidence", digits=3)),
+    Field("rank", "", "int64", "-", "-",
+          "rank by confidence among those for the same row, or of the same object without rows, 0 "
+          "for the best; -1 where none is stated", of="rank"),
     Field("reason", "", "str", "-", "-", "why, in words", of="reason"),
     Field("hints", "", "str", "-", "-",
           "what would make a grasp that fails fit much better, in words", of="hint_text"),

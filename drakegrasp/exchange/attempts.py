@@ -13,6 +13,7 @@ import hashlib
 import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, TextIO
@@ -45,6 +46,7 @@ from drakegrasp.simulation.attempts import (
     join_attempts,
     make_attempts,
     quaternion_poses,
+    read_confidence,
     taken,
     xyzw_poses,
 )
@@ -109,7 +111,10 @@ def read_attempts(
         with named(path):
             if several and data is not None:
                 return read_several(**said, fingers=hand.num_fingers, data=data)
-            return read_grasps(said["grasps"], hand.num_fingers, rows=said["rows"])
+            table = read_grasps(said["grasps"], hand.num_fingers, rows=said["rows"])
+            if (stated := said["confidence"]) is None:
+                return table
+            return replace(table, confidence=read_confidence(stated, len(table)))
 
     # Postures of a file, or of all files of a folder.
     read_as = read_as or {}
@@ -164,6 +169,9 @@ def _as_asked(raw: dict[str, Any], read_as: Mapping[str, str]) -> dict[str, Any]
     """Return what a file says with what the caller says, see `read_attempts`."""
     if "frame" in read_as:
         raw["frame"] = read_as["frame"]
+    if read_as.get("frame") == "object" and raw.get("scale") is not None:
+        # Meshes in {O} are exported in metres, whatever the unit of their sources.
+        raw["scale"] = np.where(np.asarray(raw["scale"]) == 1.0, np.nan, raw["scale"])
     if "link" in read_as:
         raw["link"] = _link([read_as["link"]])
     if shape := read_as.get("preshape"):
@@ -198,8 +206,7 @@ def _named(raw: dict[str, Any], of: str | None) -> dict[str, Any]:
     objects = [name or of or "" for name in raw["objects"]]
     if raw.get("of_row") is not None and not any(objects):
         raise GraspError("postures must name an object in each row, got rows of a dataset alone")
-    # What a file says for a score is not asked.
-    return {**raw, "objects": objects, "of_row": None, "confidence": None}
+    return {**raw, "objects": objects, "of_row": None}
 
 
 def _made(hand: Hand, raw: dict[str, Any]) -> Attempts:
@@ -302,7 +309,8 @@ def holds_postures(path: Path) -> bool:
             return is_grasp_file(path) or _poses_alone(path) is not None
         if suffix in ARRAYS[1:] and path.is_file():
             with open_hdf5(path) as file:
-                return not {"q_grasp", "X_FG", "quaternion"}.isdisjoint(file)
+                named = {"q_grasp", "X_FG", "quaternion"}
+                return not named.isdisjoint(file) or is_graspgen(file)
         if suffix in TABLES and path.is_file():
             return bool({"object", "qw"} & set(_column_names(path)))
     except MachineError:
@@ -310,6 +318,11 @@ def holds_postures(path: Path) -> bool:
     except Exception as error:  # parsers raise all kinds of exceptions on foreign bytes
         raise GraspError(f"{path}: {one_line(error)}") from None
     return suffix in suffixes() and suffix not in (".npy", *ARRAYS[1:], *TABLES)
+
+
+def is_graspgen(file: h5py.File) -> bool:
+    """Return whether an HDF5 file has the predictions of GraspGen."""
+    return {"misc", "objects"} <= set(file)
 
 
 def has_rows(path: Path) -> bool:
@@ -321,6 +334,9 @@ def has_rows(path: Path) -> bool:
     if path.is_dir():
         return False
     with named(path):
+        if path.suffix.lower() in ARRAYS[1:]:
+            with open_hdf5(path) as file:
+                return "row" in file
         if path.suffix.lower() in ARRAYS:
             return "row" in _read_arrays(path)
         return path.suffix.lower() in TABLES and "row" in _column_names(path)
@@ -360,11 +376,11 @@ def _read_arrays(path: Path) -> dict[str, Any]:
     try:
         if path.suffix.lower() == ".npz":
             with path.open("rb") as raw, ZipFile(raw) as packed:
-                _refuse_large(sum(item.file_size for item in packed.infolist()))
+                refuse_large(sum(item.file_size for item in packed.infolist()))
             with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
                 return {name: file[name] for name in file.files}
         with open_hdf5(path) as file:
-            _refuse_large(sum(getattr(file[name], "nbytes", 0) for name in file))
+            refuse_large(sum(getattr(file[name], "nbytes", 0) for name in file))
             return {name: _dataset(file[name]) for name in file}
     except Exception as error:  # parsers raise all kinds of exceptions on foreign bytes
         raise GraspError(f"must be a readable file of arrays, got: {one_line(error)}") from None
@@ -384,7 +400,7 @@ def _poses_alone(path: Path) -> Array | None:
         return None
 
 
-def _refuse_large(size: int) -> None:
+def refuse_large(size: int) -> None:
     """Refuse arrays that are larger than any postures: a small file can unpack to terabytes."""
     if size > MOST_BYTES:
         raise GraspError(f"arrays must be at most {MOST_BYTES:.0e} bytes, got {size:.1e}")
@@ -542,7 +558,7 @@ def _read_columns(path: Path) -> tuple[dict[str, list[Any]], list[str]]:
         parquet = _parquet()
         try:
             said = parquet.read_metadata(path)
-            _refuse_large(8 * said.num_rows * said.num_columns)
+            refuse_large(8 * said.num_rows * said.num_columns)
             table = parquet.read_table(path)
             return dict(table.to_pydict()), [""] * table.num_rows
         except Exception as error:

@@ -63,10 +63,13 @@ QUANTITIES = {
     "contact_error": NUMBERS["contact_error"],
     "normal_error": NUMBERS["normal_error"],
     "true_error": Shown("asked to true", "mm"),
-    **{name: NUMBERS[name] for name in ("surface_distance", "slip", "turn", "smallest_friction")},
+    **{
+        name: NUMBERS[name]
+        for name in ("surface_distance", "slip", "turn", "confidence", "smallest_friction")
+    },
 }
 #: Quantities on cards.
-_CARD = ("contact_error", "true_error", "slip", "turn")
+_CARD = ("contact_error", "true_error", "slip", "turn", "confidence")
 #: Words of a verdict on a held grasp; and all words, for filtering.
 WORDS = ("held", "success", "precision", "stable", "sample")
 VERDICTS = ("fails", *WORDS, "held_any")

@@ -27,33 +27,15 @@ from drakegrasp.frames import Array, as_numbers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.protocols.protocol import PostureVerdict
-from drakegrasp.simulation.attempts import EACH, Attempts
+from drakegrasp.simulation.attempts import EACH, Attempts, ranked
 from drakegrasp.verification.placing import PlacedGrasp, dataset_config, read_several
 from drakegrasp.verification.result import Verification
 
 
 def rank(table: Attempts) -> Attempts:
-    """Return predictions for rows of a split in the order of rows, and of ranks within a row.
-
-    The best are first, by their confidence; of equals the one that was given first. Confidence that
-    is no finite number becomes -inf.
-
-    Raises:
-        GraspError: If confidence is not one number per prediction.
-    """
-    stated = None
-    if table.confidence is not None:
-        stated = as_numbers(table.confidence, "confidence must be numbers")
-        if stated.shape != (len(table),):
-            raise GraspError(
-                f"confidence must be ({len(table)},), one per grasp, got {stated.shape}"
-            )
-        stated = np.where(np.isfinite(stated), stated, -np.inf)
-    falling = np.zeros(len(table)) if stated is None else -stated
-    order = np.lexsort((np.arange(len(table)), falling, table.of_row))
-    _, starts, counts = np.unique(table.of_row[order], return_index=True, return_counts=True)
-    ranks = np.arange(len(table)) - np.repeat(starts, counts)
-    return replace(replace(table, confidence=stated).at(order.tolist()), rank=ranks)
+    """Return predictions for rows of a split in the order of rows, and of ranks within a row."""
+    table = ranked(table, table.of_row)
+    return table.at(np.lexsort((table.rank, table.of_row)).tolist())
 
 
 def rank_array(

@@ -21,7 +21,15 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.errors import NAMED, GraspError, listed
-from drakegrasp.frames import FARTHEST, NO_MESH_FRAME, X_WT, Array, invert_pose, make_pose
+from drakegrasp.frames import (
+    FARTHEST,
+    NO_MESH_FRAME,
+    X_WT,
+    Array,
+    as_numbers,
+    invert_pose,
+    make_pose,
+)
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
@@ -97,7 +105,7 @@ class Attempts:
         points, normals: (n, k, 3), contact points [m] and unit normals in the frame of the
             caller; NaN in rows without a valid grasp.
         normalised: (n,), whether a normal was not of unit length.
-        rank: (n,), for predictions to score: 0 for the best prediction of its row.
+        rank: (n,), for predictions: 0 for the best prediction of its row or object, see `ranked`.
         file, sha256: Source of predictions to score, and its hash.
     """
 
@@ -265,6 +273,27 @@ class Attempts:
         return digest.hexdigest()[:16]
 
 
+def ranked(table: Attempts, of: Sequence[Any] | npt.NDArray[Any]) -> Attempts:
+    """Return a table with the rank of each row among those that are for the same.
+
+    The best is first, by its confidence; of equals the one that was given first. Confidence that is
+    no finite number becomes -inf.
+
+    Args:
+        table: The attempts.
+        of: (n,), what each is for.
+    """
+    stated = table.confidence
+    if stated is not None:
+        stated = np.where(np.isfinite(stated), stated, -np.inf)
+    _, number, counts = np.unique(np.asarray(of), return_inverse=True, return_counts=True)
+    falling = np.zeros(len(table)) if stated is None else -stated
+    order = np.lexsort((falling, number))
+    ranks = np.zeros(len(table), dtype=np.int64)
+    ranks[order] = np.arange(len(table)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return replace(table, confidence=stated, rank=ranks)
+
+
 def taken(value: Any, rows: Sequence[int]) -> Any:
     """Return some rows of a column: an array, a tuple or a list."""
     if isinstance(value, np.ndarray):
@@ -371,10 +400,22 @@ def make_attempts(
         X_TO=_poses(X_TO, count, "X_TO", bad, some=True),
         invalid=tuple(bad),
         of_row=of_row,
-        confidence=confidence,
+        confidence=None if confidence is None else read_confidence(confidence, count),
         link=link or "",
         X_FG_xyzw=X_FG_xyzw,
     )
+
+
+def read_confidence(stated: Any, count: int) -> Array:
+    """Return the confidence (n,) that is stated of as many rows; NaN: none is.
+
+    Raises:
+        GraspError: If it is not one number per row.
+    """
+    confidence = as_numbers(stated, "confidence must be numbers")
+    if confidence.shape != (count,):
+        raise GraspError(f"confidence must be ({count},), one per grasp, got {confidence.shape}")
+    return confidence
 
 
 def _refuse_table(count: int, frame: str, X_TC: npt.ArrayLike | None) -> None:

@@ -95,6 +95,9 @@ class Verification:
         seconds: Wall-clock time by stage [s].
         stand: Index of the resting pose of this verdict: the best of those in which a posture was
             tried.
+        confidence: Confidence of the grasp in the caller's file; NaN if the file has none.
+        rank: Rank by confidence among the grasps for the same row, or of the same object; 0 for the
+            best, -1 without confidence.
     """
 
     method: str
@@ -115,6 +118,8 @@ class Verification:
     smallest_friction: float = np.nan
     seconds: dict[str, float] = field(default_factory=dict)
     stand: int = 0
+    confidence: float = np.nan
+    rank: int = -1
 
     @property
     def success(self) -> bool:

@@ -152,6 +152,8 @@ def json_line(index: int, result: Verification) -> str:
         "reason": result.reason,
         "explain": result.explain(),
         "hints": list(result.hints),
+        **fields("confidence"),
+        "rank": None if result.rank < 0 else result.rank,
         **fields("held_any", "tries"),
         "outcomes": [each.trial.outcome.label for each in result.tries],
         **fields("X_TO", "p_OQ", "nhat_Q_O", "normalised", "snapped", "surface_distance"),

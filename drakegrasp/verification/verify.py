@@ -53,7 +53,8 @@ MARGINS = (1.0, 0.5)
 def verify_placed(grasp: PlacedGrasp) -> Verification:
     """Return whether a grasp holds its object; the contacts are rounded to 0.1 mm."""
     p_OQ, nhat_Q_O = grasp.contacts()
-    normalised = grasp.attempt.normalised
+    normalised, ranks = grasp.attempt.normalised, grasp.attempt.rank
+    stated = grasp.attempt.confidence
     base = Verification(
         method=grasp.method,
         outcome=Outcome.INVALID,
@@ -64,6 +65,8 @@ def verify_placed(grasp: PlacedGrasp) -> Verification:
         nhat_Q_O=nhat_Q_O,
         surface_distance=np.full(len(p_OQ), np.nan),
         normalised=normalised is not None and bool(normalised[0]),
+        confidence=np.nan if stated is None else float(stated[0]),
+        rank=-1 if stated is None or ranks is None else int(ranks[0]),
     )
     if grasp.invalid:
         return base

@@ -661,9 +661,12 @@ def test_samples_that_were_exported_come_back(exported, grasps):
             read_attempts(next(exported(form).rglob(ONE_FILE[form])), HAND)
 
 
-def test_what_a_file_says_for_a_score_is_not_asked(tmp_path):
-    """Not even how many values there are: a table of postures can still be cut."""
-    np.savez(tmp_path / "p.npz", **arrays(), row=[0], confidence=0.5)
+def test_without_a_dataset_rows_are_not_asked_and_confidence_is_one_per_row(tmp_path):
+    """Not even how many rows there are: a table of postures can still be cut."""
+    np.savez(tmp_path / "p.npz", **arrays(), row=[0], confidence=[0.5, 0.7])
     table = read_attempts(tmp_path / "p.npz", HAND)
-    assert (table.of_row, table.confidence) == (None, None)
-    assert len(table.at([0])) == 1
+    assert table.of_row is None
+    assert table.at([1]).confidence.tolist() == [0.7]
+    np.savez(tmp_path / "p.npz", **arrays(), confidence=0.5)
+    with pytest.raises(GraspError, match=r"confidence must be \(2,\), one per grasp, got \(\)"):
+        read_attempts(tmp_path / "p.npz", HAND)
