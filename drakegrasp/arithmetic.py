@@ -1,9 +1,9 @@
 """Matrix products, lengths and sines with the same bits on every CPU, BLAS and C library.
 
 BLAS, NumPy's sines and the C library choose their kernels by the CPU, and each kernel rounds
-differently. But IEEE 754 fixes sums, products, quotients and square roots if each is rounded by
-itself in a stated order; NumPy rounds after each call, so nothing is fused. Everything that is
-drawn, and everything that decides before a simulation begins, is computed with these functions.
+differently. But IEEE 754 determines sums, products, quotients and square roots if each is rounded
+separately in a fixed order. NumPy rounds after each call, so nothing is fused. All random draws and
+all decisions before a simulation are computed with these functions.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _COS = (
 def multiply(A: npt.ArrayLike, B: npt.ArrayLike) -> Array:
     """Return matrix products, as `A @ B` does; terms are added in the order of k.
 
-    Poses compose by it: `X_AC = multiply(X_AB, X_BC)`.
+    Poses are composed with it: `X_AC = multiply(X_AB, X_BC)`.
 
     Args:
         A: (..., n, k).

@@ -1,4 +1,4 @@
-"""The exception tree: everything that drakegrasp raises because of a caller's mistake.
+"""The exceptions that drakegrasp raises because of a caller's mistake.
 
 * DrakegraspError
   * ConfigError          a configuration value, key or preset that cannot be used
@@ -10,10 +10,10 @@
     * DiskFullError      no space left to write; the same command continues later
     * BlankImageError    OpenGL rendered a blank image
 
-Failures of the physics are not here: they are values, see `drakegrasp.outcomes`.
-Messages about an argument follow one pattern: which argument, what it must be, what it was.
-`first_line` and `one_line` quote errors of other libraries in our messages; `printable` makes
-texts of strangers safe to show.
+Failures of the physics are values and not exceptions, see `drakegrasp.outcomes`. Messages about an
+argument follow one pattern: which argument, what it must be, what it was. `first_line` and
+`one_line` quote errors of other libraries in our messages. `printable` makes texts of strangers
+safe to show.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from __future__ import annotations
 import codecs
 from collections.abc import Sequence
 
-#: A line that lists many names has this many of them.
+#: Maximum number of names in a line that lists names.
 NAMED = 10
-#: Most characters of a message that `one_line` keeps.
+#: Maximum number of characters of a message that `one_line` keeps.
 LONGEST_MESSAGE = 200
 
 
@@ -52,7 +52,7 @@ class GraspError(DrakegraspError, ValueError):
 
 
 class MachineError(DrakegraspError, RuntimeError):
-    """A resource that this machine lacks; the message says how to get it."""
+    """A resource that this machine lacks; the message states how to get it."""
 
 
 class DiskFullError(MachineError):
@@ -64,7 +64,7 @@ class BlankImageError(MachineError):
 
 
 def printable(text: str) -> str:
-    r"""Return a text whose control characters are shown as codes, e.g. \x1b, and do nothing."""
+    r"""Return a text whose control characters are replaced by harmless codes, e.g. \x1b."""
     return "".join(
         c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text
     )
@@ -76,7 +76,7 @@ def first_line(error: BaseException) -> str:
 
 
 def _said(error: BaseException) -> str:
-    """Return an error's message; Python's own about a text in another encoding helps nobody."""
+    """Return an error's message, or a clearer one for a text in another encoding than UTF-8."""
     if isinstance(error, UnicodeDecodeError) and error.encoding.startswith("utf-8"):
         wide = error.object.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         return f"text in {'UTF-16' if wide else 'another encoding'}: save it in UTF-8"
@@ -86,7 +86,7 @@ def _said(error: BaseException) -> str:
 def one_line(error: BaseException) -> str:
     """Return an error's whole message on one line, cut at `LONGEST_MESSAGE` characters.
 
-    For parsers, which say on later lines where in the file the mistake is.
+    It is for errors of parsers, whose later lines state where in the file the mistake is.
     """
     return " ".join(_said(error).split())[:LONGEST_MESSAGE] or type(error).__name__
 
@@ -97,11 +97,11 @@ def counted(count: int, noun: str, plural: str | None = None) -> str:
 
 
 def listed(names: Sequence[str], total: int | None = None) -> str:
-    """Return names in a line, of many only the first `NAMED` and how many more there are.
+    """Return names in one line: at most the first `NAMED`, and how many more there are.
 
     Args:
-        names: All of them, or at least the first `NAMED`.
-        total: How many there are; as many as are given if None.
+        names: All names, or at least the first `NAMED`.
+        total: Total number of names; None for the number of given names.
     """
     more = (len(names) if total is None else total) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {more:,} more" if more > 0 else "")

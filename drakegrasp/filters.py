@@ -1,12 +1,13 @@
 """Which successes become samples: the limits, the reasons, and the rules that apply them.
 
-A filter is a `Rule`: the columns that it needs, and which rows it refuses. A new one is one entry
-in `RULES`, with its reason in `Removal` and its limit in `LIMITS`; the configuration, the writer,
-verdicts, `check` and the docs follow. A filter removes a grasp from the two data files, never from
-trials.hdf5, and a removal has one reason: the first rule that refuses it. The filters of images and
-contacts are the paper's (Veres et al., "Postprocessing"); those of the hold are our own.
+A filter is a `Rule`: the columns that it needs, and the rows that it rejects. A new filter is one
+entry in `RULES`, with its reason in `Removal` and its limit in `LIMITS`; the configuration, the
+writer, verdicts, `check` and the docs follow. A filter removes a grasp from the two data files, but
+never from trials.hdf5. A removal has one reason: the first rule that rejects the grasp. The filters
+of images and contacts are the paper's (Veres et al., "Postprocessing"); the filters of the hold are
+our own.
 
-Pure functions of arrays; imports NumPy only.
+All functions are pure functions of arrays. The module imports only NumPy.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ Flags = npt.NDArray[np.bool_]
 
 
 class Removal(IntEnum):
-    """Why a success is not a sample, in the order of the filters but for the last."""
+    """Why a success is not a sample, in the order of the filters except for the last ones."""
 
     KEPT = 0
-    OTHER_LINKS = 1  # after the lift more than fingertips touch the object
+    OTHER_LINKS = 1  # links that are not fingertips touch the object after the lift
     SLID = 2  # the object moved too far in the hand
     TURNED = 3  # the object turned too far in the hand
     NOT_SEEN = 4  # the object is missing in an image
@@ -40,11 +41,11 @@ class Removal(IntEnum):
     NORMAL_OFF = 9  # a contact's mean normal is not that of the surface: its patches span an edge
     OUTLIER = 10  # a component of the grasp is too far from the mean of its object's grasps
     REJECTED = 11  # an inspection rejected it; the last of the filters
-    # Values are stored in files: a filter that came later has the next number, not the next place.
+    # Values are stored in files: a later filter has the next number, which is not its place.
     SUSPICIOUS = 12  # the suspicion score or a part of it is too high; before OUTLIER
     MISSING_FINGER = 13  # a fingertip that is not required does not touch; the first of all
-    REFINED_TEST = 14  # a refined palm pose whose split is test; after the split is drawn
-    OWN = 15  # a filter of the user's own does not keep it; before OUTLIER
+    REFINED_TEST = 14  # a refined palm pose in the test split; after the split is drawn
+    OWN = 15  # a user-defined filter does not keep it; before OUTLIER
     NEAR_CONE = 16  # a fingertip uses too much of its friction cone; before OUTLIER
 
     @property
@@ -58,12 +59,12 @@ class Limit:
     """A setting of the filters: `filters.NAME` of a configuration.
 
     Attributes:
-        default: Its value where a configuration gives none.
-        kind: Which numbers it may be.
-        meaning: What it limits, with its unit.
-        off: Which value switches it off, if one does.
-        later: Whether it came after the first datasets of this schema: where it has its default it
-            leaves no trace in a dataset, so that older ones are continued.
+        default: Value if a configuration gives none.
+        kind: Kind of numbers that are allowed.
+        meaning: What the setting limits, with its unit.
+        off: Value that switches the filter off, if there is one.
+        later: Whether it is newer than the first datasets of this schema. Its default is then not
+            stored in a dataset, so that older datasets can be continued.
     """
 
     default: float | None
@@ -94,7 +95,7 @@ LIMITS = {
     "max_normal_angle_deg": Limit(
         30.0, "positive", "between a contact's mean normal and the object's nearest face", "null"
     ),
-    # As thresholds the score and its parts also remove sound grasps: they are off.
+    # As thresholds, the score and its parts would also remove good grasps, so they are off.
     "max_suspicion": Limit(None, "positive", "score of dataset/quality.py", "null"),
     "max_penetration": Limit(None, "positive", "[m], of the object in a fingertip", "null"),
     "max_imbalance": Limit(
@@ -110,7 +111,7 @@ LIMITS = {
 
 
 class Limits(Protocol):
-    """Values of `LIMITS`, by their names: section `filters` of a configuration."""
+    """Values of `LIMITS` by their names: the section `filters` of a configuration."""
 
     @property
     def require(self) -> str:
@@ -124,11 +125,11 @@ class Rule:
     """A filter.
 
     Attributes:
-        removal: The reason that it gives.
-        needs: Names of the columns that it looks at; of a table without one it says nothing.
-        refuses: Given a table of n rows and the limits, which rows (n,) it refuses.
-        limit: Name of the limit that can switch it off; empty: it is always on.
-        of_hold: Whether it judges the hold, which `require: held` switches off.
+        removal: Reason of its removals.
+        needs: Names of the columns that it uses; it is not applied to a table without one of them.
+        refuses: Given a table of n rows and the limits, returns the rows (n,) that it rejects.
+        limit: Name of the limit that can switch it off; empty if it is always on.
+        of_hold: Whether it judges the hold; `require: held` switches such rules off.
     """
 
     removal: Removal
@@ -138,7 +139,7 @@ class Rule:
     of_hold: bool = False
 
     def is_on(self, limits: Limits) -> bool:
-        """Return whether the limits switch it on."""
+        """Return whether the limits switch the rule on."""
         if self.of_hold and limits.require == "held":
             return False
         if not self.limit:
@@ -156,9 +157,9 @@ def at_most(
     of_hold: bool = False,
     by_finger: bool = False,
 ) -> Rule:
-    """Return the rule that a value, times `scale`, is not above a limit; NaN is.
+    """Return the rule that a value, times `scale`, is at most a limit; it rejects NaN.
 
-    Of a number of each finger (n, k), `by_finger`, none may be that the grasp uses.
+    With `by_finger`, the value is a number per finger (n, k), and that of each used finger counts.
     """
 
     def refuses(t: Table, limits: Limits) -> Flags:
@@ -170,11 +171,11 @@ def at_most(
 
 
 def _not_finite(column: str) -> Rule:
-    """Return the rule that a contact of a used finger has a point and a normal."""
+    """Return the rule that each contact of a used finger has a finite point and normal."""
 
     def refuses(t: Table, limits: Limits) -> Flags:
-        # Of a finger that is not used a contact is NaN. The mean normal of opposed patches has
-        # length zero: normalised it is NaN.
+        # The contact of an unused finger is NaN. The mean normal of opposed patches has length
+        # zero, so the normalised one is NaN.
         unused = np.tile(np.repeat(t["unused"], 3, axis=1), 2)
         return np.asarray(~(np.isfinite(t[column]) | unused).all(axis=1))
 
@@ -186,10 +187,10 @@ def _unless(removal: Removal, column: str) -> Rule:
     return Rule(removal=removal, needs=(column,), refuses=lambda t, limits: ~t[column])
 
 
-#: All filters that judge a success alone, in their order: the first one that refuses it counts.
+#: All filters that judge a success on its own, in their order: the first that rejects it counts.
 #: The columns are those of `dataset.assembly.survey`.
 RULES = (
-    # A grasp vector has a contact of every finger that its preshape uses.
+    # A grasp vector has a contact for every finger that its preshape uses.
     _unless(Removal.MISSING_FINGER, "complete"),
     at_most(Removal.OTHER_LINKS, "other_links", "other_links", of_hold=True),
     at_most(Removal.SLID, "slip", "max_slip", of_hold=True),
@@ -217,14 +218,14 @@ RULES = (
     at_most(Removal.SUSPICIOUS, "normal_sum", "max_normal_sum"),
     at_most(Removal.NEAR_CONE, "slip_use", "max_slip_use", by_finger=True),
 )
-#: The columns that the rules look at.
+#: The columns that the rules use.
 NEEDED = tuple(dict.fromkeys(name for rule in RULES for name in rule.needs))
 
 
 def first_removal(t: Table, limits: Limits, rules: Sequence[Rule] = RULES) -> npt.NDArray[np.uint8]:
-    """Return the reason of the first rule that refuses each row, `KEPT` (n,) if none does.
+    """Return the reason of the first rule that rejects each row, `KEPT` (n,) if no rule does.
 
-    A rule whose columns the table lacks is left out, and so is one that is off.
+    A rule is left out if it is off or the table lacks one of its columns.
     """
     removal = np.full(t.count, Removal.KEPT, dtype=np.uint8)
     for rule in rules:
@@ -241,8 +242,8 @@ def rules_of_hold() -> Iterator[Rule]:
 def is_outlier(values: Array, sigma: float) -> Flags:
     """Return for rows (n, d) whether a component is more than sigma deviations from its mean.
 
-    Among n values none is more than sqrt(n - 1) deviations from the mean (Samuelson's
-    inequality), so the paper's 4 sigma removes nothing from objects with fewer than 18 grasps.
+    Among n values, none is more than sqrt(n - 1) deviations from the mean (Samuelson's inequality).
+    So the paper's 4 sigma removes nothing from objects with fewer than 18 grasps.
     """
     deviation = values.std(axis=0)
     return np.asarray(np.any(np.abs(values - values.mean(axis=0)) > sigma * deviation, axis=1))

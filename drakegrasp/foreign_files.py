@@ -1,12 +1,12 @@
-"""Files and names of unknown origin: nothing is waited for, has no end, or fills the memory.
+"""Reads files and names of unknown origin without waiting, endless reading or filling the memory.
 
-In: a path, and the most bytes that such a file may have. Out: its bytes, or an `OSError` that says
-what is there instead, as for any file that cannot be read. A link is followed: a dataset from a hub
+In: a path, and the maximum size of such a file. Out: its bytes, or an `OSError` that states what is
+there instead, as for any file that cannot be read. Links are followed, because a dataset from a hub
 consists of links into its cache.
 
-Of JSON every mistake is a `ValueError`, and nothing is read in two ways: Python's own reader takes
-NaN, keeps the last of two equal keys, and gives up in other ways at bytes that are no text, at
-values that are nested too deeply and at numbers of thousands of digits.
+Every mistake in JSON is a `ValueError`, and no text has two readings. Python's own reader accepts
+NaN and keeps the last of two equal keys. It raises other errors for bytes that are not text, for
+values that are nested too deeply and for numbers of thousands of digits.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from typing import Any, NoReturn
 
 from drakegrasp.errors import DataError
 
-#: Longest name of an object [bytes]: file systems allow 255, and we append to it.
+#: Longest name of an object [bytes]; file systems allow 255, and we append to it.
 MAX_NAME = 200
-#: What a name must be, for error messages.
+#: Requirement for a name, in error messages.
 NAME_RULE = (
     "printable, not empty, without slashes, not begin with a dot, and have at most "
     f"{MAX_NAME} bytes"
 )
-#: Most bytes of a text (JSON, YAML, CSV), and of arrays or a mesh that are read at once.
+#: Maximum size of a text (JSON, YAML, CSV), and of arrays or a mesh that are read at once [bytes].
 LARGEST_TEXT, LARGEST_CONTENT = 2**28, 2**30
-#: Most bytes of a file that is hashed whole: a shard is built in memory.
+#: Maximum size of a file that is hashed as a whole [bytes]; a shard is built in memory.
 LARGEST_SEALED = 2**32
-#: A file that is read in parts has so many bytes, or more than this share of them is on the disk: a
-#: file of holes takes no room, but hours to read. File systems that compress save less.
+#: Of a file that is larger than this [bytes] and read in parts, at least this fraction must be on
+#: the disk. A sparse file takes no room, but hours to read. File systems that compress save less.
 LARGE, SOLID = 2**36, 1e-3
-#: What a path may be instead of a file, in words.
+#: Names of what a path may be instead of a file.
 _KINDS = {
     stat.S_IFIFO: "a pipe",
     stat.S_IFCHR: "a device",
@@ -43,14 +43,15 @@ _KINDS = {
 
 
 def refuse_irregular(path: Path, largest: int | None = None) -> None:
-    """Refuse what is no regular file, or is larger than such a file can be.
+    """Reject a path that is not a regular file, or a file that is too large.
 
     Args:
-        path: Of the file.
-        largest: Most bytes; None for a file that is read in parts, which must not consist of holes.
+        path: Path of the file.
+        largest: Maximum size [bytes]; None for a file that is read in parts, which must not be
+            sparse.
 
     Raises:
-        OSError: If it is, or is not there.
+        OSError: If the path is rejected, or does not exist.
     """
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
@@ -63,10 +64,10 @@ def refuse_irregular(path: Path, largest: int | None = None) -> None:
 
 
 def refuse_link(folder: Path) -> None:
-    """Refuse a link where a command writes into a dataset: it may lead anywhere.
+    """Reject a link where a command writes into a dataset, because it may lead anywhere.
 
     Raises:
-        DataError: If it is one.
+        DataError: If the folder is a link.
     """
     if folder.is_symlink():
         raise DataError(f"{folder}: must be a folder of the dataset to write to, got a link")
@@ -82,15 +83,15 @@ def read_text(path: Path, encoding: str = "utf-8") -> str:
     """Return the text of a file, see `refuse_irregular`.
 
     Raises:
-        OSError: If it cannot be read.
-        UnicodeDecodeError: If it is no text in this encoding.
+        OSError: If the file cannot be read.
+        UnicodeDecodeError: If the file is not text in this encoding.
     """
     refuse_irregular(path, LARGEST_TEXT)
     return path.read_text(encoding=encoding)
 
 
 def _refusal(what: str) -> OSError:
-    """Return an error whose `strerror` is its message: those of the system have both."""
+    """Return an error whose `strerror` is its message, because system errors have both."""
     error = OSError(what)
     error.strerror = what
     return error
@@ -100,7 +101,7 @@ def read_json(path: Path) -> Any:
     """Return the content of a JSON file.
 
     Raises:
-        OSError: If it cannot be read.
+        OSError: If the file cannot be read.
         ValueError: As for `parse_json`.
     """
     return parse_json(read_content(path, LARGEST_TEXT))
@@ -110,8 +111,8 @@ def parse_json(text: str | bytes) -> Any:
     """Return the content of a JSON text.
 
     Raises:
-        ValueError: If it is no JSON in UTF-8, is nested too deeply, has a key twice or a number
-            that is none, with the reason.
+        ValueError: If the text is not JSON in UTF-8, is nested too deeply, or has a repeated key or
+            an invalid number; the message has the reason.
     """
     try:
         text = text if isinstance(text, str) else text.decode("utf-8")
@@ -138,6 +139,6 @@ def _no_number(text: str) -> NoReturn:
 
 
 def is_name(text: str) -> bool:
-    """Return whether a text may be the name of an object or a class."""
+    """Return whether a text is allowed as the name of an object or a class."""
     bad = any(c in "/\\" or not c.isprintable() for c in text) or text.startswith(".")
     return bool(text.strip()) and not bad and len(text.encode()) <= MAX_NAME

@@ -1,16 +1,16 @@
-"""Frame letters and the packing of poses, in NumPy only.
+"""Frame letters and the packing of poses. Uses NumPy only.
 
-Drake's monogram notation is used everywhere: `X_AB` is the pose of frame B
-expressed in frame A (it maps coordinates in B to coordinates in A), `R_AB` its
-rotation, `p_AB` its translation. Composition matches neighbouring letters:
-`X_AC = multiply(X_AB, X_BC)` (`arithmetic.multiply`, whose bits no CPU changes).
+Drake's monogram notation is used everywhere: `X_AB` is the pose of frame B expressed in frame A (it
+maps coordinates in B to coordinates in A), `R_AB` its rotation, `p_AB` its translation. Composition
+matches neighbouring letters: `X_AC = multiply(X_AB, X_BC)` (`arithmetic.multiply`, whose bits do
+not depend on the CPU).
 
-Letters: W world, T table-top centre, O object (centre of the mesh's bounding box),
-Ocm its centre of mass, G palm (+Gz out of the palm), Fi distal link of finger i,
-Qi contact point of finger i, C camera (+X right, +Y down, +Z forward), I image frame.
+Letters: W world, T table-top centre, O object (centre of the mesh's bounding box), Ocm its centre
+of mass, G palm (+Gz out of the palm), Fi distal link of finger i, Qi contact point of finger i,
+C camera (+X right, +Y down, +Z forward), I image frame.
 
-Inside the package a pose is a (4, 4) float64 array; in files it is (12,), the first
-three rows, row-major. Drake's `RigidTransform` appears only where Drake is called.
+Inside the package a pose is a (4, 4) float64 array. In files it is (12,): the first three rows,
+row-major. Drake's `RigidTransform` is used only where Drake is called.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from drakegrasp.errors import GraspError, first_line
 #: Position of the table-top centre T in the world [m] (Veres et al., "Coordinate frames").
 P_WT = np.array([0.0, 0.0, 0.65])
 
-#: How far a rotation matrix may be from orthogonal: files hold them in single precision.
+#: Largest deviation of a rotation matrix from orthogonal; files store them in single precision.
 ROTATION_TOLERANCE = 1e-4
-#: Why numbers in the frame of a mesh file cannot be used.
+#: Error message for numbers in the unknown frame of a mesh file.
 NO_MESH_FRAME = (
     "frame must not be mesh where the frame of the mesh file is not known, as on a dataset, got "
     "mesh: give the mesh itself (drakegrasp verify FILE --object MESH)"
 )
-#: What is farther from the origin of its frame is no contact and no palm [m].
+#: Largest distance of a contact or a palm from the origin of its frame [m].
 FARTHEST = 1e3
-#: Other kinds of array, by NumPy's letter, as errors name them.
+#: Names of other kinds of array in errors, by NumPy's letter.
 _OTHER_KINDS = {"U": "text", "S": "text", "b": "truth values", "c": "complex numbers"}
 
 
@@ -83,7 +83,7 @@ def transform_points(X_AB: npt.ArrayLike, p_BQ: npt.ArrayLike) -> Array:
 def rotate_vectors(X_AB: npt.ArrayLike, v_B: npt.ArrayLike) -> Array:
     """Return free vectors (n, 3) of frame B (normals, forces) expressed in frame A.
 
-    Only the rotation of X_AB acts: a normal has no position.
+    Only the rotation of X_AB is applied, because a free vector has no position.
     """
     X = np.asarray(X_AB, dtype=float)
     return multiply(v_B, X[:3, :3].T)
@@ -92,7 +92,8 @@ def rotate_vectors(X_AB: npt.ArrayLike, v_B: npt.ArrayLike) -> Array:
 def rotation_about(axis: npt.ArrayLike, angle: npt.ArrayLike) -> Array:
     """Return the rotations (..., 3, 3) by angles (...,) [rad] about a unit axis (3,).
 
-    Rodrigues' formula: R = 1 + sin(a) K + (1 - cos(a)) K^2, with K the cross product by the axis.
+    Rodrigues' formula: R = 1 + sin(a) K + (1 - cos(a)) K^2, where K is the cross product with the
+    axis.
     """
     x, y, z = np.asarray(axis, dtype=float)
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -111,9 +112,9 @@ X_WT = make_pose(np.eye(3), P_WT)
 
 
 def without_torch(value: Any) -> Any:
-    """Return torch tensors, also those in lists, as NumPy arrays; anything else as it is.
+    """Return torch tensors, also in lists, as NumPy arrays, and other values unchanged.
 
-    NumPy itself refuses tensors that require gradients, and has no bfloat16.
+    NumPy rejects tensors that require gradients, and has no bfloat16.
     """
     if isinstance(value, list | tuple):
         return [without_torch(each) for each in value]
@@ -124,14 +125,14 @@ def without_torch(value: Any) -> Any:
 
 
 def as_numbers(value: npt.ArrayLike, must: str) -> Array:
-    """Return an array of real numbers, of any shape; text and truth values are refused.
+    """Return an array of real numbers, of any shape; text and truth values are rejected.
 
     Args:
         value: The numbers.
-        must: Beginning of the error's message, e.g. "X_TC must be a pose".
+        must: Beginning of the error message, e.g. "X_TC must be a pose".
 
     Raises:
-        GraspError: If it is anything else.
+        GraspError: If the value is anything else.
     """
     try:
         array = np.asarray(without_torch(value))
@@ -150,11 +151,11 @@ def read_pose(X_AB: npt.ArrayLike, name: str) -> Array:
     """Return a pose (4, 4), or poses (n, 4, 4), with exact rotations.
 
     Args:
-        X_AB: (4, 4), (3, 4) or (12,), or many of them.
-        name: What to call it in an error.
+        X_AB: (4, 4), (3, 4) or (12,), or many poses in one of these shapes.
+        name: Name of the argument in errors.
 
     Raises:
-        GraspError: If it is not a pose.
+        GraspError: If X_AB is not a pose.
     """
     # Any layout as (4, 4) or (n, 4, 4).
     X = as_numbers(X_AB, f"{name} must be a pose, 4 x 4 numbers")
@@ -166,7 +167,7 @@ def read_pose(X_AB: npt.ArrayLike, name: str) -> Array:
     if X.ndim not in (2, 3) or X.shape[-2:] != (4, 4):
         raise GraspError(f"{name} must be a pose, 4 x 4 numbers, got an array of shape {X.shape}")
 
-    # Refuse what is not a rigid transform.
+    # Reject what is not a rigid transform.
     if not np.isfinite(X).all():
         raise GraspError(f"{name} must be finite, got numbers that are not")
     if np.any(np.abs(X[..., 3, :] - [0.0, 0.0, 0.0, 1.0]) > ROTATION_TOLERANCE):
@@ -181,7 +182,7 @@ def read_pose(X_AB: npt.ArrayLike, name: str) -> Array:
             f"got one that is off by {off:.2g} with determinant {np.linalg.det(R).min():.3g}"
         )
 
-    # The nearest exact rotation (orthogonal Procrustes).
+    # Replace each rotation by the closest exact rotation (orthogonal Procrustes).
     U, _, Vt = np.linalg.svd(R)
     exact = X.copy()
     exact[..., :3, :3], exact[..., 3, :] = U @ Vt, [0.0, 0.0, 0.0, 1.0]

@@ -1,8 +1,8 @@
 """The grasp vector: k contact points, then k outward normals, as 6k numbers.
 
-For a three-finger hand these are the paper's 18 dimensions [p1 p2 p3 n1 n2 n3]
-(Veres et al., "Dataset overview"). Finger order is the hand file's. Points are in
-metres, normals are unit vectors that point out of the object.
+For a three-finger hand, these are the paper's 18 dimensions [p1 p2 p3 n1 n2 n3] (Veres et al.,
+"Dataset overview"). The order of the fingers is that of the hand file. Points are in metres.
+Normals are unit vectors that point out of the object.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ def unpack_grasp(grasp: npt.ArrayLike) -> tuple[Array, Array]:
 
 
 def unused_fingers(bits: npt.ArrayLike, fingers: int) -> npt.NDArray[np.bool_]:
-    """Return which fingers (..., k) grasps leave out, of bits (...): 1 for the first finger."""
+    """Return the fingers (..., k) that grasps leave out, from bits (...); bit 0 is the first."""
     place = np.arange(fingers, dtype=np.int64)
     return np.asarray(np.asarray(bits, dtype=np.int64)[..., None] >> place & 1, dtype=np.bool_)
 
 
 def for_all_fingers(values: Array, unused: int, fingers: int, fill: float = np.nan) -> Array:
-    """Return values (k, ...) of values (m, ...) of the fingers that a grasp does not leave out.
+    """Return values (k, ...) for all fingers, given values (m, ...) for the used fingers.
 
     Args:
-        values: Of these fingers, in their order.
-        unused: The others, as bits: 1 for the first finger.
+        values: Values of the used fingers, in their order.
+        unused: The unused fingers, as bits; bit 0 is the first finger.
         fingers: Number of fingers, k.
-        fill: What the others get.
+        fill: Value for the unused fingers.
     """
     spread = np.full((fingers, *values.shape[1:]), fill, dtype=values.dtype)
     spread[~unused_fingers(unused, fingers)] = values
@@ -65,7 +65,7 @@ def for_all_fingers(values: Array, unused: int, fingers: int, fill: float = np.n
 
 
 def transform_grasp(X_AB: npt.ArrayLike, grasp_B: npt.ArrayLike) -> Array:
-    """Return the grasp vector (6k,) in frame A of one in frame B, under X_AB (4, 4).
+    """Return a grasp vector (6k,) of frame B in frame A, given X_AB (4, 4).
 
     Points are moved by the whole pose, normals by its rotation alone.
     """

@@ -1,7 +1,7 @@
 """How an attempt can end, and how far it got: the enums that all files share.
 
-All that is known of an outcome by itself is here. `drakegrasp.simulation.verdict` and
-`drakegrasp.simulation.trial` say when an attempt has it.
+This module has the properties of an outcome that need no attempt. `drakegrasp.simulation.verdict`
+and `drakegrasp.simulation.trial` decide when an attempt has an outcome.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from typing import Self
 
 
 class Stage(IntEnum):
-    """How far an attempt got; it decides which columns of `trials.hdf5` hold values."""
+    """How far an attempt got; it decides which columns of `trials.hdf5` have values."""
 
     PLACED = 0  # geometry only: nothing was simulated
     CLOSED = 1  # the fingers were closed and judged
     LIFTED = 2  # the object was freed, lifted and judged again
 
 
-#: What becomes of attempts, in the order of the funnel, with the stage that they have reached at
-#: least. What is in no group is of verification only: no file of a dataset holds it.
+#: Groups of outcomes in the order of the funnel, each with the minimum stage that its attempts have
+#: reached. Outcomes without a group are only for verification: no file of a dataset has them.
 GROUPS = {
     "no ray": Stage.PLACED,
     "collis.": Stage.PLACED,
@@ -44,7 +44,7 @@ class Outcome(IntEnum):
     text: str
 
     def __new__(cls, value: int, group: str = "", text: str = "") -> Self:
-        """Make a member that equals its value."""
+        """Create a member that equals its value."""
         member = int.__new__(cls, value)
         member._value_, member.group, member.text = value, group, text
         return member
@@ -56,13 +56,13 @@ class Outcome(IntEnum):
     SCREENED = 4, "collis.", "geometry shows that not every fingertip can reach the object"
     MISSING_FINGERTIP = 5, "no grip", "a fingertip closes without touching the object"
     HAND_CONTACT = 6, "no grip", "a part of the hand that is not a fingertip touches the object"
-    # So is a hand that came too far below the table's top on its way (`close.scrape_depth`).
+    # This also includes a hand that was too far below the table's top (`close.scrape_depth`).
     TABLE_CONTACT = (
         7,
         "no grip",
         "the closing or lifting hand, or the lifted object, touches the table",
     )
-    # In datasets of older versions, also what is PARTLY_HELD now.
+    # In datasets of older versions, this includes what is now PARTLY_HELD.
     SLIPPED = (
         8,
         "lost",
@@ -76,10 +76,10 @@ class Outcome(IntEnum):
         "the limit of computing time passed, which says nothing about the grasp",
     )
     CRASHED = 12, "errors", "its process was killed, which says nothing about the grasp"
-    # Result files of older versions.
+    # Outcomes in result files of older versions.
     UNREACHABLE = 13, "", "no wrist pose brings the fingertips to the contacts"
     OFF_SURFACE = 14, "", "a contact, or its normal, is off the surface"  # by forces only
-    # Whether the hand would have held it is unknown, of this one and the next.
+    # For this outcome and the next, it is unknown whether the hand would have held the object.
     MOVED = 15, "moved", "the object moved more in the hand than a sample may"
     NOT_LIFTED = 16, "left", "closed with a small chance or a flat image"
     INVALID = 17, "", "the row of numbers is no grasp"  # it counts as a failure
@@ -101,17 +101,17 @@ class Outcome(IntEnum):
 
     @property
     def verification_only(self) -> bool:
-        """Whether only verification gives this outcome; no file of a dataset holds it."""
+        """Whether only verification has this outcome; no file of a dataset has it."""
         return not self.group
 
     @property
     def dataset_only(self) -> bool:
-        """Whether only attempts of a dataset have this outcome: verification tries whole lifts."""
+        """Whether only datasets have this outcome, because verification tries whole lifts."""
         return self.group in ("left", "moved")
 
     @property
     def stage(self) -> Stage:
-        """The stage that every attempt with this outcome has reached, at least."""
+        """The minimum stage that every attempt with this outcome has reached."""
         return GROUPS.get(self.group, Stage.PLACED)
 
 

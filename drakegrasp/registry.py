@@ -1,24 +1,24 @@
-"""What is looked up by name: samplers, rules, protocols, formats, hands, kinds of clusters.
+"""Finds things by name: samplers, rules, protocols, formats, hands, kinds of clusters.
 
-Each is an entry point of an installed package in the group `drakegrasp.KIND`. Ours stand in
-pyproject.toml like anybody's, and are loaded when they are asked for: a new one is one module and
-one line. In a checkout pyproject.toml itself is read, so that no line in it waits for an
-installation.
+Each is an entry point of an installed package in the group `drakegrasp.KIND`. The package's own
+entry points are in pyproject.toml like those of any other package, and are loaded on request. A new
+one needs one module and one line. In a checkout, pyproject.toml itself is read, so that a new line
+works without a new installation.
 
 clusters: a subclass of `cluster.kinds.Local`.
 exporters: a function (dataset, folder, progress) that returns the number of samples.
 hands: the path of a hand file.
 importers: a function (path, hand) that returns arguments of `simulation.attempts.make_attempts`, or
     None for a file of another format. The name ends with the suffix of the files.
-protocols: a subclass of `protocols.protocol.MujocoProtocol`; `lift` alone is none.
-rules: a `filters.Rule`. Those of the package are `filters.RULES`: each has a limit and a code.
-samplers: a `simulation.candidates.Sampler`, or a class as a file of the user's own has it.
+protocols: a subclass of `protocols.protocol.MujocoProtocol`, except for `lift`.
+rules: a `filters.Rule`. The package's own rules are `filters.RULES`; each has a limit and a code.
+samplers: a `simulation.candidates.Sampler`, or a class with the signature of user-defined samplers.
 
-A class of the user's own is named `file.py:Name`, and imported from the file's text. A
-configuration keeps the name without folders, followed by 16 digits of the file's SHA-256, so that a
-changed file is another setting. The text goes to every worker with the
-configuration and is written into no file: code is never imported from a dataset, and a command that
-needs it must be given the file again.
+A user-defined class is named `file.py:Name`, and imported from the file's text. A configuration
+stores the name without folders, followed by 16 digits of the file's SHA-256, so that a changed file
+is another setting. The text is sent to every worker with the configuration and is written into no
+file. Code is never imported from a dataset, so a command that needs it must be given the file
+again.
 """
 
 from __future__ import annotations
@@ -39,31 +39,31 @@ from typing import Any, Literal, TypeAlias
 
 from drakegrasp.errors import ConfigError, MachineError, listed, one_line
 
-#: What has names; a group of entry points is `drakegrasp.` and one of these.
+#: Kinds of named things; a group of entry points is `drakegrasp.` and one of these.
 Kind: TypeAlias = Literal[
     "clusters", "exporters", "hands", "importers", "protocols", "rules", "samplers"
 ]
-#: Processes keep so many imported files.
+#: Number of imported files that a process caches.
 _KEPT_FILES = 32
 _PROJECT = Path(__file__).resolve().parent.parent / "pyproject.toml"
 
 
 def names(kind: Kind) -> tuple[str, ...]:
-    """Return all names of a kind: ours in their order, and then those of other packages."""
+    """Return all names of a kind: the package's own in order, then those of other packages."""
     return (*_ours(kind), *(name for name in _theirs(kind) if name not in _ours(kind)))
 
 
 def is_known(kind: Kind, name: str) -> bool:
-    """Return whether there is something of a name; other packages are asked last."""
+    """Return whether a name is known; other packages are searched last."""
     return name in _ours(kind) or name in _theirs(kind)
 
 
 def find(kind: Kind, name: str) -> Any:
-    """Return what a name stands for, loaded now.
+    """Load and return what is registered under a name.
 
     Raises:
-        ConfigError: If there is none of that name, or it cannot be loaded.
-        MachineError: If a library is missing that it needs.
+        ConfigError: If the name is unknown, or its entry point cannot be loaded.
+        MachineError: If it needs a library that is missing.
     """
     entry = _entry(kind, name)
     package = "drakegrasp" if entry.dist is None else entry.dist.name
@@ -82,7 +82,7 @@ def find(kind: Kind, name: str) -> Any:
 
 
 def summary(kind: Kind, name: str) -> str:
-    """Return what the module of a name says of it in its constant `HELP`, without loading it."""
+    """Return the constant `HELP` of the module of a name, without loading the module."""
     spec = util.find_spec(_entry(kind, name).module)
     text = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
     for node in ast.parse(text).body:
@@ -114,11 +114,11 @@ def _theirs(kind: Kind) -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in metadata.entry_points(group=f"drakegrasp.{kind}")}
 
 
-# Classes of the user's own
+# User-defined classes
 
 
 def read_class(setting: str) -> tuple[str, str]:
-    """Return the name that a configuration keeps of `path/file.py:Name`, and the file's text.
+    """Return the name that a configuration stores for `path/file.py:Name`, and the file's text.
 
     Raises:
         ConfigError: If the file cannot be read, or has no class of that name.
@@ -145,18 +145,18 @@ def own_class(
     method: str,
     takes: Sequence[str] = (),
 ) -> type[Any]:
-    """Return a class of the user's own.
+    """Return a user-defined class.
 
     Args:
-        stored: Its name in a configuration.
-        code: Text of the file by such names; empty for what was read from a dataset.
+        stored: Name of the class in a configuration.
+        code: Texts of the files by such names; empty for a configuration from a dataset.
         key: The setting that names the class.
-        arguments: Of its constructor, by position.
-        method: What its instances must have.
+        arguments: Arguments of its constructor, by position.
+        method: Name of a method that its instances must have.
         takes: Arguments of the method, by position.
 
     Raises:
-        ConfigError: If the text is not there or cannot be imported, or the class is of another
+        ConfigError: If the text is missing or cannot be imported, or the class has another
             signature.
     """
     if stored not in code:
@@ -175,15 +175,15 @@ def own_class(
 
 
 def run_own(stored: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call code of the user's own, or of another package.
+    """Call user-defined code, or code of another package.
 
     Args:
-        stored: Its name in a configuration.
-        function: What is called.
-        arguments: By position.
+        stored: Name of the code in a configuration.
+        function: The function to call.
+        arguments: Arguments by position.
 
     Raises:
-        ConfigError: If it raises an error, with the line of the user's file.
+        ConfigError: If the code raises an error, with the line of the user's file.
     """
     try:
         return function(*arguments)
@@ -194,7 +194,7 @@ def run_own(stored: str, function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def accepts(function: object, arguments: Sequence[str]) -> bool:
-    """Return whether something can be called with so many arguments by position."""
+    """Return whether something can be called with these arguments by position."""
     try:
         inspect.signature(function).bind(*arguments)  # type: ignore[arg-type]
     except (TypeError, ValueError):
@@ -215,7 +215,7 @@ def _import(stored: str, text: str) -> type[Any]:
 @lru_cache(maxsize=_KEPT_FILES)
 def _module(file: str, digest: str, text: str) -> ModuleType:
     """Return the module of a file's text."""
-    # Data classes look for the module of their fields' types among those that are loaded.
+    # Data classes look for the module of their field types among the loaded modules.
     module = ModuleType(f"drakegrasp_user_{digest}")
     module.__file__ = file
     sys.modules[module.__name__] = module

@@ -1,7 +1,7 @@
 """Random numbers that are the same on every machine and with every release of NumPy.
 
-NumPy guarantees the raw stream of PCG64 and the mixing of `SeedSequence`; what its `Generator`
-makes of them may change from release to release. So everything that is drawn comes from the raw
+NumPy guarantees the raw stream of PCG64 and the mixing of `SeedSequence`. The results of its
+`Generator` may change from release to release. So all random numbers are computed from the raw
 64-bit words, by the rules below.
 """
 
@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array
 
-#: Normal numbers are rounded to multiples of this. The tails need the C library's logarithm, whose
-#: last bits differ between machines, by far less than this.
+#: Normal numbers are rounded to multiples of this. Their tails need the C library's logarithm,
+#: whose last bits differ between machines by far less than this.
 _NORMAL_GRID = 2.0**-32
 
 
@@ -52,21 +52,21 @@ class Stream:
         return (self.words(count) % np.uint64(bound)).astype(np.int64)
 
     def permutation(self, count: int) -> npt.NDArray[np.int64]:
-        """Return 0..count-1 (count,) in random order: sorted by a word for each."""
+        """Return 0..count-1 (count,) in random order: sorted by one random word per number."""
         return np.argsort(self.words(count), kind="stable").astype(np.int64)
 
     def normal(self, count: int) -> Array:
         """Return (count,) normal numbers of mean 0 and standard deviation 1, multiples of 2^-32."""
-        # Half a step up, because the inverse of the distribution has no value at 0; it has none
-        # at 1 either, to which the largest number would be rounded up.
+        # Add half a step, because the inverse of the distribution has no value at 0. It has no
+        # value at 1 either, to which the largest number would be rounded.
         share = np.minimum(self.uniform(count) + 2.0**-54, 1.0 - 2.0**-53)
         drawn = np.array([NormalDist().inv_cdf(u) for u in share.tolist()])
         return np.asarray(np.rint(drawn / _NORMAL_GRID) * _NORMAL_GRID)
 
 
 def object_key(name: str) -> int:
-    """Return the integer in 0..2^32-1 that stands for an object or a class in a stream's place.
+    """Return the integer in 0..2^32-1 that identifies an object or a class in a stream's place.
 
-    It depends on the name alone, so adding a mesh to a directory changes no other object.
+    It depends only on the name, so adding a mesh to a directory does not change other objects.
     """
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big")

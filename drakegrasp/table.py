@@ -1,7 +1,7 @@
-"""A table: n rows by the names of their columns, whatever they are of.
+"""A table: n rows by the names of their columns, for rows of any kind.
 
 Attempts, trials, successes and verdicts are rows with the fields of `drakegrasp.dataset.schema`,
-and columns that follow from these. Imports NumPy only.
+and with columns that are computed from these fields. Imports only NumPy.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ AnyArray = npt.NDArray[Any]
 class Table(Mapping[str, AnyArray]):
     """n rows by the names of their columns: a mapping of names to arrays (n, ...).
 
-    Columns are also attributes, as `table.slip`. A table does not change; its arrays are not
+    Columns are also attributes, e.g. `table.slip`. A table does not change; its arrays are not
     copied.
 
     Args:
         columns: Arrays (n, ...) by their names.
-        named: More of them.
+        named: More arrays, as keyword arguments.
 
     Raises:
         ValueError: If the columns differ in their number of rows.
@@ -62,7 +62,7 @@ class Table(Mapping[str, AnyArray]):
         return iter(self._columns)
 
     def __len__(self) -> int:
-        """Return the number of columns, as of every mapping; `count` is that of the rows."""
+        """Return the number of columns, as for every mapping; `count` is the number of rows."""
         return len(self._columns)
 
     def __repr__(self) -> str:
@@ -74,21 +74,21 @@ class Table(Mapping[str, AnyArray]):
         return (*self._columns,)
 
     def has(self, *names: str) -> bool:
-        """Return whether all columns of some names are there."""
+        """Return whether the table has all columns of these names."""
         return all(name in self._columns for name in names)
 
     def with_columns(
         self, columns: Mapping[str, npt.ArrayLike] | None = None, **named: Any
     ) -> Table:
-        """Return the table with more columns, or others in the place of its own."""
+        """Return the table with more columns, or with some of its columns replaced."""
         return Table({**self._columns, **(columns or {}), **named})
 
     def only(self, *names: str) -> Table:
-        """Return the table of some columns, of those that are there."""
+        """Return the table with only the columns of these names, as far as it has them."""
         return Table({name: self._columns[name] for name in names if name in self._columns})
 
 
 def join(tables: Sequence[Table]) -> Table:
-    """Return the rows of tables with the same columns as one."""
+    """Return the concatenated rows of tables with the same columns."""
     first, *_ = tables
     return Table({name: np.concatenate([table[name] for table in tables]) for name in first})

@@ -1,7 +1,7 @@
-"""YAML of unknown origin: read without running anything, and refused if it grows.
+"""Reads YAML of unknown origin without running code, and rejects text that expands too much.
 
-An alias repeats what an anchor names. A few lines of aliases of aliases stand for billions of
-values, which fill the memory as soon as something walks through them.
+An alias repeats what an anchor names. A few lines of aliases of aliases can expand to billions of
+values, which fill the memory as soon as something iterates over them.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from typing import Any
 
 import yaml
 
-#: Values that a text may stand for, its aliases written out; 100,000 objects have fewer.
+#: Maximum number of values after aliases are expanded; 100,000 objects have fewer.
 MOST_VALUES = 1_000_000
 
 
-#: Brackets within each other; settings have three. PyYAML takes seconds for a thousand.
+#: Maximum depth of nested brackets; settings have three. PyYAML takes seconds for a thousand.
 DEEPEST = 100
 
 
@@ -30,8 +30,8 @@ def parse_yaml(text: str | bytes) -> Any:
     """Return the content of a YAML text.
 
     Raises:
-        yaml.YAMLError: If it is no YAML, is nested too deeply, contains itself, has a key twice, or
-            stands for more than `MOST_VALUES` values.
+        yaml.YAMLError: If the text is not YAML, is nested too deeply, contains itself, has a
+            repeated key, or expands to more than `MOST_VALUES` values.
     """
     loader = _Loader(text)
     try:
@@ -44,16 +44,16 @@ def parse_yaml(text: str | bytes) -> Any:
     except RecursionError:
         raise yaml.YAMLError("values nested too deeply") from None
     except ValueError as error:
-        # A number of thousands of digits, or a date that no calendar has.
+        # The text has a number of thousands of digits, or a date that does not exist.
         raise yaml.YAMLError(str(error)) from None
     finally:
         loader.dispose()
 
 
 def parse_yaml_once(text: str | bytes) -> Any:
-    """Return what `parse_yaml` does, for a small text that a process parses again and again.
+    """Return the result of `parse_yaml`, cached, for a small text that is parsed many times.
 
-    The caller must not change it.
+    The caller must not change the result.
     """
     return _parsed(text.encode() if isinstance(text, str) else text)
 
@@ -65,11 +65,11 @@ def _refuse_large(root: yaml.Node) -> None:
     sizes: dict[int, int] = {}
 
     def size(node: yaml.Node) -> int:
-        """Return the number of values that a node stands for; each node is looked at once."""
+        """Return the number of values that a node expands to; each node is visited once."""
         if isinstance(node, yaml.ScalarNode):
             return 1
         if id(node) not in sizes:
-            sizes[id(node)] = MOST_VALUES + 1  # of a node that contains itself
+            sizes[id(node)] = MOST_VALUES + 1  # for a node that contains itself
             sizes[id(node)] = 1 + sum(map(size, _children(node)))
         return sizes[id(node)]
 
@@ -78,7 +78,7 @@ def _refuse_large(root: yaml.Node) -> None:
 
 
 def _refuse_twins(root: yaml.Node) -> None:
-    """Refuse a mapping with a key twice, of which PyYAML would take the last."""
+    """Reject a mapping with a repeated key, of which PyYAML would use the last value."""
     nodes, seen = [root], set()
     while nodes:
         node = nodes.pop()

@@ -63,35 +63,36 @@ def build_dataset(
 ) -> BuildReport:
     """Build the dataset of a directory of meshes; the same as `drakegrasp build`.
 
-    Work that is complete in `out` is kept: the same call continues where an earlier one stopped.
+    Work that is complete in `out` is kept: the same call continues where an earlier call stopped.
 
     Args:
-        objects: Directory of meshes, or "builtin" for the built-in objects, of which
-            `config.builtin` says how many.
+        objects: Directory of meshes, or "builtin" for the built-in objects, whose number
+            `config.builtin` specifies.
         out: Directory of the dataset; it must be visible to every worker.
-        config: All the rules; the defaults if None.
+        config: All the rules; None for the defaults.
         units: Unit of length of the meshes: m, cm or mm.
         manifest: YAML file with units and classes per mesh, if it is not beside the meshes.
         only: Names of the objects to build; all if empty.
-        postures: Instead of drawn palm poses: a file of postures, or a table of them. Only the
-            objects that it names are built; rows that are no posture are told, and left out.
-        part: Only a part of the work units, e.g. "3/16": `merge` joins the directories of all
-            parts. Not with a number of samples.
-        read_as: What is said of all postures of a file: `frame` and `link`, whatever it says
-            itself, and the `preshape` of rows that name none.
-        client: A Dask client whose workers do the work, e.g. of `connect`.
+        postures: A file or a table of postures that replace drawn palm poses. Only the objects that
+            it names are built; invalid rows are reported and left out.
+        part: A part of the work units, e.g. "3/16"; `merge` joins the directories of all parts.
+            It cannot be combined with a requested number of samples.
+        read_as: How to read all postures of a file: `frame` and `link` override what the file
+            states; `preshape` applies to rows that name none.
+        client: A Dask client whose workers do the work, e.g. from `connect`.
         show: Whether to show progress on standard error.
-        workers: Instead of a client, the arguments of `connect`; one process per core without any.
+        workers: The arguments of `connect`, instead of a client; one process per core if neither
+            is given.
 
     Raises:
         MeshError: If there is no mesh.
-        GraspError: If no row of the postures is one of an object that is there.
-        ConfigError: If both workers and a scheduler are given, the address is empty, or the
-            scheduler wants no certificate although `tls` says so; or if the part is none.
+        GraspError: If no row of the postures is for an available object.
+        ConfigError: If both workers and a scheduler are given, the address is empty, the scheduler
+            wants no certificate although `tls` is set, or the part is invalid.
         DataError: If `out` cannot be used, another process builds there, or no mesh can be
             simulated.
-        MachineError: If there is no scheduler, the workers cannot do the work, or no room is
-            left; the same call continues when that is fixed.
+        MachineError: If there is no scheduler, the workers cannot do the work, or the disk is full;
+            the same call continues when that is fixed.
     """
     cluster = joined(client, workers)
     out, config = Path(out).absolute(), config or load_config()
@@ -138,17 +139,17 @@ def build_on(
 ) -> BuildReport:
     """Build a dataset on the workers of a cluster; see `build_dataset`.
 
-    The directory is locked before the workers start: a second build is refused before that.
+    The directory is locked before the workers start, so a second build is rejected before that.
 
     Args:
-        cluster: Starts workers that all see `out`, and yields their client, e.g. `connect(2)`. A
-            client of the caller's own goes in as `contextlib.nullcontext(client)`.
+        cluster: Starts workers that can all read `out`, and yields their client, e.g. `connect(2)`.
+            Give an existing client as `contextlib.nullcontext(client)`.
         sources: The meshes; None for the built-in objects.
         out: Directory of the dataset, absolute.
         config: All the rules.
-        only: As for `build_dataset`.
-        postures: As for `build_dataset`.
-        part: As for `build_dataset`.
+        only: See `build_dataset`.
+        postures: See `build_dataset`.
+        part: See `build_dataset`.
         show: Whether to show progress on standard error.
 
     Raises:
@@ -173,11 +174,11 @@ def build_on(
             why = f": {postures.refused}" if postures.refused else ", got none of them"
             raise GraspError(f"postures must be of an object that is built{why}")
     with build_lock(out) as dead, ExitStack() as stack:
-        # A directory that cannot be used is refused before workers start.
+        # A directory that cannot be used is rejected before workers start.
         before = claim_directory(out, config)
         config = config if before is None else continued(config, before.config)
 
-        # Workers read the hand in the directory.
+        # Workers read the hand from the directory.
         config = carry_hand(out, config, before.config.hand if before else None)
         stack.callback(_release_unused, out)
         client = stack.enter_context(cluster)
@@ -210,7 +211,7 @@ def build_on(
 
 
 def _release_unused(out: Path) -> None:
-    """Remove what a build that did not begin has put into a directory."""
+    """Remove what a build put into a directory if it did not begin."""
     if not (out / MANIFEST).exists():
         release_directory(out)
 
@@ -224,15 +225,17 @@ def make_benchmark(
     show: bool = True,
     **workers: Unpack[Workers],
 ) -> BuildReport:
-    """Make the frozen benchmark `drakegrasp-bench-1`; the same as `drakegrasp bench-set`.
+    """Build the frozen benchmark `drakegrasp-bench-1`; the same as `drakegrasp bench-set`.
 
     Args:
-        out: Directory of the benchmark, which is a dataset whose samples all test.
+        out: Directory of the benchmark, a dataset whose samples are all test samples.
         only: Names of objects, for a part of the benchmark; all if empty.
-        overrides: `"key=value"` settings that differ from the published ones; each card says so.
-        client: A Dask client whose workers do the work, e.g. of `connect`.
+        overrides: `"key=value"` settings that differ from the published ones; each card states
+            them.
+        client: A Dask client whose workers do the work, e.g. from `connect`.
         show: Whether to show progress on standard error.
-        workers: Instead of a client, the arguments of `connect`; one process per core without any.
+        workers: The arguments of `connect`, instead of a client; one process per core if neither
+            is given.
 
     Raises:
         MeshError: If `only` names no object.
@@ -240,7 +243,7 @@ def make_benchmark(
     """
     config, folder = load_config(PRESET, list(overrides)), Path(out).absolute()
     with build_lock(folder):
-        # A directory that cannot be used is refused before anything in it changes.
+        # A directory that cannot be used is rejected before anything in it changes.
         _claim_benchmark(folder, config, only)
         with progress_bar("objects", "meshes", show=show) as report:
             meshes = write_objects(folder, config, only=only, progress=report)
@@ -250,10 +253,10 @@ def make_benchmark(
 
 
 def _claim_benchmark(folder: Path, config: Config, only: Sequence[str]) -> None:
-    """Refuse a directory that this call cannot make or continue as the benchmark.
+    """Reject a directory that this call cannot build or continue as the benchmark.
 
     Raises:
-        DataError: If it holds other files, another dataset, or objects that `only` leaves out.
+        DataError: If it has other files, another dataset, or objects that `only` leaves out.
     """
     known = claim_directory(folder, config)
     if known is None:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 #: Folder of the convex parts of objects, for protocols of MuJoCo.
 CONVEX_PARTS = "convex_parts"
-#: Receives verdicts as they come: called with the place of a grasp and its verdict.
+#: Receives verdicts as they are computed: called with the index of a grasp and its verdict.
 Deliver: TypeAlias = Callable[[int, Verdict], None]
 
 
@@ -64,36 +64,36 @@ def score(
     """Return the score of predicted grasps against reference rows; see docs/how-to/score.md.
 
     Args:
-        predictions: In the frame of the rows' camera: (n, 6k), one per row, or (n, m, 6k), m per
-            row; or a file of them or of postures, or several files of one method that was trained
-            several times.
-            An empty list scores the reference rows alone.
+        predictions: Predictions in the frame of the rows' camera: (n, 6k) with one per row, or
+            (n, m, 6k) with m per row; a file of them or of postures; or several files of one method
+            that was trained several times. An empty list scores only the reference rows.
         dataset: The split whose rows the predictions are for.
-        rows: With an array: (n,), the row of each; all rows, in order, if None.
+        rows: With an array: (n,), row of each prediction; None for all rows, in order.
         confidence: With an array: (n,) or (n, m), greater is better.
-        read_as: What is said of all postures of files: `frame` and `link`, whatever these say, and
-            the `preshape` of rows that name none.
-        against: File or files of another method for the same rows: the card says by how much the
-            headline is above its, object by object.
-        train: Training rows for reference rows; the split `train` of the same file if None.
+        read_as: How to read all postures of files: `frame` and `link` override what the files
+            state; `preshape` applies to rows that name none.
+        against: File or files of another method for the same rows. The card states by how much the
+            headline is above that of the other method, object by object.
+        train: Training rows for the reference rows; None for the split `train` of the same file.
         references: Names of the reference rows, see `scoring.references.REFERENCES`.
-        per_object: Rows of each object, at most; all if None.
-        overrides: `"key=value"` settings; `verify.max_tries` is 1 if they do not say otherwise,
-            because the headline is of the first wrist pose.
-        protocol: The rule of a verdict, by name or `FILE.py:NAME`. All but "lift" try the first
-            wrist pose of a prediction in MuJoCo, on this machine.
-        out: Folder that keeps verdicts, so that the same call continues, and gets the card.
-        again: What the card says about how to make it again.
-        client: A Dask client whose workers do the work, e.g. of `connect`.
+        per_object: Maximum number of rows of each object; None for all.
+        overrides: `"key=value"` settings. `verify.max_tries` is 1 unless they set it, because the
+            headline is about the first wrist pose.
+        protocol: The rule of a verdict, by name or as `FILE.py:NAME`. All protocols but "lift" try
+            the first wrist pose of a prediction in MuJoCo, on this machine.
+        out: Folder that stores verdicts, so that the same call can continue, and the card.
+        again: The card's statement on how to create it again.
+        client: A Dask client whose workers do the work, e.g. from `connect`.
         show: Whether to show progress on standard error.
-        workers: Instead of a client, the arguments of `connect`; one process per core without any.
+        workers: The arguments of `connect`, instead of a client; one process per core if neither
+            is given.
 
     Raises:
-        GraspError: If predictions and rows do not fit, there is nothing to score, or `train` is of
-            another camera or hand.
+        GraspError: If predictions and rows do not match, there is nothing to score, or `train` is
+            of another camera or hand.
         ConfigError, DataError, HandError, MachineError: As `run_verification`.
     """
-    # What is scored, by which rules.
+    # The predictions, and the rules of the score.
     unknown = [name for name in references if name not in REFERENCES]
     if unknown:
         raise GraspError(f"references must be of {', '.join(REFERENCES)}, got {unknown[0]!r}")
@@ -110,7 +110,7 @@ def score(
     if peer:
         require_mujoco("mujoco", "coacd")
 
-    # The verdicts, by this process or workers.
+    # The verdicts, from this process or from workers.
     def try_all(grasps: Attempts, chosen: Sequence[int], deliver: Deliver) -> None:
         placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
         if peer:
@@ -158,12 +158,12 @@ def _method(files: object, dataset: GraspDataset, read_as: Mapping[str, str] | N
 
 
 def _versions() -> dict[str, str]:
-    """Return the versions of what makes a verdict by a protocol; CoACD cuts the objects for it."""
+    """Return the versions that decide a protocol's verdict; CoACD cuts the objects into parts."""
     return {**versions(), "coacd": metadata.version("coacd")}
 
 
 def _training_rows(dataset: GraspDataset, references: Sequence[str]) -> GraspDataset:
-    """Return the training rows of the file of a split; contacts count for reference rows only."""
+    """Return the training rows of the file of a split; only reference rows need their contacts."""
     if type(dataset) is GraspDataset:
         return GraspDataset(dataset.path, split="train", fewer_fingers=not references)
     return type(dataset)(dataset.path, split="train")

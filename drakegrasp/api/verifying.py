@@ -1,7 +1,7 @@
 """Verifying grasps, on Dask workers or in this process.
 
-`verify_grasp` and `verify_grasps` are the calls for everything that a grasp can be on: a mesh, an
-object that was placed before, a sample, a dataset. The others are short forms of them.
+`verify_grasp` and `verify_grasps` verify grasps on everything that a grasp can be on: a mesh, a
+placed object, a sample, or a dataset. The other functions are short forms of them.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from drakegrasp.verification.verify import ResultCallback, ignore_result, verify
 if TYPE_CHECKING:
     from distributed import Client
 
-#: What an object on the table is made of: a mesh file, a mesh, or an object that was placed before.
+#: Source of an object on the table: a mesh file, a mesh, or a placed object.
 ObjectMesh: TypeAlias = str | Path | trimesh.Trimesh | Placed
-#: What a grasp can be on: an object, or what says of each grasp which object it is for.
+#: Target of a grasp: an object, or a sample or dataset that defines the object of each grasp.
 GraspTarget: TypeAlias = ObjectMesh | Sample | GraspDataset
 
-#: Up to this many grasps are verified in this process: starting workers would take longer.
+#: Up to this many grasps are verified in this process, because starting workers would take longer.
 FEW_GRASPS = 4
-#: Grasps of one object are verified together, at most so many, as long as each worker has some
-#: tasks, so that none is idle in the end.
+#: Largest number of grasps of one object in a task, and smallest number of tasks per worker, so
+#: that no worker is idle at the end.
 MOST_TOGETHER, TASKS_PER_WORKER = 16, 4
 
 
 class How(TypedDict, total=False):
-    """What the calls of this module take alike; see `verify_grasps`."""
+    """Arguments that several functions of this module share; see `verify_grasps`."""
 
     frame: str | None
     X_TC: npt.ArrayLike | None
@@ -76,7 +76,7 @@ def verify_grasp(
     snap_points: bool = False,
     config: Config | None = None,
 ) -> Verification:
-    """Return whether a predicted grasp holds its object in the simulator, why not, and how.
+    """Return whether a predicted grasp holds its object in the simulator, and the reason.
 
     >>> verdict = verify_grasp(grasp, "mug.obj", units="cm")          # doctest: +SKIP
     >>> verdict = verify_grasp(my_network(sample.image), on=sample)   # doctest: +SKIP
@@ -85,12 +85,12 @@ def verify_grasp(
         grasp: (6k,) for a hand of k fingers (18 for the Barrett Hand): k contact points [m], then
             k normals out of the object, in the finger order of the hand file. A list, an array, or
             a tensor of torch.
-        on: What the grasp is on, see `verify_grasps`.
+        on: Target of the grasp, see `verify_grasps`.
         row: The grasp's row, if `on` is a `GraspDataset`.
-        frame: Of the grasp, "object", "camera", "table" or "mesh"; `verify_grasps` says more of
-            this and the next ones.
+        frame: Frame of the grasp: "object", "camera", "table" or "mesh". See `verify_grasps` for
+            details of this and the following arguments.
         X_TC: With frame "camera" on an object: pose (4, 4) of the camera in {T}.
-        units: Of a mesh: m, cm or mm.
+        units: Unit of a mesh: m, cm or mm.
         X_TO: Pose (4, 4) of an object on the table.
         hand: Name or YAML file of the hand.
         method: "hand" or "forces".
@@ -98,13 +98,13 @@ def verify_grasp(
         config: Hand, physics, lift and rules.
 
     Returns:
-        The verdict. Numbers that are no grasp, e.g. NaN, have the outcome `invalid`.
+        The verdict. Numbers that are not a valid grasp, e.g. NaN, have the outcome `invalid`.
 
     Raises:
-        GraspError: If the grasp is no vector, else as `verify_grasps`.
+        GraspError: If the grasp is not a vector, or as `verify_grasps`.
         MeshError, ConfigError, HandError, DataError: As `verify_grasps`.
     """
-    # One grasp, and one row where a row is needed.
+    # Require one grasp, and one row if a row is needed.
     vector = as_numbers(grasp, "a grasp must be a vector of numbers")
     if vector.ndim != 1:
         raise GraspError(
@@ -153,41 +153,42 @@ def verify_grasps(
     | `on` | the grasps are on | default frame | friction and mass |
     |---|---|---|---|
     | path of a mesh, `trimesh.Trimesh` | this object, dropped on the table | object | of `config` |
-    | `PlacedObject` | this object as it lies | object | as it was placed with |
-    | `Sample` | its object as it lies in its row, all of them | camera | drawn for its row |
-    | `GraspDataset` | the objects of `rows`, as they lie there | camera | drawn for each row |
+    | `PlacedObject` | this object in its pose | object | as it was placed with |
+    | `Sample` | the object and pose of its row, for all grasps | camera | drawn for its row |
+    | `GraspDataset` | the objects and poses of `rows` | camera | drawn for each row |
 
     Args:
-        grasps: (n, 6k), or (6k,) for one. A row that is no grasp has the outcome `invalid`, and
-            spoils no other.
-        on: What they are on.
-        rows: Only of a `GraspDataset`: the row of its split for each grasp; all rows, in order, if
-            None.
-        frame: The frame of the grasps: "object" {O}, whose origin is the centre of the bounding
-            box, "camera" {C}, "table" {T}, the centre of the table top, or for a mesh also
-            "mesh" {M}, the axes and origin of the file. The default if None.
-        X_TC: Only of an object, with frame "camera": pose of the camera in {T}, (4, 4), or one
-            per grasp (n, 4, 4). Rows have their own.
-        units: Only of a mesh: unit of its lengths, m, cm or mm; metres if None. An `objects.yaml`
+        grasps: (n, 6k), or (6k,) for one grasp. A row that is not a valid grasp has the outcome
+            `invalid` and does not affect other rows.
+        on: Target of the grasps, see the table.
+        rows: Only for a `GraspDataset`: row of its split for each grasp; None for all rows, in
+            order.
+        frame: Frame of the grasps: "object" {O}, whose origin is the centre of the bounding box;
+            "camera" {C}; "table" {T}, at the centre of the table top; or for a mesh also
+            "mesh" {M}, with the axes and origin of the file. None for the default.
+        X_TC: Only for an object, with frame "camera": pose of the camera in {T}, (4, 4), or one
+            per grasp (n, 4, 4). Rows have their own cameras.
+        units: Only for a mesh: unit of its lengths, m, cm or mm; metres if None. An `objects.yaml`
             beside a file wins. Grasps are always in metres.
-        X_TO: Only of an object: its pose on the table, (4, 4).
-        hand: Name or YAML file of the hand; that of the configuration or of the dataset if None.
-        method: "hand" closes a simulated hand on the contacts and lifts; "forces" asks whether
-            forces at the contacts of the surface that they select can lift the object.
-        snap_points: Whether to move the points, not the normals, to the nearest ones of the
+        X_TO: Only for an object: its pose on the table, (4, 4).
+        hand: Name or YAML file of the hand; None for the hand of the configuration or the dataset.
+        method: "hand" closes a simulated hand on the contacts and lifts. "forces" computes whether
+            forces at the surface contacts that the grasp selects can lift the object.
+        snap_points: Whether to move the points, but not the normals, to the closest points of the
             object's surface first.
         config: Hand, physics, lift and rules. If None, those of the placed object or of the
-            dataset, else the defaults. In place of a dataset's, nothing drawn for a row counts.
+            dataset, or else the defaults. If it replaces a dataset's, values drawn for a row are
+            not used.
         client: A Dask client whose workers share the work. If None, this process verifies up to
-            four grasps, and workers of this machine more.
+            four grasps, and workers of this machine verify more.
         show: Whether to show progress on standard error.
 
     Raises:
-        GraspError: If the array does not hold grasps, `on` is nothing of these, an argument does
-            not go with it, rows do not exist or are not one per grasp, or a frame, pose or method
-            cannot be used.
+        GraspError: If the array does not hold grasps, `on` is not a valid target, an argument does
+            not apply to the target, rows do not exist or are not one per grasp, or a frame, pose or
+            method is invalid.
         MeshError: If a mesh cannot be simulated or does not come to rest.
-        ConfigError: If config is not one, or the object was prepared with other values.
+        ConfigError: If config is not a `Config`, or the object was prepared with other values.
         HandError: If the hand cannot be used.
         DataError: If the dataset cannot be used, or has changed since the sample was read.
         MachineError: If a worker would give other results than this machine.
@@ -215,7 +216,7 @@ def _place_on_rows(
     fixed: Mapping[str, object],
     **how: Any,
 ) -> list[PlacedGrasp]:
-    """Return grasps on rows, which define the object, how it lies, and the cameras."""
+    """Return grasps on rows, which define the object, its pose, and the cameras."""
     for name, value in fixed.items():
         if value is not None:
             raise GraspError(
@@ -226,7 +227,7 @@ def _place_on_rows(
     data, chosen = (on.dataset, on.row) if isinstance(on, Sample) else (on, rows)
     placed = place_on_rows(grasps, data, chosen, **how)
 
-    # The object of a verdict can verify more grasps.
+    # The user can verify more grasps on the object of a verdict.
     things = {id(thing): thing for grasp in placed for thing in grasp.stands}
     doors = {
         key: PlacedObject(model=thing.model, X_TO=thing.X_TO, config=thing.config, X_OM=thing.X_OM)
@@ -249,7 +250,7 @@ def _refuse_other_targets(on: object) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class PlacedObject(ObjectOnTable):
-    """An object on the table, on which grasps can be verified; made by `place_object`."""
+    """An object on the table, on which grasps can be verified; created by `place_object`."""
 
     def verify(
         self,
@@ -274,19 +275,19 @@ def place_object(
     """Return an object on the table, prepared once for any number of grasps.
 
     Args:
-        mesh: Path of a mesh file, a mesh, or an object that was placed before. The origin
-            of {O} is the centre of its bounding box, not that of the file.
+        mesh: Path of a mesh file, a mesh, or a placed object. The origin of {O} is the centre of
+            the bounding box, not the origin of the file.
         units: Unit of the mesh's lengths: m, cm or mm; metres if None. An `objects.yaml` beside
             a file wins. Grasps are always in metres.
-        X_TO: Pose of the object on the table, (4, 4); dropped as in a build if None.
-        hand: Name or YAML file of the hand; the configuration's ("barrett") if None.
-        config: Hand, physics, lift and rules; that of an object that was placed before, else the
-            defaults, if None.
+        X_TO: Pose of the object on the table, (4, 4); if None, the object is dropped as in a build.
+        hand: Name or YAML file of the hand; None for the configuration's ("barrett").
+        config: Hand, physics, lift and rules; None for those of a placed object, or else the
+            defaults.
 
     Raises:
         MeshError: If the mesh cannot be simulated or does not come to rest.
-        GraspError: If X_TO is no pose or does not stand on the table.
-        ConfigError: If config is not one, or an object was placed before with other values.
+        GraspError: If X_TO is not a pose or does not put the object on the table.
+        ConfigError: If config is not a `Config`, or the object was placed with other values.
         HandError: If the hand cannot be used.
     """
     used = config_for(mesh, config)
@@ -321,21 +322,21 @@ def run_verification(
 ) -> list[Verification]:
     """Return the verdicts on placed grasps in the caller's order; the work of `drakegrasp verify`.
 
-    With one worker, or with few grasps, this process does the work: starting workers would take
-    longer.
+    With one worker, or with few grasps, this process does the work, because starting workers would
+    take longer.
 
     Args:
         grasps: See `verification.placing`.
         client: A Dask client whose workers do the work.
         on_result: Is called with each verdict in the caller's order, once all earlier ones exist.
         show: Whether to show progress on standard error.
-        workers: Instead of a client, the arguments of `connect`.
+        workers: The arguments of `connect`, instead of a client.
 
     Raises:
         ConfigError: As `connect`.
         MachineError: If a worker would give other results than this machine.
     """
-    # A worker of somebody's pool may not start processes.
+    # A worker of another process pool may not start processes.
     few = len(grasps) <= FEW_GRASPS or multiprocessing.current_process().daemon
     elsewhere = client or workers.get("scheduler") or workers.get("scheduler_file")
     cluster = joined(client, workers) if elsewhere or workers or not few else None

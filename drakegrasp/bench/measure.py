@@ -1,8 +1,8 @@
-"""Measures what attempts cost on this machine, stage by stage, in this process alone.
+"""Measures the cost of attempts on this machine, stage by stage, in this process alone.
 
-In: meshes and a configuration. Out: plain data for a JSON file. Costs are seconds of CPU time
-of this process, so that other work on the machine disturbs them as little as possible. The
-cost of preparing an object is counted apart, because a dataset pays it once.
+In: meshes and a configuration. Out: plain data for a JSON file. Costs are seconds of CPU time of
+this process, so that other work on the machine disturbs them as little as possible. The cost of
+preparing an object is counted separately, because a dataset pays it once.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ def measure(
 
     Args:
         sources: The meshes.
-        config: What to run; `candidates.max` says how much.
-        mujoco: Whether to run all attempts in MuJoCo as well; needs the extra `[peer]`.
-        progress: Called with the number of attempts done and the estimated number in all.
+        config: The configuration to run; `candidates.max` determines the number of attempts.
+        mujoco: Whether to also run all attempts in MuJoCo; needs the extra `[peer]`.
+        progress: Called with the number of finished attempts and the estimated total.
 
     Raises:
         MeshError: If a mesh cannot be prepared.
@@ -91,7 +91,7 @@ class _Counter:
 
 
 def summarize(objects: Sequence[dict[str, Any]], config: Config) -> dict[str, Any]:
-    """Return the whole report: machine, versions, each object and all together."""
+    """Return the whole report: machine, versions, each object, and the sum of all objects."""
     total = {"objects": len(objects), **_sum_rates(objects)}
     if any("peer" in report for report in objects):
         total["peer"] = _sum_baseline([report["peer"] for report in objects])
@@ -108,10 +108,10 @@ def summarize(objects: Sequence[dict[str, Any]], config: Config) -> dict[str, An
 
 
 def compare(now: dict[str, Any], then: dict[str, Any]) -> dict[str, float | None]:
-    """Return the ratio of each rate to that of an earlier report; None where that was zero.
+    """Return the ratio of each rate to that of an earlier report; None if that was zero.
 
     Raises:
-        DataError: If the reports differ in objects, or in the attempts of one.
+        DataError: If the reports differ in objects, or in the attempts of an object.
     """
     attempts = [{o["name"]: o["attempts"] for o in report["objects"]} for report in (now, then)]
     different = sorted(name for name, _ in attempts[0].items() ^ attempts[1].items())
@@ -135,7 +135,7 @@ def _measure_object(
     attempts = list_attempts(prepared, range(len(prepared.candidates)), config)
     counter.begin(len(attempts))
 
-    # Build what all attempts share, and screen them by geometry.
+    # Build what all attempts share, and screen the attempts by geometry.
     with _cpu_timed(seconds, "scene"):
         scene = build_scene(prepared.model, config.physics, load_hand(config.hand_source))
         bench = TrialSetup(prepared=prepared, config=config, scene=scene)
@@ -144,7 +144,7 @@ def _measure_object(
     with _cpu_timed(seconds, "screen"):
         predictions = predict_attempts(bench, attempts)
 
-    # Simulate what is left, and render the successes.
+    # Simulate the remaining attempts, and render the successes.
     records: list[TrialRecord] = []
     for attempt, prediction in zip(attempts, predictions, strict=True):
         with _cpu_timed(seconds, "try"):
@@ -198,7 +198,7 @@ def _run_baseline(
 ) -> dict[str, Any]:
     """Return the outcomes and costs of the same attempts in MuJoCo.
 
-    Cutting the object into convex parts counts as preparing it.
+    Cutting the object into convex parts counts as preparation.
     """
     from drakegrasp.bench.mujoco_baseline import MujocoBaseline
 

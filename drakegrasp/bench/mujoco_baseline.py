@@ -1,9 +1,9 @@
-"""Simulates the same attempts in MuJoCo: for Drake's speed, and for what its labels are worth.
+"""Simulates the same attempts in MuJoCo, to compare with Drake's speed and labels.
 
-In: a prepared object and attempts. Out: their outcomes. MuJoCo collides convex parts of the object,
-and contacts are points. No attempt is screened and no image is rendered. Otherwise the trial is
-that of `drakegrasp.simulation.trial`: the same hand, drive, pads, path and verdict. Needs the extra
-`[peer]`.
+In: a prepared object and attempts. Out: their outcomes. MuJoCo uses convex parts of the object for
+collisions, and contacts are points. No attempt is screened and no image is rendered. Otherwise the
+trial is that of `drakegrasp.simulation.trial`: the same hand, drive, pads, path and verdict. Needs
+the extra `[peer]`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class PeerTrial:
         outcome: The verdict.
         lifted: Whether the closed hand was allowed to lift.
         slip: Distance that {O} moved in {G} during the lift [m]; NaN if not lifted.
-        turn: Angle that it turned in {G} [rad]; NaN if not lifted.
+        turn: Angle that {O} turned in {G} [rad]; NaN if not lifted.
     """
 
     outcome: Outcome
@@ -59,7 +59,7 @@ class PeerContacts:
 
     Attributes:
         touching: (k,), whether each fingertip presses on the object with its pad.
-        other_links: Number of other links that touch the object, or of fingertips beside the pad.
+        other_links: Number of links that touch the object, other than fingertips with their pads.
         hand_on_table, object_on_table: Whether hand and object touch the table.
     """
 
@@ -81,8 +81,8 @@ class MujocoBaseline:
 
         Args:
             model: The object.
-            X_TO: Its resting pose, (4, 4).
-            config: The configuration; gives hand, friction, closing and the lift.
+            X_TO: Resting pose of the object, (4, 4).
+            config: The configuration: hand, friction, closing and lift.
 
         Raises:
             ConfigError: See `drive_of`.
@@ -100,7 +100,7 @@ class MujocoBaseline:
         self._find_addresses()
 
     def _find_addresses(self) -> None:
-        """Look up where bodies and joints are in MuJoCo's arrays."""
+        """Look up the places of bodies and joints in MuJoCo's arrays."""
         m, hand = self._model, self._hand
         self._object, self._palm = m.body("object").id, m.body(hand.palm_link).id
         self._tips = [m.body(finger.fingertip).id for finger in hand.fingers]
@@ -117,9 +117,9 @@ class MujocoBaseline:
         self._followers = {m.joint(c.joint).qposadr[0]: c.offset for c in coupled}
 
     def _weighed(self) -> Iterator[tuple[str, int | slice]]:
-        """Yield MuJoCo's arrays that are in proportion to the object's mass, and its place there.
+        """Yield MuJoCo's arrays that scale with the object's mass, and the object's place in them.
 
-        Those named `invweight0` are in inverse proportion.
+        Arrays named `invweight0` scale with the inverse of the mass.
         """
         body, velocity = self._object, self._object_v
         for name in ("body_mass", "body_subtreemass", "body_inertia", "body_invweight0"):
@@ -128,7 +128,7 @@ class MujocoBaseline:
             yield name, velocity
 
     def _set_materials(self, materials: Materials) -> None:
-        """Give the object its mass, and the coefficient of friction to each side."""
+        """Set the object's mass, and the coefficient of friction of each side."""
         m, factor = self._model, materials.mass / self._usual.mass
         for name, at in self._weighed():
             scale = 1.0 / factor if name.endswith("invweight0") else factor
@@ -138,12 +138,12 @@ class MujocoBaseline:
         m.geom_friction[self._table] = pair_friction(materials.friction_table)
 
     def place(self, X_TO: Array) -> None:
-        """Let the object rest in a pose (4, 4) from the next attempt on."""
+        """Set the object's resting pose (4, 4) for the following attempts."""
         self._X_WO = X_WT @ X_TO
 
     def run(self, attempt: Attempt) -> PeerTrial:
         """Return the result of one attempt; its fingers close from the open hand."""
-        # Palm pose and start, as in a trial.
+        # Check palm pose and start, as in a trial.
         if not attempt.ray_hits:
             return PeerTrial(outcome=Outcome.RAY_MISS)
         X_WG = self._X_WO @ attempt.X_OG
@@ -164,7 +164,7 @@ class MujocoBaseline:
         if verdict != Outcome.SUCCESS:
             return PeerTrial(outcome=Outcome(int(verdict)))
 
-        # Lift, and judge what the hand holds then.
+        # Lift, and judge what the hand then holds.
         X_GO = self._object_in_hand()
         self._lift(X_WG)
         lifted = self._contacts()
@@ -183,13 +183,13 @@ class MujocoBaseline:
         )
 
     def _reset(self, X_WG: Array, spread: float) -> None:
-        """Put the open hand at its start and the object at rest, which no contact moves."""
+        """Put the open hand at its start, and the object at rest so that no contact moves it."""
         m, d = self._model, self._data
         mujoco.mj_resetData(m, d)
         self._drive.disengage()
         self._clamp_object(True)
 
-        # The wrist has no rotation and the spread is locked, so both turn bodies of the model.
+        # The wrist has no rotation and the spread is locked, so both are rotations of bodies.
         X_WB = X_WG @ invert_pose(self._hand.X_BG)
         m.body_quat[self._palm] = quaternion(X_WB[:3, :3])
         for spread_joint in self._spreads:
@@ -202,8 +202,8 @@ class MujocoBaseline:
         mujoco.mj_forward(m, d)
 
     def _clamp_object(self, clamp: bool) -> None:
-        """Give the object an inertia that no contact moves, or its own."""
-        # MuJoCo takes the inertia of a body whose centre of mass is its origin from dof_M0.
+        """Give the object an inertia so large that no contact moves it, or its own inertia."""
+        # MuJoCo uses dof_M0 for the inertia of a body whose centre of mass is its origin.
         added = IMMOVABLE if clamp else 0.0
         self._model.dof_armature[self._object_v] = added
         self._model.dof_M0[self._object_v] = self._object_inertia + added
@@ -229,7 +229,7 @@ class MujocoBaseline:
         self._clamp_object(False)
         self._drive.engage(d)
 
-        # The wrist stands still while the object is released, then moves as in Drake.
+        # The wrist does not move while the object is released; then it moves as in Drake.
         path = lift_path(invert_pose(X_WT) @ X_WG, self._config)
         p_WB = d.qpos[self._wrist_q].copy()
         steps = round((rules.release_time + path.duration + rules.hold_time) / TIME_STEP)
@@ -265,9 +265,9 @@ class MujocoBaseline:
         )
 
     def _contacts(self) -> PeerContacts:
-        """Return the contacts of the last step; weaker ones than the limit do not count."""
+        """Return the contacts of the last step; contacts weaker than the limit do not count."""
         m, d, limit = self._model, self._data, self._config.physics.contact_force
-        # Of each fingertip on its pad and beside it: the force, and the sum of normal forces.
+        # For each fingertip, on its pad and beside it: the force, and the sum of normal forces.
         tips, pressure = np.zeros((len(self._tips), 2, 3)), np.zeros((len(self._tips), 2))
         others, hand_on_table, object_on_table = dict[int, float](), 0.0, np.zeros(3)
         for i, contact in enumerate(d.contact[: d.ncon]):
@@ -294,7 +294,7 @@ class MujocoBaseline:
             else:
                 others[link] = others.get(link, 0.0) + float(np.linalg.norm(force))
 
-        # As in Drake: contact that is mostly on the pad is the fingertip's, else it is split.
+        # As in Drake, contact that is mostly on the pad is the fingertip's; other contact is split.
         whole = pressure[:, 1] <= MAX_BESIDE * pressure.sum(axis=1)
         tips[whole] = np.stack([tips[whole].sum(axis=1), np.zeros((whole.sum(), 3))], axis=1)
         on_pad, beside = np.moveaxis(np.linalg.norm(tips, axis=2) > limit, 1, 0)

@@ -1,6 +1,6 @@
-"""The drive of the fingers in MuJoCo, by the rules of `drakegrasp.simulation.drive`.
+"""The drive of the fingers in MuJoCo, with the rules of `drakegrasp.simulation.drive`.
 
-MuJoCo's joint limits hold what the drive holds. The motor's torque stays on.
+MuJoCo's joint limits replace the holding of the drive. The motor's torque stays on.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class FingerDrive:
         """Find the joints and motors.
 
         Args:
-            model: With the joints and motors of `mjcf.scene`; its limits are changed.
+            model: Model with the joints and motors of `mjcf.scene`; its limits are changed.
             hand: The hand.
             drive: What holds the closing joints, see `drakegrasp.simulation.drive`.
         """
@@ -29,7 +29,7 @@ class FingerDrive:
         self._joints = np.array([model.joint(f.closing_joint).id for f in fingers])
         self._motors = np.array([model.actuator(f.name).id for f in fingers])
         self._q, self._v = model.jnt_qposadr[self._joints], model.jnt_dofadr[self._joints]
-        # A motor turns its joints at fixed ratios, so it carries their torques by the same ratios.
+        # A motor moves its joints at fixed ratios, so it supports their torques by the same ratios.
         self._gain = np.zeros((len(self._joints), model.nv))
         for i, finger in enumerate(hand.motor_fingers):
             self._gain[i, self._v[i]] = 1.0
@@ -41,7 +41,7 @@ class FingerDrive:
         self._yields = np.zeros(len(self._joints), dtype=np.bool_)
 
     def disengage(self) -> None:
-        """Give joints and motors the limits of the hand's files again."""
+        """Restore the limits of joints and motors to those of the hand's files."""
         self._yields[:] = False
         self._model.jnt_range[self._joints] = self._range
         self._set_torques()
@@ -54,11 +54,11 @@ class FingerDrive:
             self._model.jnt_range[self._joints, 1] = data.qpos[self._q]
 
     def update(self, data: mujoco.MjData) -> None:
-        """After a step: let worms take up what the fingers closed, or yield to their load."""
+        """After a step, let worms follow the fingers that closed, or yield to a large load."""
         if self._drive != "worm":
             return
 
-        # A finger that was pushed open is held again where it stands or closes.
+        # A finger that was pushed open is held again when it stops or closes.
         angles, lower = data.qpos[self._q], self._model.jnt_range[self._joints, 0]
         held_again = self._yields & (data.qvel[self._v] >= 0.0)
         lower = np.where(
@@ -66,7 +66,7 @@ class FingerDrive:
         )
         self._yields &= ~held_again
 
-        # A worm yields to a load beyond its strength; its finger opens against that strength.
+        # A worm yields to a load beyond its strength; its finger opens against this strength.
         loads = self.loads(data)
         overloaded = ~self._yields & ~held_again & (loads > self._holding)
         self._yields |= overloaded
@@ -75,10 +75,10 @@ class FingerDrive:
         self._set_torques()
 
     def loads(self, data: mujoco.MjData) -> Array:
-        """Return by how much contacts pushed each motor open in the last step, (m,) [N m or N].
+        """Return the loads (m,) by which contacts pushed motors open in the last step [N m or N].
 
         Torques that a caller applies to joints count as contacts. Reactions of motors and limits do
-        not: where a finger runs into its limit they are larger for a step.
+        not count, because they are larger for one step if a finger runs into its limit.
         """
         is_contact = data.efc_type >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
         torques = np.zeros(self._model.nv)

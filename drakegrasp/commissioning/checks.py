@@ -1,7 +1,7 @@
 """Checks of a hand's files and geometry; nothing is simulated.
 
-In: a hand that was loaded. Out: a `Finding` per check: masses, limits, couplings and efforts of its
-files; palm, finger order, pads, and what meets when it closes.
+In: a loaded hand. Out: a `Finding` per check: masses, limits, couplings and efforts of its files;
+palm, finger order, pads, and links that collide when the hand closes.
 """
 
 from __future__ import annotations
@@ -51,27 +51,28 @@ from drakegrasp.pictures.still_scene import Poses, StillScene
 from drakegrasp.simulation.construction import FINGER_DAMPING
 from drakegrasp.simulation.drive import drive_of
 
-#: Least range of a closing joint, in its unit: less does not close a hand.
+#: Smallest range of a closing joint, in its unit; a smaller range does not close a hand.
 LEAST_RANGE = np.deg2rad(5.0)
 #: Largest difference of a coupling from the model's own.
 SAME = 1e-3
-#: The origin of {G} may lie this deep in the hand [m]: in the Barrett Hand it is 1.35 mm deep.
+#: The origin of {G} may be this deep in the hand [m]; in the Barrett Hand it is 1.35 mm deep.
 PALM_DEPTH = 0.005
 #: Length of the palm ray that must be free [m].
 RAY = 0.3
-#: Pads that come so close meet [m].
+#: Pads that come this close to each other meet [m].
 MEETING = 0.008
-#: The hand may reach so far beyond its pinch along +Gz [m]: farther, the palm cannot face a table.
+#: Largest reach of the hand beyond its pinch along +Gz [m]; with more, the palm cannot face a
+#: table.
 BEYOND_PINCH = 0.1
-#: Postures on the way from the open to the closed hand, and of each of two fingers that meet.
+#: Number of postures from the open to the closed hand, and of each of two fingers that meet.
 POSTURES, MEETING_STEPS = 40, 40
-#: Links of different fingers may overlap by so much before their fingertips meet [m].
+#: Links of different fingers may overlap by this before their fingertips meet [m].
 OVERLAP = 0.002
-#: Width of what a hand must at least be able to hold [m].
+#: Width of an object that every hand must be able to hold [m].
 WIDTH = 0.02
-#: A pad point lies on its fingertip within this distance [m].
+#: Largest distance of a pad point from the surface of its fingertip [m].
 ON_SURFACE = 0.003
-#: Room behind a pad's face [m], and the cosine from which a border is parallel to it.
+#: Required room behind a pad's face [m], and the cosine above which a border is parallel to it.
 LEEWAY, FACING = 0.003, 0.95
 
 
@@ -81,8 +82,8 @@ class Finding:
 
     Attributes:
         name: What was checked.
-        ok: Whether it is as it must be.
-        text: What was found; of a fault, its place and what it must be.
+        ok: Whether the check passed.
+        text: What was found; for a fault, its place and the requirement.
     """
 
     name: str
@@ -91,13 +92,13 @@ class Finding:
 
 
 def judge(name: str, faults: Sequence[str], fine: str) -> Finding:
-    """Return the finding of a check: its faults, or what is fine if there are none."""
+    """Return the finding of a check: its faults, or the text `fine` if there are none."""
     return Finding(name=name, ok=not faults, text="; ".join(faults) or fine)
 
 
 def check_masses(hand: Hand) -> Finding:
-    """Return whether every link has a mass, and an inertia that a body can have."""
-    # Drake parses the inertias; the masses are those that the file gives.
+    """Return whether every link has a mass and a physically possible inertia."""
+    # Drake parses the inertias; the masses are read from the text of the file.
     root = read_xml(hand.model.path)
     masses, impossible = declared_masses(root), impossible_inertias(root)
     plant, faults = MultibodyPlant(0.0), []
@@ -113,8 +114,8 @@ def check_masses(hand: Hand) -> Finding:
 
 
 def check_limits(hand: Hand) -> Finding:
-    """Return whether each closing joint has limits between which it closes, from zero."""
-    # The closing joints' own limits, then what their coupled joints leave of them.
+    """Return whether each closing joint has limits between which it can close, from zero."""
+    # Check the closing joints' own limits, then the range that their coupled joints leave.
     faults, ranges = [], []
     of_joint = dict(zip(hand.joint_names, hand.joint_limits, strict=True))
     for finger, (lower, upper), unit in zip(
@@ -141,7 +142,7 @@ def check_limits(hand: Hand) -> Finding:
         shown = f"{1e3 * upper:.0f} mm" if finger.slides else f"{np.rad2deg(upper):.0f}°"
         ranges.append(f"{finger.name} {shown}")
 
-    # The spreads.
+    # Check the spreads.
     least, most = np.rad2deg(coordinate_limits(hand)[0])
     for spread in hand.spreads_deg:
         if not least - 1e-6 <= spread <= most + 1e-6:
@@ -150,8 +151,8 @@ def check_limits(hand: Hand) -> Finding:
 
 
 def check_couplings(hand: Hand) -> Finding:
-    """Return whether the couplings agree with those of the model, where it has any."""
-    # Position of each joint by closing joint, as the hand file has it.
+    """Return whether the couplings agree with those of the model, if the model has any."""
+    # The closing joint that each joint follows, according to the hand file.
     own = {c.joint: (f.closing_joint, c) for f in hand.fingers for c in f.coupled}
     mimics = declared_mimics(read_xml(hand.model.path))
     faults = [_coupling_fault(hand, own, m) for m in mimics if not _moves_as(hand, m)]
@@ -160,7 +161,7 @@ def check_couplings(hand: Hand) -> Finding:
 
 
 def _coupling_fault(hand: Hand, own: Mapping[str, tuple[str, Coupling]], mimic: Mimic) -> str:
-    """Return what is wrong where a hand does not move as a coupling of its model says."""
+    """Return the fault of a hand that does not move according to a coupling of its model."""
     # One motor may move two fingers in the model.
     closes = {finger.closing_joint: finger.name for finger in hand.fingers}
     if {mimic.joint, mimic.leader} <= set(closes) and mimic.ratio > 0.0:
@@ -183,11 +184,11 @@ def _coupling_fault(hand: Hand, own: Mapping[str, tuple[str, Coupling]], mimic: 
 
 
 def _moves_as(hand: Hand, mimic: Mimic) -> bool:
-    """Return whether two joints of a hand move as a coupling of its model says."""
+    """Return whether two joints of a hand move according to a coupling of its model."""
     if not {mimic.joint, mimic.leader} <= set(hand.joint_names):
         return False
 
-    # Positions are linear in the coordinates: those of the spread, of a motor, or of none.
+    # Positions are linear in the coordinates: those of the spread, of a motor, or none.
     j, i = (hand.joint_names.index(name) for name in (mimic.joint, mimic.leader))
     gains = hand.joint_gain @ block_diag(1.0, hand.closing_ratio)
     gain = gains[j] - mimic.ratio * gains[i]
@@ -197,7 +198,7 @@ def _moves_as(hand: Hand, mimic: Mimic) -> bool:
 
 def check_efforts(hand: Hand, config: Config) -> Finding:
     """Return whether motors reach their efforts and close the hand in time, and what it presses."""
-    # A motor is a gain on the lack of speed: a stalled one gives gain * speed, up to its limit.
+    # A motor is a gain on the speed error: a stalled motor gives gain * speed, up to its limit.
     faults = []
     limits, units = coordinate_limits(hand)[1:, 1], hand.closing_unit
     for finger, speed, limit, unit in zip(
@@ -215,11 +216,11 @@ def check_efforts(hand: Hand, config: Config) -> Finding:
                 f"{config.close.max_time:g} s, got {limit / speed:.2g} s"
             )
 
-    # What the fingertips press with, and whether friction then carries the payload.
+    # Compute the fingertip forces, and whether friction then supports the payload.
     forces = fingertip_forces(hand, "torque")
     carried = config.physics.friction_hand * float(forces.sum()) / 9.81
     if hand.payload is not None and carried < hand.payload:
-        # Rounded down to grams: what is said must pass.
+        # Round down to grams, because the reported payload must pass the check.
         most = np.floor(1e3 * carried) / 1e3
         faults.append(
             f"payload must be at most {most:g} kg, which friction carries, got {hand.payload:g} kg"
@@ -230,8 +231,8 @@ def check_efforts(hand: Hand, config: Config) -> Finding:
 
 
 def check_geometry(hand: Hand) -> Iterator[Finding]:
-    """Yield what is right and wrong about a hand's geometry; nothing is simulated."""
-    # Seen from behind, fingers run the other way round.
+    """Yield findings on a hand's geometry; nothing is simulated."""
+    # The palm comes first: seen from behind, the order of the fingers is reversed.
     palm = check_palm(hand)
     yield palm
     if not palm.ok:
@@ -246,7 +247,7 @@ def check_geometry(hand: Hand) -> Iterator[Finding]:
 
 def check_palm(hand: Hand) -> Finding:
     """Return whether +Gz leaves the hand at the palm, towards where the fingertips close."""
-    # How much of the ray from the origin of {G} along +Gz is within the open hand.
+    # Compute how far the ray from the origin of {G} along +Gz is inside the open hand.
     opened, shapes, faults = np.zeros(hand.num_fingers), link_shapes(hand.model), []
     depths = [(0.0, "")]
     for link in hand.link_chains:
@@ -264,7 +265,7 @@ def check_palm(hand: Hand) -> Finding:
             f"{1e3 * worst:.0f} mm from the origin of {{G}}: check palm.p_BG and palm.rpy_deg"
         )
 
-    # The fingertips close in front of the palm.
+    # Check that the fingertips close in front of the palm.
     height = float(pad_points_at(hand, 0.5 * closed_positions(hand))[:, 2].mean())
     if height <= 0.0:
         faults.append(
@@ -274,7 +275,7 @@ def check_palm(hand: Hand) -> Finding:
     text = f"its ray is free; half-closed fingertips {1e3 * height:.0f} mm ahead"
     pinch = None if faults else find_pinch(hand, WIDTH)
     if pinch is not None:
-        # What is beyond the pinch meets the table before the fingertips meet the object.
+        # Links beyond the pinch would meet the table before the fingertips meet the object.
         beyond = reach(hand, np.array([0.0, 0.0, 1.0])) - float(pinch.p_GM[2])
         text += f"; it reaches {1e3 * beyond:.0f} mm beyond what it pinches"
         if beyond > BEYOND_PINCH:
@@ -293,11 +294,12 @@ def ray_end(corners: Array) -> float:
 
 
 def check_order(hand: Hand) -> Finding:
-    """Return whether the fingers are in the order in which they stand around +Gz.
+    """Return whether the fingers are in their order around +Gz.
 
-    Seen from the object, which looks at the palm, they run counter-clockwise. For two fingers every
-    order does.
+    Seen from the object, which faces the palm, the order must be counter-clockwise. For two
+    fingers, every order is correct.
     """
+    # Angles of the pad points about Gz, measured from the first finger, must increase.
     # Angles of the pad points about Gz: from the first one on, they rise to a full turn.
     points = pad_points_at(hand, np.zeros(hand.num_fingers))[:, :2]
     centred = points - points.mean(axis=0)
@@ -310,8 +312,8 @@ def check_order(hand: Hand) -> Finding:
 
 
 def check_pads(hand: Hand) -> Finding:
-    """Return whether each pad lies on its fingertip's surface and faces where the finger closes."""
-    # Distance of the pad points from the surface.
+    """Return whether each pad is on its fingertip's surface and faces where the finger closes."""
+    # Check the distance of the pad points from the surface.
     shapes, faults, areas = link_shapes(hand.model), [], []
     facing = _facing(hand)
     for i, (finger, pad) in enumerate(
@@ -334,7 +336,7 @@ def check_pads(hand: Hand) -> Finding:
             faults.append(f"fingers.{i}.pad_region must hold a part of the surface, got none of it")
             continue
 
-        # The pad must face the way that it moves, and have room behind its face.
+        # The pad must face the direction of its motion, and have room behind its face.
         if facing[i] <= 0.0:
             faults.append(
                 f"the pad of finger {finger.name!r} must face where the finger closes, got its "
@@ -346,8 +348,8 @@ def check_pads(hand: Hand) -> Finding:
 
 
 def _turned_round(hand: Hand, i: int) -> str:
-    """Return how to mend a finger that moves away from its pad's side."""
-    # A joint that opens moves the pad away from those of the other fingers.
+    """Return how to repair a finger that moves away from its pad's side."""
+    # A joint that opens the hand moves the pad away from those of the other fingers.
     start = pad_points_at(hand, np.zeros(hand.num_fingers))
     moved = pad_points_at(hand, 0.1 * closed_positions(hand))
     others = np.delete(start, i, axis=0).mean(axis=0)
@@ -362,9 +364,9 @@ def _turned_round(hand: Hand, i: int) -> str:
 
 
 def _tight_borders(i: int, finger: Finger, pad: Array) -> Iterator[str]:
-    """Yield the borders of a pad region that lie on the pad's face, and how to mend them.
+    """Yield the borders of a pad region that lie on the pad's face, and how to repair them.
 
-    What is pressed sinks in, by a millimetre or two; behind the border it is no contact of the pad.
+    A pressed object sinks in by a millimetre or two; contact behind the border is not on the pad.
     """
     areas, normals = trimesh.triangles.area(pad), _normals(pad)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -387,7 +389,7 @@ def _normals(triangles: Array) -> Array:
 
 
 def _facing(hand: Hand) -> Array:
-    """Return the cosine (k,) of the angle between each pad's normal and its motion, halfway."""
+    """Return the cosine (k,) between each pad's normal and its motion, when half closed."""
     # Motion of the pad points as the fingers close.
     half, step = 0.5 * closed_positions(hand), 1e-4 * hand.closing_unit
     motion = pad_points_at(hand, half + step) - pad_points_at(hand, half)
@@ -419,7 +421,7 @@ def check_meeting(hand: Hand) -> Finding:
         fault = "fingers must close against each other, got all of them in one direction: check "
         return judge("fingertips", [fault + "the axes of the closing joints"], "")
 
-    # Some pads touch, each comes as far as those opposite, and something fits between them.
+    # Some pads must touch, each must reach those opposite, and an object must fit between them.
     text = f"{' and '.join(first)} against {' and '.join(second)}"
     gap, short = _least_gap(hand, group), _shortfall(hand, opposition)
     if gap <= MEETING and (short <= MEETING).all() and find_pinch(hand, WIDTH) is not None:
@@ -431,7 +433,7 @@ def check_meeting(hand: Hand) -> Finding:
     if (short <= MEETING).all():
         text += f", got {1e3 * gap:.0f} mm between them, or no posture that pinches"
 
-    # Perhaps a coupling has the wrong sign.
+    # A coupling may have the wrong sign.
     faults = [text]
     for i in np.flatnonzero(short > MEETING).tolist():
         for n, coupling in enumerate(hand.fingers[i].coupled):
@@ -445,8 +447,8 @@ def check_meeting(hand: Hand) -> Finding:
 
 
 def _least_gap(hand: Hand, group: npt.NDArray[np.bool_]) -> float:
-    """Return the least distance between a pad of one group and one of the other [m]."""
-    # The pads at each posture of their own finger.
+    """Return the smallest distance between a pad of one group and one of the other [m]."""
+    # The points of the pads in each posture of their own finger.
     path = closing_path(hand, MEETING_STEPS)
     X_GF = fingertip_poses(hand, spread=0.0, closing=path)
     clouds = [
@@ -454,7 +456,7 @@ def _least_gap(hand: Hand, group: npt.NDArray[np.bool_]) -> float:
         for i, points in enumerate(pad_points(hand))
     ]
 
-    # Nearest postures by the middles of the pads, then exactly.
+    # Find the closest postures by the centres of the pads, then compute exact distances.
     least = np.inf
     for a, b in product(np.flatnonzero(group), np.flatnonzero(~group)):
         middles = clouds[a].mean(axis=1)[:, None] - clouds[b].mean(axis=1)[None]
@@ -466,7 +468,7 @@ def _least_gap(hand: Hand, group: npt.NDArray[np.bool_]) -> float:
 
 
 def _shortfall(hand: Hand, opposition: Opposition) -> Array:
-    """Return by how much each pad (k,) does not come to those opposite, along their line [m]."""
+    """Return by how much each pad (k,) fails to reach those opposite, along their line [m]."""
     (axis, group), (_, front) = opposition, pad_fronts(hand, opposition)
     reached = (front @ axis * np.where(group, 1.0, -1.0)).max(axis=0)
     opposite = [-reached[group != own].max() for own in group]
@@ -474,8 +476,8 @@ def _shortfall(hand: Hand, opposition: Opposition) -> Array:
 
 
 def _with_other_sign(hand: Hand, finger: int, joint: str) -> Hand:
-    """Return a hand in which a coupled joint of a finger turns the other way."""
-    # The gain of the joint, among all joints and in the chain of its fingertip.
+    """Return a hand in which a coupled joint of a finger turns in the opposite direction."""
+    # The gain of the joint occurs among all joints and in the chain of its fingertip.
     signs = np.where(np.array(hand.joint_names) == joint, -1.0, 1.0)
     chains, chain = list(hand.chains), hand.chains[finger]
     own = np.where(np.array(chain.joints) == joint, -1.0, 1.0)
@@ -484,21 +486,21 @@ def _with_other_sign(hand: Hand, finger: int, joint: str) -> Hand:
 
 
 def check_overlaps(hand: Hand) -> Finding:
-    """Return whether only fingertips of different fingers meet, until the hand is closed.
+    """Return whether only fingertips of different fingers meet until the hand is closed.
 
-    In the simulation other links pass through each other, so they must not touch.
+    In the simulation, other links pass through each other, so they must not touch.
     """
-    # Which finger's closing moves a link: 0 for none of them.
+    # Find the finger whose closing moves each link: 1 for the first finger, 0 for no finger.
     scene, faults = StillScene(hand), dict[str, float]()
     moves = {link: chain.gain[:, 1:].any(axis=0) for link, chain in hand.link_chains.items()}
     movers = {link: 1 + int(by.argmax()) if by.any() else 0 for link, by in moves.items()}
 
-    # Close it step by step, until two fingertips meet.
+    # Close the hand step by step, until two fingertips meet.
     for closing in closing_path(hand, POSTURES):
         scene.pose(Poses(X_WG=np.eye(4), q=scene.positions(0.0, closing)))
         met = False
         for links, depth in scene.overlaps():
-            # What carries the palm is no link of it; the fingers do not move it.
+            # A link above the palm is not in the palm's tree, and fingers do not move it.
             one, other = (movers.get(link, 0) for link in links)
             if not one or not other or one == other:
                 continue

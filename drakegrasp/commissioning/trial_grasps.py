@@ -1,10 +1,10 @@
-"""`check_hand`: all checks of a hand, and at last trial grasps: it lifts simple objects.
+"""`check_hand`: all checks of a hand, including trial grasps in which it lifts simple objects.
 
-In: a hand. Out: for each object the best of a few attempts, whose palm poses follow from how the
+In: a hand. Out: for each object the best of a few attempts. Their palm poses follow from how the
 fingertips close (`find_pinch`). The attempts are those of a build: `run_attempt` simulates them.
-The object hangs in the air until it is held, so that gravity may act along the line on which the
-fingers close, across it, or in between: a hand whose fingers do not resist along that line holds in
-only some of these.
+The object hangs in the air until it is held. So gravity can act along the line on which the fingers
+close, across it, or in between. A hand whose fingers do not resist along that line holds in only
+some of these cases.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
-#: Widths of the objects that are tried [m].
+#: Widths of the trial objects [m].
 WIDTHS = (0.045, 0.06, 0.03)
-#: Mass of the objects, at most [kg]; a smaller payload of the hand counts.
+#: Largest mass of the objects [kg]; a smaller payload of the hand replaces it.
 MASS = 0.3
 #: Space between hand and table, between palm and object, and around the pads on the object [m].
 ABOVE_TABLE, BEFORE_PALM, AROUND_PADS = 0.1, 0.008, 0.012
-#: Least size of an object in any direction [m].
+#: Smallest size of an object in any direction [m].
 LEAST_SIZE = 0.03
-#: Fingers farther beside the middle than this share of a ball's width meet only its sides.
+#: Fingers farther from the centre than this fraction of a ball's width only meet its sides.
 WIDEST = 0.7
-#: The line along which the fingers close, by its angle above the horizontal [rad]. Where it is
-#: level, the palm faces the table.
+#: Angle of the line on which the fingers close, above the horizontal [rad]. If the line is level,
+#: the palm faces the table.
 LINES = {"level": 0.0, "tilted": np.deg2rad(45.0), "upright": np.deg2rad(90.0)}
-#: Objects that the hand must grasp, and the lines on which it must.
+#: Objects that the hand must grasp, and the lines on which it must grasp them.
 GRASPS = (
     *(("box", line) for line in LINES),
     ("cylinder", "level"),
@@ -63,19 +63,19 @@ GRASPS = (
 )
 
 
-#: An object, its pose X_TO (4, 4) on the table, where the hand starts, and the width of the object
+#: An object, its pose X_TO (4, 4) on the table, the start of the hand, and the width of the object
 #: between the fingers [m].
 TrialGrasp: TypeAlias = tuple[ObjectModel, Array, Attempt, float]
-#: What is held, but moves more in the hand than a sample may.
+#: Label of a grasp that holds, but moves more in the hand than a sample may.
 MOVED = "moved too far in the hand"
-#: What a drive does to the fingers.
+#: What a drive does to the fingers, in words.
 _HOW = {"worm": "held by worms", "locked": "locked", "torque": "pushed open"}
-#: How to mend a hand that holds nothing along the line on which its fingers close.
+#: How to repair a hand that holds nothing along the line on which its fingers close.
 _SOFT = (
     "two motors that push against each other do not hold along their line; say `drive: worm` if "
     "its gears cannot be pushed open, or its fingers share a motor"
 )
-#: How to mend a hand that loses what it holds, and one whose grasps end otherwise, by what is said.
+#: How to repair a hand that loses the object, and hands with other failures, by their labels.
 _LOST = "pads must face each other where they meet, and motors press enough (efforts)"
 _MENDS = {
     Outcome.HAND_CONTACT.label: "other links touch it first; open the hand wider, or move the palm "
@@ -88,22 +88,23 @@ _MENDS = {
 
 
 def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> Finding:
-    """Return whether the hand can grasp and lift an object, and how far that slips.
+    """Return whether the hand can grasp and lift an object, and how far the object slips.
 
-    Fingers that can be pushed open may lose what nothing centres between them. Of such a hand the
-    finding says whether it holds with locked fingers, and what becomes of that grasp without.
+    Fingers that can be pushed open may lose an object that nothing centres between them. For such a
+    hand, the finding states whether it holds with locked fingers, and the result of the same grasp
+    without locking.
 
     Args:
         hand: The hand.
         config: The rules.
         shape: "box", "cylinder" or "sphere".
-        line: On which the fingers close, one of `LINES`.
+        line: Line on which the fingers close, one of `LINES`.
     """
     name = f"{shape}, {line}"
     if shape == "sphere" and _stands_wide(hand):
         return judge(name, [], "left out: the fingers stand too wide for a ball")
 
-    # Try until one holds, which a whole lift shows.
+    # Try until one grasp holds, which only a whole lift shows.
     config = with_whole_lifts(config)
     drive = drive_of(hand, config.lift)
     rules: Drive = "locked" if drive == "torque" else drive
@@ -138,7 +139,7 @@ def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> 
 
 
 def _stands_wide(hand: Hand) -> bool:
-    """Return whether the fingers stand too far beside each other to hold a ball."""
+    """Return whether the fingers are too far beside each other to hold a ball."""
     pinch = find_pinch(hand, max(WIDTHS))
     if pinch is None:
         return False
@@ -149,7 +150,7 @@ def _stands_wide(hand: Hand) -> bool:
 
 
 def _mend(outcomes: Counter[str], missing: Counter[str]) -> str:
-    """Return what may mend a hand whose trial grasps fail; nothing if it is not known."""
+    """Return how to repair a hand whose trial grasps fail; empty if unknown."""
     label = outcomes.most_common(1)[0][0] if outcomes else ""
     if label == Outcome.MISSING_FINGERTIP.label and missing:
         return (
@@ -161,7 +162,7 @@ def _mend(outcomes: Counter[str], missing: Counter[str]) -> str:
 
 
 def _stays(record: TrialRecord, config: Config) -> bool:
-    """Return whether an object is held without moving more than a sample may."""
+    """Return whether an object is held and moves at most as much as a sample may."""
     if record.outcome is not Outcome.SUCCESS or record.lift is None:
         return False
     turned = np.rad2deg(record.lift.turn)
@@ -185,15 +186,15 @@ def trial_grasps(hand: Hand, shape: str, line: str = "level") -> Iterator[TrialG
 
 
 def _trial_grasp(hand: Hand, shape: str, pinch: Pinch, angle: float) -> TrialGrasp | None:
-    """Return an attempt; None where nothing fits between palm and fingertips.
+    """Return an attempt; None if no object fits between palm and fingertips.
 
     Args:
         hand: The hand.
         shape: "box", "cylinder" or "sphere".
-        pinch: The posture in which it will hold the object.
-        angle: Of the line on which the fingers close, above the horizontal [rad].
+        pinch: The posture in which the hand will hold the object.
+        angle: Angle of the line on which the fingers close, above the horizontal [rad].
     """
-    # The object's axes: x beside the fingers, y along their line, z towards the palm.
+    # The object's axes: x across the fingers, y along their line, z towards the palm.
     axis, _ = find_opposition(hand)
     R_OG = np.stack([np.cross([0.0, 0.0, 1.0], axis), axis, [0.0, 0.0, -1.0]])
     offsets = (pinch.p_GQ - pinch.p_GM) @ R_OG.T
@@ -205,7 +206,7 @@ def _trial_grasp(hand: Hand, shape: str, pinch: Pinch, angle: float) -> TrialGra
     if above < AROUND_PADS:
         return None
 
-    # A cylinder lies across the fingers. Those beside each other meet a ball off its middle.
+    # A cylinder lies across the fingers. Fingers beside each other meet a ball beside its centre.
     radius, p_OM = pinch.width / 2.0, np.zeros(3)
     if shape == "box":
         mesh = trimesh.creation.box([wide, pinch.width, above + below]).subdivide().subdivide()
@@ -225,7 +226,7 @@ def _trial_grasp(hand: Hand, shape: str, pinch: Pinch, angle: float) -> TrialGra
     )  # fmt: skip
     X_OG = make_pose(R_OG, p_OM - R_OG @ pinch.p_GM)
 
-    # It hangs so high that the hand is clear of the table.
+    # The object hangs so high that the hand is clear of the table.
     R_TO = rotation_about([1.0, 0.0, 0.0], angle)
     down = R_OG.T @ R_TO.T @ [0.0, 0.0, -1.0]
     height = reach(hand, down) - float((R_TO @ X_OG[:3, 3])[2]) + ABOVE_TABLE
@@ -241,14 +242,14 @@ def check_hand(
     config: Config | None = None,
     report: Callable[[Finding], None] | None = None,
 ) -> list[Finding]:
-    """Return what is right and wrong about a hand.
+    """Return the findings of all checks of a hand.
 
-    A check that others rely on comes before them, and where it fails they are left out.
+    A check that others depend on comes before them; if it fails, they are left out.
 
     Args:
-        name_or_yaml: A hand that comes with the package, or a hand file.
-        config: The rules of its trial grasps; the defaults if None.
-        report: Is called with each finding when it is there.
+        name_or_yaml: A hand of the package, or a hand file.
+        config: The rules of the trial grasps; None for the defaults.
+        report: Is called with each finding as soon as it is known.
     """
     findings = []
     for finding in _findings(name_or_yaml, config or load_config()):
@@ -259,7 +260,7 @@ def check_hand(
 
 
 def _findings(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
-    """Yield the findings, up to the first check without which others make no sense."""
+    """Yield the findings, up to a failed check that others depend on."""
     # The files: without them there is no hand.
     try:
         hand = load_hand(name_or_yaml)
@@ -271,7 +272,7 @@ def _findings(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
     fine = f"{hand.num_fingers} fingers, {joints} joints, {count} shapes in {model}"
     yield judge("files", [], fine)
 
-    # Masses, limits and couplings; the rest closes the hand, for which it needs its limits.
+    # Masses, limits and couplings. The other checks close the hand, for which they need its limits.
     yield check_masses(hand)
     limits = check_limits(hand)
     yield limits

@@ -1,8 +1,8 @@
-"""The frozen benchmark `drakegrasp-bench-1`: its objects, and what a card says of it.
+"""The frozen benchmark `drakegrasp-bench-1`: its objects, and its description on a card.
 
-In: a directory. Out: meshes, with masses and frictions of their own, for a build with the preset
-`bench1`; and a file that says where they differ from the published ones. All draws come from
-`seeding`, so whoever makes the benchmark gets the same objects.
+In: a directory. Out: meshes with their own masses and frictions, for a build with the preset
+`bench1`, and a file that states where the meshes differ from the published ones. All draws come
+from `seeding`, so everybody who builds the benchmark gets the same objects.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from drakegrasp.seeding import Stream, object_key
 from drakegrasp.shapes.catalog import CLASSES, LICENCE, BuiltinObject, draw_builtin, wavefront
 
 NAME, PRESET = "drakegrasp-bench-1", "bench1"
-#: Masses [kg] and friction coefficients that the objects draw from.
+#: Masses [kg] and friction coefficients from which those of the objects are drawn.
 MASSES = (0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 FRICTIONS = (0.3, 0.5, 0.71)
-#: Classes that no training set may have, and the seed that chooses them.
+#: Number of classes that no training set may have, and the seed that chooses them.
 NEW_CLASSES, SEED = 16, 20261
 #: Digits of the published hashes of the meshes.
 HASH_DIGITS = 16
@@ -47,7 +47,7 @@ def new_classes() -> list[str]:
 
 
 def published() -> dict[str, Any]:
-    """Return what is published of the benchmark: versions, hashes of meshes and of all rows."""
+    """Return the published facts of the benchmark: versions, hashes of meshes and of all rows."""
     text = resources.files("drakegrasp.scoring").joinpath("bench1.json").read_text("utf-8")
     found: dict[str, Any] = json.loads(text)
     return found
@@ -56,8 +56,8 @@ def published() -> dict[str, Any]:
 def material_of(item: BuiltinObject) -> tuple[float, float]:
     """Return mass [kg] and friction coefficient of an object.
 
-    The objects of a class go through the coefficients in turn, from one that is drawn; so each
-    coefficient has a third of the objects, of all classes.
+    The objects of a class take the coefficients in turn, beginning with a random one. So each
+    coefficient belongs to a third of the objects, from all classes.
     """
     mass = Stream(SEED, object_key(NAME), object_key(item.name)).integers(len(MASSES), 1)[0]
     start = Stream(SEED, object_key(NAME), object_key(item.object_class.name)).integers(3, 1)[0]
@@ -80,20 +80,20 @@ def write_objects(
         out: Directory of the benchmark.
         config: The preset, or a smaller one, e.g. in tests.
         only: Names of the objects; all if empty.
-        progress: Is told how many meshes there are.
+        progress: Is called with the number of written meshes.
 
     Raises:
         MeshError: If `only` names no object.
         OSError: If the files cannot be written.
     """
-    # Which objects.
+    # Choose the objects.
     items = {item.name: item for item in draw_builtin(config.builtin)}
     unknown = sorted(set(only) - items.keys())
     if unknown:
         raise MeshError(f"only must be names of objects of {NAME}, got {unknown[0]!r}")
     chosen = [item for name, item in items.items() if not only or name in only]
 
-    # Their meshes, compared with the published ones.
+    # Write their meshes, and compare them with the published ones.
     folder, known, differ = out / BUILTIN_FOLDER, published(), list[str]()
     folder.mkdir(parents=True, exist_ok=True)
     said: dict[str, Any] = {}
@@ -107,7 +107,7 @@ def write_objects(
         said[item.name] = {"mass": mass, "friction": friction}
         progress(done, len(chosen))
 
-    # What is said of them.
+    # Write the manifest and the description of the benchmark.
     text = yaml.safe_dump({"units": "m", "licence": LICENCE, "objects": said}, sort_keys=True)
     write_atomic(folder / MANIFEST_NAME, text.encode())
     about = {
@@ -122,16 +122,16 @@ def write_objects(
 
 
 def read_benchmark(out: Path, config: Config, versions: Mapping[str, str]) -> dict[str, Any] | None:
-    """Return what the benchmark in a directory says of itself; None if it is another dataset.
+    """Return the description of the benchmark in a directory; None for another dataset.
 
     Args:
         out: The directory.
-        config: By which grasps are tried; the published one tries the first wrist pose only.
-        versions: Of the packages that try the grasps. Those that differ from the published ones are
-            returned, because simulated values may then differ.
+        config: Configuration of the trials; the published one tries only the first wrist pose.
+        versions: Versions of the packages that run the trials. Those that differ from the published
+            versions are returned, because simulated values may then differ.
 
     Raises:
-        DataError: If its file, or the data file beside it, is damaged.
+        DataError: If the file of the benchmark, or the data file beside it, is damaged.
     """
     path = out / BUILTIN_FOLDER / BENCHMARK_FILE
     if not path.is_file():
@@ -143,14 +143,14 @@ def read_benchmark(out: Path, config: Config, versions: Mapping[str, str]) -> di
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}: must be the file of a benchmark, got another: {error}") from None
 
-    # Whether its rows are the published ones: with other versions some may come out otherwise.
+    # Compare the rows with the published ones; with other versions some rows may differ.
     if (data_file := out / DATA_FILES["oto"]).is_file():
         test, known = GraspDataset(data_file, split="test"), published()["rows"]
         found["rows"], found["published_rows"] = len(test), known["count"]
         found["rows_as_published"] = rows_digest(test, range(len(test))) == known["sha256"]
 
-    # What differs from the published benchmark: in how grasps are tried, and in what was built,
-    # which a score cannot set back.
+    # Find differences from the published benchmark: in the settings of the trials, and in the
+    # settings of the build, which a score cannot correct.
     stated, preset = published()["versions"], load_config(PRESET, ["verify.max_tries=1"])
     other = differences(preset, config, ignored=())
     other = other or differences(preset, built, ignored=("verify", "attempt_seconds"))

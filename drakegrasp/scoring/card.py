@@ -1,7 +1,7 @@
-"""The card of a score: everything that another person needs to compare with it, or to run it again.
+"""The card of a score: everything that others need to compare with the score or to repeat it.
 
-In: the judged sets and where they come from. Out: plain JSON types, and the same as Markdown. No
-time and no number of workers is in it, so equal verdicts give equal cards.
+In: the judged sets and their origin. Out: plain JSON types, and the same as Markdown. The card has
+no times and no number of workers, so equal verdicts give equal cards.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from drakegrasp.scoring.measures import (
 )
 from drakegrasp.scoring.references import REFERENCES
 
-#: Name of the card's form.
+#: Name of the format of the card.
 FORM = "drakegrasp-score-1"
-#: With fewer test objects a warning is on the card.
+#: Number of test objects below which the card has a warning.
 FEW_OBJECTS = 20
-#: What the measures are where a protocol other than the lift decides.
+#: Meanings of the measures if a protocol other than the lift decides.
 BY_PROTOCOL = {
     "headline": "success by the protocol of the first wrist pose; best-ranked prediction of each "
     "row; mean over objects",
     "objects": "objects with a row that succeeds",
 }
-#: What the measures are, in the order of a table.
+#: Meanings of the measures, in the order of a table.
 MEANINGS = {
     "headline": "a sample, held by the first wrist pose with every contact within d; best-ranked "
     "prediction of each row; mean over objects",
@@ -75,19 +75,19 @@ def card_of(
     """Return the card.
 
     Args:
-        sets: The predictions if there are any, then the reference rows.
-        grouping: Of the scored rows.
+        sets: The predictions, if there are any, then the reference rows.
+        grouping: Grouping of the scored rows.
         own: By row (3k,), contact points of its own grasp in {O} [m].
-        dataset: What was scored on: file, split, hashes, rows.
-        settings: All that decides a verdict, with the versions.
-        limit: d, the largest distance between asked and reached contacts [m].
+        dataset: The scored dataset: file, split, hashes, rows.
+        settings: Everything that decides a verdict, with the versions.
+        limit: d, the largest distance between requested and reached contacts [m].
         oracle: Whether more wrist poses than the first were tried.
-        known_objects: Scored objects that are in the training split.
+        known_objects: Number of scored objects that are in the training split.
         new_classes: Whether no class of the scored objects is in the training split.
-        benchmark: What the frozen benchmark says of itself; None for another dataset.
-        again: The command that makes the card again.
+        benchmark: Description of the frozen benchmark; None for another dataset.
+        again: The command that creates the card again.
     """
-    # What is drawn, and each set; all sets share the draws.
+    # Draw objects or classes, and describe each set; all sets share the draws.
     clusters = grouping.classes if new_classes else grouping.names
     draws = resample(clusters)
     described = {each.name: _set_of(each, grouping, own, draws, oracle) for each in sets}
@@ -124,7 +124,7 @@ def card_of(
 def _above(
     sets: Sequence[Judged], tested: Sequence[Judged], grouping: Grouping, draws: Array
 ) -> dict[str, dict[str, Estimate]]:
-    """Return by how much each tested set is above each other; a pair is compared once."""
+    """Return by how much each tested set is above every other set; a pair is compared once."""
     found: dict[str, dict[str, Estimate]] = {}
     for one in tested:
         found[one.name] = {
@@ -138,7 +138,7 @@ def _above(
 
 
 def _negative(of: Estimate) -> Estimate:
-    # Subtracting from zero keeps a zero without a sign.
+    # Subtracting from zero avoids a negative zero.
     return {"value": 0.0 - of["value"], "low": 0.0 - of["high"], "high": 0.0 - of["low"]}
 
 
@@ -149,7 +149,7 @@ def _set_of(
     draws: Array,
     oracle: bool,
 ) -> dict[str, Any]:
-    """Return what the card says of a set."""
+    """Return the description of a set on the card."""
     table, reference = judged.table, REFERENCES.get(judged.name)
     of_postures = any(ranked.grasps is None for ranked in judged.ranked)
     return {
@@ -170,7 +170,7 @@ def _set_of(
 def _warnings(
     grouping: Grouping, sets: Sequence[Judged], total: int, known_objects: int
 ) -> list[str]:
-    """Return what a reader must know before comparing."""
+    """Return what a reader must know before comparing scores."""
     found = []
     if len(grouping.names) < FEW_OBJECTS:
         found.append(
@@ -184,7 +184,7 @@ def _warnings(
     if not any(REFERENCES[each.name].trained for each in sets if each.name in REFERENCES):
         found.append("no blind row stands beside the score, so it says little (--train)")
 
-    # Verdicts that say nothing about the grasp.
+    # Count verdicts that give no information about the grasp.
     without = ("solver_error", "timeout", "crashed")
     if unknown := sum(int(np.isin(each.table.outcome, without).sum()) for each in sets):
         found.append(f"{unknown} predictions have no verdict (solver error, timeout): they fail")
@@ -205,7 +205,7 @@ def card_text(card: Mapping[str, Any]) -> str:
     lines += [f"> Warning: {warning}." for warning in card["warnings"]]
     lines += [""] if card["warnings"] else []
 
-    # The sets beside each other.
+    # A table of all sets.
     measures = [*(name for name in card["measures"] if name != "objects"), "objects"]
     rows = []
     for name, each in card["sets"].items():
@@ -237,8 +237,8 @@ def card_text(card: Mapping[str, Any]) -> str:
 
 
 def _more(card: Mapping[str, Any]) -> list[str]:
-    """Return the lines on what stands beside the headline."""
-    # The curve, and what is told of what counts.
+    """Return the lines on measures beside the headline."""
+    # The curve, and measures of the predictions that count.
     sets, lines = card["sets"], list[str]()
     if "protocol" not in card["settings"]:
         curves = [each["held_within_mm"] for each in sets.values()]
@@ -260,7 +260,7 @@ def _more(card: Mapping[str, Any]) -> list[str]:
         "",
     ]
 
-    # Several predictions per row, and stated confidence.
+    # Success with several predictions per row, and calibration.
     for name, each in sets.items():
         for measure, value in each["measures"].items():
             if measure.startswith("success@"):
@@ -276,7 +276,7 @@ def _more(card: Mapping[str, Any]) -> list[str]:
 
 
 def _origin(card: Mapping[str, Any]) -> list[str]:
-    """Return the lines that say where a card comes from and how to make it again."""
+    """Return the lines on the origin of a card and on how to create it again."""
     lines = ["## Made from", ""]
     lines += [f"* {key}: `{value}`" for key, value in card["dataset"].items()]
     for name, each in card["sets"].items():

@@ -1,10 +1,10 @@
 """Measures of a set of predictions from their verdicts, as means over objects with intervals.
 
-A row is one image of one object; an object's value is the mean over its rows, and a set's the mean
-over objects, so an object with many rows counts no more than another. Intervals are those of a
-paired bootstrap: objects are drawn with replacement, the same ones for every set of predictions, so
-a difference of two sets has an interval of its own. Where several training seeds are given they are
-drawn, too, apart from the objects (a two-level bootstrap). The draws come from `seeding`.
+A row is one image of one object. An object's value is the mean over its rows, and a set's value is
+the mean over objects, so an object with many rows has no more weight than another. Intervals come
+from a paired bootstrap: objects are drawn with replacement, the same ones for every set of
+predictions, so a difference of two sets has its own interval. If there are several training seeds,
+they are drawn independently of the objects (a two-level bootstrap). The draws come from `seeding`.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from drakegrasp.table import Table
 
 #: A mean over objects by "value", and the ends of its interval by "low" and "high".
 Estimate: TypeAlias = dict[str, float]
-#: Resamples, the share of them that an interval holds, and the seed of their draws.
+#: Number of resamples, fraction of them within an interval, and seed of their draws.
 RESAMPLES, LEVEL, SEED = 2000, 0.95, 0
 #: Decimals of values, so that sums in another order give the same text.
 DIGITS = 6
 
 
 def resample(clusters: Sequence[str]) -> Array:
-    """Return draws of objects: (B, objects), share of each in each resample; a row sums to 1.
+    """Return draws of objects (B, objects): weight of each in each resample; a row sums to 1.
 
     Args:
-        clusters: Of each object what is drawn as one: its name, or its class.
+        clusters: For each object the cluster that is drawn as one: the object's name, or its class.
     """
-    # How often each cluster is drawn; all its objects count as often.
+    # Count how often each cluster is drawn; all its objects count as often.
     names, members = np.unique(np.asarray(clusters), return_inverse=True)
     shares = _drawn(len(names), "bootstrap", RESAMPLES)[:, members]
     return np.asarray(shares / shares.sum(axis=1, keepdims=True))
 
 
 def _drawn(count: int, name: str, resamples: int) -> Array:
-    """Return (B, count), share of each of so many things in each resample, by draws of a name."""
+    """Return draws (B, count): weight of each item in each resample, seeded by a name."""
     stream = Stream(SEED, object_key(name), count)
     drawn = stream.integers(count, resamples * count).reshape(resamples, count)
     offset = np.arange(resamples)[:, None] * count
@@ -65,15 +65,15 @@ def _estimate(value: float, resampled: Array) -> Estimate:
     return {"value": _rounded(value), "low": _rounded(low), "high": _rounded(high)}
 
 
-#: Numbers of predictions per row for which success is told.
+#: Numbers of predictions per row for which success is reported.
 KS = (1, 2, 5, 10, 20, 50, 100)
-#: Distances d between asked and reached contacts of the curve held(d) [mm].
+#: Distances d between requested and reached contacts of the curve held(d) [mm].
 CURVE_MM = tuple(range(0, 61, 5))
-#: Predictions are put in so many groups of equal size by their stated confidence.
+#: Number of groups of equal size into which predictions are sorted by their stated confidence.
 BINS = 5
-#: Components of the diversity, as in DexGraspBench.
+#: Number of components of the diversity, as in DexGraspBench.
 COMPONENTS = 5
-#: A grasp covers another if its contacts are on average nearer than this [m].
+#: A grasp covers another if the mean distance between their contacts is at most this [m].
 COVER = 0.02
 #: Measures of a row's best-ranked prediction.
 FIRST = ("headline", "success", "sample", "held", "precision", "stable", "held_any")
@@ -84,9 +84,9 @@ class Judged:
     """A set of predictions and their verdicts, one list per training seed.
 
     Attributes:
-        name: Of the set.
+        name: Name of the set.
         ranked: The predictions, by training seed.
-        verdicts: Theirs, in the same order.
+        verdicts: Verdicts on the predictions, in the same order.
     """
 
     name: str
@@ -95,9 +95,10 @@ class Judged:
 
     @cached_property
     def table(self) -> Table:
-        """All predictions of all seeds: `seed`, `row` and `rank`, and what their verdicts say.
+        """All predictions of all seeds: `seed`, `row`, `rank`, and the contents of their verdicts.
 
-        That is each attribute of `Verdict`, NaN for None, and `headline`: whether it counts in it.
+        The contents are each attribute of `Verdict`, with NaN for None, and `headline`: whether the
+        prediction counts in the headline.
         """
         flat = [verdict for verdicts in self.verdicts for verdict in verdicts]
         said: dict[str, Any] = {
@@ -119,10 +120,10 @@ class Grouping:
     """The rows of a score by object.
 
     Attributes:
-        rows: Scored, in order.
-        objects: (rows,), index of the object of each.
-        names: Of the objects.
-        classes: Of the objects.
+        rows: The scored rows, in order.
+        objects: (rows,), index of each row's object.
+        names: Names of the objects.
+        classes: Classes of the objects.
     """
 
     rows: tuple[int, ...]
@@ -134,9 +135,9 @@ class Grouping:
         """Return (training seeds, rows), whether one of the `most` best of each row is good.
 
         Args:
-            judged: The set; a row without prediction fails.
-            good: Of all its predictions, in the order of its table.
-            most: So many of each row count.
+            judged: The set; a row without predictions fails.
+            good: Whether each prediction is good, in the order of the set's table.
+            most: Number of predictions that count per row.
         """
         table, found = judged.table, np.zeros((len(judged.ranked), len(self.rows)))
         kept = table[np.asarray(good, dtype=bool) & (table.rank < most)]
@@ -154,13 +155,14 @@ def estimates(
 ) -> dict[str, Estimate]:
     """Return the measures of a set that have intervals, by name.
 
-    Beside those of `FIRST`: `success@k` for the k that the set has, whether any of the k best of a
-    row counts in the headline; `objects`, the share of objects with one that does.
+    They are those of `FIRST` and two more. `success@k`, for each k that the set has, is whether any
+    of the k best predictions of a row counts in the headline. `objects` is the fraction of objects
+    with a prediction that counts.
 
     Args:
         judged: The set.
-        grouping: Of the rows.
-        draws: Of objects, see `resample`.
+        grouping: Grouping of the rows.
+        draws: Draws of objects, see `resample`.
         oracle: Whether more wrist poses than the first were tried.
     """
     table, by_row = judged.table, dict[str, Array]()
@@ -181,7 +183,7 @@ def estimates(
 def difference(one: Judged, other: Judged, grouping: Grouping, draws: Array) -> Estimate:
     """Return by how much the headline of a set is above that of another, object by object.
 
-    The training seeds of both are drawn, apart from each other.
+    The training seeds of the two sets are drawn independently.
     """
     ours, theirs = _headlines(one, grouping), _headlines(other, grouping)
     resampled = _means(ours, draws) - _means(theirs, draws, "other training seeds")
@@ -194,7 +196,7 @@ def _headlines(judged: Judged, grouping: Grouping) -> Array:
 
 
 def curve(judged: Judged, grouping: Grouping) -> list[float]:
-    """Return held(d) at `CURVE_MM`: held with every contact within d of the one asked for."""
+    """Return held(d) at `CURVE_MM`: held, with every contact within d of the requested one."""
     table, values = judged.table, []
     for limit in CURVE_MM:
         within = table.held & (table.contact_error <= 1e-3 * limit)
@@ -203,10 +205,10 @@ def curve(judged: Judged, grouping: Grouping) -> list[float]:
 
 
 def calibration(judged: Judged) -> list[dict[str, float]]:
-    """Return mean confidence and share that counts, of groups of predictions; empty if none stated.
+    """Return mean confidence and counting fraction of groups of predictions, or an empty list.
 
-    All predictions whose confidence is a finite number are in it, whatever their rank, in groups of
-    equal size by confidence.
+    It has all predictions with a finite confidence, of any rank, in groups of equal size by
+    confidence. It is empty if a training seed states no confidence.
     """
     if any(ranked.confidence is None for ranked in judged.ranked):
         return []
@@ -232,11 +234,11 @@ def penetration(judged: Judged) -> float | None:
 
 
 def diversity(judged: Judged) -> list[float] | None:
-    """Return shares of variance in the first 1 to 5 principal components of what counts.
+    """Return the fractions of variance in the first 1 to 5 principal components.
 
-    Of palm position [m], rotation vector [rad] and joints in {O}, over all predictions that count
-    in the headline, as DexGraspBench does (JYChen18/DexGraspBench, 1e7a5a6); the lower, the more
-    diverse. None if fewer than three count.
+    The variance is that of palm position [m], rotation vector [rad] and joints in {O}, over all
+    predictions that count in the headline, as in DexGraspBench (JYChen18/DexGraspBench, 1e7a5a6).
+    Lower is more diverse. The result is None if fewer than three predictions count.
     """
     kept = [posture for posture in judged.table.posture[judged.table.headline] if posture]
     if len(kept) < 3:
@@ -248,21 +250,21 @@ def diversity(judged: Judged) -> list[float] | None:
 
 
 def coverage(judged: Judged, own: Mapping[int, Array], grouping: Grouping) -> float:
-    """Return the share of own grasps near which a prediction for the same object counts.
+    """Return the fraction of own grasps near a prediction that counts for the same object.
 
     Args:
         judged: The set.
         own: By row (3k,), contact points of its own grasp in {O} [m].
-        grouping: Of the rows.
+        grouping: Grouping of the rows.
     """
-    # What counts, by object.
+    # Collect the predictions that count, by object.
     kept = judged.table[judged.table.headline & judged.table.contacts.astype(bool)]
     objects = grouping.objects[np.searchsorted(grouping.rows, kept.row)]
     counted: dict[int, list[Array]] = {}
     for index, contacts in zip(objects.tolist(), kept.contacts, strict=True):
         counted.setdefault(index, []).append(np.array(contacts).reshape(-1, 3))
 
-    # Which own grasps have one near.
+    # Find the own grasps that have one near.
     covered = []
     for row, index in zip(grouping.rows, grouping.objects.tolist(), strict=True):
         points = own[row].reshape(-1, 3)
@@ -272,7 +274,7 @@ def coverage(judged: Judged, own: Mapping[int, Array], grouping: Grouping) -> fl
 
 
 def by_name(judged: Judged, grouping: Grouping, names: Sequence[str]) -> dict[str, float]:
-    """Return the mean of the headline over the objects of each name, that of a class or its own."""
+    """Return the mean of the headline over the objects with the same name or class, by `names`."""
     values, array = _headlines(judged, grouping).mean(axis=0), np.array(names)
     return {name: _rounded(values[array == name].mean()) for name in sorted(set(names))}
 

@@ -1,8 +1,9 @@
-"""Proposals: grasps from above of what a camera saw, for a hand whose user has no network yet.
+"""Proposals: grasps from above for what a camera saw, for users who have no network yet.
 
-In: an object's visible points in {T}, whose table is z = 0. Out: `Attempts`, which
-`scoring.ranking` orders, a build tries and a score judges as those of a network. The sampler
-`above` draws such palms at random about a whole mesh; here they are few, and fixed by what is seen.
+In: an object's visible points in {T}, where the table is z = 0. Out: `Attempts`, which
+`scoring.ranking` orders, a build tries and a score judges like those of a network. The sampler
+`above` draws such palm poses at random around a whole mesh. Here they are few, and the visible
+points determine them.
 """
 
 from __future__ import annotations
@@ -20,40 +21,42 @@ from drakegrasp.scoring.ranking import chosen_hand, closed_on
 from drakegrasp.simulation.attempts import Attempts, make_attempts
 from drakegrasp.simulation.posture import joint_order
 
-#: Turns about the vertical [degree], from where the hand closes across the narrow side.
+#: Turns about the vertical [degree], relative to closing across the narrow side.
 TURNS = (0.0, 180.0, 90.0, 270.0)
-#: Of tilted palms: by how much, and about which horizontal axes, from the long side [degree].
+#: Angle of tilted palms, and the horizontal axes of the tilts, measured from the long side
+#: [degree].
 TILT, TILTED = 25.0, (0.0, 90.0, 180.0, 270.0)
-#: Places along the long side, as shares of half of it.
+#: Places along the long side, as fractions of half of it.
 ASIDE = (-0.4, 0.4)
-#: A fully closing hand comes so near to the table [m]; others are so much higher or deeper.
+#: Smallest distance of a closing hand from the table [m]; distance by which other palms are higher
+#: or deeper [m].
 TABLE_GAP, DEEPER = 0.006, 0.02
-#: Palms that are nearer to each other than both are one [m, rad].
+#: Palms that are closer to each other than both limits are the same [m, rad].
 SAME = 0.008, np.deg2rad(12.0)
 
 
 def propose(
     cloud: npt.ArrayLike, hand: Hand | str | None = None, *, name: str = "seen"
 ) -> Attempts:
-    """Return some 30 grasps from above of what a camera saw, the plainest first.
+    """Return about 30 grasps from above for what a camera saw, the simplest first.
 
-    The smallest rectangle about the points, seen from above, has a long side. The first palm looks
-    down on its middle and closes across it, as deep as the table and the hand's smallest stand-off
-    allow. The others are turned by quarters, higher or deeper by 20 mm, aside along the long side,
-    or tilted by 25 degrees. No two are within 8 mm and 12 degrees.
+    The smallest rectangle around the points, seen from above, has a long side. The first palm looks
+    down on its centre and closes across the long side, as deep as the table and the hand's smallest
+    stand-off allow. The other palms are turned by quarters, higher or deeper by 20 mm, shifted
+    along the long side, or tilted by 25 degrees. No two palms are within 8 mm and 12 degrees.
 
     Args:
-        cloud: (n, 3), points of the object alone in {T} [m]; the table is z = 0.
-        hand: A hand, or what `load_hand` takes; the default one if None. Of one with preshapes the
-            first is used.
+        cloud: (n, 3), points of the object only, in {T} [m]; the table is z = 0.
+        hand: A hand, or an argument of `load_hand`; None for the default hand. Of a hand with
+            preshapes, the first preshape is used.
         name: Name of the object in the table.
 
     Returns:
-        Postures in the frame "table": the pregrasp is the open hand, the grasp has closed on the
-        points.
+        Postures in the frame "table". The pregrasp is the open hand, and the grasp has closed on
+        the points.
 
     Raises:
-        GraspError: If the cloud is none.
+        GraspError: If the cloud is invalid.
         HandError: If the hand cannot be used, or several of its fingers move one link.
     """
     points, hand = read_cloud(cloud), chosen_hand(hand)
@@ -87,8 +90,8 @@ def _palms(points: Array, hand: Hand) -> Array:
     standoff = max(least, reach(hand, np.array([0.0, 0.0, 1.0])) + TABLE_GAP - top)
 
     def palm(turn: float, higher: float, aside: float = 0.0, tilt: float | None = None) -> Array:
-        """Return X_TG turned [degree], higher [m], aside [share] and tilted about an axis."""
-        # About the point at half the height, at which the palm looks.
+        """Return X_TG turned [degree], higher [m], aside [fraction] and tilted about an axis."""
+        # All poses look at the point at half the height, so they are relative to it.
         R = multiply(_rotation_z(heading + turn), np.diag([1.0, -1.0, -1.0]))
         X = make_pose(R, [0.0, 0.0, top / 2.0 + standoff + higher])
         if tilt is not None:
@@ -114,7 +117,7 @@ def _rotation_z(degrees: float) -> Array:
 
 
 def distinct(X_TG: Array) -> Array:
-    """Return those (m, 4, 4) of poses (n, 4, 4) that are not within `SAME` of one before them."""
+    """Return the poses (m, 4, 4) that are not within `SAME` of an earlier pose, of (n, 4, 4)."""
     kept: list[int] = []
     for i, X in enumerate(X_TG):
         known = X_TG[kept]

@@ -1,10 +1,10 @@
-"""Ranking: which of several grasps to try, by closing the hand on the points that a camera saw.
+"""Ranking: the order in which to try grasps, by closing the hand on points that a camera saw.
 
-In: grasps that anybody proposes, and an object's visible points in {T}, whose table is z = 0. Out:
-a score of each. Nothing is simulated and nothing is learned: the points become solids
-(`mesh.cloud`), and the hand's geometry says where each finger stops (`hand.finger_sweep`). A score
-is a mean over the solids and over small moves of the palm. `scoring.proposals` has grasps to begin
-with.
+In: grasps that anybody proposes, and an object's visible points in {T}, where the table is z = 0.
+Out: a score of each. Nothing is simulated and nothing is learned. The points become solids
+(`mesh.cloud`), and the hand's geometry determines where each finger stops (`hand.finger_sweep`). A
+score is a mean over the solids and over small moves of the palm. `scoring.proposals` proposes
+grasps.
 """
 
 from __future__ import annotations
@@ -27,48 +27,51 @@ from drakegrasp.simulation.posture import start_of
 from drakegrasp.simulation.screen import PointLookup, points_at
 from drakegrasp.table import Table
 
-#: Moves of the palm along its axes [m] over which a score is a mean; the first is none.
+#: Moves of the palm along its axes [m] over which a score is averaged; the first is no move.
 MOVES = 0.005 * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]])
-#: Spreads are rounded to multiples of this [rad]: the paths of a hand cost half a second.
+#: Spreads are rounded to multiples of this [rad], because the paths of a hand take half a second.
 SPREAD_STEP = np.deg2rad(2.5)
-#: Of a pad every so many-th point counts, and of the rest of the hand.
+#: Strides of the points that are used: of a pad, and of the rest of the hand.
 PAD_STRIDE, STRIDE = 2, 4
-#: A finger has met what is nearer than this [m]; it is there after so many steps at most.
+#: A finger stops closer than this to an obstacle [m]; largest number of steps of the search.
 TOUCH, STEPS = 2e-4, 60
-#: Distances count up to this [m].
+#: Larger distances are cut to this [m].
 FAR = 0.02
-#: A pad touches if it is so near when its finger stops [m].
+#: A pad touches if it is closer than this when its finger stops [m].
 PAD_GAP = 0.003
-#: The open hand is free unless it is deeper than this in object or table [m]: the solids are rough.
+#: The open hand is free unless it is deeper than this in object or table [m]; the solids are rough.
 DEEP = 0.003
-#: A moment counts as a force at this lever [m].
+#: Lever by which a moment is divided to be compared with a force [m].
 LEVER = 0.05
-#: Rounds and rate of the search for the shares of the fingers.
+#: Rounds and rate of the search for the fractions of force of the fingers.
 ROUNDS, RATE = 100, 1.0
-#: Logistic weights of `push`, `opposition`, `arm` [1/m] and `gap` [1/m], and the constant: fitted
-#: to lifts of the Barrett hand, see docs/results/choice.md.
+#: Logistic weights of `push`, `opposition`, `arm` [1/m] and `gap` [1/m], and the constant. They
+#: were fitted to lifts of the Barrett Hand, see docs/results/choice.md.
 WEIGHTS = {"push": 4.0, "opposition": 2.0, "arm": -20.0, "gap": -50.0}
 CONSTANT = -3.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ranking:
-    """The scores of n proposals, and what they follow from.
+    """The scores of n proposals, and the features that determine them.
 
     Attributes:
-        score: (n,), 0 to 1, greater is better: an estimate of how likely the hand holds; -1 of a
-            row that is no posture.
-        order: (n,), the proposals, best first; of equal ones the earlier.
-        features: Columns, each a mean over solids and moves; NaN of a row that is no posture:
-            `clearance` (n,) of the open hand from the object, negative inside, up to 20 mm [m];
-            `table` (n,), likewise from the table;
-            `touch` (n, k), whether each finger's pad is at the object where the finger stops;
-            `gap` (n,), distance of the farthest required pad from the object then, up to 20 mm [m];
-            `push` (n,), cosine between the motion of a required pad and the surface's inward normal
-            there: the least;
+        score: (n,), 0 to 1, greater is better: an estimate of the probability that the hand holds;
+            -1 for a row that is not a posture.
+        order: (n,), indices of the proposals, best first; of equal ones the earlier is first.
+        features: Columns, each a mean over solids and moves; NaN for a row that is not a posture:
+            `clearance` (n,), distance of the open hand from the object [m], negative inside, at
+            most 20 mm;
+            `table` (n,), distance of the open hand from the table [m], negative inside, at most
+            20 mm;
+            `touch` (n, k), whether each finger's pad is at the object when the finger stops;
+            `gap` (n,), distance of the farthest required pad from the object then [m], at most
+            20 mm;
+            `push` (n,), smallest cosine between the motion of a required pad and the surface's
+            inward normal there;
             `opposition` (n,), how well the contacts' normals balance, 0 to 1;
-            `arm` (n,), horizontal distance of the contacts' middle from the object's [m];
-            `robust` (n,), share in which the open hand is free and all required pads touch.
+            `arm` (n,), horizontal distance of the contacts' centre from the object's [m];
+            `robust` (n,), fraction in which the open hand is free and all required pads touch.
     """
 
     score: Array
@@ -83,20 +86,20 @@ def rank(
     *,
     spread: float = 0.0,
 ) -> Ranking:
-    """Return which proposals to try first, by closing the hand on what a camera saw.
+    """Return the order in which to try proposals, by closing the hand on what a camera saw.
 
-    Of a posture the palm's pose, the spread and the pregrasp count. From there each finger closes
-    as the hand file says, until it meets the object or the table.
+    Palm pose, spread and pregrasp of a posture are used. From there each finger closes as the hand
+    file specifies, until it meets the object or the table.
 
     Args:
         proposals: Postures of `propose` or `make_attempts`, in {T} or with their X_TO; or palm
-            poses X_TG (n, 4, 4) or (4, 4), for which the hand is open.
-        cloud: (n, 3), points of the object alone in {T} [m]; the table is z = 0.
-        hand: A hand, or what `load_hand` takes; the default one if None.
-        spread: Of palm poses [rad].
+            poses X_TG (n, 4, 4) or (4, 4), for which the hand starts open.
+        cloud: (n, 3), points of the object only, in {T} [m]; the table is z = 0.
+        hand: A hand, or an argument of `load_hand`; None for the default hand.
+        spread: Spread of palm poses [rad].
 
     Raises:
-        GraspError: If the cloud or the poses are none, or postures are in {O} without X_TO.
+        GraspError: If the cloud or the poses are invalid, or postures are in {O} without X_TO.
         HandError: If the hand cannot be used, or several of its fingers move one link.
     """
     points, hand = read_cloud(cloud), chosen_hand(hand)
@@ -122,24 +125,24 @@ def rank(
 
 
 def chosen_hand(hand: Hand | str | None) -> Hand:
-    """Return a hand as it is, the one of a name or a file, or the default one."""
+    """Return a given hand, the hand of a name or a file, or the default hand."""
     if isinstance(hand, Hand):
         return hand
     return load_hand() if hand is None else load_hand(hand)
 
 
 def closed_on(points: Array, hand: Hand, X_TG: Array, spread: float) -> Array:
-    """Return closing positions (n, k) of a hand that opens at palm poses and closes on a cloud.
+    """Return closing positions (n, k) of a hand that is open at palm poses and closes on a cloud.
 
     Args:
         points: (n, 3), see `read_cloud`.
-        hand: In one of its preshapes.
-        X_TG: (n, 4, 4).
-        spread: [rad].
+        hand: The hand in one of its preshapes.
+        X_TG: (n, 4, 4), palm poses.
+        spread: Spread angle [rad].
 
     Raises:
         GraspError: If the points lie in a vertical plane.
-        HandError: If several of its fingers move one link.
+        HandError: If several fingers move one link.
     """
     paths = _paths(hand, spread)
     lookup = PointLookup(hull_solid(points).field, np.eye(4), X_TG)
@@ -147,7 +150,7 @@ def closed_on(points: Array, hand: Hand, X_TG: Array, spread: float) -> Array:
 
 
 def _starts(proposals: Attempts | Array, hand: Hand, spread: float) -> dict[int, Attempt]:
-    """Return how each proposal begins, with {T} as its object's frame; rows that are none lack."""
+    """Return the start of each valid proposal, by its index, with {T} as its object's frame."""
     if not isinstance(proposals, Attempts):
         preshape = 0 if hand.preshapes else None
         made = (Attempt(X_OG=X, spread=spread, preshape=preshape) for X in proposals)
@@ -169,8 +172,8 @@ def _starts(proposals: Attempts | Array, hand: Hand, spread: float) -> dict[int,
 def _closed(
     solids: Sequence[Solid], hand: Hand, spread: float, starts: Sequence[Attempt]
 ) -> dict[str, Array]:
-    """Return score and features (n, ...) of starts at a spread, the means over solids and moves."""
-    # Each start, moved.
+    """Return score and features (n, ...) of starts at a spread, averaged over solids and moves."""
+    # Apply each move to each start.
     X_TG = np.array([start.X_OG for start in starts])
     moved = np.repeat(X_TG, len(MOVES), axis=0)
     moved[:, :3, 3] += multiply(MOVES, np.swapaxes(X_TG[:, :3, :3], 1, 2)).reshape(-1, 3)
@@ -191,7 +194,7 @@ def _closed(
 def _features(
     solid: Solid, hand: Hand, paths: HandPaths, X_TG: Array, closing: Array
 ) -> dict[str, Array]:
-    """Return score and features of palm poses (n, 4, 4) where fingers (n, k) start [rad or m]."""
+    """Return score and features of palm poses (n, 4, 4) and starts of fingers (n, k) [rad or m]."""
     # The open hand.
     lookup, rows = PointLookup(solid.field, np.eye(4), X_TG), np.arange(len(X_TG))
     starts = closing / _steps(paths)
@@ -200,7 +203,7 @@ def _features(
     clearance = np.min([lookup.distances(rows, p, FAR).min(axis=1) for p in parts], axis=0)
     table = np.min([lookup.heights(rows, p).min(axis=1) for p in parts], axis=0)
 
-    # The pads, where the fingers stop.
+    # The pads, in the places where the fingers stop.
     places = _places(hand, paths, lookup, starts)
     pads = [
         _pad(solid, lookup, path, X_TG, at)
@@ -208,7 +211,7 @@ def _features(
     ]
     gaps, p_TQ, n_T, push = (np.stack(each, axis=1) for each in zip(*pads, strict=True))
 
-    # What follows from the contacts.
+    # The features of the contacts.
     touch, needed = gaps < PAD_GAP, hand.required
     opposition, middle = _opposition(p_TQ, n_T, touch)
     free = np.minimum(clearance, table) > -DEEP
@@ -232,7 +235,7 @@ def _places(hand: Hand, paths: HandPaths, lookup: PointLookup, starts: Array) ->
     steps = _steps(paths)
     closing = np.column_stack([_stop(lookup, path, at) for path, at in fingers]) * steps
 
-    # Those of one motor have closed alike: the first to stop stops them all.
+    # Fingers that share a motor close together: the first finger to stop stops them all.
     for ratio in hand.closing_ratio.T:
         own = ratio > 0.0
         closing[:, own] = ratio[own] * (closing[:, own] / ratio[own]).min(axis=1, keepdims=True)
@@ -242,8 +245,8 @@ def _places(hand: Hand, paths: HandPaths, lookup: PointLookup, starts: Array) ->
 def _stop(lookup: PointLookup, path: FingerPath, start: Array) -> Array:
     """Return the place (n,) on a path, in steps, at which a finger meets the object or the table.
 
-    No point moves by more per step than the largest `travel`, so the least distance says how many
-    steps are free (sphere tracing; Hart 1996).
+    No point moves by more than the largest `travel` per step, so the smallest distance limits the
+    number of free steps (sphere tracing; Hart 1996).
     """
     rate, end = float(path.travel.max()), len(path.angles) - 1
     place, active = start.astype(float), np.arange(len(lookup))
@@ -262,7 +265,7 @@ def _stop(lookup: PointLookup, path: FingerPath, start: Array) -> Array:
 def _pad(
     solid: Solid, lookup: PointLookup, path: FingerPath, X_TG: Array, place: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return of a pad at places (n,) on its path what is nearest to the object.
+    """Return the point of a pad that is closest to the object, at places (n,) on its path.
 
     Returns:
         Its distance (n,), 0 to `FAR` [m]; the point p_TQ (n, 3) [m]; the object's inward normal
@@ -281,16 +284,17 @@ def _pad(
 
 
 def _opposition(p_TQ: Array, n_T: Array, touch: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return how well contacts balance (n,), and their middle (n, 3) [m].
+    """Return how well contacts balance (n,), and their centre (n, 3) [m].
 
-    Each touching finger presses along its normal, with shares that leave the least force and moment
-    about the contacts' mean. 1 minus that least is 1 where they cancel; of one finger it is 0. The
-    middle is the mean by these shares.
+    Each touching finger presses along its normal, with the fraction of force that minimises the
+    total force and the moment about the contacts' mean. The balance is 1 minus this minimum: 1 if
+    forces and moments cancel, and 0 for one finger. The centre is the mean weighted by these
+    fractions.
 
     Args:
         p_TQ: (n, k, 3), contacts [m].
         n_T: (n, k, 3), unit normals into the object.
-        touch: (n, k), whether each finger touches; of those where none does, all count.
+        touch: (n, k), whether each finger touches; if no finger touches, all are used.
     """
     counted = (touch | ~touch.any(axis=1, keepdims=True)).astype(float)
     shares: Array = counted / counted.sum(axis=1, keepdims=True)
@@ -299,7 +303,7 @@ def _opposition(p_TQ: Array, n_T: Array, touch: npt.NDArray[np.bool_]) -> tuple[
     wrenches = np.concatenate([n_T, moments], axis=2)
     products = np.einsum("nia,nja->nij", wrenches, wrenches)
 
-    # Exponentiated gradient keeps the shares positive (Kivinen and Warmuth 1997).
+    # Exponentiated gradient keeps the fractions positive (Kivinen and Warmuth 1997).
     for _ in range(ROUNDS):
         shares = shares * np.exp(-RATE * np.einsum("nij,nj->ni", products, shares))
         shares /= shares.sum(axis=1)[:, None]
@@ -314,7 +318,7 @@ def _steps(paths: HandPaths) -> Array:
 
 
 def _paths(hand: Hand, spread: float) -> HandPaths:
-    """Return the paths of a hand's fingers, with fewer points: a pad's come first, and stay so."""
+    """Return the paths of a hand's fingers with fewer points; points of a pad still come first."""
     paths = hand_paths(hand, spread)
     if paths is None:
         raise HandError(f"hand must be one whose fingers share no link, got {hand.name}")

@@ -1,9 +1,9 @@
 """Reference rows: predictions that the program makes itself, to be scored beside a network's.
 
-In: the rows to score, and training rows. Out: a grasp per row, contacts in the camera's frame or
-postures in {T}. `constant` and
-`random` never look at the image. The camera stands at a fixed place of the palm, so a grasp in its
-frame gives the wrist away: a network that is not far above these two has learned nothing.
+In: the rows to score, and training rows. Out: a grasp per row, as contacts in the camera's frame or
+postures in {T}. `constant` and `random` never look at the image. The camera is at a fixed place
+relative to the palm, so a grasp in its frame reveals the wrist pose. A network that is not far
+above these two has learned nothing.
 """
 
 from __future__ import annotations
@@ -28,19 +28,20 @@ from drakegrasp.simulation.attempts import Attempts, make_attempts
 from drakegrasp.verification.placing import dataset_config
 from drakegrasp.vision.camera import project, unproject
 
-#: Cells along each edge of the image descriptor.
+#: Number of cells along each edge of the image descriptor.
 CELLS = 16
-#: What a pixel of the object counts as in it, beside depths [m].
+#: Value of an object pixel in the descriptor, to compare with depths [m].
 MASK_DEPTH = 0.1
-#: Training images that are compared, at most; drawn if there are more.
+#: Maximum number of training images that are compared; drawn if there are more.
 MOST_IMAGES = 5000
-#: What a normal counts as beside points, in the distance between grasps [m].
+#: Length of a unit normal in the distance between grasps, to compare with points [m].
 NORMAL_LENGTH = 0.05
-#: A grasp from above meets the object so far below its highest visible point, or half-way down [m].
+#: Depth of a grasp from above below the object's highest visible point [m]; at most half its
+#: height.
 DEPTH_OF_GRASP = 0.03
-#: Between neighbouring fingers of a grasp from above [m].
+#: Distance between neighbouring fingers of a grasp from above [m].
 FINGER_SPACING = 0.04
-#: Half the edge of the square of pixels from which a normal is fitted.
+#: Half the edge of the square of pixels to which a normal is fitted.
 PATCH = 2
 
 
@@ -50,13 +51,13 @@ Pixels: TypeAlias = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """The rows to score, the training rows, and the seed of what is drawn.
+    """The rows to score, the training rows, and the seed of the draws.
 
     Attributes:
-        data: Its split has the rows.
-        rows: To score.
+        data: The dataset; its split has the rows.
+        rows: The rows to score.
         train: The training split; it may be empty.
-        seed: Of the draws.
+        seed: Seed of the draws.
     """
 
     data: GraspDataset
@@ -71,21 +72,21 @@ class Scene:
 
     @cached_property
     def constant(self) -> Array:
-        """(6k,), the training grasp nearest to their mean."""
+        """(6k,), the training grasp that is closest to their mean."""
         scaled = self.train_grasps.copy()
         scaled[:, scaled.shape[1] // 2 :] *= NORMAL_LENGTH
         return self.train_grasps[np.argmin(((scaled - scaled.mean(axis=0)) ** 2).sum(axis=1))]
 
     @cached_property
     def thumb(self) -> int:
-        """The finger whose normal is most against the mean of the others, in most grasps."""
+        """The finger whose normal is most opposed to the mean of the others, in most grasps."""
         grasps = self.train_grasps if len(self.train_grasps) else self.data.column("grasps")
         normals = grasps.reshape(len(grasps), 2, -1, 3)[:, 1]
         against = np.einsum("nki,ni->nk", normals, normals.sum(axis=1)).argmin(axis=1)
         return int(np.bincount(against).argmax())
 
     def stream(self, name: str, row: int) -> Stream:
-        """Return the stream of a reference for a row; the row's trial names it, not its place."""
+        """Return the stream of a reference for a row, seeded by the trial of the row."""
         return Stream(self.seed, object_key(name), int(self.data.value("trial_id", row)))
 
     def visible(self, row: int) -> tuple[Pixels, Array]:
@@ -99,7 +100,7 @@ class Scene:
 def _contact(pixels: Pixels, points: Array, pixel: int) -> tuple[Array, Array]:
     """Return the point of an object pixel and the normal of a plane through its patch.
 
-    The normal points to the camera, as what is seen does.
+    The normal points towards the camera, because the patch is visible.
     """
     near = np.abs(pixels - pixels[pixel]).max(axis=1) <= PATCH
     patch, point = points[near], points[pixel]
@@ -111,15 +112,15 @@ def _contact(pixels: Pixels, points: Array, pixel: int) -> tuple[Array, Array]:
 
 
 def own(scene: Scene) -> Array:
-    """Return the stored grasps of the rows: the ceiling."""
+    """Return the stored grasps of the rows: the upper bound."""
     return np.asarray(scene.data.column("grasps")[list(scene.rows)], dtype=float)
 
 
 def nearest_image(scene: Scene) -> Array:
-    """Return the grasp of the training image whose descriptor is nearest.
+    """Return the grasp of the training image with the closest descriptor.
 
-    The descriptor has the mean depth [m], cut at the far plane, and 0.1 times the share of object
-    pixels, of each cell of a grid of 16 by 16; the distance is Euclidean.
+    The descriptor has two values for each cell of a grid of 16 by 16: the mean depth [m], cut at
+    the far plane, and 0.1 times the fraction of object pixels. The distance is Euclidean.
     """
     count = len(scene.train)
     known = np.arange(count)
@@ -152,9 +153,9 @@ def _descriptor(data: GraspDataset, row: int) -> Array:
 
 
 def constant(scene: Scene) -> Array:
-    """Return one grasp for all rows: the training grasp nearest to the mean, in the camera's frame.
+    """Return one grasp for all rows: the training grasp closest to the mean, in the camera's frame.
 
-    A normal of length 1 counts as 50 mm in the distance.
+    A normal of length 1 is treated as equal to 50 mm in the distance.
     """
     return np.tile(scene.constant, (len(scene.rows), 1))
 
@@ -170,8 +171,8 @@ def top_down(scene: Scene) -> Array:
     """Return a grasp from above at the visible centroid, which closes across the minor axis.
 
     The axes are principal axes of the visible points, seen from above. The finger that opposes the
-    others in most training grasps is on one side, the others on the other, 30 mm below the highest
-    visible point or half-way down.
+    others in most training grasps is on one side, and the other fingers on the other side. They are
+    30 mm below the highest visible point, or half-way down if that is higher.
     """
     poses = scene.data.column(f"object_props/frame_work2cam_{scene.data.camera}")
     return np.array([_from_above(scene, row, unpack_pose(poses[row])) for row in scene.rows])
@@ -179,7 +180,7 @@ def top_down(scene: Scene) -> Array:
 
 def _from_above(scene: Scene, row: int, X_TC: Array) -> Array:
     """Return the grasp (6k,) of `top_down` for a row, with the pose of its camera."""
-    # Visible points from above, and their axes.
+    # Visible points seen from above, and their axes.
     p_TQ = transform_points(X_TC, scene.visible(row)[1])
     centroid = p_TQ[:, :2].mean(axis=0)
     centred = p_TQ[:, :2] - centroid
@@ -188,7 +189,7 @@ def _from_above(scene: Scene, row: int, X_TC: Array) -> Array:
     top = float(np.quantile(p_TQ[:, 2], 0.98))
     height = max(top - DEPTH_OF_GRASP, top / 2.0)
 
-    # The thumb on one side, the others side by side on the other.
+    # The thumb is on one side, the other fingers are side by side on the other.
     fingers, others = scene.data.column("grasps").shape[1] // 6, 0
     points, normals = np.zeros((fingers, 3)), np.zeros((fingers, 3))
     for finger in range(fingers):
@@ -205,10 +206,10 @@ def _from_above(scene: Scene, row: int, X_TC: Array) -> Array:
 
 
 def palm_normals(scene: Scene) -> Array:
-    """Return contacts where rays about the palm's direction meet what is seen.
+    """Return contacts at which rays about the palm's direction meet the visible surface.
 
     The rays go through the contacts of the constant grasp, which lie about the palm's direction, or
-    through the object's nearest pixel; points and normals are those of the depth image.
+    through the object's closest pixel. Points and normals are those of the depth image.
     """
     axis = unpack_grasp(scene.constant)[0]
 
@@ -243,11 +244,11 @@ def _on_surface(scene: Scene, choose: Callable[[Scene, int, Pixels, int], Sequen
 
 
 def closing(scene: Scene) -> Attempts:
-    """Return of `propose` what `rank` puts first, for the visible points of each row.
+    """Return for each row the grasp of `propose` that `rank` puts first, for the visible points.
 
-    A row of which no grasp can be proposed is no grasp, and says why.
+    A row for which no grasp can be proposed is invalid, with the reason.
     """
-    # A row is NaN until something is proposed.
+    # A row is NaN until a grasp is proposed.
     hand = load_hand(dataset_config(scene.data).hand_source)
     poses = unpack_pose(scene.data.column(f"object_props/frame_work2cam_{scene.data.camera}"))
     count, joints = len(scene.rows), len(hand.joint_names)
@@ -275,21 +276,21 @@ def closing(scene: Scene) -> Attempts:
 
 
 def _chosen(p_TQ: Array, hand: Hand) -> Attempts:
-    """Return the one grasp of points (n, 3) in {T} that closing the hand puts first."""
+    """Return the one grasp for points (n, 3) in {T} that `rank` puts first."""
     grasps = propose(p_TQ, hand)
     return grasps.at([int(rank(grasps, p_TQ, hand).order[0])])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """A maker of reference rows: what it makes, in words, and whether it needs training rows."""
+    """A reference: the function that makes its rows, a description, whether it needs training."""
 
     make: Callable[[Scene], Array | Attempts]
     words: str
     trained: bool = True
 
 
-#: By name, in the order of a card: the ceiling, the network's rivals, the blind rows, geometry.
+#: References by name, in the order of a card: upper bound, network's rivals, blind rows, geometry.
 REFERENCES = {
     "own": Reference(make=own, words="the rows' own grasps: the ceiling", trained=False),
     "nearest image": Reference(make=nearest_image, words="grasp of the nearest training image"),

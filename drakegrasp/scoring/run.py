@@ -1,7 +1,7 @@
-"""The path of a score: predictions and rows come in, a `Score` goes out.
+"""The path of a score: predictions and rows in, a `Score` out.
 
-Reference rows are made, all predictions that have no verdict yet are tried together, and the
-verdicts become a card. Who does the work is the caller's choice (`Verify`).
+Reference rows are created, all predictions without a verdict are tried together, and the verdicts
+become a card. The caller chooses who does the work (`Verify`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from drakegrasp.scoring.verdict import Verdict, VerdictFile, rank_array, verdict
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.attempts import Attempts, join_attempts
 
-#: Tries n attempts on rows (n,) and calls back with the place of each and its verdict.
+#: Tries n attempts on rows (n,), and calls back with the index and the verdict of each.
 Verify: TypeAlias = Callable[[Attempts, Sequence[int], Callable[[int, Verdict], None]], object]
 #: The name of a method on a card, and its predictions by training seed.
 Method: TypeAlias = tuple[str, tuple[Attempts, ...]]
@@ -44,7 +44,7 @@ class Score:
 
     Attributes:
         card: Plain JSON types, see docs/how-to/score.md.
-        seconds: By set, the median wall-clock time of a verdict [s]; the card has no time in it.
+        seconds: By set, the median wall-clock time of a verdict [s]; the card has no times.
         sets: The predictions of each set and their verdicts.
     """
 
@@ -95,24 +95,25 @@ def score(
     """Return the score of predictions.
 
     Args:
-        data: Its split has the rows.
+        data: The dataset; its split has the rows.
         verify: Tries grasps.
-        train: Rows from which reference rows are made.
-        predictions: By training seed; none scores the reference rows alone.
-        name: Of the predictions, on the card.
+        train: Training rows for the reference rows.
+        predictions: Predictions by training seed; if empty, only the reference rows are scored.
+        name: Name of the predictions on the card.
         against: Name and predictions of another method, for the same rows.
         references: Names of the reference rows, in the order of the card.
-        per_object: Rows of each object, at most; all if None.
-        config: Of the verification.
-        overridden: Paths of the keys that the caller sets; a row's own friction gives way to them.
-        again: The command that makes the card again.
-        protocol: Name, source, numbers and versions of a protocol in place of the lift.
-        folder: Keeps verdicts, so that the same call goes on; nothing is kept if None.
+        per_object: Maximum number of rows of each object; None for all.
+        config: Configuration of the verification.
+        overridden: Paths of the keys that the caller sets; they take precedence over values drawn
+            for a row.
+        again: The command that creates the card again.
+        protocol: Name, source, numbers and versions of a protocol that replaces the lift.
+        folder: Folder that stores verdicts, so that the same call can continue; None for none.
 
     Raises:
         GraspError: If there is nothing to score, the predictions are for different rows, the
-            training rows are of another camera or hand, or the card could not tell the other method
-            from the predictions.
+            training rows are of another camera or hand, or the other method has the same name as
+            the predictions.
     """
     _refuse_other_train(data, train)
     if against is not None and (not predictions or against[0] == name):
@@ -121,7 +122,7 @@ def score(
             f"{name if predictions else 'no predictions'}"
         )
 
-    # The rows, and what is scored on them.
+    # The rows, and the sets that are scored on them.
     methods = [(name, predictions), *([against] if against else [])]
     rows = _chosen_rows(data, [each for _, own in methods for each in own], per_object)
     grouping = _grouping(data, rows)
@@ -133,7 +134,7 @@ def score(
     if not sets:
         raise GraspError("there must be predictions or reference rows to score, got none")
 
-    # Their verdicts: all predictions that have none are tried together.
+    # Their verdicts: all predictions without a verdict are tried together.
     versions = installed_versions(config)
     settings = {
         "config": config.to_dict(),
@@ -165,11 +166,11 @@ def score(
 
 
 def _refuse_other_train(data: GraspDataset, train: GraspDataset) -> None:
-    """Refuse training rows whose grasps are no predictions for the rows to score.
+    """Reject training rows whose grasps cannot be predictions for the rows to score.
 
     Raises:
-        GraspError: If they are in the frame of the other camera, or of a hand with more or fewer
-            fingers.
+        GraspError: If they are in the frame of the other camera, or of a hand with another number
+            of fingers.
     """
     numbers, found = (each.column("grasps").shape[1] for each in (data, train))
     if (train.camera, found) != (data.camera, numbers):
@@ -186,7 +187,7 @@ def _chosen_rows(
     if per_object is not None and per_object < 1:
         raise GraspError(f"per_object must be 1 or more, got {per_object}")
 
-    # Those of the predictions; all of a method are for the same.
+    # The rows of the predictions; all methods must have the same rows.
     rows = np.unique(predictions[0].of_row) if predictions else np.arange(len(data))
     for other in predictions[1:]:
         if not np.array_equal(np.unique(other.of_row), rows):
@@ -199,7 +200,7 @@ def _chosen_rows(
     if per_object is None:
         return [int(row) for row in rows]
 
-    # Drawn by the names of their objects, so other objects do not change them.
+    # Draw rows by the names of their objects, so that other objects do not change them.
     names = data.column("object_props/object_name")[rows]
     chosen: list[int] = []
     for name in sorted(set(names.tolist())):
@@ -210,7 +211,7 @@ def _chosen_rows(
 
 
 def _grouping(data: GraspDataset, rows: Sequence[int]) -> Grouping:
-    """Return the rows by object."""
+    """Return the grouping of rows by object."""
     objects = data.column("object_props/object_name")[list(rows)]
     classes = data.column("object_props/class_name")[list(rows)]
     names, first, members = np.unique(objects, return_index=True, return_inverse=True)
@@ -229,20 +230,20 @@ def _verdicts(
     verify: Verify,
     folder: Path | None,
 ) -> Iterator[tuple[Verdict, ...]]:
-    """Return the verdicts of each of several sets of predictions; equal predictions share one."""
+    """Return the verdicts on each of several sets of predictions; equal predictions share one."""
     # The files of the two cameras have the same content.
     content = f"{data.content} {data.camera}"
     keys = []
     for each in sets:
-        # Palm poses alone may differ in their preshape alone.
+        # Palm poses alone may differ only in their preshape.
         frame = "" if each.grasps is not None else f" posture in {each.frame}"
         shapes = [name and f" of {name}" for name in each.preshape]
         numbers = zip(shapes, each.of_row.tolist(), each.numbers(), strict=True)
         keys.append([verdict_key(settings, content + frame + s, *of) for s, *of in numbers])
 
-    # Contacts of all sets are tried together, postures file by file; each verdict is kept as soon
-    # as it is known. Those of an object in a resting pose stand together: verdicts come in this
-    # order, in which none waits for another object.
+    # Contacts of all sets are tried together, postures file by file. Each verdict is stored as soon
+    # as it is known. Predictions for an object in a resting pose are adjacent: verdicts come in
+    # this order, so none waits for another object.
     known = VerdictFile(None if folder is None else folder / VERDICTS)
     objects = data.column("object_props/object_name").tolist()
     resting = data.column("grasp_props/resting").tolist()
@@ -286,10 +287,10 @@ def _texts(data: GraspDataset, name: str) -> set[str]:
 
 
 def _known_objects(names: Sequence[str], data: GraspDataset, train: GraspDataset) -> int:
-    """Return how many scored objects are in the training split.
+    """Return the number of scored objects that are in the training split.
 
-    Built-in objects of another seed have their names, but other meshes. A data file without its
-    dataset knows no meshes: then names alone decide.
+    Built-in objects of another seed have the same names but other meshes. For a data file without
+    its dataset, the meshes are unknown, so only the names decide.
     """
     own, known = _meshes(data), _meshes(train)
     common = set(names) & _texts(train, "object_name")
@@ -297,7 +298,7 @@ def _known_objects(names: Sequence[str], data: GraspDataset, train: GraspDataset
 
 
 def _meshes(data: GraspDataset) -> dict[str, str]:
-    """Return the hash of each object's mesh by its name; none of a file without its dataset."""
+    """Return the hash of each object's mesh by name; empty for a file without its dataset."""
     try:
         return {each.name: each.mesh_sha256 for each in read_manifest(data.path.parent).objects}
     except DataError:
@@ -305,7 +306,7 @@ def _meshes(data: GraspDataset) -> dict[str, str]:
 
 
 def _described(data: GraspDataset, rows: Sequence[int]) -> dict[str, Any]:
-    """Return what a card says of the dataset. The hashes tell whether values differ."""
+    """Return the dataset's description on a card; its hashes show whether values differ."""
     return {
         "file": data.path.name,
         "split": data.split,
@@ -316,7 +317,7 @@ def _described(data: GraspDataset, rows: Sequence[int]) -> dict[str, Any]:
 
 
 def own_contacts(data: GraspDataset, rows: Sequence[int]) -> list[Array]:
-    """Return (3k,) contact points in {O} [m] of the own grasp of each row."""
+    """Return the contact points (3k,) in {O} [m] of the own grasp of each row."""
     X_TC = unpack_pose(data.column(f"object_props/frame_work2cam_{data.camera}")[list(rows)])
     X_WT = unpack_pose(data.column("object_props/frame_world2work")[list(rows)])
     X_WO = unpack_pose(data.column("object_props/frame_world2obj")[list(rows)])

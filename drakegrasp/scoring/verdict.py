@@ -1,9 +1,9 @@
-"""What is scored: ranked predictions, and what a score keeps of the verdict on each.
+"""Ranked predictions, and the part of each verdict that a score stores.
 
-In: arrays and files with m predictions for each row of a split, and whatever tries a grasp, by
-whatever rule. Out: `Attempts` in the order of rows and ranks, by stated confidence or in their
-order where none is stated; and a `Verdict` for each. Verdicts are kept as lines of JSON under the
-key of what was tried, so an interrupted score goes on.
+In: arrays and files with m predictions for each row of a split, and verdicts of any rule on them.
+Out: `Attempts` in the order of rows and ranks, and a `Verdict` for each. Ranks follow the stated
+confidence, or the given order if none is stated. Verdicts are stored as lines of JSON under a key
+of what was tried, so an interrupted score can continue.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from drakegrasp.verification.result import Verification
 
 
 def rank(table: Attempts) -> Attempts:
-    """Return predictions for rows of a split in the order of rows, and of ranks within a row."""
+    """Return predictions for rows of a split, ordered by row and by rank within a row."""
     table = ranked(table, table.of_row)
     return table.at(np.lexsort((table.rank, table.of_row)).tolist())
 
@@ -47,17 +47,17 @@ def rank_array(
 ) -> Attempts:
     """Return predicted contacts of an array, ranked; see `read_several`.
 
-    A table of predictions for rows is ranked as it is.
+    A table of predictions for rows is only ranked.
 
     Args:
-        name: What errors and the card call them.
+        name: Name of the predictions in errors and on the card.
         grasps: (n, 6k), or (n, m, 6k); or a table with `of_row`.
         data: The split.
-        rows: (n,), the row that each is for.
+        rows: (n,), row that each prediction is for.
         confidence: (n,) or (n, m).
 
     Raises:
-        GraspError: If they cannot be used.
+        GraspError: If the predictions cannot be used.
     """
     if isinstance(grasps, Attempts):
         sha256 = hashlib.sha256(np.ascontiguousarray(grasps.numbers()).tobytes()).hexdigest()
@@ -95,13 +95,13 @@ def ranked_sets(
     confidence: npt.ArrayLike | None = None,
     read_as: Mapping[str, str] | None = None,
 ) -> tuple[str, tuple[Attempts, ...]]:
-    """Return the name of what is scored, and its predictions by training seed.
+    """Return the name of the scored method, and its predictions by training seed.
 
     Args:
         predictions: An array, a path, or paths.
         data: The split.
-        rows: With an array: the row of each.
-        confidence: With an array: of each.
+        rows: With an array: row that each prediction is for.
+        confidence: With an array: confidence of each prediction.
         read_as: With files of postures, see `read_attempts`.
 
     Raises:
@@ -120,7 +120,7 @@ def ranked_sets(
         one = rank_array("predictions", predictions, data, rows, confidence)
         return one.file, (one,)
 
-    # Files, each of a training seed.
+    # Files, one per training seed.
     if rows is not None or confidence is not None:
         raise GraspError("rows and confidence must be in the files if files are given, got them")
     found = tuple(rank_file(Path(path), data, read_as) for path in paths)
@@ -130,28 +130,28 @@ def ranked_sets(
     return f"{names[0]} and {len(found) - 1} more", found
 
 
-#: Decimals of lengths [m] and angles [rad]: those to which contacts are rounded, and two more.
+#: Decimals of lengths [m] and angles [rad]: two more than those to which contacts are rounded.
 _DIGITS = 6
 
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """The verdict on one prediction. All but `held_any` is of the first wrist pose.
+    """The verdict on one prediction. All but `held_any` is about the first wrist pose.
 
     Attributes:
         outcome: Name of the outcome.
         held, precision, stable, sample: As in a dataset, wherever the fingertips touch.
-        success: Held, with every contact within `verify.max_contact_error` of the asked one.
+        success: Held, with every contact within `verify.max_contact_error` of the requested one.
         held_any: Whether any of at most five wrist poses holds: an oracle chose among them.
-        contact_error: Largest distance between asked and reached contacts [m]; None if a fingertip
-            did not touch; 0 for a posture that holds, which asks for no contacts.
-        penetration: Largest after closing [m]; None if the hand did not close.
-        contacts: (3k,), the asked points in {O} [m], of a posture those after closing; empty for
-            what is no grasp.
+        contact_error: Largest distance between requested and reached contacts [m]; None if a
+            fingertip did not touch; 0 for a posture that holds, because it requests no contacts.
+        penetration: Largest penetration after closing [m]; None if the hand did not close.
+        contacts: (3k,), the requested points in {O} [m], or for a posture the points after closing;
+            empty for an invalid row.
         posture: Position [m], rotation vector [rad] and joints after closing in {O}; empty if the
             hand did not close.
         seconds: Wall-clock time [s].
-        reason: Why it is no grasp; empty for others.
+        reason: Why the row is invalid; empty for other rows.
     """
 
     outcome: str
@@ -170,12 +170,12 @@ class Verdict:
 
     @property
     def counted(self) -> bool:
-        """Whether it counts in the headline: a sample, made by the contacts that were asked for."""
+        """Whether it counts in the headline: a sample that is made by the requested contacts."""
         return self.success and self.sample
 
 
 def verdict_of(result: Verification) -> Verdict:
-    """Return what a score keeps of a verification."""
+    """Return the part of a verification that a score stores."""
     first, farthest, p_OQ = result.first, result.farthest_contact, result.p_OQ
     closed = None if first is None else first.trial.closed
     if result.method == "posture" and closed is not None:
@@ -198,9 +198,9 @@ def verdict_of(result: Verification) -> Verdict:
 
 
 def protocol_verdict(grasp: PlacedGrasp, found: PostureVerdict) -> Verdict:
-    """Return what a score keeps of a prediction that a protocol has tried in MuJoCo.
+    """Return the part that a score stores of a prediction tried by a MuJoCo protocol.
 
-    A protocol knows success alone, which then stands for all measures.
+    A protocol only decides on success, which is then used for all measures.
     """
     outcome = found.reason.partition(":")[0] or "success"
     measures = ("success", "held", "precision", "stable", "sample", "held_any")
@@ -234,12 +234,12 @@ def _tuple(values: Array | None) -> tuple[float, ...]:
 
 
 class VerdictFile:
-    """Verdicts by the key of what was tried, kept as lines of JSON.
+    """Verdicts by the key of what was tried, stored as lines of JSON.
 
-    A line that was cut off by a crash is left out, and its grasp tried again.
+    A line that was cut off by a crash is ignored, and its grasp is tried again.
 
     Args:
-        path: The file, made with the first line; None keeps the verdicts in memory only.
+        path: The file, created with the first line; None keeps the verdicts only in memory.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -260,7 +260,7 @@ class VerdictFile:
             return
 
     def add(self, key: str, verdict: Verdict) -> None:
-        """Keep a verdict; its line is complete when the call returns.
+        """Store a verdict; its line is complete when the call returns.
 
         Raises:
             OSError: If the file cannot be written.
@@ -271,7 +271,7 @@ class VerdictFile:
         if self._stream is None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._stream = self.path.open("a", encoding="utf-8")
-            # A line that was cut off must not become one with the next.
+            # A line that was cut off must not be joined with the next line.
             self._stream.write("\n" if self._stream.tell() else "")
         self._stream.write(json.dumps({"key": key, **asdict(verdict)}) + "\n")
         self._stream.flush()
@@ -288,9 +288,9 @@ def verdict_key(settings: Mapping[str, Any], signature: str, row: int, grasp: Ar
 
     Args:
         settings: All that decides the verdict beside the row: rules and versions.
-        signature: Of the dataset's content, with the camera in whose frame grasps are.
-        row: Of the split.
-        grasp: (6k,).
+        signature: Hash of the dataset's content, with the camera in whose frame the grasps are.
+        row: Row of the split.
+        grasp: (6k,), or the numbers of a posture.
     """
     text = json.dumps([settings, signature, row], sort_keys=True)
     digest = hashlib.sha256(text.encode())

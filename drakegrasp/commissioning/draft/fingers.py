@@ -1,10 +1,10 @@
 """The fingers of a vendor's model: its palm, the joints of each finger, and how it may close.
 
-In: a `VendorModel`, and what a person says of it. Out: the joints of each finger, with its
-`Closing`s: straight lines in the space of its joints, from open to closed.
+In: a `VendorModel`, and a person's answers. Out: the joints of each finger, with its `Closing`s:
+straight lines in the space of its joints, from open to closed.
 
-Joints that turn about the same axis as the last one, at zero, bend the finger: they close together.
-The others (a spread, an abduction, a thumb's opposition) keep a position.
+Joints that turn about the same axis as the last joint, at zero, bend the finger and close together.
+The other joints (a spread, an abduction, a thumb's opposition) keep a position.
 """
 
 from __future__ import annotations
@@ -19,38 +19,40 @@ from drakegrasp.commissioning.draft.model import VendorJoint, VendorModel
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, transform_points
 
-#: Cosine from which two axes count as parallel.
+#: Cosine above which two axes are parallel.
 PARALLEL = 0.94
-#: Joints that keep a position are tried at several if they can turn so far [rad], else at 0.
+#: Joints that keep a position are tried at several positions if their range is this large [rad], or
+#: else only at 0.
 WIDE, POSITIONS = 0.8, 5
-#: Ratios of the second and later bending joints to the first, where each has a motor.
+#: Ratios of the second and later bending joints to the first, if each has a motor.
 RATIOS = {2: ((1.0,), (0.5,)), 3: ((1.0, 0.5), (1.0, 1.0), (0.5, 0.25))}
-#: How far the second bending joint is bent in the open hand [rad], and what that costs [1/rad].
+#: Positions of the second bending joint in the open hand [rad], and their cost [1/rad].
 BENT, BENT_COST = (0.0, 0.3), 0.1
-#: What it costs to start elsewhere than at zero, to close in the smaller part of a range, and that
-#: another joint is away from its rest [1/rad].
+#: Cost of a start that is not zero, of closing in the smaller part of a range, and of another joint
+#: away from its rest [1/rad].
 NOT_ZERO, SMALLER, AWAY = 1.0, 0.6, 0.08
-#: A closing joint moves at least so far [rad, m]; one without limits is taken to move so far [rad].
+#: Smallest motion of a closing joint, turning [rad] and sliding [m]; assumed motion of a joint
+#: without limits [rad].
 LEAST, UNLIMITED = {False: 0.15, True: 0.004}, np.pi / 2.0
-#: Postures on the way from open to closed.
+#: Number of postures from open to closed.
 STEPS = 12
-#: A link of the same motor that reaches less than this share of the farthest is no finger.
+#: A link of the same motor is not a finger if it reaches less than this fraction of the farthest.
 REACH = 0.8
-#: What a motor moves in a finger: number of each joint, its ratio and its offset to a position.
+#: Joints of a finger that a motor moves: index of each joint, ratio and offset of its position.
 _Moved = list[tuple[int, float, float]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """What overrides the guesses; names are those of the vendor's model.
+    """A person's answers that override the guesses; names are those of the vendor's model.
 
     Attributes:
-        palm: The link that carries the fingers.
+        palm: The link from which the fingers branch.
         approach: (3,), +Gz in the palm link, out of the palm.
-        fingers: Fingertip links, all that grasp.
+        fingers: Fingertip links of all fingers that grasp.
         joints: Positions of joints that no finger closes [rad or m].
-        reverse: Closing joints that close the other way.
-        effort: Largest effort of the motors [N m or N], where it is one for all.
+        reverse: Closing joints that close in the other direction.
+        effort: Largest effort of the motors [N m or N], if it is the same for all.
         settings: Lines KEY=VALUE of the hand file.
     """
 
@@ -65,14 +67,14 @@ class Answers:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Closing:
-    """A way to close a finger of m joints: positions q0 + gain * c, for c of 0..limit.
+    """A method of closing a finger with m joints: positions q0 + gain * c, for c in 0..limit.
 
     Attributes:
         q0, gain: (m,), in the vendor's positions.
-        limit: Where a joint is at its own limit [rad or m].
-        preshape: Position of each joint that leads others, or none, and does not close.
-        at_rest: Whether those joints are as near to zero as they can be.
-        cost: How unusual it is.
+        limit: Closing at which a joint reaches its own limit [rad or m].
+        preshape: Position of each joint that does not close and follows no other joint.
+        at_rest: Whether those joints are as near to zero as possible.
+        cost: How unusual the closing is.
     """
 
     q0: Array
@@ -91,7 +93,7 @@ def find_palm(model: VendorModel, answers: Answers) -> str:
     """Return the link from which the fingers branch.
 
     Raises:
-        HandError: If there is none, or the answer is no link.
+        HandError: If there is no such link, or the answer is not a link.
     """
     if answers.palm is not None:
         if answers.palm not in model.links:
@@ -111,10 +113,10 @@ def find_palm(model: VendorModel, answers: Answers) -> str:
 def find_fingers(
     model: VendorModel, palm: str, answers: Answers
 ) -> list[tuple[list[VendorJoint], list[Closing]]]:
-    """Return the fingers in the order of the model: joints from the palm, and ways to close.
+    """Return the fingers in the order of the model: joints from the palm, and closings.
 
     Raises:
-        HandError: If there are fewer than two, or an answer names none of them.
+        HandError: If there are fewer than two, or an answer names a link that is not a finger's.
     """
     fingers = []
     for tip in find_tips(model, palm, answers):
@@ -132,10 +134,10 @@ def find_fingers(
 
 
 def find_tips(model: VendorModel, palm: str, answers: Answers) -> list[str]:
-    """Return the last links of fingers: those with shapes that carry no others with shapes.
+    """Return the last links of fingers: links with shapes and no further links with shapes.
 
     Raises:
-        HandError: If an answer is no link.
+        HandError: If an answer is not a link.
     """
     leaves = [
         name
@@ -151,7 +153,8 @@ def find_tips(model: VendorModel, palm: str, answers: Answers) -> list[str]:
 def _without_linkages(model: VendorModel, palm: str, leaves: Sequence[str]) -> list[str]:
     """Return the leaves without the bars of linkages.
 
-    Those are moved by a motor that moves others, and have fewer joints or reach less far.
+    A bar is moved by a motor that also moves another leaf, and has fewer joints or reaches less
+    far.
     """
     facts = {}
     for leaf in leaves:
@@ -170,8 +173,8 @@ def _without_linkages(model: VendorModel, palm: str, leaves: Sequence[str]) -> l
 def find_closings(
     model: VendorModel, joints: Sequence[VendorJoint], answers: Answers
 ) -> list[Closing]:
-    """Return the ways in which a finger may close."""
-    # Which motors bend it, and what the others may be at.
+    """Return the methods by which a finger may close."""
+    # Find the motors that bend it, and the possible positions of the other motors.
     motors: dict[str, _Moved] = {}
     for j, joint in enumerate(joints):
         mimic = model.mimic(joint.name)
@@ -191,7 +194,7 @@ def find_closings(
     choices = [_positions(model, leader, answers) for leader in kept]
     rests = tuple(positions[0] for positions in choices)
 
-    # Both senses, unless a person said which it is.
+    # Try both directions, unless a person specified the direction.
     found, lead = [], next(iter(bending.values()))[0][0]
     for sign in (-1.0,) if joints[lead].name in answers.reverse else (1.0, -1.0):
         senses = [sign * (1.0 if axes[m[0][0]] @ axes[lead] >= 0.0 else -1.0)
@@ -212,7 +215,7 @@ def find_closings(
 
 
 def _bends_finger(moved: _Moved, joints: Sequence[VendorJoint], axes: Sequence[Array]) -> bool:
-    """Return whether a motor moves the last joint, or one that turns about the same axis (3,)."""
+    """Return whether a motor moves the last joint, or a joint with the same axis (3,)."""
     first, last = moved[0][0], len(joints) - 1
     turns = not (joints[last].slides or joints[first].slides)
     return moved[-1][0] == last or (turns and bool(abs(axes[first] @ axes[-1]) > PARALLEL))
@@ -233,8 +236,8 @@ def _positions(model: VendorModel, leader: str, answers: Answers) -> list[float]
 def _bends(
     joints: Sequence[VendorJoint], motors: Sequence[_Moved], senses: Sequence[float]
 ) -> list[Closing]:
-    """Return the ways to bend a finger by motors in senses of theirs, the other joints at 0."""
-    # The first starts at zero if it can close from there, else at its end.
+    """Return the methods to bend a finger by motors in given directions, other joints at 0."""
+    # The first motor starts at zero if the finger can close from there, or else at its end.
     spans = [_span(joints, *motor) for motor in zip(motors, senses, strict=True)]
     _, low, high = spans[0]
     slides = joints[motors[0][0][0]].slides
@@ -245,7 +248,7 @@ def _bends(
     cost = SMALLER * (1.0 - (high - start) / max(high - low, 1e-9))
     cost += 0.0 if from_zero or slides else NOT_ZERO
 
-    # The others follow in usual ratios, or each through its whole range.
+    # The other motors follow in usual ratios, or each through its whole range.
     ratios: list[tuple[float, ...]] = [()]
     if len(spans) > 1:
         whole = tuple((top - max(0.0, bottom)) / (high - start) for _, bottom, top in spans[1:])
@@ -267,7 +270,7 @@ def _bends(
 def _span(
     joints: Sequence[VendorJoint], moved: _Moved, sense: float
 ) -> tuple[_Moved, float, float]:
-    """Return how joints move with the first one in a sense of its positions, and how far it can."""
+    """Return how joints move with the first one in a given direction, and its range."""
     _, ratio, offset = moved[0]
     own, ends = [(j, r / ratio, o - offset * r / ratio) for j, r, o in moved], []
     for j, r, o in own:

@@ -1,8 +1,8 @@
-"""Which fingers close against which, where they touch, and whether other links meet before.
+"""Which fingers close against each other, where they touch, and whether other links collide first.
 
-In: the joints of a model's fingers, and how they may close. Out: `Grip`s, the best first: a finger,
-often a thumb, and one or two that it meets. For each pair of fingers, all ways to close of both are
-compared. The pad of a fingertip is the part of its surface that faces the closing motion.
+In: the joints of a model's fingers, and their closings. Out: `Grip`s, the best first: a finger,
+often a thumb, and one or two fingers that it meets. For each pair of fingers, all closings of both
+are compared. The pad of a fingertip is the part of its surface that faces the closing motion.
 """
 
 from __future__ import annotations
@@ -21,54 +21,55 @@ from drakegrasp.frames import Array, invert_pose, transform_points
 from drakegrasp.hand.finger_sweep import even_points
 from drakegrasp.hand.shapes import hull_planes, ray_span
 
-#: A direction this near to an axis of the link is taken for the axis [rad].
+#: A direction this close to an axis of the link is replaced by the axis [rad].
 SNAP = np.deg2rad(12.0)
-#: Share of a link, from its end, that is pad; and of its thickness. The second is at least so deep
-#: and at most so deep [m]: what is pressed sinks in.
+#: Fraction of a link's length, from its end, that is the pad; fraction of its thickness, and the
+#: smallest and largest depth of the pad [m], because pressed objects sink in.
 LENGTH, DEPTH, DEEP = 0.55, 0.45, (0.004, 0.008)
 #: Distance of the pad point from the end, in thicknesses, and its bounds [m].
 FROM_END, NEAR_END = 0.7, (0.004, 0.014)
-#: Spacing of points on the surface of a fingertip, and of shapes that are compared [m].
+#: Spacing of points on the surface of a fingertip, and on shapes that are compared [m].
 SPACING, COMPARED = 0.0015, 0.006
-#: Width of what is pinched [m], and how far from it costs nothing.
+#: Width of the pinched object [m], and the deviation from it that costs nothing.
 WIDTH, TOLERANCE = 0.04, 0.01
-#: What it costs if one finger has closed fully and the other not at all, if pads come no nearer
-#: than they should [1/m], and if they pinch at another width [1/m].
+#: Cost if one finger has closed fully and the other not at all, if pads do not come close enough
+#: [1/m], and if they pinch at another width [1/m].
 UNEVEN, APART, OFF_WIDTH = 0.5, 20.0, 40.0
-#: What it costs that a pad passes the other one instead of coming towards it.
+#: Cost of a pad that passes the other pad instead of approaching it.
 PASSING = 0.5
-#: What it costs to pinch near the end of the way, from this share on, and to open less far [1/m].
+#: Fraction of the closing after which a pinch is late, cost of that; opening below which a grip is
+#: narrow [m], and cost of that [1/m].
 LATE, LATE_COST, OPENING, NARROW = 0.75, 2.0, 0.06, 10.0
-#: Pads that come so close meet [m].
+#: Pads that come this close to each other meet [m].
 MEETING = 0.006
 #: Angles by which a contact may be nearer to a fingertip's end than its pad [rad], and their cost.
 ROUND, ROUND_COST = np.deg2rad([0.0, 30.0, 60.0]), 0.2
 #: A finger that turns about its own direction has no side by which it closes, as a cosine.
 SQUARE = 0.3
-#: Grips that are returned at most.
+#: Maximum number of grips that are returned.
 GRIPS = 40
-#: A hand of more fingers than this grasps with so many.
+#: Maximum number of fingers that grasp; a hand with more fingers uses this many.
 FINGERS = 3
-#: Links other than fingertips overlap by less [m]: points miss a part of what Drake sees.
+#: Allowed overlap of links other than fingertips [m]; points miss a part of what Drake detects.
 SUNK = 2e-4
 _Ball: TypeAlias = tuple[Array, float]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Member:
-    """A finger that may be in a grip, and one of its ways to close, at s steps.
+    """A finger that may be in a grip, with one of its closings, at s steps.
 
     Attributes:
-        joints: Of the finger, from the palm.
+        joints: Joints of the finger, from the palm.
         closing: How it closes.
-        joint: What the motor drives: the first joint that closes, in the vendor's positions.
-        sign: Sense of that joint's positions in which it closes.
+        joint: The joint that the motor drives: the first joint that closes, in vendor's positions.
+        sign: Direction of that joint's positions in which it closes.
         zero: That joint's position in the open hand [rad or m].
-        pad_point: (3,), where contacts usually are, in the fingertip link [m].
+        pad_point: (3,), usual contact point in the fingertip link [m].
         pad_region: Half-spaces of the hand file, in the fingertip link.
-        points: (s, 3), of the pad in the palm link, from open to closed [m].
-        moves: (s, 3), unit directions in which it moves.
-        normals: (r, s, 3), where it faces: a fingertip's end is round.
+        points: (s, 3), pad point in the palm link, from open to closed [m].
+        moves: (s, 3), unit directions in which the pad moves.
+        normals: (r, s, 3), directions that the pad faces: a fingertip's end is round.
     """
 
     joints: list[VendorJoint]
@@ -88,21 +89,21 @@ class Member:
         return self.joints[-1].child
 
     def followers(self) -> dict[str, tuple[float, float]]:
-        """Return ratio and offset, to the driven joint, of the finger's joints that follow it."""
+        """Return ratio and offset to the driven joint, for the finger's joints that follow it."""
         rows = zip(self.joints, self.closing.gain, self.closing.q0, strict=True)
         return {j.name: (float(g), float(q)) for j, g, q in rows if g != 0.0 and j != self.joint}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Grip:
-    """Fingers that close against one.
+    """Fingers that close against one finger.
 
     Attributes:
         members: The fingers; the last one opposes the others.
-        step: Of each, at which a thing of `WIDTH` is pinched.
-        cost: How far the pinch is from a straight and even one.
+        step: Step of each finger at which an object of `WIDTH` is pinched.
+        cost: How far the pinch is from a straight and even pinch.
         axis: (3,), unit, from the fingers to the last one in the pinch, in the palm link.
-        middle: (3,), between the fingers and the last one [m].
+        middle: (3,), centre between the fingers and the last one [m].
     """
 
     members: tuple[Member, ...]
@@ -115,8 +116,8 @@ class Grip:
 def find_members(
     model: VendorModel, palm: str, joints: list[VendorJoint], closings: Sequence[Closing]
 ) -> list[Member]:
-    """Return a finger with where its pad comes, for every way to close."""
-    # The end of the fingertip, and where it goes.
+    """Return a finger with the path of its pad, for each of its closings."""
+    # The end of the fingertip, and its motion.
     last, link = joints[-1], model.links[joints[-1].child]
     X = _tip_poses(joints, np.stack([closing.path() for closing in closings]))
     parts = [shape.corners() for shape in link.collisions]
@@ -125,7 +126,7 @@ def find_members(
     motion = np.diff(X[..., :3, :3] @ end + X[..., :3, 3], axis=1)
     inside = (np.swapaxes(X[:, :-1, :3, :3], -1, -2) @ motion[..., None])[..., 0].mean(axis=1)
 
-    # It faces its motion, square to the finger and to the axis about which it turns.
+    # The pad faces its motion, perpendicular to the finger and to the axis about which it turns.
     front = last.axis if last.slides else np.cross(last.axis, along)
     if np.linalg.norm(front) < SQUARE:
         front = inside.mean(axis=0) - (inside.mean(axis=0) @ along) * along
@@ -171,11 +172,11 @@ def _outward(model: VendorModel, palm: str, joints: Sequence[VendorJoint]) -> Ar
 
 
 def _end_of(points: Array, along: Array | None) -> tuple[Array, Array]:
-    """Return the end (3,) of a link, and the unit direction to it (3,).
+    """Return the end (3,) of a link, and the unit direction towards it (3,).
 
     Args:
-        points: (n, 3), of its surface, in the link's frame [m].
-        along: Direction of the finger; if None it leads from the origin, where the joint is.
+        points: (n, 3), points of the link's surface, in the link's frame [m].
+        along: Direction of the finger; None for the direction from the origin, where the joint is.
     """
     if along is None:
         centre, far = points.mean(axis=0), np.linalg.norm(points, axis=1)
@@ -189,14 +190,14 @@ def _end_of(points: Array, along: Array | None) -> tuple[Array, Array]:
 def _find_pad(
     parts: Sequence[Array], points: Array, normal: Array, along: Array
 ) -> tuple[Array, Array, Array, list[list[float]]]:
-    """Return the pad of a link of convex parts (n, 3) [m], in its frame.
+    """Return the pad of a link with convex parts (n, 3) [m], in the link's frame.
 
-    That is its point, the unit directions out of the link and towards the finger's end, (3,) each,
-    and the half-spaces of the hand file's `pad_region`.
+    The pad consists of its point, the unit directions out of the link and towards the finger's end,
+    (3,) each, and the half-spaces of the hand file's `pad_region`.
 
     Args:
-        parts: Corners of each.
-        points: (m, 3), of their surfaces.
+        parts: Corners of each part.
+        points: (m, 3), points of their surfaces.
         normal: Direction (3,) in which the link moves when it closes.
         along: Direction (3,) towards the end of the finger.
     """
@@ -204,7 +205,7 @@ def _find_pad(
     along = _snapped(along - (along @ normal) * normal)
     across = np.cross(normal, along)
 
-    # The level of the pad point: near the end, in the middle of what is there.
+    # Choose the level of the pad point: near the end, in the centre of the surface there.
     heights = points @ along
     top, length = float(heights.max()), float(np.ptp(heights))
     thickness = float(np.ptp(points[heights > top - 0.4 * length] @ normal))
@@ -213,14 +214,14 @@ def _find_pad(
     sides = at[at @ normal > (at @ normal).max() - 0.002] @ across
     middle = float(sides.max() + sides.min()) / 2.0
 
-    # The surface there: a ray along the normal leaves the last of the parts.
+    # Find the surface there: a ray along the normal leaves the last of the parts.
     start = level * along + middle * across + (points @ normal).min() * normal
     spans = [ray_span(part, start, normal) for part in parts]
     leaves = [span[1] for span in spans if span is not None and span[1] >= 0.0]
     height = max(leaves) if leaves else float((at @ normal).max() - start @ normal)
     point = np.round(start + height * normal, 5) + 0.0
 
-    # How deep the region reaches below the point, and how far behind it, along the finger.
+    # Compute how deep the region reaches below the point, and how far behind it along the finger.
     depth = float(np.clip(DEPTH * thickness, *DEEP))
     back, region = max(LENGTH * length - (top - level), 0.004), []
     for direction, space in ((normal, depth), (along, back)):
@@ -230,7 +231,7 @@ def _find_pad(
 
 
 def _snapped(direction: Array) -> Array:
-    """Return a unit direction (3,), or the axis that is near to it."""
+    """Return a unit direction (3,), replaced by a coordinate axis if it is close to one."""
     direction = direction / np.linalg.norm(direction)
     axis = int(np.argmax(np.abs(direction)))
     if np.arccos(min(abs(direction[axis]), 1.0)) < SNAP:
@@ -239,11 +240,11 @@ def _snapped(direction: Array) -> Array:
 
 
 def find_grips(fingers: Sequence[Sequence[Member]]) -> list[Grip]:
-    """Return the best ways in which fingers close against one of them.
+    """Return the best grips of fingers against one of them.
 
-    The other joints of fingers are at rest: only one finger, which opposes, turns those.
+    The other joints of fingers are at rest; only the finger that opposes may turn its other joints.
     """
-    # What each way to close the last finger costs with each way to close the others.
+    # Compute the cost of each closing of the last finger with each closing of the others.
     ranked: list[tuple[float, int, int, list[tuple[int, int]]]] = []
     resting = [[m for m in ways if m.closing.at_rest] for ways in fingers]
     for t, ways in enumerate(fingers):
@@ -255,7 +256,7 @@ def find_grips(fingers: Sequence[Sequence[Member]]) -> list[Grip]:
                 ranked.append((total + last.closing.cost, t, b, chosen))
     ranked.sort(key=lambda entry: entry[:3])
 
-    # The best ones that differ in the last finger's positions.
+    # Keep the best grips that differ in the last finger's positions.
     grips: dict[tuple[int, tuple[float, ...]], Grip] = {}
     for cost, t, b, chosen in ranked:
         last = fingers[t][b]
@@ -266,7 +267,7 @@ def find_grips(fingers: Sequence[Sequence[Member]]) -> list[Grip]:
 
 
 def _alike(resting: Sequence[Sequence[Member]], others: Sequence[int]) -> list[list[int]]:
-    """Return which fingers may close together: those with as many ways to, or else all."""
+    """Return groups of fingers that may close together: those with equally many closings."""
     groups = [
         [o for o in others if len(resting[o]) == count]
         for count in sorted({len(resting[o]) for o in others})
@@ -278,7 +279,7 @@ def _alike(resting: Sequence[Sequence[Member]], others: Sequence[int]) -> list[l
 def _cheapest(
     group: Sequence[int], costs: dict[int, Array], b: int
 ) -> tuple[float, list[tuple[int, int]]]:
-    """Return the cheapest fingers of a group against one, which close alike if they can."""
+    """Return the cheapest fingers of a group against one, with the same closing if possible."""
     wanted = min(len(costs), FINGERS - 1)
     rows = [costs[o][b] for o in group]
     if len({len(row) for row in rows}) == 1:
@@ -294,7 +295,7 @@ def _cheapest(
 
 
 def _pair_costs(ways: Sequence[Member], others: Sequence[Member]) -> Array:
-    """Return the cost (b, a) of each way to close one finger with each of another."""
+    """Return the cost (b, a) of each closing of one finger with each closing of others."""
     own = np.array([member.closing.cost for member in others])
     stacked = (
         np.stack([member.points for member in others]),
@@ -305,15 +306,15 @@ def _pair_costs(ways: Sequence[Member], others: Sequence[Member]) -> Array:
 
 
 def _costs(last: Member, points: Array, moves: Array, normals: Array) -> Array:
-    """Return the cost (a, s, s) of one way to close a finger, with each of another, by steps.
+    """Return the cost (a, s, s) of one closing of a finger with each closing of another, by steps.
 
     Args:
         last: The finger that opposes.
-        points: (a, s, 3), where the other's pad is.
-        moves: (a, s, 3), unit directions in which it moves.
-        normals: (r, a, s, 3), where it faces.
+        points: (a, s, 3), positions of the other finger's pad.
+        moves: (a, s, 3), unit directions in which that pad moves.
+        normals: (r, a, s, 3), directions that it faces.
     """
-    # Pads that face each other along the line between them.
+    # Pads should face each other along the line between them.
     line = last.points[None, None] - points[:, :, None]
     gap = np.linalg.norm(line, axis=-1)
     unit = line / np.maximum(gap, 1e-6)[..., None]
@@ -336,12 +337,12 @@ def _costs(last: Member, points: Array, moves: Array, normals: Array) -> Array:
 
 
 def _grip(others: Sequence[Member], last: Member, cost: float) -> Grip:
-    """Return the grip of some fingers against one, each with its way to close."""
+    """Return the grip of some fingers against one, each with its closing."""
     costs = [_costs(last, m.points[None], m.moves[None], m.normals[:, None])[0] for m in others]
     at = int(np.stack(costs).min(axis=1).sum(axis=0).argmin())
     steps = [int(table[:, at].argmin()) for table in costs]
 
-    # The pad points in the pinch: that of the last finger, and the others' mean.
+    # The pad points in the pinch: the last finger's point, and the mean of the others.
     points = np.array([m.points[s] for m, s in zip(others, steps, strict=True)])
     end, start = last.points[at], points.mean(axis=0)
     return Grip(
@@ -376,8 +377,8 @@ def clear_grips(
         return _ball(whole), [(hull_planes(points), points, _ball(points)) for points in clouds]
 
     def overlap(a: str, b: str, X: Mapping[str, Array], depth: float) -> bool:
-        """Return whether points of one link are so deep [m] in another, or the other way round."""
-        # Balls around whole links tell most pairs apart.
+        """Return whether a point of one link is deeper [m] than `depth` inside the other link."""
+        # Balls around whole links exclude most pairs.
         X_AB = invert_pose(X[a]) @ X[b]
         X_BA = invert_pose(X_AB)
         (around_a, parts_a), (around_b, parts_b) = shapes_of(a), shapes_of(b)
@@ -411,7 +412,7 @@ def _ball(points: Array) -> _Ball:
 
 
 def _apart(X_AB: Array, ball_B: _Ball, ball_A: _Ball) -> bool:
-    """Return whether two balls do not meet."""
+    """Return whether two balls do not intersect."""
     (p_BQ, radius_b), (p_AP, radius_a) = ball_B, ball_A
     distance = np.linalg.norm(X_AB[:3, :3] @ p_BQ + X_AB[:3, 3] - p_AP)
     return bool(distance > radius_a + radius_b)

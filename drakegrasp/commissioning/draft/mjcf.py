@@ -1,8 +1,8 @@
 """MJCF as MuJoCo compiles it and as Drake reads it.
 
 In: the XML of an MJCF file, with meshes beside it. Out: the same hand without the parts of the
-language that Drake drops (bodies and joints without names, frames, classes within classes), and
-joints, couplings, efforts and inertias as MuJoCo compiles them, which Drake reads in part.
+language that Drake drops (bodies and joints without names, frames, classes within classes), and the
+joints, couplings, efforts and inertias as MuJoCo compiles them; Drake reads only a part of these.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from drakegrasp.hand.parsing import Mimic
 
 #: Attributes that a class of MJCF gives to the elements of each tag.
 _Defaults = dict[str, dict[str, str]]
-#: Sections that say nothing of a hand.
+#: Sections that are not about a hand.
 _ASIDE = ("size", "keyframe", "sensor", "visual", "statistic", "custom", "deformable")
-#: What makes bodies that the file does not write out.
+#: Elements that create bodies that the file does not write out.
 _MADE = ("replicate", "composite", "flexcomp", "attach", "model")
 
 
 def trim(root: Element) -> None:
-    """Leave out what says nothing of a hand, and name each body and joint.
+    """Remove sections that are not about a hand, and name each body and joint.
 
     Raises:
         HandError: If bodies are not written out.
@@ -51,7 +51,7 @@ def trim(root: Element) -> None:
 
 
 def _name(parent: Element, name: str, count: list[int]) -> None:
-    """Give names to the bodies and joints below an element of a body of this name."""
+    """Name the bodies and joints below an element that belongs to a body of this name."""
     for child in parent:
         if child.tag == "frame":
             _name(child, name, count)
@@ -65,10 +65,10 @@ def _name(parent: Element, name: str, count: list[int]) -> None:
 
 
 def spell_out(root: Element) -> None:
-    """Replace frames by bodies that are welded, and write into each class what it inherits.
+    """Replace frames by welded bodies, and write into each class the values that it inherits.
 
     Raises:
-        HandError: If a frame holds a joint or an inertia of the body around it.
+        HandError: If a frame contains a joint or an inertia of the body around it.
     """
     for world in root.findall("worldbody"):
         _lift_frames(world)
@@ -84,7 +84,7 @@ def spell_out(root: Element) -> None:
 
 
 def _lift_frames(world: Element) -> None:
-    """Put what frames of the world hold into the world: the hand hangs free, wherever it is."""
+    """Move the content of the world's frames into the world: the pose of the hand is not used."""
     while (frame := world.find("frame")) is not None:
         place = list(world).index(frame)
         for child in frame:
@@ -95,9 +95,9 @@ def _lift_frames(world: Element) -> None:
 
 
 def _inherit(default: Element, above: _Defaults) -> _Defaults:
-    """Write what a class of MJCF has from the classes around it into it; return what it gives.
+    """Write the values that a class of MJCF inherits into the class; return all its values.
 
-    Drake looks only as far as the next class: what that one does not name would be lost.
+    Drake looks only at the next class, so values that this class does not name would be lost.
     """
     given = {tag: dict(attributes) for tag, attributes in above.items()}
     own = [element for element in default if element.tag != "default"]
@@ -111,19 +111,19 @@ def _inherit(default: Element, above: _Defaults) -> _Defaults:
     return given
 
 
-#: What MuJoCo makes of a file: M_BBo_B of each body with a mass; limits (2,) of each joint that
-#: moves [rad or m]; the largest effort of each that has one [N m or N]; joints that follow others;
-#: and what was left out, a line each.
+#: Results of MuJoCo's compiler: M_BBo_B of each body with a mass; limits (2,) of each moving joint
+#: [rad or m]; the largest effort of each joint that has one [N m or N]; joints that follow others;
+#: and notes on what was left out, one line each.
 Compiled: TypeAlias = tuple[
     dict[str, SpatialInertia], dict[str, Array], dict[str, float], list[Mimic], list[str]
 ]
 
 
 def compile_model(path: Path) -> Compiled:
-    """Return what MuJoCo makes of an MJCF file in which every body and joint has a name.
+    """Return MuJoCo's compilation of an MJCF file in which every body and joint has a name.
 
     Raises:
-        HandError: If MuJoCo is missing, or refuses it, or an equality is no line.
+        HandError: If MuJoCo is missing or rejects the file, or an equality is not linear.
     """
     try:
         import mujoco
@@ -149,7 +149,7 @@ def compile_model(path: Path) -> Compiled:
 
 
 def _mimics(mujoco: Any, model: Any) -> tuple[list[Mimic], list[str]]:
-    """Return the equalities of joints that are active, and a note of each other one that is."""
+    """Return the active equalities of joints, and a note for each other active equality."""
     mimics, notes = [], []
     for e in np.flatnonzero(model.eq_active0):
         kind = mujoco.mjtEq(int(model.eq_type[e]))
@@ -167,7 +167,7 @@ def _mimics(mujoco: Any, model: Any) -> tuple[list[Mimic], list[str]]:
         if any(rest):
             raise HandError(f"model: polycoef of joint {name!r} must be a line, got a curve")
 
-        # Equalities hold between the ways from the posture that the file draws.
+        # Equalities hold between displacements from the posture that the file draws.
         zero, start = (float(q) for q in model.qpos0[model.jnt_qposadr[[follower, led_by]]])
         offset += zero - ratio * start
         leader = model.joint(led_by).name
@@ -176,14 +176,14 @@ def _mimics(mujoco: Any, model: Any) -> tuple[list[Mimic], list[str]]:
 
 
 def _efforts(mujoco: Any, model: Any) -> dict[str, float]:
-    """Return what the actuators of each joint give together at rest, at most what it may take."""
+    """Return the total effort of each joint's actuators at rest, within the joint's own limit."""
     total: dict[int, Array] = {}
     for a in range(len(model.actuator_trntype)):
         force = _force(mujoco, model, a)
         for joint, arm in _arms(mujoco, model, a):
             total[joint] = total.get(joint, np.zeros(2)) + np.sort(arm * force)
 
-    # The limit of the joint itself holds for the sum, and alone where no actuator is.
+    # The joint's own limit applies to the sum, and on its own if there is no actuator.
     efforts = {}
     for j in range(model.njnt):
         span = total.get(j)
@@ -204,7 +204,7 @@ def _arms(mujoco: Any, model: Any, a: int) -> list[tuple[int, float]]:
     if kind != kinds.mjTRN_TENDON:
         return []
 
-    # A tendon that is a sum of joints; one through space has other levers in each posture.
+    # A tendon that is a sum of joints; a spatial tendon has other levers in each posture.
     first = model.tendon_adr[target]
     wraps = slice(first, first + model.tendon_num[target])
     rows = zip(model.wrap_type[wraps], model.wrap_objid[wraps], model.wrap_prm[wraps], strict=True)
@@ -213,7 +213,7 @@ def _arms(mujoco: Any, model: Any, a: int) -> list[tuple[int, float]]:
 
 
 def _force(mujoco: Any, model: Any, a: int) -> Array:
-    """Return the least and largest force (2,) of an actuator at rest; infinite if unknown."""
+    """Return the smallest and largest force (2,) of an actuator at rest; infinite if unknown."""
     force, biases, dynamics = np.array([-np.inf, np.inf]), mujoco.mjtBias, mujoco.mjtDyn
     gain, bias = model.actuator_gainprm[a], model.actuator_biasprm[a]
     kind = model.actuator_biastype[a]
@@ -221,7 +221,7 @@ def _force(mujoco: Any, model: Any, a: int) -> Array:
     direct = int(model.actuator_dyntype[a]) in instant
     fixed = model.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED
 
-    # A servo's force depends on where it is: only its range of force limits it.
+    # A servo's force depends on its position, so only its force range limits it.
     constant = kind == biases.mjBIAS_NONE or (kind == biases.mjBIAS_AFFINE and bias[1] == 0.0)
     if direct and fixed and constant and model.actuator_ctrllimited[a]:
         start = 0.0 if kind == biases.mjBIAS_NONE else bias[0]
@@ -232,7 +232,7 @@ def _force(mujoco: Any, model: Any, a: int) -> Array:
 
 
 def _inertias(model: Any) -> dict[str, SpatialInertia]:
-    """Return M_BBo_B of each body but the world that has a mass."""
+    """Return M_BBo_B of each body with a mass, except for the world."""
     found = {}
     for b in range(1, model.nbody):
         name, mass = model.body(b).name, float(model.body_mass[b])

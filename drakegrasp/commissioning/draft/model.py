@@ -1,8 +1,8 @@
 """A vendor's model as data: a tree of rigid links, and the joints between them.
 
-In: a `Source`, which Drake parses. Out: a `VendorModel`, in which links that are welded to each
-other are one, every link that moves has a mass, and limits let mimics follow. The frame of a link
-is that of the joint that carries it.
+In: a `Source`, which Drake parses. Out: a `VendorModel`. In it, links that are welded to each other
+are one link, every moving link has a mass, and limits let mimic joints follow. The frame of a link
+is the frame of the joint to its parent.
 """
 
 from __future__ import annotations
@@ -48,18 +48,18 @@ from drakegrasp.hand.parsing import (
     refuse_other_joint,
 )
 
-#: A joint that follows has room if its limits leave it this share of its leader's way.
+#: Smallest fraction of a leader's range that the limits of a following joint must leave to it.
 ROOM = 0.5
-#: A hand is so large [m], with its arm if it has one; else its units are others.
+#: Smallest and largest size of a hand, including an arm [m]; other sizes mean other units.
 SIZES = (0.03, 3.0)
-#: Limits of hands' turning joints are within [rad], and masses of hands [kg], with an arm if there
-#: is one; else their units are others.
+#: Smallest and largest limit of turning joints [rad], and range of masses of a hand, including an
+#: arm [kg]; other values mean other units.
 SMALLEST_TURN, LARGEST_TURN, MASSES = 0.1, 2.0 * np.pi, (0.01, 60.0)
-#: A hull that reaches farther beyond its mesh [m] gets a note: own choice, half of a fingertip.
+#: Reach of a hull beyond its mesh from which there is a note [m]; own choice, half of a fingertip.
 HOLLOW = 0.01
-#: Mass [kg] and radius [m] of a link that has neither mass nor shape but moves.
+#: Mass [kg] and radius [m] of a moving link that has neither mass nor shape.
 BARE_MASS, BARE_RADIUS = 1e-3, 0.016
-#: What Drake says of parts that MuJoCo reads or that are no part of a hand, or that is said again.
+#: Drake's warnings on parts that MuJoCo reads or that no hand has, or that are reported elsewhere.
 _ASIDE = re.compile(
     "child of '(equality|actuator|tendon|contact|sensor|asset|option|default)'|'(light|camera|site|"
     "compiler|option|tendon|equality|sensor|contact|exclude|transmission|gazebo|general)'|"
@@ -69,12 +69,12 @@ _ASIDE = re.compile(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Link:
-    """A rigid link: vendors' links that are welded together, under the name of the heaviest.
+    """A rigid link: a vendor's links that are welded together, under the name of the heaviest.
 
     Attributes:
-        name: Its name.
-        inertia: M_LLo_L; zero of a body whose model gives none, before it is welded.
-        collisions: Shapes that collide, convex ones.
+        name: Name of the link.
+        inertia: M_LLo_L; zero for a body whose model gives none, before it is welded.
+        collisions: Convex collision shapes.
         visuals: Shapes that are drawn.
     """
 
@@ -84,12 +84,12 @@ class Link:
     visuals: tuple[Shape, ...]
 
     def corners(self) -> Array:
-        """Return the corners (n, 3) of its collision shapes [m]."""
+        """Return the corners (n, 3) of the collision shapes [m]."""
         return np.concatenate([np.zeros((0, 3)), *[s.corners() for s in self.collisions]])
 
     @property
     def weight(self) -> tuple[float, int, int]:
-        """How much it counts among those that are welded to it: the first names them all."""
+        """Rank of the link among the links welded to it: the highest gives its name to all."""
         return self.inertia.get_mass(), len(self.collisions), len(self.visuals)
 
 
@@ -98,13 +98,14 @@ class VendorJoint:
     """A joint that turns or slides; at position 0 the child's frame is at X_PJ in the parent.
 
     Attributes:
-        name: Its name.
+        name: Name of the joint.
         slides: Whether it slides.
         parent, child: Names of links.
-        X_PJ: (4, 4).
+        X_PJ: (4, 4), pose of the child in the parent at position 0.
         axis: (3,), unit, in the child's frame.
         limits: (2,), lower and upper [rad or m].
-        effort, velocity: Largest [N m or N], [rad/s or m/s]; infinite or 0 if not given.
+        effort, velocity: Largest effort [N m or N] and velocity [rad/s or m/s]; infinite or 0 if
+            not given.
     """
 
     name: str
@@ -118,7 +119,7 @@ class VendorJoint:
     velocity: float
 
     def motion(self, positions: Array | float) -> Array:
-        """Return the poses (..., 4, 4) of the child at positions (...), in its own at 0."""
+        """Return the poses (..., 4, 4) of the child at positions (...), relative to position 0."""
         positions = np.asarray(positions, dtype=float)
         X = np.zeros((*positions.shape, 4, 4)) + np.eye(4)
         if self.slides:
@@ -132,7 +133,7 @@ class VendorJoint:
         return np.asarray(self.X_PJ @ self.motion(position))
 
     def rebased(self, sign: float, zero: float) -> VendorJoint:
-        """Return the joint with positions c instead of q = zero + sign * c."""
+        """Return the joint with positions c instead of q, where q = zero + sign * c."""
         limits = np.sort((self.limits - zero) * sign)
         return replace(self, X_PJ=self.pose(zero), axis=sign * self.axis, limits=limits)
 
@@ -142,12 +143,12 @@ class VendorModel:
     """A tree of rigid links.
 
     Attributes:
-        name: Of the model.
-        root: Name of the link that no joint carries.
-        links: By name.
-        joints: By name, each after those that carry its parent.
-        mimics: What each joint follows, by its name; leaders follow nothing.
-        notes: What was left out or put in, a line each.
+        name: Name of the model.
+        root: Name of the link without a parent.
+        links: Links by name.
+        joints: Joints by name, each after those above its parent.
+        mimics: The joint that each joint follows, by the follower's name; leaders follow no joint.
+        notes: What was left out or added, one line each.
     """
 
     name: str
@@ -158,7 +159,7 @@ class VendorModel:
     notes: tuple[str, ...]
 
     def chain(self, link: str, base: str | None = None) -> list[VendorJoint]:
-        """Return the joints from a base, or the root, to a link."""
+        """Return the joints from a base, or from the root, to a link."""
         above = {joint.child: joint for joint in self.joints.values()}
         path: list[VendorJoint] = []
         while link != base and link in above:
@@ -167,30 +168,30 @@ class VendorModel:
         return path
 
     def below(self, link: str) -> list[str]:
-        """Return the links that a link carries by a joint."""
+        """Return the child links of a link."""
         return [joint.child for joint in self.joints.values() if joint.parent == link]
 
     def carries(self, base: str, link: str) -> bool:
-        """Return whether a link moves with another one that is not the link itself."""
+        """Return whether a base is an ancestor of a link."""
         return [joint.parent for joint in self.chain(link, base)][:1] == [base]
 
     def has_shapes(self, link: str) -> bool:
-        """Return whether a link, or one that it carries, has a shape that collides."""
+        """Return whether a link or one of its descendants has a collision shape."""
         return bool(self.links[link].collisions) or any(map(self.has_shapes, self.below(link)))
 
     def pose(self, link: str, positions: Mapping[str, float], base: str | None = None) -> Array:
-        """Return the pose (4, 4) of a link in a base, or the root; joints are at 0 if not given."""
+        """Return the pose (4, 4) of a link in a base or the root; joints not given are at 0."""
         X = np.eye(4)
         for joint in self.chain(link, base):
             X = X @ joint.pose(positions.get(joint.name, 0.0))
         return X
 
     def mimic(self, joint: str) -> Mimic:
-        """Return what a joint follows: itself, if nothing else."""
+        """Return the leader of a joint, with ratio and offset; by default the joint itself."""
         return self.mimics.get(joint, Mimic(joint=joint, leader=joint, ratio=1.0, offset=0.0))
 
     def relation(self, joint: str, to: str) -> tuple[float, float] | None:
-        """Return ratio and offset of a joint's position to another's; None if none leads both."""
+        """Return ratio and offset of a joint's position to another's; None if unrelated."""
         own, other = self.mimic(joint), self.mimic(to)
         ratio = own.ratio / other.ratio
         return (ratio, own.offset - ratio * other.offset) if own.leader == other.leader else None
@@ -200,9 +201,9 @@ def read_model(source: Source) -> VendorModel:
     """Return a vendor's model.
 
     Raises:
-        HandError: If it is no tree of rigid links with meshes that can be read, in one line.
+        HandError: If it is not a tree of rigid links with readable meshes, in one line.
     """
-    # What the text says and Drake does not keep.
+    # Read what the text declares and Drake does not keep.
     root = source.root
     is_mjcf = root.tag == "mujoco"
     masses = {} if is_mjcf else declared_masses(root)
@@ -213,7 +214,7 @@ def read_model(source: Source) -> VendorModel:
     if not is_mjcf:
         refuse_impossible(root)
 
-    # What Drake makes of it, and of MJCF MuJoCo.
+    # Parse it with Drake, and MJCF also with MuJoCo.
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / f"model.{FORMATS[root.tag]}"
         if is_mjcf:
@@ -239,7 +240,7 @@ def read_model(source: Source) -> VendorModel:
         for motor in map(plant.get_joint_actuator, plant.GetJointActuatorIndices()):
             efforts.setdefault(motor.joint().name(), motor.effort_limit())
 
-    # Links and joints, and what follows what.
+    # Build links and joints, and find their leaders.
     carriers = _carriers(plant, moved, bodies)
     places, links = _places(bodies, carriers), {}
     for head in dict.fromkeys(head for head, _ in places.values()):
@@ -290,7 +291,7 @@ def _bodies(
     meshes: Mapping[str, Shape],
     inertias: Mapping[str, SpatialInertia] | None,
 ) -> dict[Any, Link]:
-    """Return the bodies that Drake parsed, before they are joined with those welded to them."""
+    """Return the bodies that Drake parsed, before welded bodies are joined."""
     found = {}
     for index in plant.GetBodyIndices(instance):
         body = plant.get_body(index)
@@ -303,7 +304,7 @@ def _bodies(
             )
         )
 
-        # Drake replaces a mass of zero by one of its own. Shapes without bounds are no part.
+        # Drake replaces a mass of zero by its own value. Shapes without bounds are left out.
         inertia = SpatialInertia.Zero()
         if inertias is not None:
             inertia = inertias.get(name, inertia)
@@ -315,7 +316,7 @@ def _bodies(
 
 
 def _refuse_lost(kind: str, of_mujoco: Iterable[str], of_drake: Set[str]) -> None:
-    """Refuse joints or bodies that MuJoCo reads and Drake does not."""
+    """Reject joints or bodies that MuJoCo reads and Drake does not."""
     for name in of_mujoco:
         if name not in of_drake:
             raise HandError(f"model: {kind} {name!r} of MuJoCo must be one of Drake, got none")
@@ -324,8 +325,8 @@ def _refuse_lost(kind: str, of_mujoco: Iterable[str], of_drake: Set[str]) -> Non
 def _carriers(
     plant: MultibodyPlant, joints: Sequence[Any], bodies: Mapping[Any, Link]
 ) -> dict[Any, Any]:
-    """Return the joint that carries each body but the root."""
-    # The hand hangs free, however the file holds it.
+    """Return the joint to the parent of each body except for the root."""
+    # The hand is free, however the file fixes it to the world.
     found: dict[Any, Any] = {}
     for joint in joints:
         if joint.parent_body().index() == plant.world_body().index():
@@ -339,7 +340,7 @@ def _carriers(
             )
         found[child.index()] = joint
 
-    # One body is left that nothing carries.
+    # One body must be left that has no parent.
     roots = [body.name for index, body in bodies.items() if index not in found]
     if len(roots) != 1:
         got = f"{len(roots)} ({', '.join(roots)})" if roots else "none: its joints form a loop"
@@ -350,11 +351,11 @@ def _carriers(
 def _places(
     bodies: Mapping[Any, Link], carriers: Mapping[Any, Any]
 ) -> dict[Any, tuple[Any, Array]]:
-    """Return the link of each body, by the body that a joint carries, and its pose (4, 4) there.
+    """Return for each body the first body of its link, and its pose (4, 4) in the link.
 
-    Bodies come after those that carry them.
+    Bodies come after their parents.
     """
-    # From the root on. The frame of a link is that of its joint.
+    # Go from the root outwards. The frame of a link is that of its joint.
     order = [index for index in bodies if index not in carriers]
     places: dict[Any, tuple[Any, Array]] = {}
     for index in order:
@@ -385,13 +386,13 @@ def _fixed(frame: Any) -> Array:
 def _weld(
     members: Sequence[tuple[Link, Array]], impossible: Mapping[str, str]
 ) -> tuple[Link, list[str]]:
-    """Return the link of bodies with their poses in its frame, and notes of what was put in.
+    """Return the link of bodies with their poses in its frame, and notes of what was added.
 
     Args:
         members: The bodies, with their poses (4, 4).
-        impossible: What is wrong with inertias that the model gives, by the names of bodies.
+        impossible: Faults of impossible inertias in the model, by the names of bodies.
     """
-    # Shapes; what only is drawn collides as well, if nothing else does.
+    # Join the shapes; without collision shapes, the visual shapes also collide.
     name, notes = max((body for body, _ in members), key=lambda body: body.weight).name, []
     solids, visuals = (
         [replace(s, X_LS=X_LB @ s.X_LS) for body, X_LB in members for s in getattr(body, kind)]
@@ -409,14 +410,14 @@ def _weld(
                 "its mesh, and what is hollow there is solid: cut the mesh into convex parts"
             )
 
-    # Inertias add up about the link's origin.
+    # Add the inertias about the link's origin.
     total = SpatialInertia.Zero()
     for body, X_LB in members:
         if body.inertia.get_mass() > 0.0:
             own = body.inertia.ReExpress(RotationMatrix(X_LB[:3, :3])).Shift(-X_LB[:3, 3])
             total = added(total, own)
 
-    # What has no mass gets one by its size, and what no body has is replaced.
+    # A link without mass gets a mass by its size, and an impossible inertia is replaced.
     wrong = [impossible[body.name] for body, _ in members if body.name in impossible]
     ball = SpatialInertia(BARE_MASS, np.zeros(3), UnitInertia.SolidSphere(BARE_RADIUS))
     if total.get_mass() == 0.0:
@@ -440,7 +441,7 @@ def _joints(
     efforts: Mapping[str, float],
     ranges: Mapping[str, Array],
 ) -> dict[str, VendorJoint]:
-    """Return the joints that move, by name, each after those that carry its parent."""
+    """Return the joints that move, by name, each after those above its parent."""
     found = {}
     for index in links:
         joint = carriers.get(index)
@@ -451,7 +452,7 @@ def _joints(
         limits = ranges.get(name, drakes)
         refuse_limits(name, *limits)
 
-        # Efforts without end say nothing.
+        # Infinite efforts give no information.
         effort = efforts.get(name, 0.0)
         found[name] = VendorJoint(
             name=name,
@@ -468,10 +469,10 @@ def _joints(
 
 
 def find_leaders(mimics: Sequence[Mimic], joints: Mapping[str, VendorJoint]) -> dict[str, Mimic]:
-    """Return what each joint follows, through all that its leader follows.
+    """Return the leader of each following joint, through chains of mimics.
 
     Raises:
-        HandError: If mimics form a circle, or name what is no joint that moves.
+        HandError: If mimics form a circle, or name something that is not a moving joint.
     """
     given = {mimic.joint: mimic for mimic in mimics}
     found: dict[str, Mimic] = {}
@@ -479,7 +480,7 @@ def find_leaders(mimics: Sequence[Mimic], joints: Mapping[str, VendorJoint]) -> 
         if name not in joints:
             raise HandError(f"model: joint {name!r} follows another, so it must turn or slide")
 
-        # Up to a joint that follows nothing.
+        # Follow the leaders up to a joint that follows none.
         ratio, offset, leader, seen = mimic.ratio, mimic.offset, mimic.leader, {name}
         while leader in given and leader not in seen:
             seen.add(leader)
@@ -497,7 +498,7 @@ def find_leaders(mimics: Sequence[Mimic], joints: Mapping[str, VendorJoint]) -> 
 
 
 def make_room(joints: dict[str, VendorJoint], mimics: Mapping[str, Mimic]) -> Iterator[str]:
-    """Give joints limits that let them follow, and yield a note of each whose limits did not.
+    """Give joints limits that let them follow, and yield a note for each that was changed.
 
     Limits of some vendors' mimics have the wrong sign.
     """
@@ -514,7 +515,7 @@ def make_room(joints: dict[str, VendorJoint], mimics: Mapping[str, Mimic]) -> It
 
 
 def doubtful_units(model: VendorModel) -> Iterator[str]:
-    """Yield that angles or masses of a model are such as no hand has: its units may be others."""
+    """Yield doubts about a model whose angles or masses no hand has: its units may be others."""
     turning = [joint.limits for joint in model.joints.values() if not joint.slides]
     angles = np.abs([limits for limits in turning if np.isfinite(limits).all()])
     if angles.size and np.median(angles.max(axis=1)) > LARGEST_TURN:
@@ -533,7 +534,7 @@ def doubtful_units(model: VendorModel) -> Iterator[str]:
 
 
 def _refuse_size(model: VendorModel) -> None:
-    """Refuse a model without shapes, or one whose units are not metres."""
+    """Reject a model without shapes, or a model whose units are not metres."""
     points = [transform_points(model.pose(n, {}), own.corners()) for n, own in model.links.items()]
     cloud = np.concatenate(points)
     if not len(cloud):

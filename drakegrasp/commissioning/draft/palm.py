@@ -1,7 +1,8 @@
-"""The palm frame G of a grip: where the palm's surface is, and which way it faces.
+"""The palm frame G of a grip: where the palm's surface is, and which direction it faces.
 
-In: a model and a `Grip`. Out: poses X_BG, the best first. Gz is square to the line along which the
-fingers close, and its ray from the palm to the pinch is free; Gy points to the finger that opposes.
+In: a model and a `Grip`. Out: poses X_BG, the best first. Gz is perpendicular to the line along
+which the fingers close, and its ray from the palm to the pinch is free. Gy points to the finger
+that opposes the others.
 """
 
 from __future__ import annotations
@@ -18,13 +19,14 @@ from drakegrasp.commissioning.draft.model import VendorModel
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
 from drakegrasp.hand.shapes import ray_span
 
-#: Directions that are tried: their steps [deg], and how near an axis of the palm counts as one.
+#: Step of the directions that are tried [deg], and largest angle from an axis of the palm that is
+#: replaced by the axis.
 STEP_DEG, ALIGNED = 15, np.deg2rad(15.0)
-#: The pinch is at least so far in front of the palm [m].
+#: Smallest distance of the pinch in front of the palm [m].
 AHEAD = 0.015
-#: What it costs to face aside of the line from the palm to the pinch [1/rad], that a link reaches
-#: farther than `BEYOND` beyond the pinch [1/m], to face no axis of the palm, and that the palm is
-#: beside the ray.
+#: Costs: of an angle to the line from the palm to the pinch [1/rad]; of a link that reaches farther
+#: than `BEYOND` [m] beyond the pinch [1/m]; of facing no axis of the palm; of a palm beside the
+#: ray.
 ASIDE, BEYOND, FAR, OBLIQUE, BESIDE = 0.5, 0.03, 12.0, 0.15, 0.3
 
 
@@ -33,10 +35,10 @@ class PalmFrame:
     """A palm frame.
 
     Attributes:
-        p_BG: (3,) [m].
-        rpy_deg: (3,) [deg].
-        height: Of the pinch above the palm [m].
-        cost: How unusual it is.
+        p_BG: (3,), origin of G in B [m].
+        rpy_deg: (3,), roll, pitch and yaw of G in B [deg].
+        height: Height of the pinch above the palm [m].
+        cost: How unusual the frame is.
     """
 
     p_BG: Array
@@ -46,7 +48,7 @@ class PalmFrame:
 
     @property
     def X_BG(self) -> Array:
-        """The pose (4, 4)."""
+        """The pose X_BG (4, 4)."""
         R = RollPitchYaw(np.deg2rad(self.rpy_deg)).ToRotationMatrix().matrix()
         return make_pose(R, self.p_BG)
 
@@ -58,17 +60,17 @@ def find_palm_frames(
     postures: Sequence[Mapping[str, float]],
     approach: Array | None,
 ) -> list[PalmFrame]:
-    """Return the palm frames of a grip, the best first; none if the palm faces no pinch.
+    """Return the palm frames of a grip, the best first; empty if the palm faces no pinch.
 
     Args:
         model: The model.
         palm: Link B.
         grip: The fingers.
         postures: Positions of all joints, from the open to the closed hand.
-        approach: (3,), +Gz in B, if it is known.
+        approach: (3,), +Gz in B; None if unknown.
     """
 
-    # The corners of each shape in B, in the open hand, and of all links on the way.
+    # The corners of each shape in B, in a posture.
     def placed(posture: Mapping[str, float]) -> list[Array]:
         return [
             transform_points(model.pose(name, posture, palm), shape.corners())
@@ -111,7 +113,7 @@ def find_palm_frames(
 
 
 def _directions(grip: Grip, centre: Array, approach: Array | None) -> list[tuple[Array, float]]:
-    """Return unit directions (3,) that Gz may have, and how far they are aside [rad]."""
+    """Return possible unit directions (3,) of Gz, with angles to the line palm-pinch [rad]."""
     if approach is not None:
         return [(approach / np.linalg.norm(approach), 0.0)]
     axis = grip.axis
@@ -129,7 +131,7 @@ def _directions(grip: Grip, centre: Array, approach: Array | None) -> list[tuple
 
 def _origin(grip: Grip, direction: Array, parts: list[Array]) -> tuple[Array, bool] | None:
     """Return the origin (3,) of G on the palm below the pinch, and whether the palm is beside."""
-    # Where the ray to the pinch leaves the palm, or else its foremost point.
+    # Find where the ray to the pinch leaves the palm, or else the palm's foremost point.
     spans = [ray_span(corners, grip.middle, direction) for corners in parts]
     leaves = [span[1] for span in spans if span is not None]
     if leaves:

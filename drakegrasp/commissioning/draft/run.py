@@ -1,9 +1,9 @@
 """Drafts a hand file from a vendor's model.
 
-In: a URDF, SDFormat or MJCF file, and what a person says of the hand. Out: a folder that is
-complete by itself: hand file, with a comment on each line that was guessed, model as URDF, meshes.
-Of several ways to grasp, the first is taken that passes `hand check`, else the one that fails the
-fewest of its checks.
+In: a URDF, SDFormat or MJCF file, and a person's answers about the hand. Out: a complete folder
+with the hand file, which has a comment on each guessed line, the model as URDF, and meshes. Of
+several possible grips, the first one that passes `hand check` is used, or else the one that fails
+the fewest checks.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ def write_urdf(model: VendorModel, path: Path, comments: Sequence[str]) -> None:
 
     Args:
         model: The model.
-        path: The URDF file; meshes come into a folder beside it.
-        comments: Lines for its head.
+        path: The URDF file; meshes are written to a folder beside it.
+        comments: Lines for the beginning of the file.
     """
     robot = Element("robot", {"name": model.name, "xmlns:drake": "https://drake.mit.edu"})
     for line in comments:
@@ -100,7 +100,7 @@ def _add_origin(parent: Element, X: Array) -> None:
 
 
 def _add_link(robot: Element, link: Link, stem: str, folder: Path) -> None:
-    """Add a link; its meshes become files whose names start with a stem."""
+    """Add a link; its meshes become files whose names start with `stem`."""
     # Inertia about the centre of mass.
     element = _add(robot, "link", name=link.name)
     inertial, p_LLcm = _add(element, "inertial"), link.inertia.get_com()
@@ -110,7 +110,7 @@ def _add_link(robot: Element, link: Link, stem: str, folder: Path) -> None:
     pairs = combinations_with_replacement(range(3), 2)
     _add(inertial, "inertia", **{f"i{'xyz'[a]}{'xyz'[b]}": tensor[a, b] for a, b in pairs})
 
-    # Shapes; meshes are files of their own.
+    # Shapes; meshes are separate files.
     for tag, shapes in (("collision", link.collisions), ("visual", link.visuals)):
         for n, shape in enumerate(shapes):
             _add_shape(element, tag, shape, f"{stem}_{tag}_{n}", folder)
@@ -137,14 +137,14 @@ def _add_shape(parent: Element, tag: str, shape: Shape, name: str, folder: Path)
         if tag == "collision":
             _add(mesh, "drake:declare_convex")
 
-    # Only what is drawn has a colour.
+    # Only visual shapes have a colour.
     if tag == "visual" and shape.colour is not None:
         material = _add(element, "material", name=f"{name}_colour")
         _add(material, "color", rgba=np.array([*shape.colour, 1.0]))
 
 
 def _add_joint(robot: Element, joint: VendorJoint, mimic: Mimic | None) -> None:
-    """Add a joint, with what it follows."""
+    """Add a joint, with the joint that it follows."""
     limited = bool(np.isfinite(joint.limits).all())
     turns = "revolute" if limited else "continuous"
     element = _add(robot, "joint", name=joint.name, type="prismatic" if joint.slides else turns)
@@ -153,7 +153,7 @@ def _add_joint(robot: Element, joint: VendorJoint, mimic: Mimic | None) -> None:
     _add_origin(element, joint.X_PJ)
     _add(element, "axis", xyz=joint.axis)
 
-    # Limits, and the joint that leads it.
+    # Limits, and the leader.
     ends = dict(zip(("lower", "upper"), joint.limits, strict=True)) if limited else {}
     speed = joint.velocity if np.isfinite(joint.velocity) else FAST
     _add(element, "limit", **ends, effort=joint.effort, velocity=speed)
@@ -166,13 +166,13 @@ def hand_text(tree: Mapping[str, Any], reasons: Mapping[str, str], head: list[st
     """Return the YAML of a hand file.
 
     Args:
-        tree: Its keys.
+        tree: Keys and values of the file.
         reasons: Comments, by the paths of keys.
-        head: Lines at its top.
+        head: Lines at the top of the file.
     """
     lines = [f"# {line}" for line in head]
     for key, value in tree.items():
-        # A mapping, or a list of them, is a block of a line per key: its start, value and path.
+        # A mapping, or a list of mappings, is a block with one line per key: start, value and path.
         rows: list[tuple[str, Any, str]] = []
         if isinstance(value, dict):
             rows = [(f"  {_flow(n)}:", item, f"{key}.{n}") for n, item in value.items()]
@@ -183,7 +183,7 @@ def hand_text(tree: Mapping[str, Any], reasons: Mapping[str, str], head: list[st
                 for n, (name, item) in enumerate(entry.items())
             ]
         if not rows:
-            # What comes after a block stands apart from it.
+            # Separate a block from what follows it.
             lines += [""] if lines[-1].startswith(" ") else []
             lines.append(_line(f"{key}: {_flow(value)}", reasons.get(key)))
             continue
@@ -204,26 +204,27 @@ def _flow(value: Any) -> str:
     return text.removesuffix("\n").removesuffix("\n...").strip()
 
 
-#: Grips that are tried, palm frames with each, and shares of the closing at which links are seen.
+#: Number of grips that are tried, number of palm frames with each, and fractions of the closing at
+#: which links are placed.
 GRIPS, FRAMES, SHARES = 6, 2, (0.0, 0.25, 0.5, 0.75, 1.0)
-#: Postures at which links of different fingers are compared.
+#: Number of postures in which links of different fingers are compared.
 POSTURES = 24
-#: A pinch that costs more than this is not a pinch: fingers that pass each other.
+#: Largest cost of a pinch; fingers with a larger cost pass each other.
 WORST = 2.4
-#: Files of a vendor that say what may be done with the model.
+#: Patterns of a vendor's licence files.
 LICENCES = ("LICENSE*", "LICENCE*", "COPYING*", "NOTICE*")
-#: So many folders above the model's may have them.
+#: Number of folders above the model's that may have licence files.
 MOST_ABOVE = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class NewHand:
-    """A hand that was drafted.
+    """A drafted hand.
 
     Attributes:
-        path: Its hand file.
-        notes: What was left out of the model, put in, or is not used.
-        findings: What the checks of its files and geometry say.
+        path: The hand file.
+        notes: What was left out of the model, added to it, or is not used.
+        findings: Findings of the checks of its files and geometry.
     """
 
     path: Path
@@ -245,13 +246,13 @@ def draft_hand(
     Args:
         path: A URDF, SDFormat or MJCF file.
         out: The folder; it must not exist, or be empty.
-        answers: What overrides the guesses.
+        answers: Answers that override the guesses.
         packages: Folders of package:// URIs, by name.
-        roots: Folders outside of the model's whose files it may use.
+        roots: Folders outside the model's folder whose files it may use.
 
     Raises:
-        HandError: If the model cannot be used, or something cannot be guessed; one line that says
-            how to mend or answer it.
+        HandError: If the model cannot be used, or something cannot be guessed. The message has one
+            line, which states how to repair the model or give an answer.
     """
     answers, config = answers or Answers(), load_config()
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
@@ -278,9 +279,10 @@ def draft_hand(
 
 
 def _licences(folder: Path) -> list[Path]:
-    """Return the licence files of the nearest folder that has some, from that of a model upwards.
+    """Return the licence files of the closest folder with some, from the model's folder upwards.
 
-    A repository often has one at its root. What is above that, or far above, is another's.
+    A repository often has one at its root. A file above the root, or far above, is another
+    project's.
     """
     for above in (folder, *folder.parents[:MOST_ABOVE]):
         found = chain.from_iterable(above.glob(name) for name in LICENCES)
@@ -294,16 +296,16 @@ def _licences(folder: Path) -> list[Path]:
 def _find_best(
     model: VendorModel, path: Path, answers: Answers, config: Config
 ) -> tuple[Draft, tuple[Finding, ...]]:
-    """Return the first draft that passes all checks, or that which passes most, and its findings.
+    """Return the first draft that passes all checks, or that passes most, and its findings.
 
     Raises:
-        HandError: If there is none.
+        HandError: If there is no draft.
     """
     best: tuple[int, Draft, tuple[Finding, ...]] | None = None
     with tempfile.TemporaryDirectory() as scratch:
         folders = (Path(scratch) / str(n) for n in count())
         for drafts in _drafts(model, answers, config):
-            # The palm frames of a grip, until its geometry is sound; then whether it holds.
+            # Try the palm frames of a grip until its geometry is sound, then whether it holds.
             for draft in drafts:
                 file = _write(draft, next(folders), path, drawn=False)
                 findings = _findings(file, config)
@@ -328,7 +330,7 @@ def _find_best(
 
 
 def _refuse_unknown(model: VendorModel, answers: Answers) -> None:
-    """Refuse answers about joints that the model does not have."""
+    """Reject answers about joints that the model does not have."""
     for option, names in (("--joint", answers.joints), ("--reverse", answers.reverse)):
         for name in names:
             if name not in model.joints:
@@ -353,7 +355,7 @@ def _drafts(model: VendorModel, answers: Answers, config: Config) -> Iterator[It
             "JOINT"
         )
 
-    # Those whose links meet too early are left out; the first of all is better than none.
+    # Leave out grips whose links collide too early; if all do, the first of all is used.
     shares = np.arange(POSTURES) / (POSTURES - 1)
     clear = clear_grips(model, palm, grips, lambda g: (positions(model, g, s) for s in shares))
     for grip in chain(islice(clear, GRIPS), grips[:1]):
@@ -365,7 +367,7 @@ def _drafts(model: VendorModel, answers: Answers, config: Config) -> Iterator[It
 def _write(draft: Draft, folder: Path, path: Path, *, drawn: bool = True) -> Path:
     """Write the files of a hand, and return the hand file.
 
-    Most of the time of writing one is that of its pictures, which may be left out.
+    Visual shapes take most of the time of writing, so they can be left out.
     """
     vendor = draft.model
     if not drawn:
@@ -388,7 +390,7 @@ def _write(draft: Draft, folder: Path, path: Path, *, drawn: bool = True) -> Pat
 
 
 def _findings(file: Path, config: Config) -> tuple[Finding, ...]:
-    """Return what is right and wrong about a hand; nothing is simulated."""
+    """Return the findings of the checks without a simulation."""
     try:
         hand = load_hand(file)
     except HandError as error:

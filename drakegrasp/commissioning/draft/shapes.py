@@ -1,8 +1,9 @@
 """Shapes of a vendor's links: primitives of Drake, and meshes of many formats.
 
 In: the XML of a model, the mesh files that it names, and the shapes that Drake parsed. Out: XML
-that names Wavefront files of a scratch folder, which Drake reads; and `Shape`s on the links. What
-is no primitive becomes triangles, few enough to be drawn quickly; what collides a convex hull.
+that names Wavefront files of a scratch folder, which Drake can read, and `Shape`s on the links. A
+shape that is not a primitive becomes triangles, few enough to be drawn quickly. A collision shape
+becomes a convex hull.
 """
 
 from __future__ import annotations
@@ -43,17 +44,19 @@ from drakegrasp.mesh.wavefront import obj_text
 
 #: Formats of mesh files.
 FORMATS = (".obj", ".stl", ".dae", ".glb", ".gltf", ".ply")
-#: A mesh file has at most so many bytes; a mesh with more faces than this is drawn with so many.
+#: Maximum size of a mesh file [bytes]; number of faces to which larger meshes are simplified.
 LARGEST, MOST_FACES = 200_000_000, 8_000
-#: No colour is darker: nothing of a black hand can be told in a picture.
+#: Lower bound of colours, because the details of a black hand are invisible in a picture.
 DARKEST = 0.15
-#: Corners of the hull of a collision mesh: of a ball of 10 mm radius they miss less than 0.4 mm.
+#: Number of corners of the hull of a collision mesh; on a ball of 10 mm radius they miss less than
+#: 0.4 mm.
 CORNERS = 64
-#: What is thinner than this [m] is made as thick: a plane has no hull.
+#: Minimum thickness of a hull [m]: a plane has no hull.
 THIN = 4e-4
-#: Points on a hull that are compared with ten times as many of its mesh: some 3 mm apart on a palm.
+#: Number of points on a hull that are compared with ten times as many points of its mesh, which are
+#: about 3 mm apart on a palm.
 SAMPLES = 1000
-#: Mean density of links whose model gives no mass [kg/m^3]: own choice, that of solid plastic.
+#: Mean density of links whose model gives no mass [kg/m^3]; own choice, that of solid plastic.
 DENSITY = 1200.0
 
 
@@ -62,10 +65,10 @@ class Shape:
     """A shape on a link: a primitive, or else a mesh.
 
     Attributes:
-        X_LS: Pose on the link, (4, 4).
+        X_LS: Pose of the shape on the link, (4, 4).
         primitive: A box, cylinder, capsule or sphere.
-        vertices: (n, 3) of a mesh, in its own frame [m].
-        faces: (m, 3) of a mesh.
+        vertices: (n, 3), vertices of a mesh, in its own frame [m].
+        faces: (m, 3), faces of a mesh.
         colour: (3,), if the model or the mesh file gives one.
     """
 
@@ -76,13 +79,13 @@ class Shape:
     colour: Array | None = None
 
     def corners(self) -> Array:
-        """Return points (n, 3) whose hull is that of the shape, in the link's frame [m]."""
+        """Return points (n, 3) with the same hull as the shape, in the link's frame [m]."""
         own = self.vertices if self.primitive is None else primitive_corners(self.primitive)
         assert own is not None
         return transform_points(self.X_LS, own)
 
     def hull(self) -> Shape:
-        """Return a mesh as its convex hull of few corners; other shapes as they are."""
+        """Return the convex hull of a mesh, with few corners; other shapes unchanged."""
         if self.vertices is None:
             return self
         points = self.vertices
@@ -95,7 +98,7 @@ class Shape:
         return _with_hull(self, points[farthest])
 
     def reach_beyond(self, mesh: Shape) -> float:
-        """Return how far the surface of a hull is from that of its mesh at most [m]."""
+        """Return the largest distance of the surface of a hull from that of its mesh [m]."""
         (own, _), (other, _) = (
             trimesh.sample.sample_surface(trimesh.Trimesh(s.vertices, s.faces), count, seed=0)
             for s, count in ((self, SAMPLES), (mesh, 10 * SAMPLES))
@@ -115,15 +118,15 @@ def read_shape(
     role: Role,
     meshes: Mapping[str, Shape],
 ) -> Shape | None:
-    """Return a shape that Drake parsed, on its body; None for one without bounds.
+    """Return a shape that Drake parsed, on its body; None for a shape without bounds.
 
     Args:
-        inspector: Describes it.
+        inspector: The inspector of the scene graph.
         geometry: The shape.
-        role: Whether it is seen or collides.
-        meshes: What the mesh files hold, by their names.
+        role: Whether the shape is drawn or collides.
+        meshes: Contents of the mesh files, by their names.
     """
-    # What it is, and the colour that the model gives it.
+    # Read its kind, and the colour that the model gives it.
     shape, colour = inspector.GetShape(geometry), None
     properties = inspector.GetProperties(geometry, role)
     if properties is not None and properties.HasProperty("phong", "diffuse"):
@@ -133,7 +136,7 @@ def read_shape(
     if isinstance(shape, Box | Cylinder | Capsule | Sphere):
         return replace(found, primitive=shape)
 
-    # Else triangles: of its file, or of its hull.
+    # Other shapes become triangles: those of the file, or of the hull.
     if isinstance(shape, Mesh | Convex) and shape.source().is_path():
         mesh = meshes[shape.source().path().name]
         assert mesh.vertices is not None
@@ -152,12 +155,12 @@ def solid_inertia(shapes: Sequence[Shape]) -> SpatialInertia:
     """Return M_LLo_L of convex shapes of a link, solids of `DENSITY`, which may overlap."""
     total = SpatialInertia.Zero()
     for shape in shapes:
-        # Flat shapes have no volume: half a millimetre around makes one.
+        # Flat shapes have no volume, so half a millimetre is added on all sides.
         corners = shape.corners()
         solid = Convex(np.concatenate([corners - 5e-4, corners + 5e-4]).T, "hull")
         try:
             total = added(total, CalcSpatialInertia(solid, DENSITY))
-        except (RuntimeError, ValueError):  # lengths whose powers are beyond arithmetic
+        except (RuntimeError, ValueError):  # lengths whose powers overflow
             reach = float(np.abs(corners).max())
             raise HandError(
                 f"model: must be a hand in metres, got a shape that reaches {reach:.3g} m from its "
@@ -178,10 +181,10 @@ def added(one: SpatialInertia, other: SpatialInertia) -> SpatialInertia:
 def replace_meshes(source: Source, folder: Path) -> tuple[dict[str, Shape], list[str]]:
     """Replace every mesh in the XML by a Wavefront file in a folder.
 
-    A picture of a link that cannot be read is left out: its collision shapes are drawn instead.
+    A visual shape that cannot be read is left out; the collision shapes are drawn instead.
 
     Returns:
-        What the files hold by their names, and notes of what was left out.
+        The contents of the files by their names, and notes of what was left out.
 
     Raises:
         HandError: If a mesh of a collision shape cannot be read.
@@ -198,7 +201,7 @@ def replace_meshes(source: Source, folder: Path) -> tuple[dict[str, Shape], list
             (folder / name).write_text(text, encoding="utf-8")
         return name
 
-    # URDF and SDFormat: shapes of links that hold meshes.
+    # In URDF and SDFormat, shapes of links contain the meshes.
     notes: list[str] = []
     if source.root.tag == "mujoco":
         _replace_assets(source, convert)
@@ -229,7 +232,7 @@ def _replace(mesh: Element, source: Source, convert: Callable[[str, Path], str])
 
 def _replace_assets(source: Source, convert: Callable[[str, Path], str]) -> None:
     """Replace the files of an MJCF model's meshes, and leave out its textures."""
-    # The folder of the meshes is the compiler's.
+    # The compiler element specifies the folder of the meshes.
     base = source.folder
     for compiler in source.root.iter("compiler"):
         place = compiler.attrib.pop("meshdir", None) or compiler.attrib.pop("assetdir", None)
@@ -237,7 +240,7 @@ def _replace_assets(source: Source, convert: Callable[[str, Path], str]) -> None
         for key in ("assetdir", "texturedir", "strippath"):
             compiler.attrib.pop(key, None)
 
-    # A file's name stands for a name that is not given.
+    # If a mesh has no name, its name is that of the file.
     for assets in source.root.iter("asset"):
         for element in list(assets):
             if element.tag == "texture":
@@ -250,12 +253,12 @@ def _replace_assets(source: Source, convert: Callable[[str, Path], str]) -> None
 
 
 def _read_mesh(path: Path) -> Shape:
-    """Return what a mesh file holds.
+    """Return the content of a mesh file.
 
     Raises:
-        HandError: If it is missing, of another format, or holds no triangles.
+        HandError: If the file is missing, has another format, or contains no triangles.
     """
-    # Refuse what trimesh need not see.
+    # Reject what need not be given to trimesh.
     what = f"model: mesh {path.name!r}"
     if path.suffix.lower() not in FORMATS:
         raise HandError(f"{what} must be one of {', '.join(FORMATS)}, got {path.suffix!r}")
@@ -269,7 +272,7 @@ def _read_mesh(path: Path) -> Shape:
     try:
         scene: Any = trimesh.load_scene(path)
         mesh: Any = scene.to_mesh()
-        # Seams of textures and shading would tear where faces are left out.
+        # Seams of textures and shading would become gaps when faces are removed.
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
         vertices = np.asarray(mesh.vertices, dtype=float)
         faces = np.asarray(mesh.faces, dtype=np.int64)
@@ -281,7 +284,7 @@ def _read_mesh(path: Path) -> Shape:
     if not len(faces) or not np.isfinite(vertices).all():
         raise HandError(f"{what} must hold triangles with finite corners")
 
-    # Few faces are enough for a picture.
+    # A picture needs only few faces.
     if len(faces) > MOST_FACES:
         vertices, faces = fast_simplification.simplify(
             vertices.astype(np.float32), faces.astype(np.int32), target_count=MOST_FACES
@@ -291,7 +294,7 @@ def _read_mesh(path: Path) -> Shape:
 
 
 def _colour(scene: Any) -> Array | None:
-    """Return the colour (3,) that most of a scene's surface has; None if it has none."""
+    """Return the colour (3,) of the largest mesh of a scene; None if no mesh has a colour."""
     found: list[tuple[float, Array]] = []
     for mesh in scene.geometry.values():
         colour = getattr(getattr(mesh.visual, "material", None), "main_color", None)

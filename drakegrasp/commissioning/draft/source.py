@@ -1,8 +1,8 @@
 """The text of a vendor's model, and the folders whose files it may use.
 
-In: a URDF, SDFormat or MJCF file. Out: its XML, complete by itself but for meshes. A file that asks
-for too much (entities, depth, includes without end) is refused before anything else reads it.
-Nothing is fetched, and no file outside of the folders is read.
+In: a URDF, SDFormat or MJCF file. Out: its XML, complete except for meshes. A file with entities,
+too much nesting or endless includes is rejected before anything else reads it. Nothing is
+downloaded, and no file outside the folders is read.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from drakegrasp.hand.files import find_packages
 #: Formats by the tag of the root.
 FORMATS = {"robot": "urdf", "sdf": "sdf", "mujoco": "xml"}
 SUFFIXES = (".urdf", ".sdf", ".xml", ".mjcf")
-#: A model's text has at most so many bytes, elements within each other, and files of its own.
+#: Maximum size of a model's text [bytes], depth of nested elements, and number of included files.
 LONGEST, DEEPEST, MOST_INCLUDES = 20_000_000, 200, 50
-#: Bytes that are parsed at a time.
+#: Number of bytes that are parsed at a time.
 BITE = 65_536
-#: Numbers of URDF (attributes) and SDFormat (elements), those of MJCF, and what may be infinite.
+#: Names of numbers in URDF (attributes) and SDFormat (elements), in MJCF, and of infinite ones.
 _NUMBERS = {
     *("xyz", "rpy", "ixx", "ixy", "ixz", "iyy", "iyz", "izz", "mass", "lower", "upper", "pose"),
     *("effort", "velocity", "multiplier", "offset", "reference", "radius", "length", "size"),
@@ -41,19 +41,19 @@ _MJCF_NUMBERS = {
 }
 _ENDLESS = ("lower", "upper", "effort", "velocity", "range", "ctrlrange", "forcerange")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
-#: What an element of a model may not lead to: Drake would look for the file itself.
+#: Elements that would make Drake look for other files.
 _ELSEWHERE = {"robot": ("drake:include",), "sdf": ("include",), "mujoco": ("hfield", "plugin")}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """A vendor's model, read.
+    """A vendor's model that was read.
 
     Attributes:
-        root: Its XML, with what it includes.
-        folder: That of the model.
-        packages: Of package:// URIs, by name.
-        given: Folders outside of the model's that it may use: those that the user named.
+        root: Its XML, with included files.
+        folder: Folder of the model.
+        packages: Folders of package:// URIs, by name.
+        given: Folders outside the model's folder that it may use, as named by the user.
     """
 
     root: Element
@@ -65,9 +65,9 @@ class Source:
         """Return the file of a URI or path; relative ones start at `base`.
 
         Raises:
-            HandError: If it is a URI of another kind, or lies outside of the folders.
+            HandError: If the URI is of another kind, or the file is outside the folders.
         """
-        # A package is one that is known, or a folder of its name above the model.
+        # A package is a known one, or a folder of its name above the model.
         scheme, separator, rest = uri.partition("://")
         if separator and scheme not in ("package", "file", "model"):
             raise HandError(
@@ -86,7 +86,7 @@ class Source:
         else:
             path, allowed = base / unquote(rest if separator else uri), [self.folder]
 
-        # What a link or `..` leads to is what counts.
+        # Check the target of links and `..`, not their text.
         try:
             real = path.resolve()
         except (OSError, RuntimeError, ValueError):
@@ -106,12 +106,13 @@ def read_source(path: Path, packages: Mapping[str, Path], given: Sequence[Path] 
     Args:
         path: A URDF, SDFormat or MJCF file.
         packages: Folders of package:// URIs, beside those in which the model lies.
-        given: Folders outside of the model's that it may use.
+        given: Folders outside the model's folder that it may use.
 
     Raises:
-        HandError: If it cannot be read, in one line that says how to mend it.
+        HandError: If the model cannot be read; the message has one line, which states how to repair
+            it.
     """
-    # What it is.
+    # Check the kind of file.
     path = Path(path)
     if path.suffix.lower() == ".xacro":
         raise HandError(f"{path}: must be URDF, got xacro: run `xacro {path.name} > hand.urdf`")
@@ -126,7 +127,7 @@ def read_source(path: Path, packages: Mapping[str, Path], given: Sequence[Path] 
             f"{path}: must be a model in URDF, SDFormat or MJCF, got XML of <{root.tag}>"
         )
 
-    # What it is made of.
+    # Read its parts.
     folder = path.resolve().parent
     known = {**find_packages(folder, path.name, {}), **packages}
     source = Source(root=root, folder=folder, packages=known, given=tuple(given))
@@ -153,7 +154,7 @@ def _parse(path: Path) -> Element:
     if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
         raise HandError(f"{path}: must be XML without a document type, got <!DOCTYPE>")
 
-    # It is read bit by bit: what is too deep need not be built.
+    # Parse it in small pieces, so that a text that is nested too deeply is never built.
     depth, root = 0, None
     parser: Any = ElementTree.XMLPullParser(("start", "end"))
     try:
@@ -172,7 +173,7 @@ def _parse(path: Path) -> Element:
 
 
 def _refuse_xacro(root: Element, path: Path) -> None:
-    """Refuse what xacro would have replaced."""
+    """Reject text that xacro would have replaced."""
     for element in root.iter():
         names = [element.tag, *element.attrib]
         texts = [element.text or "", *element.attrib.values()]
@@ -186,7 +187,7 @@ def _refuse_xacro(root: Element, path: Path) -> None:
 
 
 def _refuse_words(element: Element, mjcf: bool, owner: str) -> None:
-    """Refuse what is no number where a model has numbers: parsers read its start, or nothing."""
+    """Reject text where a model has numbers: parsers would read only its beginning, or nothing."""
     owner = f"{element.tag} {element.get('name')!r}" if "name" in element.attrib else owner
     known = _MJCF_NUMBERS if mjcf else _NUMBERS
     found = [(key, text) for key, text in element.attrib.items() if key in known]
@@ -204,7 +205,7 @@ def _refuse_words(element: Element, mjcf: bool, owner: str) -> None:
 
 
 def _include(root: Element, source: Source, count: list[int]) -> None:
-    """Put the content of included MJCF files in place of their <include>."""
+    """Replace each <include> by the content of the MJCF file that it names."""
     for parent in list(root.iter()):
         for child in [c for c in parent if c.tag == "include"]:
             count[0] += 1

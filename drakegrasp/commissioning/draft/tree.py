@@ -1,16 +1,17 @@
-"""A hand file and its model, from a grip and its palm frame.
+"""Drafts a hand file and its model from a grip and its palm frame.
 
 In: a `VendorModel`, a `Grip` and a `PalmFrame`. Out: the model, in which a positive position of a
-closing joint closes, from 0, the open hand; and the keys of a hand file, each with why it is so.
+closing joint closes the finger, from 0 in the open hand; and the keys of a hand file, each with the
+reason for its value.
 
-A fingertip presses with what its weakest motor gives. With the motion dp/dc of the pad point as the
-finger closes, u = dp/dc / |dp/dc|, and the lever l_m of motor m, the motion of the pad point along
-u per its joint's, the closing joint's limit is
+A fingertip presses as hard as its weakest motor allows. With the motion dp/dc of the pad point as
+the finger closes, u = dp/dc / |dp/dc|, and the lever l_m of motor m (the motion of the pad point
+along u per motion of the motor's joint), the closing joint's limit is
 
-    T = |dp/dc| · min_m (effort_m / l_m),
+    T = |dp/dc| · min_m (effort_m / l_m).
 
-which for a finger of one motor is its effort. Where two fingers press against one, what is more is
-taken off: one motor cannot press harder than those opposite resist.
+For a finger with one motor, this is the motor's effort. If two fingers press against one, the
+stronger side is limited to the other: a motor cannot press harder than the opposing fingers resist.
 """
 
 from __future__ import annotations
@@ -33,41 +34,44 @@ from drakegrasp.hand.file_format import VERSION
 from drakegrasp.hand.parsing import Mimic
 from drakegrasp.simulation.construction import FINGER_DAMPING
 
-#: Efforts that a finger's motor can have: turning [N m], sliding [N]. Others are placeholders.
+#: Possible efforts of a finger's motor: turning [N m], sliding [N]. Other values are placeholders.
 POSSIBLE = {False: (0.005, 20.0), True: (0.5, 1000.0)}
-#: Fingers that share a motor are open together, within so much [rad or m].
+#: Fingers that share a motor must be open together, within this tolerance [rad or m].
 SAME = 1e-6
-#: A motor whose lever is shorter than this does not bear on the grasp [m/rad].
+#: A motor whose lever is shorter than this does not affect the grasp [m/rad].
 LEVER = 1e-3
 #: Usual closing speeds [rad/s], [m/s].
 TURNING, SLIDING = np.deg2rad(60.0), 0.1
-#: A worm holds so many times what its motor gives: that of a gear of about 70 % efficiency.
+#: Holding effort of a worm divided by its motor's effort, for a gear of about 70 % efficiency.
 HOLDING = 2.0
-#: Stand-offs as shares of the height of the pinch above the palm.
+#: Stand-offs as fractions of the height of the pinch above the palm.
 STANDOFFS = (0.45, 0.65, 0.8)
-#: Share of what friction carries that is the payload.
+#: Payload as a fraction of the mass that friction supports.
 PAYLOAD = 0.5
-#: Spreads that are tried if two joints spread fingers [deg], and how far they must turn [rad].
+#: Spreads that are tried if two joints spread fingers [deg], and minimum range of such joints
+#: [rad].
 SPREADS_DEG, SPREADING = [0.0, 11.25, 22.5], 0.9
-#: Names of fingers, by what the names of their links contain.
+#: Names of fingers, found in the names of their links.
 NAMES = ("thumb", "index", "middle", "ring", "pinky", "little")
 SIDES = ("left", "right")
-#: A smaller share of a joint's range is not worth a note.
+#: Fraction of a joint's range below which an unused part gets no note.
 NOTED = 0.01
+#: By index of a finger: the finger whose motor closes it, and its closing per that finger's
+#: closing.
 #: By number of a finger: the finger whose motor closes it, and its closing per that one's.
 _Drivers = Mapping[int, tuple[int, float]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Draft:
-    """A hand file that was drafted.
+    """A drafted hand file.
 
     Attributes:
-        model: Its model.
-        tree: Its keys.
-        reasons: Why a value is so, by the path of its key, as in "palm.p_BG".
+        model: The model of the hand.
+        tree: Keys and values of the hand file.
+        reasons: Reason for a value, by the path of its key, as in "palm.p_BG".
         changed: Lines for the head of the model: joints whose positions are not the vendor's.
-        grip: Its fingers, in the vendor's positions.
+        grip: The fingers, in the vendor's positions.
     """
 
     model: VendorModel
@@ -78,7 +82,7 @@ class Draft:
 
 
 def positions(model: VendorModel, grip: Grip, share: float) -> dict[str, float]:
-    """Return the position of each joint when the fingers have closed by a share of their way."""
+    """Return the position of each joint if the fingers have closed by a fraction of their range."""
     led = {name: 0.0 for name in model.joints if name not in model.mimics}
     closed: dict[str, float] = {}
     for member in grip.members:
@@ -108,7 +112,7 @@ def draft_tree(
     tree: dict[str, Any] = {"version": VERSION, "model": ""}
     tree["palm"] = {"link": palm, "p_BG": frame.p_BG.tolist(), "rpy_deg": frame.rpy_deg.tolist()}
 
-    # The fingers; by virtual work a motor's limit is what the fingers that it moves press with.
+    # The fingers. By virtual work, a motor's limit is the sum over the fingers that it moves.
     coupled, drivers = _couplings(model, grip), _shared_motors(model, grip)
     limits = np.array([0.0 if i in drivers else limit for i, limit in enumerate(limits)]) + [
         sum(ratio * limits[i] for i, (driver, ratio) in drivers.items() if driver == d)
@@ -116,7 +120,7 @@ def draft_tree(
     ]
     tree["fingers"] = _fingers(grip, limits, drivers, coupled)
 
-    # Joints that nothing else drives keep a position.
+    # Joints that are not driven keep a position.
     driven = {m.joint.name for m in grip.members} | {j for own in coupled for j in own}
     spread = _spread(grip, frame, driven)
     opened = positions(model, grip, 0.0)
@@ -126,7 +130,7 @@ def draft_tree(
     if kept:
         tree["preshape"] = kept
 
-    # How it is driven and used.
+    # Drive, speeds, and the hand's use.
     tree["drive"] = "worm"
     tree |= _speeds(grip, limits, config)
     tree["standoffs"] = [max(round(s * frame.height, 3), 0.003) for s in STANDOFFS]
@@ -139,7 +143,7 @@ def draft_tree(
             raise HandError(str(error)) from None
         reasons[setting.partition("=")[0]] = "given"
 
-    # What is not as the vendor has it.
+    # Joints that differ from the vendor's.
     changed = [
         f"joint {m.joint.name}: position is {m.sign:+g} * (the vendor's - {m.zero:g})"
         for m in grip.members
@@ -176,7 +180,7 @@ def _fingers(
             "name": name, "fingertip": member.tip, "closing_joint": joint.name
         }  # fmt: skip
 
-        # A motor of its own, or that of another finger.
+        # Its own motor, or that of another finger.
         if i in drivers:
             driver, ratio = drivers[i]
             finger["driven_by"] = {"finger": names[driver], "ratio": round(ratio, 5)}
@@ -195,7 +199,7 @@ def _fingers(
 
 
 def _finger_names(grip: Grip) -> list[str]:
-    """Return a name for each finger: a usual one, a side, or what tells its link from others."""
+    """Return a name for each finger: a usual one, a side, or the differing part of its link."""
     tips = [member.tip for member in grip.members]
     for words in (NAMES, SIDES):
         found = []
@@ -205,7 +209,7 @@ def _finger_names(grip: Grip) -> list[str]:
             found += [word for text in texts for word in words if word in text.lower()][:1]
         if len(set(found)) == len(tips):
             return found
-    # What is the same at the end of all names says nothing.
+    # The common end of all names is not informative.
     alike = (len(set(letters)) == 1 for letters in zip(*(tip[::-1] for tip in tips), strict=False))
     end = sum(1 for _ in takewhile(bool, alike))
     short = [tip[: len(tip) - end].rstrip("_-.") for tip in tips]
@@ -213,7 +217,7 @@ def _finger_names(grip: Grip) -> list[str]:
 
 
 def _couplings(model: VendorModel, grip: Grip) -> list[dict[str, tuple[float, float]]]:
-    """Return what follows each closing joint: ratio and offset by joint, in its new positions."""
+    """Return the followers of each closing joint: ratio and offset by joint, in new positions."""
     found = [member.followers() for member in grip.members]
     taken = {member.joint.name for member in grip.members} | {j for own in found for j in own}
 
@@ -229,14 +233,14 @@ def _couplings(model: VendorModel, grip: Grip) -> list[dict[str, tuple[float, fl
 
 
 def _shared_motors(model: VendorModel, grip: Grip) -> dict[int, tuple[int, float]]:
-    """Return by which finger's motor others are closed, as mimics of the model say."""
+    """Return the fingers that another finger's motor closes, according to mimics of the model."""
     found: dict[int, tuple[int, float]] = {}
     for (d, driver), (i, member) in combinations(enumerate(grip.members), 2):
         relation = model.relation(member.joint.name, driver.joint.name)
         if relation is None or d in found or i in found:
             continue
 
-        # Both must close together, from where both are open.
+        # Both must close together, starting where both are open.
         ratio = member.sign * driver.sign * relation[0]
         if ratio > 0.0 and abs(relation[0] * driver.zero + relation[1] - member.zero) < SAME:
             found[i] = d, ratio
@@ -244,7 +248,7 @@ def _shared_motors(model: VendorModel, grip: Grip) -> dict[int, tuple[int, float
 
 
 def _spread(grip: Grip, frame: PalmFrame, driven: set[str]) -> dict[str, float]:
-    """Return the sign of each of two joints that spread fingers about Gz; none if not so."""
+    """Return the sign of each of two joints that spread fingers about Gz, or an empty mapping."""
     found: dict[str, float] = {}
     for member in grip.members:
         joint = member.joints[0]
@@ -259,7 +263,7 @@ def _spread(grip: Grip, frame: PalmFrame, driven: set[str]) -> dict[str, float]:
 
 
 def _speeds(grip: Grip, limits: Array, config: Config) -> dict[str, float]:
-    """Return the closing speeds: usual ones, at which motors reach their limits in time."""
+    """Return the closing speeds: usual ones at which motors can reach their limits in time."""
     speeds: dict[str, float] = {}
     for member, limit in zip(grip.members, limits, strict=True):
         joint, unit, key, usual = member.joint, 1.0, "closing_speed_deg", float(TURNING)
@@ -280,7 +284,7 @@ def _rebased(
     drivers: _Drivers,
     spread: Mapping[str, float],
 ) -> VendorModel:
-    """Return the model in which closing joints close from 0 on, and spreads open from 0 on."""
+    """Return the model in which closing joints close from 0, and spread joints open from 0."""
     joints, mimics = dict(model.joints), {}
     for member, own in zip(grip.members, coupled, strict=True):
         joint = member.joint
@@ -300,7 +304,7 @@ def _closing_limits(model: VendorModel, grip: Grip, effort: float | None) -> tup
     """Return the effort limit (k,) at each closing joint [N m or N], and the forces (k,) [N].
 
     Raises:
-        HandError: If the model gives no effort that a motor can have.
+        HandError: If the model gives no possible effort of a motor.
     """
     found, force = np.zeros((2, len(grip.members)))
     for i, (member, step) in enumerate(zip(grip.members, grip.step, strict=True)):
@@ -311,7 +315,7 @@ def _closing_limits(model: VendorModel, grip: Grip, effort: float | None) -> tup
         )
         found[i] = force[i] * motion
 
-    # Both sides press equally.
+    # Both sides must press equally.
     sides = force[:-1].sum(), force[-1]
     share = np.ones(len(force))
     share[:-1] *= min(1.0, sides[1] / sides[0])
@@ -320,14 +324,14 @@ def _closing_limits(model: VendorModel, grip: Grip, effort: float | None) -> tup
 
 
 def _effort(model: VendorModel, leader: str, effort: float | None) -> float:
-    """Return what the motor of a joint gives, by its model or as it was answered."""
+    """Return the effort of a joint's motor, from the model or from the answer."""
     joint = model.joints[leader]
     given = joint.effort if effort is None else effort
     least, most = POSSIBLE[joint.slides]
     if least <= given <= most:
         return given
 
-    # Say where it is from.
+    # Report where the value comes from.
     unit = "N" if joint.slides else "N m"
     must = f"must be {least:g}..{most:g} {unit}"
     if effort is not None:
@@ -362,8 +366,8 @@ def _levers(model: VendorModel, member: Member, step: int) -> tuple[float, dict[
 
 
 def _reasons(model: VendorModel, grip: Grip, frame: PalmFrame, answers: Answers) -> dict[str, str]:
-    """Return why the values are so, by the paths of their keys."""
-    # Of the whole hand.
+    """Return the reasons for the values, by the paths of their keys."""
+    # For the whole hand.
     reasons = {
         "palm.link": "given" if answers.palm else "the link from which the fingers branch",
         "palm.p_BG": "on the palm's surface, where a line to the pinch leaves it [m]",
@@ -379,7 +383,7 @@ def _reasons(model: VendorModel, grip: Grip, frame: PalmFrame, answers: Answers)
         "payload": "half of what friction carries at these efforts [kg]",
     }
 
-    # Of each finger.
+    # For each finger.
     effort = f"effort of {answers.effort:g} (given)" if answers.effort else "the model's effort"
     limit = f"from {effort}; no side presses more than the other"
     for i, member in enumerate(grip.members):
@@ -399,7 +403,7 @@ def _reasons(model: VendorModel, grip: Grip, frame: PalmFrame, answers: Answers)
         }
         reasons |= {f"fingers.{i}.{key}": why for key, why in own.items()}
 
-    # Of the joints that keep a position.
+    # For the joints that keep a position.
     closed = {joint.name for member in grip.members for joint in member.joints}
     for name in model.joints:
         guess = "where the fingers oppose best" if name in closed else "out of the way"
@@ -409,7 +413,7 @@ def _reasons(model: VendorModel, grip: Grip, frame: PalmFrame, answers: Answers)
 
 def unused_parts(model: VendorModel, grip: Grip, answers: Answers) -> Iterator[str]:
     """Yield a line for each finger and each part of a closing joint's range that is not used."""
-    # What of its range a closing joint opens beyond the open hand.
+    # Find the part of a closing joint's range beyond the open hand.
     for member in grip.members:
         joint = member.joint
         lower, upper = joint.rebased(member.sign, member.zero).limits
@@ -423,7 +427,7 @@ def unused_parts(model: VendorModel, grip: Grip, answers: Answers) -> Iterator[s
             "it is fully open"
         )
 
-    # Which fingers do not grasp, and why.
+    # Find the fingers that do not grasp, with the reason.
     palm, used = find_palm(model, answers), {member.tip for member in grip.members}
     for tip in find_tips(model, palm, answers):
         if tip in used:
