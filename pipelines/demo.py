@@ -1,6 +1,6 @@
 """Build a small dataset of six built-in objects in less than a minute and show its contents.
 
-Writes DIR/meshes (the objects), DIR/dataset (the dataset) and DIR/contact_sheet.png. The
+The script writes DIR/meshes (the objects), DIR/dataset (the dataset) and DIR/contact_sheet.png. The
 same command continues an interrupted build.
 """
 
@@ -25,10 +25,11 @@ from drakegrasp.pictures.sheets import ACROSS, draw_sheet
 from drakegrasp.pictures.style import read_far, save_figure
 from drakegrasp.shapes.catalog import draw_builtin, export_builtin
 
-#: Classes that the hand often grasps, and objects of each: one trains and validates, one is tested.
+#: Classes that the hand often grasps.
 CLASSES = ("wineglass", "carton", "boot")
+#: Objects per class: one trains and validates, the other is tested.
 PER_CLASS = 2
-#: Palm poses of each object, against its surface: of the paper's far fewer become samples.
+#: Palm poses per object, normal to its surface: far fewer of the paper's poses become samples.
 CANDIDATES, METHOD = 40, "normals"
 
 
@@ -68,14 +69,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run(
     directory: Path, *, candidates: int, per_class: int = PER_CLASS, workers: int | None = None
 ) -> None:
-    """Export the objects, build their dataset, and print and draw what it holds."""
+    """Export the objects, build their dataset, and print and draw its contents."""
     meshes, out, sheet = (
         directory / "meshes",
         directory / "dataset",
         directory / "contact_sheet.png",
     )
 
-    # Shards of 20 candidates keep all cores busy to the end of so small a dataset.
+    # Shards of 20 candidates keep all cores busy to the end of such a small dataset.
     overrides = [f"candidates.max={candidates}", f"candidates.method={METHOD}"]
     overrides += [f"builtin.per_class={per_class}", "unit_candidates=20"]
     config = load_config(None, overrides)
@@ -92,14 +93,14 @@ def run(
 
 
 def contact_sheet(path: Path, png: Path, *, rows: int = 8, split: str | None = None) -> int:
-    """Draw samples of a data file: colour, depth and mask of each, with its contacts.
+    """Draw samples of a data file: each sample's colour, depth and mask, with its contacts.
 
-    The sheet shows as many different objects as it can. The same file gives the same sheet.
+    The sheet shows as many different objects as possible. The same file yields the same sheet.
 
     Args:
         path: `grasping_oto.hdf5` or `grasping_otm.hdf5`.
         png: The file to write.
-        rows: Most lines of samples.
+        rows: Maximum number of lines of samples.
         split: The split to draw from; all of them if None.
 
     Returns:
@@ -115,7 +116,7 @@ def contact_sheet(path: Path, png: Path, *, rows: int = 8, split: str | None = N
     if not places:
         raise DataError(f"{path}: must hold at least one sample to draw, got none")
 
-    # Choose some of them, and draw.
+    # Choose some of them, and draw them.
     names = [str(name) for part in parts for name in part.column("object_props/object_name")]
     chosen = spread_over_objects(names, rows * ACROSS)
     samples = [places[i][0][places[i][1]] for i in chosen]
@@ -127,14 +128,14 @@ def contact_sheet(path: Path, png: Path, *, rows: int = 8, split: str | None = N
 def spread_over_objects(names: Sequence[str], count: int) -> list[int]:
     """Return the indices of at most `count` samples, spread over as many objects as possible.
 
-    Objects are in the order of their numbers. If there are more objects than places, evenly
-    spaced ones are taken. Of each object the first samples are taken.
+    Objects are ordered by their numbers. If there are more objects than places, evenly spaced
+    objects are taken. The first samples of each object are taken.
 
     Args:
         names: Name of the object of each sample.
-        count: Most samples to choose.
+        count: Maximum number of samples to choose.
     """
-    # Turn t holds the t-th sample of every object that has so many.
+    # Turn t holds the t-th sample of every object that has at least t samples.
     order = sorted(range(len(names)), key=lambda i: (_natural(names[i]), i))
     turns: list[list[int]] = []
     for _, group in groupby(order, key=lambda i: names[i]):
@@ -150,7 +151,7 @@ def spread_over_objects(names: Sequence[str], count: int) -> list[int]:
         picks = np.linspace(0, len(turn_indices) - 1, room).round().astype(int)
         chosen += [turn_indices[k] for k in picks]
 
-    # Samples of an object stand side by side.
+    # Samples of an object are side by side.
     place = {i: k for k, i in enumerate(order)}
     return sorted(chosen, key=place.__getitem__)
 

@@ -1,13 +1,14 @@
-"""Fit the chance by which closed hands are lifted, and tell how well it orders lifts.
+"""Fit the chance that decides which closed hands are lifted, and report how well it orders lifts.
 
     python pipelines/fit_lift_chance.py TRAIN --test TEST --write FILE
 
-Both are datasets of one hand and of different objects, in which all closed hands were lifted, e.g.
-`build --config fast --set lift.least_chance=0 --set lift.least_depth_variance=0 --candidates 240`.
-Without `--write` nothing is fitted: the hand's own weights are tried. Prints JSON: of both datasets
-the area under the curve (AUC) of the chance and of the length of the mean normal alone, the share
-of samples in the better half of the lifts, and for some least chances which shares of samples and
-of lifts have less. The chances in TRAIN are those of models of its other objects.
+TRAIN and TEST are datasets of one hand and of different objects, in which all closed hands were
+lifted, e.g. `build --config fast --set lift.least_chance=0 --set lift.least_depth_variance=0
+--candidates 240`. Without `--write` nothing is fitted, and the hand's own weights are evaluated.
+The script prints JSON. For both datasets it reports the area under the curve (AUC) of the chance
+and of the length of the mean normal alone, the fraction of samples in the better half of the lifts,
+and for some minimum chances the fractions of samples and of lifts below them. The chance of each
+lift in TRAIN comes from a model that was fitted to other objects.
 """
 
 from __future__ import annotations
@@ -47,9 +48,9 @@ from drakegrasp.table import Table
 
 #: Weight of the squares of the standardized weights.
 RIDGE = 3.0
-#: Parts of the objects, of each of which a model of the others tells the chances.
+#: Parts into which the objects are divided; the chances of a part come from a model of the others.
 FOLDS = 7
-#: Least chances of which shares are told.
+#: Minimum chances for which fractions are reported.
 THRESHOLDS = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2)
 HEAD = """\
 # The chance that a lift by the Barrett Hand gives a sample: bias and weights of a logistic model
@@ -63,9 +64,9 @@ class Lifts:
     """The lifts of a dataset.
 
     Attributes:
-        features: (n, m), of the hands when they had closed, in the order of `FEATURES`.
-        sample: (n,), whether the filters of the hold keep them.
-        first: (n,), whether they are of the first round.
+        features: (n, m), features of the hands when closing ended, in the order of `FEATURES`.
+        sample: (n,), whether the filters of the hold keep the lift.
+        first: (n,), whether the attempt is of the first round.
         object: (n,), number of the object.
     """
 
@@ -83,7 +84,7 @@ def read_lifts(out: Path) -> Lifts:
     """Return the lifts of a dataset.
 
     Raises:
-        DataError: If it was chosen which hands were lifted: what was lost would be missing.
+        DataError: If the build selected which hands to lift: the lifts that it skipped are missing.
     """
     manifest = read_manifest(out)
     rules = manifest.config.lift
@@ -124,7 +125,7 @@ def read_lifts(out: Path) -> Lifts:
 
 
 def fit(lifts: Lifts) -> LiftChance:
-    """Return the logistic model of lifts, with four digits of each number."""
+    """Return the logistic model of lifts, with each number rounded to four digits."""
     centre, scale = lifts.features.mean(axis=0), lifts.features.std(axis=0)
     x = np.column_stack([np.ones(len(lifts.sample)), (lifts.features - centre) / scale])
 
@@ -141,7 +142,7 @@ def fit(lifts: Lifts) -> LiftChance:
 
 
 def auc(score: Array, sample: npt.NDArray[np.bool_]) -> float:
-    """Return the share of pairs of a sample and another lift that the score orders rightly."""
+    """Return the fraction of pairs of a sample and another lift that the score orders correctly."""
     held = int(sample.sum())
     ranks = rankdata(score)[sample].sum() - held * (held + 1) / 2
     return round(float(ranks / (held * (len(sample) - held))), 3)
@@ -155,7 +156,7 @@ def chances(lifts: Lifts, model: LiftChance) -> Array:
 
 
 def held_out(lifts: Lifts) -> Array:
-    """Return the chances (n,) of lifts, each by a model of other objects."""
+    """Return the chances (n,) of lifts, each from a model that was fitted to other objects."""
     found = np.zeros(len(lifts.sample))
     for fold in range(FOLDS):
         own = lifts.object % FOLDS == fold
@@ -164,7 +165,7 @@ def held_out(lifts: Lifts) -> Array:
 
 
 def describe(lifts: Lifts, chance: Array) -> dict[str, Any]:
-    """Return how well chances (n,) order lifts, all and those of the first round."""
+    """Return how well chances (n,) order all lifts, and the lifts of the first round."""
     told: dict[str, Any] = {"objects": len(np.unique(lifts.object))}
     normal_sum = lifts.features[:, FEATURES.index("normal_sum")]
     for name, rows in (("all", lifts.first | True), ("first round", lifts.first)):
@@ -187,8 +188,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the script; return its exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("train", type=Path, help="directory of a dataset")
-    parser.add_argument("--test", type=Path, help="directory of another one")
-    parser.add_argument("--write", type=Path, help="file of the weights")
+    parser.add_argument("--test", type=Path, help="directory of another dataset")
+    parser.add_argument("--write", type=Path, help="file to which the fitted weights are written")
     arguments = parser.parse_args(argv)
 
     train = read_lifts(arguments.train)

@@ -1,11 +1,12 @@
-"""Make the certificates of a Dask cluster: an authority, a certificate and its key.
+"""Create the certificates of a Dask cluster: an authority, a certificate and its key.
 
 \b
     python pipelines/make_certificates.py FOLDER
 
-FOLDER must be new; it gets ca.pem, cert.pem and key.pem. Scheduler, workers and client are given
-the same three, and refuse everybody else. Only you may enter FOLDER: whoever can read the key can
-run programs as you on the cluster. See docs/how-to/clusters.md.
+FOLDER must not exist yet; the script writes ca.pem, cert.pem and key.pem to it. Scheduler, workers
+and client use the same three files, and reject everybody who does not have them. Only you may enter
+FOLDER: whoever can read the key can run programs as you on the cluster. See
+docs/how-to/clusters.md.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations

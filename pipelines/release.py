@@ -1,6 +1,7 @@
-"""Check that a release agrees with itself, and print the commands that tag and send it.
+"""Check that the parts of a release agree, and print the commands that tag and push it.
 
-`make release` runs this after it has built and tried the archives. Nothing is sent anywhere.
+`make release` runs this script after it has built and tried the archives. The script itself sends
+nothing.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Lines of the changelog's section of a release, so that users read it.
+#: Maximum number of lines of a release's section in the changelog, so that users read it.
 SECTION_LINES = 60
 
 
@@ -48,7 +49,7 @@ def read_version(root: Path) -> str:
 
 
 def disagreements(root: Path) -> list[str]:
-    """Return how the changelog and the citation disagree with the version, a line each."""
+    """Return how the changelog and the citation disagree with the version, one line each."""
     version = read_version(root)
     _, *sections = re.split(r"^## ", (root / "CHANGELOG.md").read_text("utf-8"), flags=re.M)
     newest = sections[0].splitlines() if sections else [""]

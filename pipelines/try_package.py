@@ -1,7 +1,7 @@
 """Install archives of the package into empty environments, and build a tiny dataset in each.
 
-The dependencies come from where pip is set up to take them. Nothing of the checkout is on the path,
-and everything is written to a temporary folder.
+pip takes the dependencies from its configured index. The checkout is not on the path, and
+everything is written to a temporary folder.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def try_archive(archive: Path) -> None:
-    """Install an archive into an environment of its own, and use it there.
+    """Install an archive into a new environment, and use it there.
 
     Raises:
-        SystemExit: If a command fails, or what runs is not of the archive.
+        SystemExit: If a command fails, or the code that runs is not from the archive.
     """
     version = archive.name.removesuffix(".tar.gz").split("-")[1]
     with tempfile.TemporaryDirectory() as scratch:
@@ -43,10 +43,11 @@ def try_archive(archive: Path) -> None:
         venv.create(folder / "environment", with_pip=True)
         python = folder / "environment" / "bin" / "python"
         command = python.with_name("drakegrasp")
-        # Most modules of the dependencies are never imported here: compiling them takes longer.
+        # Most modules of the dependencies are never imported here, so compiling them only costs
+        # time.
         run(folder, python, "-m", "pip", "install", "--quiet", "--no-compile", archive)
 
-        # What runs is the archive's.
+        # The command and the module that run are those of the archive.
         printed = run(folder, command, "--version")
         if version not in printed.split():
             raise SystemExit(f"drakegrasp --version must print {version}, got {printed!r}")
@@ -54,7 +55,7 @@ def try_archive(archive: Path) -> None:
         if not Path(module).is_relative_to(folder):
             raise SystemExit(f"drakegrasp must be imported from {archive.name}, got {module}")
 
-        # It sees the machine, builds, and finds nothing wrong with what it built.
+        # The command describes the machine, builds a dataset, and finds no fault in it.
         run(folder, command, "doctor")
         (folder / "meshes").mkdir()
         run(folder / "meshes", python, "-c", MESH)

@@ -1,11 +1,11 @@
-"""Say how well the classifier judges grasps of objects that it never saw.
+"""Measure how well the classifier judges grasps of objects that it never saw.
 
   python pipelines/baseline/assess.py classifier.pt OUT/scenes.hdf5 reliability.png
 
-All grasps of the first round that were lifted to a verdict are judged, each once, from one view of
-its scene: a palm pose refined about one that holds is never tested, so it cannot be a sample. It
-prints JSON: AUC with its interval over objects, Brier score, and the reliability curve, which is
-drawn as well.
+The script judges each grasp of the first round that was lifted to a verdict once, from one view of
+its scene. Refined palm poses near a held grasp are left out: they are never tested, so they cannot
+be samples. The script prints JSON with the AUC and its interval over objects, the Brier score and
+the reliability curve, and draws this curve.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from drakegrasp.simulation.attempt import Source
 
 #: The two questions that the classifier answers.
 LABELS = ("held", "sample")
-#: Bins of the reliability curve, of equally many grasps.
+#: Bins of the reliability curve; all hold equally many grasps.
 BINS = 10
-#: Resamplings of objects behind an interval.
+#: Number of times that the objects are resampled for an interval.
 RESAMPLES = 2000
 
 
@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def judge(checkpoint: Path, path: Path, split: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return chances (n, 2) of the lifted grasps of a split, labels (n, 2), and objects (n,)."""
+    """Return chances and labels (n, 2) of a split's lifted grasps, and their objects (n,)."""
     said = load(checkpoint, "classifier")
     network, hand = (
         GraspClassifier(len(said["hand"]["directions"])),
@@ -73,7 +73,7 @@ def judge(checkpoint: Path, path: Path, split: str) -> tuple[np.ndarray, np.ndar
     network.load_state_dict(said["weights"])
     network.eval()
 
-    # The first view of each scene; `grasps_in` gives all grasps, of which the lifted ones count.
+    # The first view of each scene; `grasps_in` returns all grasps, and only the lifted ones count.
     data = dg.SceneDataset(path, split=split, negatives="tested", positives="held", balance="view")
     scenes, table = data.tables["views"]["scene"][data.views], data.tables["grasps"]
     chances, labels, objects = [], [], []
@@ -95,9 +95,9 @@ def judge(checkpoint: Path, path: Path, split: str) -> tuple[np.ndarray, np.ndar
 
 
 def assessment(chance: np.ndarray, label: np.ndarray, objects: np.ndarray) -> dict[str, Any]:
-    """Return how well chances (n,) say labels (n,) of grasps of some objects (n,).
+    """Return how well chances (n,) predict labels (n,) of grasps of some objects (n,).
 
-    The interval of the AUC is the middle 95 % of those of objects that are drawn with replacement.
+    The interval contains the central 95 % of the AUCs of objects drawn with replacement.
     """
     draw, rows = np.random.default_rng(0), [np.flatnonzero(objects == k) for k in set(objects)]
     drawn = []
@@ -119,7 +119,10 @@ def assessment(chance: np.ndarray, label: np.ndarray, objects: np.ndarray) -> di
 
 
 def auc(chance: np.ndarray, label: np.ndarray) -> float:
-    """Return how often a true row has the larger chance of two rows; NaN without both kinds."""
+    """Return how often, of a true and a false row, the true one has the larger chance.
+
+    The result is NaN if all rows are true or all are false.
+    """
     true = int(label.sum())
     if not 0 < true < len(label):
         return float("nan")
@@ -128,7 +131,7 @@ def auc(chance: np.ndarray, label: np.ndarray) -> float:
 
 
 def picture(found: dict[str, Any]) -> Figure:
-    """Return the reliability curves: how often what is said is true."""
+    """Return the reliability curves: how often each stated chance comes true."""
     figure = Figure(figsize=(6.4, 3.4), layout="constrained")
     for axes, name in zip(figure.subplots(1, 2, sharey=True), LABELS, strict=True):
         curve, (value, low, high) = found[name]["curve"], found[name]["auc"]

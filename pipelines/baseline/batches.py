@@ -1,9 +1,10 @@
 """Batches for the networks: tensors from `dg.SceneDataset` and `dg.GraspDataset`.
 
-A cloud is turned at random about the table's normal, with its grasps: the physics does not know
-where the table's x axis points. It is moved so that the mean of the object's points is above the
-origin; heights stay, as the table matters. Points get 1 mm of noise. Nothing is mirrored, since a
-hand is not its mirror image.
+A cloud is turned by a random angle about the table's normal, together with its grasps, because the
+physics does not depend on the direction of the table's x axis. It is shifted horizontally so that
+the mean of the object's points is above the origin; heights stay the same, because the table
+matters. Noise of 1 mm is added to the points. Nothing is mirrored, since a hand differs from its
+mirror image.
 """
 
 from __future__ import annotations
@@ -17,18 +18,19 @@ from torch.utils.data import ConcatDataset, DataLoader
 
 import drakegrasp as dg
 
-#: Points of a cloud that a network sees, all on the object.
+#: Number of points of a cloud that a network sees; all lie on the object.
 POINTS = 512
-#: Standard deviation of the noise of points [m].
+#: Standard deviation of the noise that is added to the points [m].
 NOISE = 1e-3
 
 Batch = dict[str, Tensor]
 
 
 def object_points(points: np.ndarray, on_object: np.ndarray, count: int = POINTS) -> np.ndarray:
-    """Return points (count, 3) on the object, of (n, 3); in turns if there are fewer.
+    """Return `count` points (count, 3) on the object, of a cloud (n, 3).
 
-    A cloud without the object, which hides behind nothing here, gives the points that it has.
+    Points are repeated in turn if there are fewer. If no point of the cloud lies on the object,
+    points of the whole cloud are returned.
     """
     own = np.flatnonzero(on_object) if on_object.any() else np.arange(len(points))
     return points[own[np.arange(count) % len(own)]]
@@ -37,18 +39,20 @@ def object_points(points: np.ndarray, on_object: np.ndarray, count: int = POINTS
 def cloud_batches(
     data: Sequence[dg.SceneDataset], size: int, epoch: int, *, augment: bool, seed: int
 ) -> Iterator[Batch]:
-    """Yield batches of clouds with grasps, of one epoch; same arguments, same batches.
+    """Yield batches of clouds with grasps, of one epoch; the same arguments yield the same batches.
 
     Args:
-        data: Scenes of one file or more, of the same hand, in the frame "table".
-        size: Views of a batch.
+        data: Scenes of one or more files, of the same hand, in the frame "table".
+        size: Number of views in a batch.
         epoch: Number of the epoch.
-        augment: Whether clouds are turned and shaken, and views come in random order.
-        seed: Of all draws.
+        augment: Whether clouds are turned, noise is added to points, and views come in random
+            order.
+        seed: Seed of all random draws.
 
     Yields:
         `points` (b, n, 3) in {T}; `X_TG` (b, g, 4, 4), `q` (b, g, j), `q_open`, and `held`,
-        `sample`, `tested` (b, g) of the grasps; `shift` (b, 3), what was taken from all points.
+        `sample`, `tested` (b, g) of the grasps; `shift` (b, 3), the vector subtracted from all
+        points.
     """
     for each in data:
         each.epoch = epoch
@@ -67,7 +71,7 @@ def cloud_batches(
 
 
 def turned(batch: Batch, draw: torch.Generator) -> Batch:
-    """Return a batch of which each cloud and its grasps are turned about Tz, and points shaken."""
+    """Return a batch whose clouds and grasps are turned about Tz, with noise on the points."""
     angle = 2 * torch.pi * torch.rand(len(batch["points"]), generator=draw)
     c, s, o, e = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
     R = torch.stack([c, -s, o, s, c, o, o, o, e], -1).view(-1, 3, 3)
@@ -78,7 +82,7 @@ def turned(batch: Batch, draw: torch.Generator) -> Batch:
 
 
 def centred(batch: Batch) -> Batch:
-    """Return a batch whose clouds have their mean above the origin of {T}."""
+    """Return a batch whose clouds are shifted so that their mean is above the origin of {T}."""
     shift = batch["points"].mean(1)
     shift[:, 2] = 0.0
     X_TG = batch["X_TG"].clone()
@@ -89,9 +93,10 @@ def centred(batch: Batch) -> Batch:
 def image_batches(
     data: Sequence[dg.GraspDataset], size: int, epoch: int, *, augment: bool, seed: int
 ) -> Iterator[Batch]:
-    """Yield batches of `images` (b, 4, S, S), in -1..1 but for noise, and their `grasps` (b, 6k).
+    """Yield batches of `images` (b, 4, S, S) and their `grasps` (b, 6k).
 
-    Images are not turned or mirrored: their camera stands behind the palm of their grasp.
+    The images are in -1..1 except for noise. They are not turned or mirrored, because the camera of
+    each image is placed behind the palm of its grasp.
     """
     draw = torch.Generator().manual_seed(1_000_003 * seed + epoch)
     samples = ConcatDataset([each.to_torch(["images", "grasps"]) for each in data])
@@ -106,7 +111,7 @@ def image_batches(
 
 
 def as_input(images: Tensor) -> Tensor:
-    """Return images with colours about 0 and depths in units of 0.1 m about 0.25 m."""
+    """Return images with colours centred at 0, and depths centred at 0.25 m in units of 0.1 m."""
     depth = ((images[:, 3:] - 0.25) / 0.1).clamp(-3, 3)
     return torch.cat([2 * images[:, :3] - 1, depth], 1)
 

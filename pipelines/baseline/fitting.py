@@ -1,4 +1,7 @@
-"""Fit a network: batches in, the weights that were best on validation out, a line per epoch."""
+"""Fit a network.
+
+In: batches. Out: the weights with the smallest loss in validation, and one printed line per epoch.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,9 @@ from batches import Batch
 from torch import Tensor, nn
 
 T = TypeVar("T")
-#: Share of the steps over which the learning rate rises; then it falls as a cosine.
+#: Fraction of the steps over which the learning rate rises; after it the rate falls as a cosine.
 WARM = 0.05
-#: Weight decay of AdamW, and the largest norm of a step's gradient.
+#: Weight decay of AdamW, and the maximum norm of a step's gradient.
 DECAY, LARGEST_GRADIENT = 1e-2, 5.0
 
 
@@ -29,20 +32,24 @@ def fit(
     steps: int,
     settings: argparse.Namespace,
 ) -> dict[str, Any]:
-    """Fit a network in its place, and leave it with the weights that validated best, else the last.
+    """Fit a network in place, and leave it with the weights that validated best.
+
+    If there is nothing to validate with, the network keeps the last weights.
 
     Args:
         network: The network; `loss` uses it.
-        loss: Of a batch, its mean.
-        train: Batches of an epoch, by its number: the same number gives the same batches.
-        valid: Batches of the validation part, the same each time.
-        steps: Batches of an epoch.
-        settings: Those of the command line: `epochs` at most, `patience` in epochs without a
-            better validation, learning `rate`, and `task`, what the lines begin with.
+        loss: Function that returns the mean loss of a batch.
+        train: Function that returns the batches of an epoch, given its number: the same number
+            yields the same batches.
+        valid: Function that returns the batches of the validation part, the same each time.
+        steps: Number of batches of an epoch.
+        settings: Settings of the command line: `epochs` is the maximum number of epochs, `patience`
+            the number of epochs without a better validation, `rate` the learning rate, and `task`
+            the text that begins each line.
 
     Returns:
-        The losses `train` and `valid` of each epoch, the `best` one, `seconds` and the share of
-        them that went into `loading`.
+        The losses `train` and `valid` of each epoch, the index of the `best` epoch, the total
+        `seconds`, and the fraction of them spent on `loading`.
     """
     optimizer = torch.optim.AdamW(network.parameters(), settings.rate, weight_decay=DECAY)
     total: int = max(steps * settings.epochs, 1)
@@ -72,7 +79,7 @@ def fit(
             asked = perf_counter()
         losses["train"].append(sum(values) / len(values))
 
-        # What it says of objects that it did not see.
+        # The loss on objects that the network did not see.
         losses["valid"].append(mean_loss(network, loss, valid()))
         if not losses["valid"][-1] > min(losses["valid"]):  # or there is nothing to validate with
             best, weights = epoch, copy.deepcopy(network.state_dict())
@@ -94,7 +101,7 @@ def fit(
 
 
 def ahead(batches: Iterator[T]) -> Iterator[T]:
-    """Yield batches in their order; a thread makes the next while one is used."""
+    """Yield batches in their order; a thread builds the next batch while one is used."""
     with ThreadPoolExecutor(1) as thread:
         following = thread.submit(next, batches, None)
         while (batch := following.result()) is not None:
@@ -105,7 +112,7 @@ def ahead(batches: Iterator[T]) -> Iterator[T]:
 def mean_loss(
     network: nn.Module, loss: Callable[[Batch], Tensor], batches: Iterator[Batch]
 ) -> float:
-    """Return the mean loss of batches, which is NaN without any."""
+    """Return the mean loss of batches, or NaN if there are none."""
     network.eval()
     with torch.no_grad():
         values = [loss(batch).item() for batch in batches]

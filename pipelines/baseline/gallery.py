@@ -1,10 +1,10 @@
-"""Draw the best and the worst predictions for views of scenes: those that are samples, and others.
+"""Draw the surest predictions for views of scenes: those that are samples, and those that are not.
 
   python pipelines/baseline/gallery.py predicted.h5 OUT/scenes.hdf5 card gallery.png
 
-`card` is the folder of `drakegrasp score`, whose verdicts are used; what it has not tried is tried
-now. Above are the predictions with the largest confidence that became samples, below those that did
-not: where the network is wrong while it is sure.
+`card` is the folder of `drakegrasp score`. Its verdicts are used, and predictions without a verdict
+there are tried now. The upper pictures show the predictions with the largest confidence that became
+samples. The lower ones show those that did not: there the network is wrong although it is sure.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from drakegrasp.scoring.measures import Judged
 from drakegrasp.scoring.run import VERDICTS
 from drakegrasp.vision.camera import project
 
-#: Pictures side by side, lines of each kind, the width of a picture and between two [inch].
+#: Pictures side by side, lines of each kind, the width of a picture and of the gap [inch].
 ACROSS, LINES, WIDE, GAP = 6, 2, 1.5, 0.05
-#: Length of the lines along the palm's +z, and to both sides along its x, from its origin [m].
+#: Length of the line from the palm's origin along +z, and of those to both sides along x [m].
 AHEAD, ASIDE = 0.08, 0.04
-#: Colours of samples and of others.
+#: Colours of predictions that are samples, and of the others.
 COLOURS = ("#1a7f37", "#c2410c")
 
 
@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("predictions", type=Path, help="of predict.py, for postures")
+    parser.add_argument("predictions", type=Path, help="postures that predict.py has written")
     parser.add_argument("data", type=Path, help="scenes.hdf5")
     parser.add_argument("card", type=Path, help="folder of the score")
     parser.add_argument("picture", type=Path)
@@ -58,10 +58,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def gallery(predictions: Path, data: Path, card: Path) -> Figure:
-    """Return pictures of the surest predictions that are samples, and below of those that are not.
+    """Return pictures of the surest predictions that are samples, and below them of the others.
 
     Raises:
-        DataError, GraspError, UsageError: As of `drakegrasp score`.
+        DataError, GraspError, UsageError: As `drakegrasp score` raises them.
     """
     views = dg.SceneDataset(
         data, points=None, split="test", negatives="none", balance="view", grasps=1
@@ -70,7 +70,7 @@ def gallery(predictions: Path, data: Path, card: Path) -> Figure:
     with h5py.File(predictions) as file:
         row_of, X_OG, confidence = (file[key][:] for key in ("row", "X_FG", "confidence"))
 
-    # The first choice for each view, the surest first.
+    # The first choice for each view, in the order of confidence.
     ranked, verdicts = judged.ranked[0], judged.verdicts[0]
     order = np.argsort(-np.asarray(ranked.confidence), kind="stable")
     first = [i for i in order.tolist() if ranked.rank[i] == 0]
@@ -83,7 +83,7 @@ def gallery(predictions: Path, data: Path, card: Path) -> Figure:
             down, across = divmod(number, ACROSS)
             top = (kind * LINES + down) * line + 0.3
             axes = add_axes(figure, 0.1 + across * (WIDE + GAP), top, WIDE, 0.75 * WIDE)
-            # The surest of a row comes first in the file.
+            # The surest prediction for a row comes first in the file.
             row = int(ranked.of_row[i])
             item, place = views[row], int(np.flatnonzero(row_of == row)[0])
             draw(axes, item, X_OG[place], COLOURS[kind])
@@ -95,8 +95,8 @@ def gallery(predictions: Path, data: Path, card: Path) -> Figure:
 
 
 def judge(predictions: Path, data: Path, card: Path) -> Judged:
-    """Return the predictions with their verdicts, those of a score's folder where it has them."""
-    # A score writes a card, and that of the folder has reference rows.
+    """Return the predictions with their verdicts, read from the score's folder if it has them."""
+    # Scoring writes a card, and must not replace the folder's card, which has reference rows.
     with tempfile.TemporaryDirectory() as folder:
         if (card / VERDICTS).is_file():
             shutil.copy(card / VERDICTS, folder)
@@ -107,7 +107,7 @@ def judge(predictions: Path, data: Path, card: Path) -> Judged:
 
 
 def draw(axes: Axes, item: dict[str, np.ndarray], X_OG: np.ndarray, colour: str) -> None:
-    """Draw the middle of a view with a palm: lines where it looks, and to both sides."""
+    """Draw the centre of a view with a palm: a line along its +z, and lines to both sides."""
     X_CG = invert_pose(item["X_TC"].astype(float)) @ item["X_AO"].astype(float) @ X_OG
     axes.imshow(item["rgb"], interpolation="nearest")
     axes.set_facecolor(item["rgb"][0, 0] / 255.0)

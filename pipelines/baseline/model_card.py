@@ -1,10 +1,10 @@
-"""Write the model card of a checkpoint: what it is, what it learned from, how it scores.
+"""Write the model card of a checkpoint: its purpose, its training data and its scores.
 
   python pipelines/baseline/model_card.py postures.pt README.md --score card/card.json
 
-The head is that of a README on the Hugging Face Hub. All that is said is read from the checkpoint
-and from cards of `drakegrasp score`; without one the card says that nothing was scored. Headings as
-in Mitchell et al., Model Cards for Model Reporting (FAT* 2019).
+The head has the form of a README on the Hugging Face Hub. All statements are read from the
+checkpoint and from cards of `drakegrasp score`; without a score the card states that nothing was
+scored. The headings follow Mitchell et al., Model Cards for Model Reporting (FAT* 2019).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from predict import load
 from drakegrasp.errors import DataError, DrakegraspError
 from drakegrasp.scoring.card import FORM
 
-#: What each network does, and what nobody should use it for.
+#: What each network predicts.
 SAYS = {
     "postures": "Proposes palm poses with joints, most likely first, from the points of one object "
     "on a table that one depth camera sees.",
@@ -47,7 +47,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("out", type=Path, help="Markdown file to write")
     parser.add_argument("--score", type=Path, action="append", default=[], metavar="CARD.JSON")
-    parser.add_argument("--licence", default="unknown", help="of the weights  [default: unknown]")
+    parser.add_argument(
+        "--licence", default="unknown", help="licence of the weights  [default: unknown]"
+    )
     arguments = parser.parse_args(argv)
     try:
         checkpoint = load(arguments.checkpoint, *SAYS)
@@ -112,7 +114,7 @@ def card_text(
 
 
 def _evaluation(score: dict[str, Any]) -> list[str]:
-    """Return the lines that tell of one card."""
+    """Return the lines that describe one score card."""
     dataset = score["dataset"]
     protocol = score["settings"].get("protocol", {"protocol": "lift"})["protocol"]
     return [

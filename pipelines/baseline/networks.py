@@ -1,6 +1,6 @@
 """The networks of the baseline: postures from a cloud, verdicts on them, contacts from an image.
 
-Plain PyTorch, made to be changed. All poses and points are in metres; angles in radians.
+They are plain PyTorch and meant to be changed. Poses and points are in metres, angles in radians.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch.nn import functional
 
 
 def mlp(*sizes: int) -> nn.Sequential:
-    """Return linear layers of the given sizes with a ReLU between each two."""
+    """Return linear layers of the given sizes, with a ReLU between successive layers."""
     layers: list[nn.Module] = []
     for width_in, width_out in pairwise(sizes):
         layers += [nn.Linear(width_in, width_out), nn.ReLU()]
@@ -26,9 +26,9 @@ def mlp(*sizes: int) -> nn.Sequential:
 
 
 def farthest_points(points: Tensor, count: int) -> Tensor:
-    """Return indices (b, count) of points (b, n, 3), each the farthest from those before it.
+    """Return indices (b, count) of points (b, n, 3), each farthest from the points before it.
 
-    The first is the first of the cloud, so the choice draws nothing.
+    The first index is 0, so the choice needs no random numbers.
     """
     chosen = torch.zeros(len(points), count, dtype=torch.long, device=points.device)
     nearest = torch.full(points.shape[:2], torch.inf, device=points.device)
@@ -40,7 +40,7 @@ def farthest_points(points: Tensor, count: int) -> Tensor:
 
 
 class PointEncoder(nn.Module):
-    """One level of set abstraction, as PointNet++ has it, and a feature of the whole cloud.
+    """One level of set abstraction as in PointNet++, and a feature of the whole cloud.
 
     Source: Qi et al., PointNet++ (NeurIPS 2017).
 
@@ -62,7 +62,7 @@ class PointEncoder(nn.Module):
         chosen = farthest_points(points, self.seeds)
         centres = points.gather(1, chosen[..., None].expand(-1, -1, 3))
 
-        # What each seed sees around it, and what all of them see.
+        # What each seed sees around it, and what all seeds see together.
         near = torch.cdist(centres, points).topk(self.neighbours, largest=False).indices
         patches = points[torch.arange(len(points))[:, None, None], near] - centres[:, :, None]
         local = self.local(patches / self.scale).amax(2)
@@ -80,9 +80,9 @@ class PostureSize:
 
     Attributes:
         closing: Number of coordinates of the closed hand.
-        seeds: Points of the cloud that propose postures.
-        modes: Postures that each proposes.
-        neighbours: Points that each seed sees.
+        seeds: Number of points of the cloud that propose postures.
+        modes: Number of postures that each seed proposes.
+        neighbours: Number of points that each seed sees.
         width: Length of a feature.
     """
 
@@ -94,11 +94,13 @@ class PostureSize:
 
 
 class PostureNetwork(nn.Module):
-    """Postures from the cloud of one view: a mixture density with a few modes at each seed.
+    """Network that predicts postures from the cloud of one view.
 
-    A mode has a palm position p_TG about its seed, a rotation as two columns that are made
-    orthonormal (Zhou et al., CVPR 2019), and coordinates of the closed hand. The widths of the
-    three are shared by all modes, and learned.
+    It is a mixture density with a few modes at each seed.
+
+    A mode has a palm position p_TG relative to its seed, a rotation as two columns that are made
+    orthonormal (Zhou et al., CVPR 2019), and coordinates of the closed hand. All modes share three
+    learned widths, one for each of the three parts.
 
     Args:
         size: Sizes of the network.
@@ -109,11 +111,11 @@ class PostureNetwork(nn.Module):
         self.size = size
         self.encoder = PointEncoder(size.seeds, size.neighbours, size.width)
         self.head = mlp(3 + 3 * size.width, 256, 256, size.modes * (10 + size.closing))
-        # Of position [m], rotation [rad] and coordinates: wide before anything is learned.
+        # Widths of position [m], rotation [rad] and coordinates, large before training.
         self.log_width = nn.Parameter(torch.log(torch.tensor([0.05, 0.5, 0.5])))
 
     def forward(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the modes of a cloud (b, n, 3) in {T}: m = seeds x modes of them.
+        """Return the modes of a cloud (b, n, 3) in {T}; there are m = seeds x modes of them.
 
         Returns:
             Logarithms of the weights (b, m); positions p_TG (b, m, 3) [m]; rotations R_TG
@@ -127,12 +129,12 @@ class PostureNetwork(nn.Module):
         return weight, position.flatten(1, 2), rotation.flatten(1, 2), out[..., 10:].flatten(1, 2)
 
     def loss(self, points: Tensor, p_TG: Tensor, R_TG: Tensor, closing: Tensor) -> Tensor:
-        """Return the negative log-likelihood of some postures for each cloud, the mean of a batch.
+        """Return the negative log-likelihood of postures for each cloud, averaged over the batch.
 
         Args:
-            points: (b, n, 3) in {T}.
-            p_TG: (b, g, 3).
-            R_TG: (b, g, 3, 3).
+            points: (b, n, 3), points in {T}.
+            p_TG: (b, g, 3), palm positions.
+            R_TG: (b, g, 3, 3), palm rotations.
             closing: (b, g, c), coordinates of the closed hand.
         """
         return -self.log_density(self(points), p_TG, R_TG, closing).mean()
@@ -140,7 +142,7 @@ class PostureNetwork(nn.Module):
     def log_density(
         self, modes: Sequence[Tensor], p_TG: Tensor, R_TG: Tensor, closing: Tensor
     ) -> Tensor:
-        """Return logarithms of the density (b, g) of postures, under what `forward` returned."""
+        """Return log densities (b, g) of postures, given the modes that `forward` returned."""
         weight, *means = modes
         widths = self.log_width.clamp(min=-4.6)  # 10 mm, 0.6 deg: never a spike
         x, y = (self._in_widths(each, widths) for each in ((p_TG, R_TG, closing), means))
@@ -151,9 +153,9 @@ class PostureNetwork(nn.Module):
 
     @staticmethod
     def _in_widths(postures: Sequence[Tensor], widths: Tensor) -> Tensor:
-        """Return postures as vectors (b, n, 12 + c), in which all widths are 1.
+        """Return postures as vectors (b, n, 12 + c), scaled so that all widths are 1.
 
-        |R - R'|^2 = 8 sin^2(angle / 2), so half of it is near to the squared angle.
+        |R - R'|^2 = 8 sin^2(angle / 2), so half of it is close to the squared angle.
         """
         position, rotation, coordinates = postures
         parts = position, rotation.flatten(-2) / 2**0.5, coordinates
@@ -162,7 +164,10 @@ class PostureNetwork(nn.Module):
 
 
 def orthonormal(columns: Tensor) -> Tensor:
-    """Return rotation matrices (..., 3, 3) whose first axes lie along two vectors (..., 2, 3)."""
+    """Return rotation matrices (..., 3, 3) made of two vectors (..., 2, 3).
+
+    The x axis lies along the first vector, and the y axis in the plane of both.
+    """
     x = functional.normalize(columns[..., 0, :], dim=-1)
     y = columns[..., 1, :]
     y = functional.normalize(y - (x * y).sum(-1, keepdim=True) * x, dim=-1)
@@ -173,10 +178,11 @@ def orthonormal(columns: Tensor) -> Tensor:
 
 
 class GraspClassifier(nn.Module):
-    """Whether a posture holds, and becomes a sample: a PointNet on the cloud that the palm sees.
+    """Network that judges whether a posture holds an object, and whether it becomes a sample.
 
-    The cloud and the table are given in the palm's frame {G}, so the network need not learn that
-    both may be turned together. `temperature` divides the logits; calibration sets it.
+    It is a PointNet on the cloud that the palm sees. The cloud and the table are expressed in the
+    palm's frame {G}, so the network need not learn that the verdict is the same if both are turned
+    together. `temperature` divides the logits; calibration sets it.
 
     Source: Qi et al., PointNet (CVPR 2017); Guo et al., On Calibration (ICML 2017).
 
@@ -191,7 +197,7 @@ class GraspClassifier(nn.Module):
         self.register_buffer("temperature", torch.ones(2))
 
     def forward(self, cloud: Tensor, X_TG: Tensor, closing: Tensor) -> Tensor:
-        """Return logits (b, 2) of held and sample.
+        """Return logits (b, 2) of "held" and "sample".
 
         Args:
             cloud: (b, n, 3), points in {T}.
@@ -209,15 +215,16 @@ class GraspClassifier(nn.Module):
 
 
 class ContactNetwork(nn.Module):
-    """Contact points and normals from one RGB-D image, by one or several heads.
+    """Network that predicts contact points and normals from one RGB-D image, with several heads.
 
-    One head regresses to the mean of what may be right. Of several the best learns from a sample,
-    and the network says how likely each is (Rupprecht et al., ICCV 2017).
+    A single head regresses to the mean of all correct answers. With several heads the best one
+    learns from a sample, and the network also predicts how likely each is (Rupprecht et al., ICCV
+    2017).
 
     Args:
-        length: Numbers of a grasp: 6 per finger.
+        length: Length of a grasp: 6 numbers per finger.
         heads: Number of heads.
-        mean, scale: (length,), of the grasps of the training part.
+        mean, scale: (length,), mean and standard deviation of the grasps of the training part.
     """
 
     def __init__(self, length: int, heads: int, mean: Tensor, scale: Tensor) -> None:
@@ -241,11 +248,12 @@ class ContactNetwork(nn.Module):
         return self.mean + self.scale * out[..., 1:], functional.log_softmax(out[..., 0], -1)
 
     def loss(self, images: Tensor, grasp: Tensor) -> Tensor:
-        """Return the mean of the best head's error and the surprise that it is the best."""
+        """Return the best head's mean error plus the surprise that this head is the best."""
         grasps, chance = self(images)
         error = ((grasps - grasp[:, None]) / self.scale).square().mean(-1)
         best = error.argmin(-1)
-        # The others follow a little, or a head that never is the best would never learn.
+        # The other heads learn a little as well, or a head that is never the best would never
+        # learn.
         return (0.95 * error.amin(-1) + 0.05 * error.mean(-1)).mean() + 0.1 * functional.nll_loss(
             chance, best
         )
@@ -256,15 +264,16 @@ class ContactNetwork(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class HandCoordinates:
-    """Few coordinates of a closed hand of j joints: what couplings leave free, found in the data.
+    """A few coordinates of a closed hand of j joints, found in the data.
 
-    Joints that are coupled move together in every row, so the directions in which closed hands
-    differ are as many as the hand has motors. A posture made of them keeps the couplings.
+    Coupled joints move together in every row, so closed hands differ in as many directions as the
+    hand has motors. A posture built from these directions satisfies the couplings.
 
     Attributes:
-        mean: (j,), of the closed joints.
-        directions: (c, j); a hand is mean + coordinates @ directions.
-        open: (j,), of the open hand; NaN for joints that are set before closing, as the spread.
+        mean: (j,), mean positions of the closed joints.
+        directions: (c, j), directions: a closed hand is mean + coordinates @ directions.
+        open: (j,), joint positions of the open hand; NaN for joints that are set before closing,
+            such as the spread.
     """
 
     mean: Tensor
@@ -273,7 +282,7 @@ class HandCoordinates:
 
     @classmethod
     def fit(cls, closed: Tensor, opened: Tensor) -> HandCoordinates:
-        """Return the coordinates of closed and open hands (n, j) each [rad or m]."""
+        """Return the coordinates fitted to closed and open hands, (n, j) each [rad or m]."""
         mean = closed.mean(0)
         _, values, rows = torch.linalg.svd(closed - mean, full_matrices=False)
         deviations = values / max(len(closed) - 1, 1) ** 0.5
@@ -282,18 +291,18 @@ class HandCoordinates:
         return cls(mean, rows[kept] * deviations[kept, None], opened[0].where(still, torch.nan))
 
     def coordinates(self, q: Tensor) -> Tensor:
-        """Return coordinates (n, c), of unit variance, of joints (n, j)."""
+        """Return coordinates (n, c), of unit variance, of joint positions (n, j)."""
         square = self.directions.square().sum(1)
         return (q - self.mean) @ self.directions.T / square
 
     def closed(self, coordinates: Tensor) -> Tensor:
-        """Return joints (n, j) [rad or m] of coordinates (n, c)."""
+        """Return the joint positions (n, j) [rad or m] of coordinates (n, c)."""
         return self.mean + coordinates @ self.directions
 
     def opened(self, q: Tensor) -> Tensor:
-        """Return the open hand (n, j) from which closed joints (n, j) are reached."""
+        """Return the open hands (n, j) from which hands close to the joint positions (n, j)."""
         return self.open.where(~self.open.isnan(), q)
 
     def as_dict(self) -> dict[str, Tensor]:
-        """Return what a checkpoint keeps."""
+        """Return the values that a checkpoint stores."""
         return asdict(self)

@@ -1,12 +1,12 @@
-"""Predict with a checkpoint of `train.py`, into a file for `drakegrasp score`, `verify` or `build`.
+"""Predict with a checkpoint of `train.py`, and write a file for `drakegrasp score` and others.
 
   python pipelines/baseline/predict.py postures.pt OUT/scenes.hdf5 predicted.h5
   python pipelines/baseline/predict.py postures.pt OUT/scenes.hdf5 judged.h5 --judge classifier.pt
   python pipelines/baseline/predict.py postures.pt OUT/scenes.hdf5 closed.h5 --choose closing
   python pipelines/baseline/predict.py contacts.pt OUT/grasping_oto.hdf5 predicted.h5
 
-Postures are written as `drakegrasp build --postures` reads them, with the row of the split that
-each is for.
+`verify` and `build` read the file as well. Postures are written in the form that `drakegrasp build
+--postures` reads, each with the row of the split for which it is.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.simulation.attempts import join_attempts, make_attempts
 from drakegrasp.simulation.posture import joint_order
 
-#: Two proposals are one if palms are nearer than both [m, rad].
+#: Two proposals are the same if their palms differ by less than both limits [m, rad].
 SAME = (0.01, np.deg2rad(15))
-#: From so many proposals a judge chooses.
+#: Number of proposals from which a judge chooses.
 POOL = 64
-#: Views or images at a time.
+#: Views or images that are processed together.
 BATCH = 32
 
 
@@ -62,11 +62,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--choose",
         choices=("chance", "closing"),
         default="chance",
-        help="what ranks: the network's or the judge's chance, or drakegrasp.rank, together with "
-        "grasps from above  [default: chance]",
+        help="ranking: the network's or the judge's chance, or drakegrasp.rank of the proposals "
+        "and of grasps from above  [default: chance]",
     )
-    parser.add_argument("--proposals", type=int, default=5, help="of each view  [default: 5]")
-    parser.add_argument("--views", type=int, help="of each scene  [default: all]")
+    parser.add_argument("--proposals", type=int, default=5, help="proposals per view  [default: 5]")
+    parser.add_argument("--views", type=int, help="views per scene  [default: all]")
     arguments = parser.parse_args(argv)
     try:
         checkpoint = load(arguments.checkpoint, "postures", "contacts")
@@ -86,11 +86,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def load(path: Path, *tasks: str) -> dict[str, Any]:
-    """Return the content of a checkpoint of one of some tasks."""
+    """Return the content of a checkpoint; its task must be one of `tasks`."""
     try:
         content: dict[str, Any] = torch.load(path, weights_only=True)
         task = content["task"]
-    except Exception as error:  # whatever a damaged archive raises
+    except Exception as error:  # a damaged archive can raise any exception
         raise DataError(f"{path}: must be a checkpoint of train.py, got {error!r:.80}") from error
     if task not in tasks:
         raise DataError(f"{path}: must be a checkpoint of {' or '.join(tasks)}, got {task}")
@@ -101,7 +101,7 @@ def load(path: Path, *tasks: str) -> dict[str, Any]:
 
 
 def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return postures for the views of a split, best first, as a file of postures has them."""
+    """Return postures for the views of a split, best first, in the form of a file of postures."""
     network = PostureNetwork(PostureSize(**checkpoint["size"])).eval()
     network.load_state_dict(checkpoint["weights"])
     hand, judge = HandCoordinates(**checkpoint["hand"]), None
@@ -116,7 +116,7 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
     if arguments.choose == "closing":
         closing_hand = load_hand(read_manifest(arguments.data.parent).config.hand_source)
 
-    # The views that `drakegrasp score` counts, in its order.
+    # The views that `drakegrasp score` counts, in its order of rows.
     data = dg.SceneDataset(
         arguments.data, split=arguments.split, negatives="none", balance="view", grasps=1
     )
@@ -133,7 +133,7 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
                 clouds = batch["points"][:, :SEEN].expand(len(X_TG), -1, -1)
                 confidence = judge[0](clouds, X_TG, judge[1].coordinates(q))[:, 1].sigmoid()
 
-            # Back to where the cloud was.
+            # Back to the original position of the cloud.
             X_TG[:, :3, 3] += batch["shift"]
             table = Choice(X_TG.numpy(), q.numpy(), hand.opened(q).numpy(), confidence.numpy())
             if closing_hand is not None:
@@ -162,7 +162,7 @@ def predict_postures(checkpoint: dict[str, Any], arguments: argparse.Namespace) 
 
 
 class Choice(NamedTuple):
-    """n proposals for a view: X_TG (n, 4, 4), joints (n, j) closed and open, confidence (n,)."""
+    """n proposals for a view: X_TG (n, 4, 4), closed and open joints (n, j), confidence (n,)."""
 
     X_TG: Array
     q_grasp: Array
@@ -171,15 +171,15 @@ class Choice(NamedTuple):
 
 
 def chosen_by_closing(found: Choice, cloud: Array, hand: dg.Hand, joints: Sequence[str]) -> Choice:
-    """Return proposals and grasps from above, with what `drakegrasp.rank` says as confidence.
+    """Return proposals and grasps from above, with the score of `drakegrasp.rank` as confidence.
 
-    A view that shows too little for that keeps the proposals as they are.
+    If a view shows too little for that, the proposals are returned unchanged.
 
     Args:
-        found: Of the network.
+        found: Proposals of the network.
         cloud: (n, 3), points on the object in {T} [m].
         hand: The hand.
-        joints: (j,), names of its joints.
+        joints: (j,), names of the hand's joints.
     """
     try:
         above = dg.propose(cloud, hand)
@@ -206,9 +206,10 @@ COLUMNS = ("object", "resting", "row", "X_FG", "q_grasp", "q_pregrasp", "confide
 def proposals(
     network: PostureNetwork, hand: HandCoordinates, points: Tensor, count: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the modes of a cloud (1, n, 3) that are likeliest of all, no two of them the same.
+    """Return the most likely modes of a cloud (1, n, 3), no two of them the same.
 
-    A mode is as likely as all modes around it make it: its own weight is small where many agree.
+    Modes are ordered by the density of the whole mixture: the weight of a single mode is small
+    where many agree.
 
     Returns:
         Log densities (m,), largest first, poses X_TG (m, 4, 4) and closed joints (m, j),
@@ -227,7 +228,7 @@ def proposals(
             break
     X_TG = torch.eye(4).repeat(len(kept), 1, 1)
     X_TG[:, :3, :3], X_TG[:, :3, 3] = rotation[kept], position[kept]
-    # Beyond what was seen in training a hand may not be one.
+    # Coordinates far outside the training data may not describe a possible hand.
     return density[kept], X_TG, hand.closed(coordinates[kept].clamp(-3, 3))
 
 

@@ -4,9 +4,9 @@
   python pipelines/baseline/train.py classifier OUT/scenes.hdf5 classifier.pt
   python pipelines/baseline/train.py contacts OUT/grasping_oto.hdf5 contacts.pt --heads 5
 
-Several files of one hand train together, and the first validates. The checkpoint holds the weights
-that validated best, all settings, hashes of the files and the versions. The same command gives the
-same weights on the same machine and versions.
+Several files of one hand train together, and the first one validates. The checkpoint holds the
+weights that validated best, all settings, hashes of the files and the versions. The same command
+produces the same weights on the same machine with the same versions.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from torch.nn import functional
 import drakegrasp as dg
 from drakegrasp.errors import DataError, DrakegraspError
 
-#: Points of a cloud that the classifier sees: it looks at each cloud once for each grasp.
+#: Points of a cloud that the classifier sees: it processes each cloud once for each grasp.
 SEEN = 128
 
 
@@ -53,18 +53,27 @@ def main(argv: Sequence[str] | None = None) -> int:
         "data", type=Path, nargs="+", help="files scenes.hdf5, or data files for contacts"
     )
     parser.add_argument("checkpoint", type=Path, help="where to write")
-    parser.add_argument("--epochs", type=int, default=60, help="at most  [default: 60]")
-    parser.add_argument("--patience", type=int, default=10, help="[default: 10]")
+    parser.add_argument(
+        "--epochs", type=int, default=60, help="maximum number of epochs  [default: 60]"
+    )
+    parser.add_argument(
+        "--patience",
+        type=int,
+        default=10,
+        help="epochs without a better validation before training stops  [default: 10]",
+    )
     parser.add_argument("--rate", type=float, default=1e-3, help="learning rate  [default: 0.001]")
     parser.add_argument("--batch", type=int, default=32, help="[default: 32]")
     parser.add_argument("--seed", type=int, default=0, help="[default: 0]")
     parser.add_argument(
-        "--objects", type=int, help="train on so many of the first file, drawn by the seed"
+        "--objects", type=int, help="number of objects of the first file to train on, drawn by seed"
     )
     parser.add_argument(
-        "--without", metavar="CLASS", nargs="+", default=[], help="train on none of these classes"
+        "--without", metavar="CLASS", nargs="+", default=[], help="classes to leave out"
     )
-    parser.add_argument("--heads", type=int, default=5, help="of contacts  [default: 5]")
+    parser.add_argument(
+        "--heads", type=int, default=5, help="heads of the contact network  [default: 5]"
+    )
     arguments = parser.parse_args(argv)
     try:
         history = TASKS[arguments.task](arguments)
@@ -99,8 +108,8 @@ def train_postures(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def train_classifier(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Train the network that judges postures, on lifts to a verdict, and calibrate it."""
-    # Held grasps that are no samples too, or both questions had the same answers.
+    """Train the network that judges postures, on lifts with a verdict, and calibrate it."""
+    # Also held grasps that are not samples, or both questions would have the same answers.
     train, valid = _scenes(arguments, "tested", positives="held")
     hand = hand_of(train)
     torch.manual_seed(arguments.seed)
@@ -121,7 +130,7 @@ def train_classifier(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def train_contacts(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Train the network of the paper's task: contacts from one image."""
+    """Train the network for the paper's task: contacts from one image."""
     train, valid = (
         [data for path in arguments.data if len(data := dg.GraspDataset(path, split=split))]
         for split in ("train", "valid")
@@ -153,7 +162,7 @@ TASKS = {
 
 
 def judged(network: GraspClassifier, hand: HandCoordinates, batch: Batch) -> tuple[Tensor, Tensor]:
-    """Return logits and labels (n, 2), of held and sample, of all grasps of a batch."""
+    """Return logits and labels (n, 2), for "held" and "sample", of all grasps of a batch."""
     grasps = batch["X_TG"].shape[1]
     clouds = batch["points"][:, :SEEN].repeat_interleave(grasps, 0)
     logits = network(
@@ -164,7 +173,7 @@ def judged(network: GraspClassifier, hand: HandCoordinates, batch: Batch) -> tup
 
 
 def temperature(logits: Tensor, labels: Tensor) -> Tensor:
-    """Return the temperatures (2,) that make logits (n, 2) say how often labels (n, 2) are true."""
+    """Return the temperatures (2,) with which logits (n, 2) best match labels (n, 2)."""
     tried = torch.logspace(-1, 1, 81)
     losses = torch.stack(
         [
@@ -184,7 +193,7 @@ def _objects_of(data: dg.SceneDataset) -> list[int]:
 
 
 def hand_of(train: Sequence[dg.SceneDataset]) -> HandCoordinates:
-    """Return the coordinates of the hand, from the samples of the training part; print of which."""
+    """Return the hand's coordinates, fitted to the samples that train; print how many these are."""
     found: dict[str, list[np.ndarray]] = {"q": [], "q_open": []}
     for data in train:
         grasps, scenes = data.tables["grasps"], data.tables["views"]["scene"][data.views]
@@ -201,10 +210,10 @@ def hand_of(train: Sequence[dg.SceneDataset]) -> HandCoordinates:
 def _scenes(
     arguments: argparse.Namespace, negatives: Any, positives: Any = "sample"
 ) -> tuple[list[dg.SceneDataset], list[dg.SceneDataset]]:
-    """Return the parts that train and validate.
+    """Return the parts that train and the parts that validate.
 
-    Only the first file validates: what was fed back is of objects that train there. A small dataset
-    may have nothing that validates.
+    Only the first file validates: the grasps that were fed back are of objects that train there. A
+    small dataset may have no part that validates.
     """
     options = {"negatives": negatives, "positives": positives, "seed": arguments.seed}
     train = []
@@ -225,7 +234,7 @@ def _scenes(
 
 
 def _names(arguments: argparse.Namespace, path: Path, split: str, options: Any) -> list[str]:
-    """Return the names of the objects with grasps to draw, of the classes that are not left out."""
+    """Return the names of the objects that have grasps to draw and whose class is not left out."""
     data = dg.SceneDataset(path, split=split, **options)
     if unknown := sorted(set(arguments.without) - set(data.classes)):
         raise DataError(f"{path}: --without must name classes of it, got {unknown[0]}")
@@ -262,7 +271,7 @@ def _save(
     history: dict[str, Any],
     **more: Any,
 ) -> None:
-    """Write the checkpoint, whole or not at all."""
+    """Write the checkpoint completely or not at all."""
     content = {
         "task": arguments.task,
         "weights": network.state_dict(),

@@ -17,8 +17,8 @@ _HEAD = f"""<!-- Made by `make docs-pages` from shapes/catalog.py: change that. 
 
 # Built-in objects
 
-{len(CLASSES)} classes of everyday things come with the package, so that a dataset needs no
-meshes. They follow the kinds of objects of the paper; the shapes and sizes are our own, for a
+{len(CLASSES)} classes of everyday objects are included in the package, so that a dataset needs no
+meshes. They follow the kinds of objects in the paper. Their shapes and sizes are our own and fit a
 hand of the Barrett Hand's size.
 
 ![The first object of every class](../images/builtin.png)
@@ -30,26 +30,26 @@ drakegrasp build --objects builtin --per-class 5 --out OUT
 ```
 
 The first command prints the classes and their parameters, the second writes {5 * len(CLASSES)}
-meshes (`.obj`, metres), the third builds a dataset of the same objects.
+meshes (`.obj`, metres), and the third builds a dataset of the same objects.
 
-A class is a function of a few parameters. Each object draws them from the ranges below, in steps
-of 0.1 mm, 0.1° or one piece. It is called `<number>_<class>_<index>`, e.g. `1_mug_2`; its sizes
-depend on its class, its index and `--objects-seed` (`builtin.seed`) alone, so more objects per
-class change no earlier one. The same seed gives the same mesh files on every machine.
+A class is a function of a few parameters. Each object draws its parameters from the ranges below,
+in steps of 0.1 mm, 0.1° or one piece. Its name is `<number>_<class>_<index>`, e.g. `1_mug_2`. Its
+sizes depend only on its class, its index and `--objects-seed` (`builtin.seed`), so a larger number
+of objects per class does not change the earlier objects. The same seed produces the same mesh files
+on every machine.
 
-`--per-class` (`builtin.per_class`) is {BuiltinConfig().per_class} by default: of the objects of
-a class one is [tested](outcomes.md#split) and the others train. Both options are stored in
-`manifest.json`, and a build continues only with the same.
+`--per-class` (`builtin.per_class`) is {BuiltinConfig().per_class} by default: one object of a class
+is [tested](outcomes.md#split), and the others train. Both options are stored in `manifest.json`,
+and a build continues only with the same values.
 
-Every object is one watertight solid of at most 3000 triangles. It stands or lies on z = 0 as it
-does on a table, z up, and stays so when it is dropped. Hollow things have walls of 4.5 to 6 mm.
-Thin flat things of the paper's set, such as forks and pens, are left out: the Barrett Hand
-cannot take them from a table.
+Every object is one watertight solid of at most 3000 triangles. It stands or lies on z = 0 as on a
+table, with z up, and keeps this pose when it is dropped. Hollow objects have walls of 4.5 to 6 mm.
+Thin flat objects of the paper's set, such as forks and pens, are left out: the Barrett Hand cannot
+pick them up from a table.
 
-In Python, `export_builtin("MESHES", ["1_mug_1", "1_mug_2"])` of
-`drakegrasp.shapes.catalog` writes single objects, and `builtin_object("1_mug_2",
-seed=3).sizes` are the sizes of one. To add a class, write a function in
-`drakegrasp/shapes/`, add a row at the end of the table in
+In Python, `export_builtin("MESHES", ["1_mug_1", "1_mug_2"])` of `drakegrasp.shapes.catalog` writes
+single objects, and `builtin_object("1_mug_2", seed=3).sizes` returns the sizes of one object. To
+add a class, write a function in `drakegrasp/shapes/`, add a row at the end of the table in
 `drakegrasp/shapes/catalog.py`, and run `make docs-pages`.
 """
 

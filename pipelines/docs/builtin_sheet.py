@@ -1,4 +1,4 @@
-"""Draw the contact sheet of the built-in objects: the first of every class, with its name."""
+"""Draw the contact sheet of the built-in objects: one object of every class, with its name."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from drakegrasp.pictures.style import INK, add_axes, hide_ticks, save_figure
 from drakegrasp.shapes.catalog import CLASSES, BuiltinObject
 from drakegrasp.vision.rendering import build_renderer, render
 
-#: Objects per line of the sheet, and the edge of each picture [inch].
+#: Objects per line of the sheet, and the edge length of each picture [inch].
 ACROSS, EDGE = 8, 1.3
-#: Pixels per inch, and how many times larger pictures are rendered than they are shown.
+#: Pixels per inch, and the factor by which pictures are rendered larger than they are shown.
 DPI, OVERSAMPLING = 150, 2
-#: Where the camera is: azimuth from +x and elevation [rad]; its field of view is narrow.
+#: Direction to the camera: azimuth from +x and elevation [rad]; its narrow field of view [deg].
 AZIMUTH, ELEVATION, FOV_Y_DEG = np.deg2rad(-58.0), np.deg2rad(27.0), 20.0
 
 
@@ -56,7 +56,7 @@ def draw_sheet(objects: Sequence[BuiltinObject]) -> Figure:
     size = (across * EDGE + 2 * margin, lines * (EDGE + caption) + 2 * margin)
     figure = Figure(figsize=size, facecolor="white")
 
-    # A picture of each, above its class.
+    # A picture of each object, above its class.
     for k, item in enumerate(objects):
         line, column = divmod(k, across)
         left, top = margin + column * EDGE, margin + line * (EDGE + caption)
@@ -72,8 +72,8 @@ def draw_sheet(objects: Sequence[BuiltinObject]) -> Figure:
 
 
 def picture(item: BuiltinObject) -> npt.NDArray[np.float32]:
-    """Return the picture (n, n, 3) of an object as it stands on the table, 0..1."""
-    # Only its surface is drawn: the rest of the model is arbitrary.
+    """Return the picture (n, n, 3) of an object as it rests on the table, with values in 0..1."""
+    # Only the surface is drawn, so the other values of the model are arbitrary.
     mesh = item.build()
     vertices, faces = mesh.vertices - mesh.bounds.mean(axis=0), mesh.faces.astype(np.int32)
     model = ObjectModel(
@@ -90,7 +90,7 @@ def picture(item: BuiltinObject) -> npt.NDArray[np.float32]:
         collision_error=0.0,
     )
 
-    # From the camera, larger than shown, and averaged.
+    # Render the view larger than it is shown, and average it.
     size = round(EDGE * DPI) * OVERSAMPLING
     config = CameraConfig(size=size, fov_y_deg=FOV_Y_DEG, near=0.05, far=5.0)
     X_TO = make_pose(np.eye(3), [0.0, 0.0, model.half_extents[2]])
@@ -101,7 +101,7 @@ def picture(item: BuiltinObject) -> npt.NDArray[np.float32]:
 
 
 def camera_pose(model: ObjectModel) -> Array:
-    """Return X_TC (4, 4) of a camera whose picture an object at rest fills."""
+    """Return X_TC (4, 4) of a camera whose picture is filled by the object at rest."""
     sideways = np.array([-np.sin(AZIMUTH), np.cos(AZIMUTH), 0.0])
     back = np.array(
         [
@@ -112,7 +112,7 @@ def camera_pose(model: ObjectModel) -> Array:
     )
     R_TC = np.column_stack([sideways, np.cross(-back, sideways), -back])
 
-    # The middle of what the camera sees of the object, and half of its larger side.
+    # The centre of the object as the camera sees it, and half of its larger side.
     seen = model.visual_vertices @ R_TC
     low, high = seen.min(axis=0), seen.max(axis=0)
     middle = R_TC @ ((low + high) / 2.0) + [0.0, 0.0, model.half_extents[2]]

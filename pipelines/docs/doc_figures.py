@@ -1,7 +1,7 @@
-"""The figures of the README and the docs. Needs matplotlib, not Drake.
+"""The figures of the README and the docs. They need matplotlib, but not Drake.
 
-In: data files, and pictures with their cameras (from `trial_pictures`). Out: PNG files: one trial
-from start to lift, and all frames.
+In: data files, and pictures with their cameras (from `trial_pictures`). Out: PNG files, one of a
+trial from start to lift and one of all frames.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ class Triad(NamedTuple):
     """A frame {A} to draw over a picture.
 
     Attributes:
-        label: Its letter.
-        X_WA: (4, 4), its pose.
-        length: Of its axes [m].
+        label: Letter of the frame.
+        X_WA: (4, 4), pose of the frame.
+        length: Length of its axes [m].
     """
 
     label: str
@@ -58,10 +58,11 @@ class Panel:
     Attributes:
         title: Text above the picture.
         picture: The picture.
-        triads: Frames.
+        triads: Frames to draw.
         lines: Dashed polylines, each (n, 3) in {W} [m].
-        points: By name, points (3,) in {W} [m].
-        arrows: By name, tail (3,) and tip (3,) in {W} [m], drawn in the colours of the fingers.
+        points: Points (3,) in {W} [m], by name.
+        arrows: Tail (3,) and tip (3,) of each arrow in {W} [m], by name; drawn in the colours of
+            the fingers.
     """
 
     title: str
@@ -73,13 +74,13 @@ class Panel:
 
 
 def draw_panel(axes: Axes, panel: Panel) -> None:
-    """Draw lines, frames, points and arrows of a panel over its picture."""
+    """Draw the lines, frames, points and arrows of a panel over its picture."""
     picture, halo = panel.picture, [withStroke(linewidth=3.0, foreground="white")]
     for line in panel.lines:
         axes.plot(*picture.pixels(line).T, color=INK, linewidth=0.9, linestyle=(0, (5, 3)))
     for triad in panel.triads:
         tips = triad.X_WA[:3, 3] + triad.length * triad.X_WA[:3, :3].T
-        # Draw the farthest axis first, so that nearer ones cover it.
+        # Draw the farthest axis first, so that nearer axes cover it.
         depths = transform_points(invert_pose(picture.X_WC), tips)[:, 2]
         for k in np.argsort(-depths):
             ends = picture.pixels(np.vstack([triad.X_WA[:3, 3], tips[k]]))
@@ -106,7 +107,8 @@ def hero_figure(
         oto: `grasping_oto.hdf5`.
         otm: `grasping_otm.hdf5` of the same dataset.
         trial_id: A trial that became a sample.
-        pictures: Of the trial placed, closed and lifted, from `trial_pictures.render_trial`.
+        pictures: Pictures of the trial placed, closed and lifted, from
+            `trial_pictures.render_trial`.
         png: The file to write.
 
     Raises:
@@ -169,13 +171,13 @@ def find_sample(path: Path, trial_id: int) -> tuple[Sample, Array]:
 
 
 def frames_figure(panels: Sequence[Panel], png: Path) -> None:
-    """Draw panels side by side. The last is a camera's image; its pixel axes are drawn too.
+    """Draw panels side by side. The last panel is a camera's image, with its pixel axes.
 
     Args:
-        panels: From `trial_pictures.frames_panels`.
+        panels: Panels from `trial_pictures.frames_panels`.
         png: The file to write.
     """
-    # The page [inch]: all panels of one height but the last, which is smaller.
+    # The page [inch]: all panels have the same height except the last one, which is smaller.
     high, gap, margin, head = 5.0, 0.15, 0.1, 0.3
     aspects = [p.picture.image.shape[1] / p.picture.image.shape[0] for p in panels]
     heights = [high] * (len(panels) - 1) + [0.62 * high]
@@ -192,7 +194,7 @@ def frames_figure(panels: Sequence[Panel], png: Path) -> None:
         axes.set_title(panel.title, fontsize=9.5, color=INK, loc="left", pad=5)
         draw_panel(axes, panel)
 
-    # Below the last one there is room for the legend.
+    # The legend is below the last panel, which is smaller.
     _draw_pixel_axes(axes)
     text = (
         "axes: x red, y green, z blue\n"

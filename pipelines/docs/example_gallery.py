@@ -1,9 +1,9 @@
-"""Write docs/examples/index.md, the gallery, from the scripts beside it, or check it.
+"""Write or check docs/examples/index.md, the gallery of the example scripts in its folder.
 
 Usage: python pipelines/docs/example_gallery.py [--check] FILE
        python pipelines/docs/example_gallery.py --pictures docs/images
 
-The second form runs all scripts, which takes a minute, and keeps the picture of each.
+The second form runs all scripts, which takes a minute, and stores the picture of each.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ _HEAD = """<!-- Made by `make docs-pages` from the scripts in this folder: chang
 
 # Examples
 
-A course in short scripts: each shows one thing, prints what it did and draws one picture. Run
-them in order from any folder; they write to `example/` there, and 01 builds the dataset that most
-of the others read. All of them together take a minute.
+This is a course of short scripts. Each script shows one topic, prints its results and draws one
+picture. Run them in order from any folder. They write to `example/` in that folder, and 01 builds
+the dataset that most of the others read. All scripts together take about a minute.
 
 ```
 python docs/examples/01_dataset.py
 ```
 
-How to train a network: [tutorial](../tutorial.md#3-train).
+To train a network, see the [tutorial](../tutorial.md#3-train).
 """
 
 
@@ -49,17 +49,17 @@ class Example:
 
     @property
     def anchor(self) -> str:
-        """The anchor of its section."""
+        """The anchor of the example's section."""
         return f"{self.number}-{self.title.removesuffix('.').lower().replace(' ', '-')}"
 
     @property
     def number(self) -> str:
-        """Its number in the course."""
+        """The example's number in the course."""
         return self.path.stem.partition("_")[0]
 
     @property
     def picture(self) -> str:
-        """Name of its picture in docs/images."""
+        """Name of the example's picture in docs/images."""
         return f"example_{self.path.stem}.png"
 
 
@@ -67,7 +67,7 @@ def read_examples(folder: Path = EXAMPLES) -> list[Example]:
     """Return the examples of a folder in the order of their numbers.
 
     Raises:
-        ValueError: If a docstring is not a title, one line, and a line of concepts.
+        ValueError: If a docstring does not consist of a title, one line and a line of concepts.
     """
     return [read_example(path) for path in sorted(folder.glob("[0-9][0-9]_*.py"))]
 
@@ -118,7 +118,7 @@ def _section(item: Example) -> str:
 
 
 def draw_pictures(folder: Path) -> None:
-    """Run all examples in a folder that is removed, and keep their pictures."""
+    """Run all examples in a temporary folder, and store their pictures."""
     with tempfile.TemporaryDirectory() as scratch:
         for item in read_examples():
             subprocess.run([sys.executable, item.path], cwd=scratch, check=True)

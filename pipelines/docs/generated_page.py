@@ -1,4 +1,4 @@
-"""The command line of a script that makes one page of the docs from code."""
+"""The command line of a script that generates one page of the docs from code."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from pathlib import Path
 
 
 def main(page: str, description: str, argv: Sequence[str] | None = None) -> int:
-    """Write the page, or with --check return 1 if the file differs from it.
+    """Write the page, or with `--check` return 1 if the file differs from it.
 
     Args:
-        page: Its Markdown.
-        description: What the script makes, for its help text.
+        page: Markdown text of the page.
+        description: Description of what the script writes, for its help text.
         argv: Arguments of the command line; those of the process if None.
     """
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("target", type=Path, help="the page")
-    parser.add_argument("--check", action="store_true", help="compare, and write nothing")
+    parser.add_argument("target", type=Path, help="file of the page")
+    parser.add_argument("--check", action="store_true", help="compare the file, and write nothing")
     arguments = parser.parse_args(argv)
 
     target = arguments.target

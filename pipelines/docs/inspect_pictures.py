@@ -1,8 +1,8 @@
 """Take the pictures of the inspection page for the docs: galleries, a grasp, a prediction, a scene.
 
-In: a dataset's directory, and the results of `drakegrasp verify` for rows of it. Out: one picture
-of each page, `inspect_NAME.png`; of predictions and scenes only if there are any. Needs Playwright
-and the system's Chromium (`make test-browser` installs it).
+In: a dataset's directory, and the results of `drakegrasp verify` for some of its rows. Out: one
+picture of each page, `inspect_NAME.png`. Predictions and scenes are left out if there are none. The
+script needs Playwright and the system's Chromium (`make test-browser` installs both).
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from playwright.sync_api import sync_playwright
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.page.serve import listen
 
-#: As root Chromium has no sandbox; WebGL is computed by the CPU.
+#: Chromium cannot use its sandbox when it runs as root; the CPU computes WebGL.
 OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 #: Size of a picture [px].
 WIDTH, HEIGHT = 1280, 900
-#: Longest wait for anything on a page [ms].
+#: Maximum wait for anything on a page [ms].
 PATIENCE = 60_000.0
 
 
@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Run the script."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="directory of a dataset")
-    parser.add_argument("pictures", type=Path, help="directory that the pictures go to")
+    parser.add_argument("pictures", type=Path, help="directory for the pictures")
     parser.add_argument("--predictions", type=Path, help="file that verify --out has written")
     arguments = parser.parse_args(argv)
 
@@ -43,8 +43,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     thread.start()
     address = f"http://127.0.0.1:{listener.getsockname()[1]}"
 
-    # Look at it: galleries, the first grasp, the scene of the training part with most tested ones,
-    # and one of the farthest predictions that hold, in the dark theme.
+    # Take the pictures: the galleries, the first grasp, the training scene with the most tested
+    # grasps, and in the dark theme a held prediction that is among the farthest from the stored
+    # grasps.
     program = shutil.which("chromium") or shutil.which("chromium-browser")
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=program, args=list(OPTIONS))

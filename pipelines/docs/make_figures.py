@@ -1,7 +1,8 @@
 """Draw the figures of the README and the docs from a dataset of built-in objects.
 
-Writes trial.png (one grasp from start to lift, with the images of both cameras), frames.png
-(all frames) and candidates.png (palm poses by surface normals and by rotations, on a mug).
+The script writes trial.png (one grasp from start to lift, with the images of both cameras),
+frames.png (all frames) and candidates.png (palm poses on a mug, by surface normals and by
+rotations).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from drakegrasp.pictures.style import save_figure
 from drakegrasp.shapes.catalog import export_builtin
 from drakegrasp.simulation.candidates import sample_candidates
 
-#: The object of the figure of the candidates.
+#: Object in the figure of the candidates.
 MUG = "1_mug_1"
 
 
@@ -40,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--rays", type=int, default=220, help="palm poses drawn per method")
     arguments = parser.parse_args(argv)
 
-    # One trial, and its frames.
+    # Draw one trial and its frames.
     out, images = arguments.dataset, arguments.images
     images.mkdir(parents=True, exist_ok=True)
     pictures = render_trial(out, arguments.trial)
@@ -48,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     hero_figure(oto, otm, arguments.trial, pictures, images / "trial.png")
     frames_figure(frames_panels(out, arguments.trial), images / "frames.png")
 
-    # Candidates of a built-in mug.
+    # Draw candidates of a built-in mug.
     with tempfile.TemporaryDirectory() as folder:
         export_builtin(folder, [MUG])
         mug = prepare(find_meshes(Path(folder))[0], load_config(None, ["candidates.max=1"]))
@@ -57,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def draw_candidates(prepared: PreparedObject, rays: int, png: Path) -> None:
-    """Draw palm poses of an object by both methods."""
+    """Draw palm poses of an object from both methods."""
     drawn = {}
     for method, title in METHODS.items():
         overrides = [f"candidates.method={method}", f"candidates.max={10 * rays}"]

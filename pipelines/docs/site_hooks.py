@@ -1,7 +1,8 @@
-"""What the site of the docs needs beyond the folder `docs`; mkdocs loads this file as a hook.
+"""Steps that the docs site needs besides the folder `docs`; mkdocs loads this file as a hook.
 
-Links that lead out of `docs/` are right on GitHub and must lead to a page here: the README of the
-hands' models becomes one. Anchors are GitHub's, so that one link fits both.
+Links that lead out of `docs/` work on GitHub and must lead to a page of the site here: the README
+of the hands' models becomes such a page. Headings get GitHub's anchors, so that one link works in
+both places.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ from mkdocs.structure.files import File, Files
 from pymdownx.slugs import slugify
 
 ROOT = Path(__file__).resolve().parents[2]
-#: Files outside of `docs/` that are pages of the site, by their path in the repository.
+#: Files outside of `docs/` that become pages of the site, by their path in the repository.
 PAGES = {"drakegrasp/models/README.md": "reference/models.md"}
-#: A link in Markdown to a file of the repository: its text, path and anchor.
+#: A Markdown link to a file of the repository: its text, path and anchor.
 LINK = re.compile(r"(\]\()((?:\.\./)*[\w./-]+\.md)((?:#[^)]*)?\))")
 
 
@@ -35,9 +36,9 @@ def on_files(files: Files, *, config: Any) -> Files:
 
 
 def on_page_markdown(text: str, *, page: Any, **_: Any) -> str:
-    """Turn links between `docs/` and the files of PAGES to the pages of the site."""
+    """Replace links between `docs/` and the files of PAGES by links to the pages of the site."""
     home = PurePosixPath(page.file.src_uri)
-    # Where the page lies in the repository, from which its links are right on GitHub.
+    # Path of the page in the repository; its links are relative to this path on GitHub.
     origin = {target: PurePosixPath(source) for source, target in PAGES.items()}.get(
         str(home), PurePosixPath("docs") / home
     )
@@ -63,5 +64,5 @@ def _normal(path: PurePosixPath) -> str:
 
 
 def _relative(target: str, page: PurePosixPath) -> str:
-    """Return the link from a page to another, both below `docs/`."""
+    """Return the link from a page to a target, both below `docs/`."""
     return "../" * (len(page.parts) - 1) + target

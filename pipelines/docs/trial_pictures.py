@@ -1,8 +1,8 @@
-"""Third-person pictures of a trial with hand and object, for the README and the docs.
+"""Third-person pictures of the hand and object of a trial, for the README and the docs.
 
-In: a dataset's directory and the number of a trial. Out: pictures of its stages, rendered from
-the poses and joint positions in trials.hdf5, and the panels of the figure of all frames.
-Nothing is simulated.
+In: a dataset's directory and the number of a trial. Out: pictures of its stages, rendered from the
+poses and joint positions in trials.hdf5, and the panels of the figure of all frames. Nothing is
+simulated.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from drakegrasp.pictures.rendered import frustum, load_trial
 from drakegrasp.pictures.still_scene import NO_SHADOWS, StillScene, camera_pose
 from drakegrasp.vision.camera import Picture
 
-#: Edge of the table where the world's origin below it must be seen [m].
+#: Edge length of a table so small that the world's origin below it is visible [m].
 SMALL_TABLE = 0.28
-#: Azimuth between a camera's line of sight and the view that shows it from the side [rad].
+#: Azimuth between a camera's line of sight and the view that shows this line from the side [rad].
 SIDE_VIEW = np.deg2rad(62.0)
-#: For the picture of the lift the camera rises by this share of the lift, and moves back by this
-#: share of its distance.
+#: For the picture of the lift the camera rises by the fraction FOLLOW of the lift, and moves back
+#: by the fraction BACK of its distance.
 FOLLOW, BACK = 0.85, 0.3
 
 
@@ -38,7 +38,7 @@ def render_trial(out: Path, trial_id: int, *, size: tuple[int, int] = (480, 480)
     Raises:
         DataError: If the trial does not exist, or ended before the lift.
     """
-    # One view for the first two.
+    # The first two pictures share one view.
     trial = load_trial(out, trial_id)
     scene = trial.scene
     X_WC = scene.choose_view(np.vstack([scene.outline(p) for p in (trial.place, trial.close)]))
@@ -47,8 +47,8 @@ def render_trial(out: Path, trial_id: int, *, size: tuple[int, int] = (480, 480)
         scene.pose(poses)
         pictures.append(scene.picture(X_WC, size))
 
-    # For the lift the camera follows part of the way, so that the table stays in view and the gap
-    # below the object is seen.
+    # For the lift the camera rises only part of the way, so that the table stays in view and the
+    # gap below the object is visible.
     rise = trial.lift.X_WG[:3, 3] - trial.close.X_WG[:3, 3]
     distance = float(np.linalg.norm(X_WC[:3, 3] - trial.close.X_WO[:3, 3]))
     back = make_pose(np.eye(3), [0.0, 0.0, -BACK * distance])
@@ -68,7 +68,7 @@ def frames_panels(out: Path, trial_id: int) -> list[Panel]:
     Raises:
         DataError: If the trial is not a sample.
     """
-    # The frames of the sample's files, and those of the trial in the world.
+    # The frames in the sample's files, and those of the trial in the world.
     sample, K = find_sample(out / DATA_FILES["otm"], trial_id)
     X_WC = X_WT @ unpack_pose(sample.props["frame_work2cam_otm"])
     X_WI = X_WC @ unpack_pose(sample.props["frame_cam2img_otm"])
@@ -80,7 +80,7 @@ def frames_panels(out: Path, trial_id: int) -> list[Panel]:
     # The overview, on a small table that does not hide the world's origin below it.
     small = StillScene(scene.hand, trial.model, table_size=SMALL_TABLE)
     around = np.vstack([np.zeros((1, 3)), small.outline(trial.close), X_WC[None, :3, 3]])
-    # Look at the camera's line of sight almost from the side, so that its length is seen.
+    # Look at the camera's line of sight almost from the side, so that its length is visible.
     azimuth = float(np.arctan2(X_WC[1, 2], X_WC[0, 2])) + SIDE_VIEW
     lines = [np.vstack([np.zeros(3), X_WT[:3, 3]]), np.vstack([X_WG[:3, 3], X_WC[:3, 3]])]
     afar = Panel(
@@ -113,7 +113,7 @@ def frames_panels(out: Path, trial_id: int) -> list[Panel]:
         arrows=contacts,
     )
 
-    # What the dataset's camera saw.
+    # The image of the dataset's camera.
     rgb = np.rint(255.0 * np.moveaxis(sample.image[:3], 0, 2)).astype(np.uint8)
     seen = Panel(
         title="image (otm): pixels, image frame",

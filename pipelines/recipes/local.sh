@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# A build on this machine, a worker on every core. The same command goes on where it stopped.
+# A build on this machine, with a worker on every core. The same command continues a stopped build.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# A build on a scheduler that runs already. Its workers need one thread each:
+# A build on a scheduler that is already running. Its workers need one thread each:
 #     python pipelines/make_certificates.py keys
 #     tls="--tls-ca-file keys/ca.pem --tls-cert keys/cert.pem --tls-key keys/key.pem"
 #     dask scheduler $tls --protocol tls --host 127.0.0.1 --scheduler-file scheduler.json

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# A build whose workers are SLURM jobs of their own: they start as the queue lets them, and
-# each that reaches its walltime is replaced. Run it where jobs are submitted, in tmux or
-# screen: this process hands out the work. Partition, account and the like are taken from
+# A build in which each worker is a SLURM job: jobs start as the queue lets them, and a job that
+# reaches its walltime is replaced. Run the script where jobs are submitted, in tmux or screen,
+# because this process hands out the work. Partition, account and similar settings are read from
 # ~/.config/dask/jobqueue.yaml (see jobqueue.yaml beside this file).
 # Needs: pip install 'drakegrasp[jobqueue]'.
 set -euo pipefail
