@@ -3,16 +3,16 @@
 In: an object, the physics configuration and, for grasps, a hand. Out: a `scene.Scene`, or a
 `scene.ObjectScene` without a hand.
 
-The hand hangs on three prismatic joints from the world and on a frame that is welded to the palm.
-That frame's rotation is set in the context: the palm's orientation is exact and constant, and the
-plant needs no rotational wrist joints (our own construction).
+The hand is attached to the world by three prismatic joints and a frame that is welded to the palm.
+The rotation of this frame is set in the context. So the palm's orientation is exact and constant,
+and the plant needs no rotational wrist joints (our own construction).
 
-Friction and mass are values of a scene's context: they are set for an attempt without building it
-anew, and the results are the same bits as those of a scene that is built with them.
+Friction and mass are values of a scene's context. They are set for an attempt without building the
+scene again, and the results have the same bits as those of a scene that was built with them.
 
-Three traps of Drake 1.51.1 shape this module. Geometry on the world body crashes as soon as a
-joint is locked, so the table is a body of its own. `AddMultibodyPlantSceneGraph` leaks the plant.
-Sampled output ports report the contacts of the step before.
+Three pitfalls of Drake 1.51.1 affect this module. Geometry on the world body crashes as soon as a
+joint is locked, so the table is a separate body. `AddMultibodyPlantSceneGraph` leaks the plant.
+Sampled output ports report the contacts of the previous step.
 """
 
 from __future__ import annotations
@@ -78,26 +78,26 @@ from drakegrasp.simulation.conditions import Materials
 from drakegrasp.simulation.scene import Motor, ObjectScene, Scene, joint_limits
 from drakegrasp.vision.camera import object_colour
 
-#: Mass of each of the three bodies that carry the wrist [kg]; small compared to the hand's.
+#: Mass of each of the three bodies of the wrist [kg]; small compared to the hand's.
 WRIST_BODY_MASS = 0.02
 #: Wrist gains [N/m], [N s/m]: under 2 kg the wrist sags by 0.02 mm.
 WRIST_STIFFNESS, WRIST_DAMPING = 1e6, 1e4
 #: Gain of the velocity-controlled fingers [N m s/rad]: a finger that is 0.1 rad/s too slow gets a
-#: torque of 2 N m. That of fingers that slide follows from `description.SLIDE`.
+#: torque of 2 N m. The gain of sliding fingers follows from `description.SLIDE`.
 FINGER_DAMPING = 20.0
 #: Drake requires a positive stiffness [N m/rad]; this one adds less than a millionth of the torque.
 FINGER_STIFFNESS = 1e-6
-#: A motor of its own that is this far from its path [rad, or 0.1 m] gives all its torque, and its
+#: A separate motor that is this far from its path [rad, or 0.1 m] applies its full torque, and its
 #: damping is its stiffness times this time [s]; own choices.
 SOFT, LAG = 0.1, 0.1
-#: Distance above the table at which the solver knows of a contact before it has a force [m]: a flat
-#: base on a stiff table jitters without it (RobotLocomotion/drake#21514). An edge or a tip sinks in
-#: by about twice as much.
+#: Distance above the table at which the solver considers a contact before it has a force [m].
+#: Without it, a flat base on a stiff table jitters (RobotLocomotion/drake#21514). An edge or a tip
+#: sinks in by about twice as much.
 TABLE_MARGIN = 5e-5
 #: Resolution hint for the few hand parts that are cylinders [m]; boxes and meshes ignore it.
 RESOLUTION_HINT = 0.005
 #: Frames per simulated second in Meshcat [Hz]. A power of two makes their times exact, so that
-#: rounding merges no two of them.
+#: rounding errors do not merge any two of them.
 MESHCAT_RATE = 32.0
 
 #: Group and name of a shape's coefficient of friction.
@@ -110,17 +110,17 @@ def build_scene(
     """Return the scene of an object, the table and a hand.
 
     The object has two rigid hydroelastic surfaces: the hand meets its exact collision mesh, the
-    table a surface that carries well. The table and every part of the hand are compliant, so that
-    each contact with the object is hydroelastic.
+    table a surface that provides stable support. The table and every part of the hand are
+    compliant, so that each contact with the object is hydroelastic.
 
-    `Scene.coarse_scene` builds the scene with coarse steps when it is first called,
-    `Scene.own_motors` that with a motor for each joint of the fingers.
+    `Scene.coarse_scene` builds the scene with coarse steps when it is first called, and
+    `Scene.own_motors` the scene with a motor for each joint of the fingers.
 
     Args:
-        model: The object; its own friction, if it has one, wins.
+        model: The object; its own friction, if it has one, takes precedence.
         physics: Materials, solver and time step.
         hand: The hand.
-        meshcat: Where to show the scene while it is simulated; the results are the same bits.
+        meshcat: Where to show the scene while it is simulated; the results have the same bits.
     """
     physics, hand = model.own_physics(physics), within_load(hand, physics.finger_load)
     own = cache(partial(_with_coarse, model, physics, hand, meshcat, own_motors=True))
@@ -135,7 +135,7 @@ def _with_coarse(
     *,
     own_motors: bool = False,
 ) -> Scene:
-    """Return a scene that knows how to build the one with coarse steps."""
+    """Return a scene that can build its scene with coarse steps."""
     build = partial(_build, model, hand=hand, meshcat=meshcat, own_motors=own_motors)
     scene = build(physics=physics)
     if physics.coarse_steps == 1:
@@ -155,10 +155,11 @@ def build_object_scene(
     """Return the scene of an object and the table; see `build_scene`.
 
     Args:
-        model: The object; its own friction, if it has one, wins.
+        model: The object; its own friction, if it has one, takes precedence.
         physics: Materials, solver and time step.
         meshcat: Where to show the scene while it is simulated.
-        resting_surface: What the table meets, in {O}; the object's `resting_surface` if None.
+        resting_surface: Surface that meets the table, in {O}; None for the object's
+            `resting_surface`.
     """
     physics = model.own_physics(physics)
     builder, drawn = _draft(model, physics, resting_surface or model.resting_surface, meshcat)
@@ -178,7 +179,7 @@ def _draft(
         time_step=physics.time_step,
         contact_model="hydroelastic_with_fallback",
         discrete_contact_approximation=physics.solver,
-        # Sampled ports would report the contacts of the step before.
+        # Sampled ports would report the contacts of the previous step.
         use_sampled_output_ports=False,
     )
     plant, scene_graph = AddMultibodyPlant(config, builder)
@@ -189,7 +190,7 @@ def _draft(
     table_side = _add_surface(plant, object_body, "table", resting_surface, physics)
     table = _add_table(plant, scene_graph, physics)
 
-    # A recording shows it.
+    # A recording needs a visual shape.
     if meshcat is not None:
         _add_visual(plant, object_body, model)
         rate = MeshcatVisualizerParams(publish_period=1.0 / MESHCAT_RATE)
@@ -223,7 +224,7 @@ def _build(
     _make_compliant_hand(plant, scene_graph, instance, fingertips, physics)
     plant.Finalize()
 
-    # What needs the finalized plant: collision filters and the wrist's input.
+    # Add what needs the finalized plant: collision filters and the wrist's input.
     parts = [geometry for geometry, _ in drawn["parts"]]
     manager = scene_graph.collision_filter_manager()
     _part_surfaces(plant, manager, (drawn["object"], drawn["table"]), parts)
@@ -233,7 +234,7 @@ def _build(
         plant.get_desired_state_input_port(drawn["wrist_instance"]),
     )
 
-    # Motors of their own follow a path; the command of the hand file's never changes.
+    # Separate motors follow a path; the command of the hand file's motors never changes.
     command, path = plant.get_desired_state_input_port(instance), None
     if own_motors:
         still = PiecewisePolynomial(np.zeros((len(drawn["motors"]), 1)))
@@ -251,7 +252,7 @@ def _build(
 def _add_surface(
     plant: MultibodyPlant, body: RigidBody, name: str, surface: Solid, physics: PhysicsConfig
 ) -> GeometryId:
-    """Add a rigid hydroelastic surface in {O} to the object, named after what it meets."""
+    """Add a rigid hydroelastic surface in {O} to the object, named after its contact partner."""
     properties = ProximityProperties()
     AddRigidHydroelasticProperties(properties)
     _add_material(properties, object_friction(physics), physics)
@@ -265,17 +266,17 @@ def _surface_mesh(surface: Solid, name: str) -> Mesh:
 
 
 def swap_object(scene: Scene, model: ObjectModel, physics: PhysicsConfig) -> Scene:
-    """Return a scene of another object that shares its diagram with a scene that is built.
+    """Return a scene of another object that shares its diagram with an existing scene.
 
-    Hand and table take nine tenths of the time of building a scene. The new scene has a context of
-    its own, in which the object has other surfaces and another inertia; an attempt in it gives the
-    same bits as in a scene that is built. One of the two is simulated at a time: the wrist's path
-    and the limits of joints belong to the diagram.
+    Hand and table take nine tenths of the time of building a scene. The new scene has its own
+    context, in which the object has other surfaces and another inertia. An attempt in it gives the
+    same bits as in a scene that was built. Only one of the two scenes may be simulated at a time,
+    because the wrist's path and the limits of joints belong to the diagram.
 
     Args:
-        scene: Of the same hand, without Meshcat.
+        scene: A scene of the same hand, without Meshcat.
         model: The other object.
-        physics: That of the scene, but for friction.
+        physics: Physics of the scene, except for friction.
     """
     context = scene.simulator.get_context().Clone()
     graph_context = scene.scene_graph.GetMyMutableContextFromRoot(context)
@@ -284,7 +285,7 @@ def swap_object(scene: Scene, model: ObjectModel, physics: PhysicsConfig) -> Sce
     for geometry, (name, surface) in zip(ids, surfaces.items(), strict=True):
         mesh = _surface_mesh(surface, name)
         scene.scene_graph.ChangeShape(graph_context, scene.plant.get_source_id(), geometry, mesh)
-    # A new shape meets everything.
+    # A new shape collides with everything until it is filtered.
     _part_surfaces(
         scene.plant,
         scene.scene_graph.collision_filter_manager(graph_context),
@@ -295,7 +296,7 @@ def swap_object(scene: Scene, model: ObjectModel, physics: PhysicsConfig) -> Sce
         scene.plant.GetMyMutableContextFromRoot(context), object_inertia(model, model.mass)
     )
 
-    # So do the scenes with coarse steps and with a motor for each joint, when they are needed.
+    # The scenes with coarse steps and with a motor for each joint are swapped on demand.
     others = {"coarse_scene": scene.coarse_scene, "own_motors": scene.own_motors}
     swapped: dict[str, Any] = {
         name: cache(lambda known=known: swap_object(known(), model, physics))
@@ -308,8 +309,8 @@ def swap_object(scene: Scene, model: ObjectModel, physics: PhysicsConfig) -> Sce
 
 
 def object_inertia(model: ObjectModel, mass: float) -> SpatialInertia:
-    """Return the spatial inertia of an object in {O} that has a mass [kg] of any amount."""
-    # Mass properties about Ocm in {O}; Drake shifts them to the origin of {O}.
+    """Return the spatial inertia of an object in {O}, scaled to a mass [kg]."""
+    # Mass properties are about Ocm in {O}; Drake shifts them to the origin of {O}.
     I = mass / model.mass * model.I_OOcm_O  # noqa: E741
     return SpatialInertia.MakeFromCentralInertia(
         mass,
@@ -319,7 +320,7 @@ def object_inertia(model: ObjectModel, mass: float) -> SpatialInertia:
 
 
 def _add_visual(plant: MultibodyPlant, body: RigidBody, model: ObjectModel) -> None:
-    # Show the collision surface: its number of faces is bounded, that of the file is not.
+    # Show the collision surface: its number of faces is bounded, unlike that of the file.
     text = obj_text(model.collision_vertices, model.collision_faces, normals=True)
     mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", model.name)))
     colour = np.array([*object_colour(model.name), 1.0])
@@ -342,15 +343,16 @@ def object_friction(physics: PhysicsConfig) -> float:
     """Return the object's own friction coefficient.
 
     Drake combines the coefficients a, b of a pair to 2 a b / (a + b). If the object has the larger
-    of the two effective values, a positive coefficient of each partner gives the effective value.
+    of the two effective values, each effective value results from a positive coefficient of the
+    partner.
     """
     return max(physics.friction_hand, physics.friction_table)
 
 
 def partner_friction(effective: float, physics: PhysicsConfig) -> float:
-    """Return the coefficient of hand or table that gives the effective one with the object.
+    """Return the coefficient of hand or table that results in an effective one with the object.
 
-    With the object's own coefficient a, Drake's rule is solved for the partner's b:
+    With the object's own coefficient a, Drake's rule is solved for the partner's coefficient b:
 
         μ = 2 a b / (a + b)   ⇔   b = μ a / (2 a − μ)
     """
@@ -380,13 +382,13 @@ def _assign_proximity(
 def _add_hand(
     plant: MultibodyPlant, scene_graph: SceneGraph, hand: Hand, own_motors: bool
 ) -> dict[str, Any]:
-    """Add the hand on its wrist, and return the attributes of `Scene` that are parts of them."""
+    """Add the hand on its wrist, and return the attributes of `Scene` that describe them."""
     # Weld the palm to the wrist by frames whose poses are parameters of the context.
     wrist_instance = plant.AddModelInstance("wrist")
     wrist_joints = _add_wrist(plant, wrist_instance)
     instance = add_model(plant, hand.model)
     base = plant.GetBodyByName(hand.palm_link, instance)
-    # Links of any name may be in the hand's model: ours must not be one of them.
+    # Links in the hand's model may have any name: our frame's name must differ from them.
     palm = plant.AddFrame(
         FixedOffsetFrame("drakegrasp_palm", base.body_frame(), RigidTransform(hand.X_BG), instance)
     )
@@ -395,7 +397,7 @@ def _add_hand(
     plant.WeldFrames(wrist_frame, palm, RigidTransform())
 
     motors = (_add_own_motors if own_motors else _add_actuation)(plant, hand, instance)
-    # The arm, which is not simulated, carries the weight of the hand.
+    # The arm, which is not simulated, supports the weight of the hand.
     for weightless in (instance, wrist_instance):
         plant.set_gravity_enabled(weightless, False)
 
@@ -445,20 +447,21 @@ def _add_actuation(
 ) -> dict[str, Any]:
     """Add each finger's motor, and couple the joints that follow its closing joint.
 
-    With the closing joint's position q and the speed ω at which the hand closes, a motor gives
+    With the closing joint's position q and the speed ω at which the hand closes, a motor applies
 
         τ = K (0 − q) + D (ω − dq/dt), cut off at ± the finger's effort limit,
         K = `FINGER_STIFFNESS` / u², D = `FINGER_DAMPING` / u²,
 
-    where u = 1 rad, or the slide that counts as 1 rad (`Hand.closing_unit`). A rotor of inertia I
-    behind a gear of ratio n adds n² I to the joint. A coupled joint is at r q + q₀, with the ratio
-    and the offset of the hand file; so are the joints of a finger that this one drives.
+    where u = 1 rad, or the slide that is treated as equal to 1 rad (`Hand.closing_unit`). A rotor
+    of inertia I behind a gear of ratio n adds n² I to the joint. A coupled joint is at r q + q₀,
+    with the ratio and the offset of the hand file. The joints of a finger that this finger drives
+    are coupled in the same way.
 
     Returns:
-        The attributes of `Scene` that say of the motors.
+        The attributes of `Scene` that describe the motors.
     """
-    # Fingers of one motor push equally, so that the couplings carry no more than what is uneven:
-    # in Drake they are stiff, but not rigid.
+    # Fingers that share a motor push equally, so that the couplings only transmit differences. In
+    # Drake, couplings are stiff, but not rigid.
     actuators = []
     for i, unit in enumerate(hand.closing_unit.tolist()):
         finger = _with_share(hand, i)
@@ -466,7 +469,7 @@ def _add_actuation(
         gains = PdControllerGains(p=FINGER_STIFFNESS / unit**2, d=FINGER_DAMPING / unit**2)
         actuators.append(_add_motor(plant, finger.name, joint, finger, gains))
 
-    # Each motor moves the closing joint of its finger, and what follows it.
+    # Each motor moves the closing joint of its finger, and the joints that follow it.
     motors, driven = [], []
     for m, i in enumerate(hand.motor_fingers):
         own = [i, *(j for j in np.flatnonzero(hand.motor_of == m).tolist() if j != i)]
@@ -486,18 +489,18 @@ def _add_actuation(
 def _add_own_motors(
     plant: MultibodyPlant, hand: Hand, instance: ModelInstanceIndex
 ) -> dict[str, Any]:
-    """Add a motor for every joint from the palm to a fingertip that can have one.
+    """Add a motor for every joint between the palm and a fingertip that can have one.
 
-    With the position q of the joint and the position q_d and speed of its path, a motor gives
+    With the position q of the joint and the position q_d and speed of its path, a motor applies
 
         τ = K (q_d − q) + D (dq_d/dt − dq/dt), cut off at ± the effort limit τ_max,
         K = τ_max / (`SOFT` u), D = K `LAG`,
 
-    with effort limit, holding effort, rotor and gear of the finger's closing joint; fingers of one
-    motor have equal shares of its efforts. `Hand.own_motors` says which joints have one.
+    with effort limit, holding effort, rotor and gear of the finger's closing joint. Fingers that
+    share a motor have equal fractions of its efforts. `Hand.own_motors` lists these joints.
 
     Returns:
-        The attributes of `Scene` that say of the motors.
+        The attributes of `Scene` that describe the motors.
     """
     motors: list[Motor] = []
     fingers, own = list[Finger](), hand.own_motors
@@ -514,7 +517,7 @@ def _add_own_motors(
 
 
 def _with_share(hand: Hand, i: int) -> Finger:
-    """Return a finger with the efforts that it has where all fingers of its motor press equally."""
+    """Return a finger with its fraction of efforts if all fingers of its motor press equally."""
     ratio = hand.closing_ratio[:, hand.motor_of[i]]
     share, finger = float(ratio[i] / ratio.sum()), hand.fingers[i]
     holding = None if finger.holding_effort is None else share * finger.holding_effort
@@ -575,12 +578,12 @@ def _part_surfaces(
     bodies: tuple[RigidBody, RigidBody],
     parts: Sequence[GeometryId],
 ) -> None:
-    """Let the hand's parts meet one surface of the object alone, the table the other one alone."""
+    """Let the hand's parts meet only one surface of the object, and the table only the other."""
     (hand_side, table_side), slab = map(plant.GetCollisionGeometriesForBody, bodies)
     declare = CollisionFilterDeclaration()
     declare.ExcludeBetween(GeometrySet(hand_side), GeometrySet(slab))
     declare.ExcludeBetween(GeometrySet(table_side), GeometrySet(parts))
-    # Drake does this for a body's first shapes, but not for those that replace them.
+    # Drake does this for a body's first shapes, but not for shapes that replace them.
     declare.ExcludeWithin(GeometrySet([hand_side, table_side]))
     manager.Apply(declare)
 
@@ -604,7 +607,7 @@ def _filter_within_hand(
     every_tip = GeometrySet([geometry for tip in tips for geometry in tip])
     others = GeometrySet([geometry for link in links.values() for geometry in link])
 
-    # Exclude all pairs but those of two fingertips.
+    # Exclude all pairs except for pairs of two fingertips.
     manager = scene_graph.collision_filter_manager()
     manager.Apply(CollisionFilterDeclaration().ExcludeWithin(others))
     manager.Apply(CollisionFilterDeclaration().ExcludeBetween(others, every_tip))
@@ -612,15 +615,15 @@ def _filter_within_hand(
         manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(tip)))
 
 
-# Friction and mass of a scene that is built
+# Friction and mass of an existing scene
 
 
 def set_materials(scene: Scene, materials: Materials) -> None:
-    """Give a scene the friction and mass of an attempt; nothing is done where it has them.
+    """Set the friction and mass of a scene to those of an attempt, unless it already has them.
 
     Args:
-        scene: Of the object and a hand.
-        materials: What the scene has from now on.
+        scene: Scene of the object and a hand.
+        materials: Friction and mass from now on.
     """
     if scene.object.get_mass(scene.context) != materials.mass:
         inertia = object_inertia(scene.model, materials.mass)
@@ -630,7 +633,7 @@ def set_materials(scene: Scene, materials: Materials) -> None:
 
 
 def copy_materials(scene: Scene, before: Scene) -> None:
-    """Give a scene the friction and mass of another one of the same object and hand."""
+    """Copy the friction and mass of another scene of the same object and hand."""
     if scene.object.get_mass(scene.context) != before.object.get_mass(before.context):
         inertia = before.object.CalcSpatialInertiaInBodyFrame(before.context)
         scene.object.SetSpatialInertiaInBodyFrame(scene.context, inertia)
@@ -639,8 +642,8 @@ def copy_materials(scene: Scene, before: Scene) -> None:
 
 
 def _set_friction(scene: Scene, geometry: GeometryId, mu: float) -> None:
-    """Give a shape its own coefficient of friction, if it has another one."""
-    # Assigning properties computes the shape's hydroelastic form again, which takes time.
+    """Set a shape's own coefficient of friction, if it has another one."""
+    # Assigning properties recomputes the shape's hydroelastic representation, which takes time.
     if _friction(scene, geometry) == mu:
         return
     properties = ProximityProperties(_properties(scene, geometry))

@@ -1,19 +1,19 @@
 """The drive of the fingers: what keeps a closing joint from being pushed open during a lift.
 
-In: a scene whose closed hand is about to lift, and the kind of drive. The motor's torque stays on
-with each of them:
+In: a scene whose closed hand is about to lift, and the kind of drive. With each kind, the motor's
+torque stays on:
 
-* `torque`: nothing else holds the joint; what pushes harder than the motor pushes it open.
-* `worm`: the joint never opens. After each step its angle becomes the joint's lower limit. Where
-  the contacts load a finger by more than its `holding_effort`, the worm yields: the joint opens
-  against that torque, until it stands or closes again.
+* `torque`: only the motor holds the joint; a load larger than its torque pushes the joint open.
+* `worm`: the joint never opens. After each step its angle becomes the joint's lower limit. If the
+  contacts load a finger by more than its `holding_effort`, the worm yields: the joint opens against
+  that torque until it stops or closes again.
 * `locked`: the joint keeps its angle, whatever the load.
 
-Of a closing joint that slides, angles are lengths [m] and torques are forces [N]. A joint with a
-motor of its own closes towards the position to which it is commanded.
+For a sliding closing joint, angles are lengths [m] and torques are forces [N]. A joint with its own
+motor closes towards its commanded position.
 
-Limits of joints and actuators belong to the plant, not to its context: `disengage` restores them
-after a lift, and `hand_over` carries them to the scene that continues one.
+Limits of joints and actuators belong to the plant and not to its context. So `disengage` restores
+them after a lift, and `hand_over` moves them to the scene that continues a lift.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from drakegrasp.simulation.scene import (
     joint_limits,
 )
 
-#: A finger that opens more slowly than this stands, in the unit of its closing joint [1/s].
+#: A finger that opens more slowly than this is at rest, in the unit of its closing joint [1/s].
 STANDING = 1e-4
-#: Efforts that differ by less than this share are the same.
+#: Efforts that differ by less than this fraction are equal.
 ROUNDING = 1e-9
 
 
@@ -64,8 +64,8 @@ def engage(scene: Scene, drive: Drive) -> None:
     """Let the drive hold the closing joints at their angles from now on.
 
     Args:
-        scene: Its motors are on.
-        drive: See the module.
+        scene: The scene, with its motors on.
+        drive: The kind of drive, see the module.
     """
     if drive == "torque":
         return
@@ -73,7 +73,7 @@ def engage(scene: Scene, drive: Drive) -> None:
     for joint, sign, angle, limits in zip(
         scene.closing_joints, signs, signs * angles, scene.closing_limits, strict=True
     ):
-        # A joint that closed up to its limit may be a little beyond.
+        # A joint that closed up to its limit may be slightly beyond it.
         _, upper = _signed(limits, sign)
         least = angle if drive == "locked" else min(angle, upper)
         _set_limits(joint, *_signed((least, angle if drive == "locked" else upper), sign))
@@ -82,7 +82,7 @@ def engage(scene: Scene, drive: Drive) -> None:
 
 
 def disengage(scene: Scene) -> None:
-    """Give the closing joints and their motors the limits of the hand's files again."""
+    """Restore the limits of the closing joints and their motors to those of the hand's files."""
     scene.simulator.clear_monitor()
     for i, joint in enumerate(scene.closing_joints):
         _set_limits(joint, *scene.closing_limits[i])
@@ -107,11 +107,11 @@ def hand_over(scene: Scene, before: Scene) -> None:
 
 
 def opening_torques(scene: Scene) -> Array:
-    """Return the torque (m,) [N m or N] by which contacts push each closing joint open now.
+    """Return the torque (m,) [N m or N] by which contacts now push each closing joint open.
 
-    Contacts act on joint j of the hand with the torque τ_j = Σ J_jᵀ f, the sum over all contact
-    forces f, where J_j dq_j/dt is the velocity that the joint gives to a force's point. Where motor
-    i moves joint j at the ratio r_ij, virtual work makes the load of its closing joint
+    Contacts act on joint j of the hand with the torque τ_j = Σ J_jᵀ f. The sum is over all contact
+    forces f, and J_j dq_j/dt is the velocity that the joint gives to a force's point. If motor i
+    moves joint j at the ratio r_ij, virtual work gives the load of its closing joint
 
         τ_i = − Σ_j r_ij τ_j,   with r = 1 for the closing joint itself.
     """
@@ -121,7 +121,7 @@ def opening_torques(scene: Scene) -> Array:
     torques = np.zeros(plant.num_velocities())
     plant.SetVelocitiesInArray(scene.instance, port.Eval(scene.context), torques)
 
-    # A motor moves its joints at fixed ratios, so it carries their torques by the same ratios.
+    # A motor moves its joints at fixed ratios, so it supports their torques by the same ratios.
     return _closing_signs(scene) * np.array(
         [
             -sum(ratio * torques[joint.velocity_start()] for joint, ratio in driven.items())
@@ -131,10 +131,10 @@ def opening_torques(scene: Scene) -> Array:
 
 
 def _closing_signs(scene: Scene) -> Array:
-    """Return (m,), 1 where a larger position of a joint is closer, else -1.
+    """Return (m,), 1 for a joint that closes towards larger positions, else -1.
 
-    A motor of its own pushes towards the position to which it is commanded. A joint that passes it
-    is held from both sides.
+    A joint's own motor pushes towards its commanded position. A joint that passes this position is
+    held from both sides.
     """
     if scene.joint_trajectory is None:
         return np.ones(len(scene.closing_joints))
@@ -142,7 +142,7 @@ def _closing_signs(scene: Scene) -> Array:
 
 
 def _signed(limits: tuple[float, float], sign: float) -> tuple[float, float]:
-    """Return limits as they are, or with -1 those of the negative position; both ways alike."""
+    """Return limits unchanged for sign 1, or those of the negative position for sign -1."""
     lower, upper = limits
     return (lower, upper) if sign > 0.0 else (-upper, -lower)
 
@@ -154,34 +154,34 @@ def _start_worms(scene: Scene) -> None:
 
 
 def _turn_worms(scene: Scene, _: Context) -> EventStatus:
-    """Between two steps: follow the fingers that closed, and yield where a load is too large.
+    """Between two steps: follow the fingers that closed, and yield to a load that is too large.
 
     With the position q, the lower limit l and the load τ (`opening_torques`) of a closing joint:
 
         it holds:   l ← max(l, q);   it yields from the step on at which τ > τ_hold
-        it yields:  l ← that of the hand's files, and the motor gives up to τ_hold;
+        it yields:  l ← that of the hand's files, and the motor applies up to τ_hold;
                     it holds again, with l ← q, once dq/dt ≥ −`STANDING` u
 
-    where τ_hold is the finger's `holding_effort` and u its `Hand.closing_unit`. Of a joint that
-    closes towards smaller positions, q, l and dq/dt have the other sign.
+    where τ_hold is the finger's `holding_effort` and u its `Hand.closing_unit`. For a joint that
+    closes towards smaller positions, q, l and dq/dt have the opposite sign.
     """
     signs = _closing_signs(scene)
     angles, rates = signs * closing_angles(scene), signs * closing_rates(scene)
 
-    # Set the limits before loads are read: Drake solves this state once, for the loads and for the
-    # step that follows.
+    # Set the limits before the loads are read: Drake solves this state once, for the loads and for
+    # the following step.
     for i, effort_limit in enumerate(scene.effort_limits.tolist()):
         joint, motor = scene.closing_joints[i], scene.motors[i]
         lower, upper = _signed(joint_limits(joint), signs[i])
         yields = motor.effort_limit() > effort_limit * (1.0 + ROUNDING)
         if yields and rates[i] >= -STANDING:
-            # A finger that yielded stands again: from now on the worm holds it here.
+            # A finger that yielded is at rest again: from now on the worm holds it here.
             motor.set_effort_limit(effort_limit)
             _set_limits(joint, *_signed((min(angles[i], upper), upper), signs[i]))
         elif not yields and angles[i] > lower:
             _set_limits(joint, *_signed((min(angles[i], upper), upper), signs[i]))
 
-    # A finger whose load exceeds what its worm holds opens against just that torque.
+    # A finger whose load exceeds the strength of its worm opens against exactly that torque.
     loads, overloaded = opening_torques(scene), False
     for i, holding_effort in enumerate(scene.holding_efforts):
         assert holding_effort is not None
@@ -192,7 +192,7 @@ def _turn_worms(scene: Scene, _: Context) -> EventStatus:
             motor.set_effort_limit(holding_effort)
             overloaded = True
 
-    # What Drake has solved for this state is void then: a new state makes it solve again.
+    # Drake's solution for this state is then invalid: set the state again so that it is recomputed.
     if overloaded:
         scene.plant.SetPositions(scene.context, scene.plant.GetPositions(scene.context))
     return EventStatus.DidNothing()

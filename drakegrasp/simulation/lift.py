@@ -1,20 +1,20 @@
-"""The lift of an attempt: the object is freed, and the wrist brings it to its target.
+"""The lift of an attempt: the object is freed, and the wrist moves it to its target.
 
-In: a scene whose closed hand may lift, and the rules. Out: the contacts at the end, and where the
-object is then. First the wrist stays where it is for `lift.release_time`, so that what the object
-moves by when it becomes free can be told from what the motion adds. Two things save time without
-changing the verdict:
+In: a scene whose closed hand may lift, and the rules. Out: the contacts at the end, and the pose of
+the object then. First the wrist does not move for `lift.release_time`. So the motion of the object
+when it becomes free can be distinguished from the motion that the lift adds. Two things save time
+without changing the verdict:
 
-* While nothing moves in the hand, a step is `physics.coarse_steps` times as long: a grasp at rest
-  needs no fine steps. A second diagram takes the coarse steps; it takes over the state.
+* While nothing moves in the hand, a step is `physics.coarse_steps` times as long, because a grasp
+  at rest needs no fine steps. A second diagram takes the coarse steps; it takes over the state.
 * The lift ends early when the verdict is certain: nothing of the hand touches the object any more,
-  or object and fingers stand still and a fingertip has clearly lost the object.
+  or object and fingers do not move and a fingertip has clearly lost the object.
 
-With `lift.stop_when: lost_sample` a lift also ends, without a verdict, at the first check at which
-the object has moved more in the hand than a sample may. What is certain at that check, or at the
-end, goes first: a verdict says more than its absence.
+With `lift.stop_when: lost_sample`, a lift also ends, without a verdict, at the first check at which
+the object has moved more in the hand than a sample may. If the verdict is certain at that check, or
+at the end, the verdict takes precedence.
 
-`LiftPath` is the way of an object without a hand, for the wrenches on it: a straight minimum-jerk
+`LiftPath` is the path of an object without a hand, for the wrenches on it: a straight minimum-jerk
 motion (Flash and Hogan, 1985) at constant orientation, within the limits of the palm.
 """
 
@@ -58,10 +58,10 @@ from drakegrasp.simulation.verdict import is_lost_sample
 HELD_SHIFT, HELD_ANGLE = 5e-4, np.deg2rad(0.5)
 #: Coarse steps are taken while the object moves less than this between checks [m], [rad].
 COARSE_SHIFT, COARSE_ANGLE = 1e-4, np.deg2rad(0.1)
-#: Beyond this distance a fingertip has lost the object for good: one that counts as standing still
-#: creeps back by less than half of it before the lift ends [m].
+#: A fingertip farther than this from the object has lost it for good [m]: a fingertip that counts
+#: as not moving creeps back by less than half of this before the lift ends.
 LOST = 3e-3
-#: A fraction of a step, far above the rounding of times.
+#: A fraction of a step, far above the rounding errors of times.
 ROUNDING = 1e-6
 
 
@@ -75,12 +75,12 @@ class Lift:
         duration: Simulated time [s].
         X_TO: Pose of the object, (4, 4).
         X_OG: Pose of the palm, (4, 4).
-        slip: Distance that {O} moved in {G} since the object is free [m].
-        turn: Angle that it turned in {G} since then [rad].
-        slip_released, turn_released: The same before the wrist moved.
-        moved: Whether it was ended early because the object moved too far in the hand.
-        clearance: Least height of the hand above the table's top [m], negative below it; NaN if it
-            is not measured.
+        slip: Distance that {O} has moved in {G} since the object is free [m].
+        turn: Angle that {O} has turned in {G} since then [rad].
+        slip_released, turn_released: The same values before the wrist moved.
+        moved: Whether the lift ended early because the object moved too far in the hand.
+        clearance: Smallest height of the hand above the table's top [m], negative below it; NaN if
+            not measured.
     """
 
     contacts: Contacts
@@ -97,10 +97,10 @@ class Lift:
 
 
 def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
-    """Free the object, move the wrist to `lift.p_TG`, hold it there, and return how that ended.
+    """Free the object, move the wrist to `lift.p_TG`, hold it there, and return the result.
 
     Args:
-        scene: With the object in the closed hand.
+        scene: Scene with the object in the closed hand.
         limits: The attempt's limits.
         config: The rules.
 
@@ -110,24 +110,24 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
     """
     X_GO_start, start = _object_in_hand(scene), scene.time
 
-    # `scene` takes fine steps, `current` is the one that takes the steps that are needed now.
+    # `scene` takes fine steps; `current` is the scene that takes the steps that are needed now.
     now, current, monitor, used = start, scene, _Monitor(scene), [scene]
     slip_released, turn_released, certain, moved = 0.0, 0.0, False, False
     way = Way() if config.close.scrape_depth is not None else None
     if way is not None:
         way.look(scene)
     try:
-        # Free the object in the hand; later the wrist goes to its target.
+        # Free the object in the hand; later the wrist moves to its target.
         release(scene)
         engage(scene, drive_of(scene.hand, config.lift))
         motion = _plan_motion(scene, config)
         end = motion.begin + motion.duration + config.lift.hold_time
 
-        # Simulate from check to check until the target was held, the verdict is certain, or the
-        # object moved too far.
+        # Simulate from check to check until the hold at the target ends, the verdict is certain, or
+        # the object has moved too far.
         while now < end and not certain and not moved:
             check = min(_next_check(now, config), motion.begin if now < motion.begin else end)
-            # Stop just before a step, so that rounding moves no step across a check.
+            # Stop just before a step, so that rounding errors do not move a step across a check.
             margin = ROUNDING * current.physics.time_step if check < end else 0.0
             limits.advance(current, check - margin - current.time)
             certain = monitor.update(current, check - now, config.close.stop_speed)
@@ -135,7 +135,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
             if way is not None:
                 way.look(current)
 
-            # How far the object moved in the hand, and how far of it before the wrist moves.
+            # Measure how far the object moved in the hand, in total and before the wrist moves.
             X_GO = _object_in_hand(current)
             slip, turn = _motion(X_GO_start, X_GO)
             if now <= motion.begin:
@@ -143,7 +143,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
             if now < end and not certain:
                 moved = bool(is_lost_sample(slip, turn, config.lift))
 
-            # Choose the step for what comes next; the state moves to the diagram that has it.
+            # Choose the next step size, and move the state to the diagram that has it.
             if now < end and not certain and not moved:
                 chosen = _scene_for(scene, monitor.at_rest)
                 if chosen is not current:
@@ -153,7 +153,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
                     hand_over(chosen, current)
                 current = chosen
 
-        # Read what the hand holds now.
+        # Read the contacts at the end.
         contacts = read_contacts(current)
     finally:
         for stage in used:
@@ -184,7 +184,7 @@ def _plan_motion(scene: Scene, config: Config) -> WristMotion:
 
 
 def _next_check(now: float, config: Config) -> float:
-    """Return the time of the next check [s]: after the period, where a coarse step begins."""
+    """Return the time of the next check [s]: after the period, when a coarse step begins."""
     return _on_grid(now + config.lift.check_period, config)
 
 
@@ -202,7 +202,7 @@ class _Monitor:
     """Compares a lift with its last check.
 
     Attributes:
-        at_rest: Whether object and fingers stood still in the hand since the last check.
+        at_rest: Whether object and fingers have not moved in the hand since the last check.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -210,7 +210,7 @@ class _Monitor:
         self._tips = {body.index() for body, required in tips if required}
         self._X_GO, self._angles = _object_in_hand(scene), closing_angles(scene)
         self._unit = scene.closing_units
-        # Whether all fingertips touched the object at a check since which nothing moved: then
+        # Whether all fingertips touched the object at a check after which nothing moved; then the
         # contacts need not be computed again.
         self._held = False
         self.at_rest = False
@@ -220,8 +220,8 @@ class _Monitor:
 
         Args:
             scene: The scene that was simulated since the last check.
-            elapsed: Simulated time since then [s].
-            stop_speed: Speed of a closing joint below which it stands, in its unit [1/s].
+            elapsed: Simulated time since the last check [s].
+            stop_speed: Speed below which a closing joint is at rest, in its unit [1/s].
         """
         # Measure what moved since the last check.
         X_GO, angles = _object_in_hand(scene), closing_angles(scene)
@@ -249,7 +249,7 @@ class _Monitor:
 
 
 def _has_lost_tip(scene: Scene) -> bool:
-    """Return whether the pad of some required fingertip has lost the object for good."""
+    """Return whether the pad of a required fingertip has lost the object for good."""
     field, X_OW = scene.model.field, invert_pose(scene.pose(scene.object))
     pads = pad_points(scene.hand)
     tips = zip(scene.fingertips, pads, scene.hand.required, strict=True)
@@ -272,9 +272,9 @@ def _motion(X_GO_before: Array, X_GO: Array) -> tuple[float, float]:
     return shift, rotation_angle(multiply(invert_pose(X_GO_before), X_GO)[:3, :3])
 
 
-#: Peak speed of a minimum-jerk motion over its mean speed (Flash and Hogan, 1985).
+#: Peak speed of a minimum-jerk motion divided by its mean speed (Flash and Hogan, 1985).
 PEAK_SPEED = 15.0 / 8.0
-#: Peak acceleration of a minimum-jerk motion times duration squared over distance.
+#: Peak acceleration of a minimum-jerk motion, times duration squared, divided by distance.
 PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
 
 
@@ -285,7 +285,7 @@ class LiftPath:
     Attributes:
         X_WO: Pose at the start, (4, 4).
         p_WO_end: Position of {O} at the end, (3,) [m].
-        duration: Of the motion [s], positive; the object stays there afterwards.
+        duration: Duration of the motion [s], positive; the object stays at the end afterwards.
     """
 
     X_WO: Array
@@ -300,7 +300,8 @@ class LiftPath:
     def at(self, time: float) -> tuple[Array, Array, Array]:
         """Return position [m], velocity [m/s] and acceleration [m/s^2] of {O} at a time [s].
 
-        With s = t / T from 0 to 1 over the duration T, and the whole way d (Flash and Hogan, 1985):
+        With s = t / T from 0 to 1 over the duration T, and the whole path d (Flash and Hogan,
+        1985):
 
             p = p₀ + d (10 s³ − 15 s⁴ + 6 s⁵)
             v = d 30 s² (1 − s)² / T
@@ -338,7 +339,7 @@ def carrying_force(model: ObjectModel, acceleration: npt.ArrayLike) -> Array:
 def lift_path(X_TO: npt.ArrayLike, config: Config) -> LiftPath:
     """Return the path from a resting pose (4, 4) to p_TO = `lift.p_TG`.
 
-    Without a hand, the object's origin goes to the target of the palm.
+    Without a hand, the object's origin moves to the target of the palm.
     """
     X_WO = X_WT @ np.asarray(X_TO, dtype=float)
     p_WO_end = X_WT[:3, 3] + config.lift.p_TG

@@ -1,10 +1,10 @@
 """The state of a scene: one object, the table and one hand in a Drake diagram.
 
-An `ObjectScene` has no hand: objects settle in it. A scene is built
-once per object (`construction`) and reset for each attempt: building costs more than simulating,
-and a reset context gives the same bits as a new one. A scene makes no decisions; `settle` and
-`trial` do. An attempt steps within limits (`TrialLimits`): both ways to stop it are exceptions,
-which `trial.run_attempt` turns into outcomes.
+An `ObjectScene` has no hand: objects settle in it. A scene is built once per object
+(`construction`) and reset for each attempt, because building costs more than simulating, and a
+reset context gives the same bits as a new one. A scene makes no decisions; `settle` and `trial` do.
+An attempt steps within limits (`TrialLimits`). Each limit raises an exception, which
+`trial.run_attempt` turns into an outcome.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ ClosingJoint: TypeAlias = RevoluteJoint | PrismaticJoint
 
 
 def joint_limits(joint: ClosingJoint) -> tuple[float, float]:
-    """Return the limits of a joint now [rad or m]; they belong to the plant."""
+    """Return the present limits of a joint [rad or m]; they belong to the plant."""
     return float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
 
 
@@ -53,7 +53,8 @@ class Motor:
     """A motor: an actuator at the closing joint of each finger that it moves.
 
     Attributes:
-        actuators: The first is at the joint at which the motor's effort is told. They push equally.
+        actuators: The first one is at the motor's joint, for which its effort is given. All push
+            equally.
         ratio: Sum of the fingers' positions per position of this joint.
     """
 
@@ -61,11 +62,11 @@ class Motor:
     ratio: float = 1.0
 
     def effort_limit(self) -> float:
-        """Return the motor's largest torque or force now [N m or N], at its joint."""
+        """Return the motor's present largest torque or force [N m or N], at its joint."""
         return float(self.actuators[0].effort_limit()) * self.ratio
 
     def set_effort_limit(self, limit: float) -> None:
-        """Set it; by virtual work each actuator gives limit / ratio."""
+        """Set this limit; by virtual work, each actuator applies limit / ratio."""
         for actuator in self.actuators:
             actuator.set_effort_limit(limit / self.ratio)
 
@@ -76,11 +77,11 @@ class ObjectScene:
 
     Attributes:
         model: The object.
-        simulator: Owns the diagram's context.
+        simulator: The simulator, which owns the diagram's context.
         plant, scene_graph: The two systems of the diagram.
         object, table: The bodies.
-        table_side: The object's surface that meets the table; a hand meets the other one.
-        physics: The configuration that it was built with.
+        table_side: The object's surface for contact with the table; a hand uses the other surface.
+        physics: The configuration with which the scene was built.
     """
 
     model: ObjectModel
@@ -103,35 +104,37 @@ class ObjectScene:
         return float(self.simulator.get_context().get_time())
 
     def pose(self, body: RigidBody) -> Array:
-        """Return the pose X_WB (4, 4) of a body now."""
+        """Return the present pose X_WB (4, 4) of a body."""
         return self.plant.EvalBodyPoseInWorld(self.context, body).GetAsMatrix4()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene(ObjectScene):
-    """An object on the table, and a hand of k fingers.
+    """An object on the table, and a hand with k fingers.
 
     Attributes:
         hand: The hand.
-        instance: The plant's model of the hand; that of the wrist is `wrist_instance`.
+        instance: The plant's model instance of the hand; that of the wrist is `wrist_instance`.
         wrist_joints: Three joints that slide along the axes of {W}.
-        wrist_frame: Its rotation in the context is the palm's orientation.
+        wrist_frame: Frame whose rotation in the context is the palm's orientation.
         wrist_trajectory: The path that the wrist follows.
-        fingertips: The k links.
-        closing_joints, motors: The joints that a motor drives, and the motors: the closing joint of
-            each finger that no other one drives, or every joint of the fingers, see `own_motors`.
-        closing_limits: Of the closing joints [rad or m].
-        closing_units: (m,), how far each moves for what counts as a radian [rad or m].
+        fingertips: The k fingertip links.
+        closing_joints, motors: The joints that motors drive, and the m motors. They are the closing
+            joints of the fingers that no other finger drives, or, in the scene of `own_motors`,
+            every joint of the fingers.
+        closing_limits: Limits of the closing joints [rad or m].
+        closing_units: (m,), motion of each joint that is treated as equal to one radian [rad or m].
         effort_limits: (m,), largest torque or force of each motor [N m or N].
-        holding_efforts: Torque or force that each motor's worm holds; None if it is not known.
+        holding_efforts: Torque or force that each motor's worm holds; None if unknown.
         driven: The joints that each motor moves, with their ratios.
         still_joints: Names of the joints that no motor moves.
-        joint_trajectory: The path that motors of their own follow; None for those of the hand file.
+        joint_trajectory: The path that separate motors of all joints follow; None for the motors of
+            the hand file.
         parts: Each shape of the hand with a point inside it, (3,) in the shape's frame [m].
         coarse_scene: Returns the scene whose step is `physics.coarse_steps` times as long; every
-            call returns the same one. None where there is no such scene.
-        own_motors: Returns the scene in which each joint of the fingers has a motor of its own;
-            every call returns the same one. None where this is that scene.
+            call returns the same scene. None if there is no such scene.
+        own_motors: Returns the scene in which each joint of the fingers has its own motor; every
+            call returns the same scene. None if this is that scene.
     """
 
     hand: Hand
@@ -178,15 +181,16 @@ def reset_attempt(
     closing: npt.ArrayLike | None = None,
     q: Array | None = None,
 ) -> None:
-    """Put hand and object at the start of an attempt; only the fingers are not locked.
+    """Put hand and object at the start of an attempt; all but the fingers are locked.
 
     Args:
-        scene: With the hand.
+        scene: Scene with the hand.
         X_WO: Pose of the object (4, 4).
         X_WG: Pose of the palm (4, 4).
         spread: Angle of the spread joints [rad].
-        closing: Position of each finger's closing joint (k,) [rad or m]; None is the open hand.
-        q: Positions of all joints of the hand (j,), in the plant's order, instead of both.
+        closing: Position of each finger's closing joint (k,) [rad or m]; None for the open hand.
+        q: Positions of all joints of the hand (j,), in the plant's order; replaces spread and
+            closing.
     """
     # Unlock the wrist before positions are set, then place the object.
     context, plant = scene.context, scene.plant
@@ -194,7 +198,7 @@ def reset_attempt(
         joint.Unlock(context)
     reset_object(scene, X_WO)
 
-    # Orientation of the palm, by its frame; joints of the fingers; position of the palm.
+    # Set the palm's orientation by its frame, the joints of the fingers, and the palm's position.
     X = np.asarray(X_WG, dtype=float)
     R_WG = RotationMatrix(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]))
     scene.wrist_frame.SetPoseInParentFrame(context, RigidTransform(R_WG, np.zeros(3)))
@@ -211,8 +215,8 @@ def reset_attempt(
         joint.set_translation(context, float(p))
         joint.Lock(context)
 
-    # The spread keeps its angle: one motor drives it, and the released code locks it too. So do
-    # the joints of the preshape.
+    # The spread joints keep their angle, because one motor drives them, and the paper's released
+    # code also locks them. The joints of the preshape also keep their positions.
     _lock_still_joints(scene)
 
     # Only the fingers move while the hand closes.
@@ -225,7 +229,7 @@ def reset_attempt(
 
 
 def command_joints(scene: Scene, times: Sequence[float], positions: Sequence[Array]) -> None:
-    """Command motors of their own to positions (m,) [rad or m] at times [s], on straight ways."""
+    """Command separate motors along straight paths to positions (m,) [rad or m] at times [s]."""
     assert scene.joint_trajectory is not None
     points = np.column_stack(positions)
     straight = PiecewisePolynomial.FirstOrderHold
@@ -234,7 +238,7 @@ def command_joints(scene: Scene, times: Sequence[float], positions: Sequence[Arr
 
 
 def commanded_joints(scene: Scene) -> Array:
-    """Return the positions (m,) [rad or m] to which motors of their own are commanded now."""
+    """Return the present commanded positions (m,) [rad or m] of separate motors."""
     source = scene.joint_trajectory
     assert source is not None
     context = source.GetMyContextFromRoot(scene.simulator.get_context())
@@ -252,8 +256,8 @@ def release(scene: Scene) -> None:
 def _let_object_meet_table(scene: ObjectScene, meet: bool) -> None:
     """Include contacts between object and table in the simulation, or exclude them.
 
-    While both are static such a contact changes nothing, but computing it at each step costs more
-    than anything else before a finger touches.
+    While both are static, such a contact changes nothing, but computing it at each step would cost
+    more than everything else before a finger touches.
     """
     manager = scene.scene_graph.collision_filter_manager(
         scene.scene_graph.GetMyMutableContextFromRoot(scene.simulator.get_mutable_context())
@@ -278,7 +282,7 @@ class WristMotion:
     Attributes:
         p_start, p_end: Start and end in {W}, (3,) [m].
         begin: Time at which it begins [s].
-        duration: Of the motion [s].
+        duration: Duration of the motion [s].
     """
 
     p_start: Array
@@ -290,13 +294,13 @@ class WristMotion:
 def move_wrist(
     scene: Scene, p_WG_target: npt.ArrayLike, duration: float, *, begin: float | None = None
 ) -> WristMotion:
-    """Command a straight minimum-jerk motion of the wrist from where it is now.
+    """Command a straight minimum-jerk motion of the wrist from its present position.
 
     Args:
-        scene: With the hand.
+        scene: Scene with the hand.
         p_WG_target: Target of the palm's origin, (3,) [m]; it stays there afterwards.
-        duration: Of the motion [s].
-        begin: Time at which it begins [s]; None is now.
+        duration: Duration of the motion [s].
+        begin: Time at which it begins [s]; None for now.
     """
     motion = WristMotion(
         p_start=np.array([j.get_translation(scene.context) for j in scene.wrist_joints]),
@@ -309,10 +313,10 @@ def move_wrist(
 
 
 def _follow(scene: Scene, motion: WristMotion) -> None:
-    # A quintic Bezier curve with threefold ends starts and stops with zero speed and
-    # acceleration: the minimum-jerk motion (Flash and Hogan, 1985).
+    # A quintic Bezier curve with threefold end points starts and stops with zero speed and
+    # acceleration: it is the minimum-jerk motion (Flash and Hogan, 1985).
     points = np.column_stack([motion.p_start] * 3 + [motion.p_end] * 3)
-    # Drake reaches a command at the end of the step, so we command one step ahead; the wrist then
+    # Drake reaches a command at the end of the step, so we command one step ahead. The wrist then
     # has no lag at any step size.
     begin = motion.begin - scene.physics.time_step
     curve = BezierCurve(begin, begin + motion.duration, points)
@@ -320,15 +324,15 @@ def _follow(scene: Scene, motion: WristMotion) -> None:
 
 
 def transfer_state(scene: Scene, before: Scene, time: float, motion: WristMotion) -> None:
-    """Continue a lift in another scene, from the state that the scene before has reached.
+    """Continue a lift in another scene, from the state that the previous scene has reached.
 
     Args:
-        scene: The scene that continues; it differs from the one before in its time step alone.
-        before: The scene whose state and palm orientation it takes over.
-        time: Of the state [s]; a step of both scenes begins there.
-        motion: Of the wrist.
+        scene: The scene that continues; it differs from the previous scene only in its time step.
+        before: The previous scene, whose state and palm orientation are copied.
+        time: Time of the state [s]; a step of both scenes begins there.
+        motion: Motion of the wrist.
     """
-    # Drake steps at whole multiples of the step: a time just before one would skip a step.
+    # Drake steps at integer multiples of the step: a time just before one would skip a step.
     step = scene.physics.time_step
     scene.simulator.get_mutable_context().SetTime(round(time / step) * step)
 
@@ -339,7 +343,7 @@ def transfer_state(scene: Scene, before: Scene, time: float, motion: WristMotion
     state = before.plant.GetPositionsAndVelocities(before.context)
     scene.plant.SetPositionsAndVelocities(scene.context, state)
 
-    # Motors of their own press on to the same positions.
+    # Separate motors continue to press towards the same positions.
     if scene.joint_trajectory is not None:
         command_joints(scene, [0.0], [commanded_joints(before)])
 
@@ -357,7 +361,7 @@ def advance(scene: ObjectScene, duration: float) -> None:
 def closing_rates(scene: Scene) -> Array:
     """Return the speed of each closing joint (m,), in its unit [1/s].
 
-    By the unit (`Scene.closing_units`) one speed limit serves joints that turn and that slide.
+    With these units (`Scene.closing_units`), one speed limit applies to turning and sliding joints.
     """
     rates = [joint.GetOneVelocity(scene.context) for joint in scene.closing_joints]
     return np.array(rates) / scene.closing_units
@@ -379,7 +383,7 @@ def hand_positions(scene: Scene) -> Array:
 
 
 def hand_joint_names(scene: Scene) -> list[str]:
-    """Return the joints' names in the order of `hand_positions`."""
+    """Return the joint names in the order of `hand_positions`."""
     names = scene.plant.GetPositionNames(
         scene.instance, add_model_instance_prefix=False, always_add_suffix=False
     )
@@ -387,7 +391,7 @@ def hand_joint_names(scene: Scene) -> list[str]:
 
 
 def palm_pose(scene: Scene) -> Array:
-    """Return the pose X_WG (4, 4) of the palm now."""
+    """Return the present pose X_WG (4, 4) of the palm."""
     base = scene.plant.GetBodyByName(scene.hand.palm_link, scene.instance)
     return multiply(scene.pose(base), scene.hand.X_BG)
 
@@ -402,12 +406,12 @@ class TrialTimeout(Exception):  # noqa: N818 - named as the outcome that it beco
 
 @dataclass(frozen=True)
 class TrialLimits:
-    """When an attempt is stopped.
+    """Limits at which an attempt is stopped.
 
     Attributes:
-        deadline: Reading of `time.thread_time` at which it times out [s]. A process that was
-            suspended, or had to share its core, does not compute meanwhile.
-        max_speed: Speed of the object above which the state has exploded [m/s].
+        deadline: Reading of `time.thread_time` at which the attempt times out [s]. It does not
+            count time in which the process was suspended or another process used its core.
+        max_speed: Speed of the object above which the state has diverged [m/s].
     """
 
     deadline: float
@@ -418,7 +422,7 @@ class TrialLimits:
 
         Raises:
             TrialTimeout: If the deadline has passed.
-            StateError: If the state has exploded.
+            StateError: If the state has diverged.
         """
         advance(scene, duration)
         if time.thread_time() > self.deadline:
