@@ -83,6 +83,7 @@ def assert_clean(out: Path, *patterns: str) -> None:
         assert list(out.rglob(pattern)) == []
 
 
+@pytest.mark.nightly
 @pytest.mark.cluster
 def test_a_killed_worker_changes_nothing(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"

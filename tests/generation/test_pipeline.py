@@ -131,7 +131,8 @@ def test_changed_filter_needs_no_simulation(out: Path, small_config: Config, aga
 def test_changed_mesh_is_done_again_and_the_others_are_not(
     meshes: Path, out: Path, again: Again
 ) -> None:
-    trimesh.creation.box([0.06, 0.06, 0.12]).export(meshes / "10_box_tall.obj")
+    # No hand closes around it, so that there is little to simulate.
+    trimesh.creation.box([0.3, 0.3, 0.12]).export(meshes / "10_box_tall.obj")
     report = again(out, meshes=meshes)
     assert (report.simulated, report.reused) == (4, 8)
     assert [str(v) for v in check_dataset(out)] == []
@@ -208,18 +209,21 @@ def test_build_keeps_what_an_inspection_rejected(meshes: Path, out: Path, again:
 
 
 def test_max_grasps_cuts_after_the_last_wanted_one(
-    small_dataset: Path, small_config: Config, tmp_path: Path, again: Again
+    small_dataset: Path, small_config: Config, out: Path, again: Again
 ) -> None:
     """The rows are those of the full dataset up to each object's first success."""
-    again(tmp_path / "out", config=override_config(small_config, ["max_grasps=1"]))
-    few, full = count_funnel(tmp_path / "out"), count_funnel(small_dataset)
+    # One object is left to be tried, as long as it takes.
+    shutil.rmtree(out / "shards" / "11_box_slim")
+    report = again(out, config=override_config(small_config, ["max_grasps=1"]))
+    assert 0 < report.simulated < 4
+    few, full = count_funnel(out), count_funnel(small_dataset)
     found = full.outcomes[:, Outcome.SUCCESS] > 0
     assert np.array_equal(few.outcomes[:, Outcome.SUCCESS], found.astype(int))
-    with h5py.File(tmp_path / "out" / "trials.hdf5") as file:
+    with h5py.File(out / "trials.hdf5") as file:
         outcome, index = file["trials/outcome"][:], file["trials/object"][:]
     for i in np.flatnonzero(found):
         assert outcome[index == i][-1] == Outcome.SUCCESS
-    assert [str(v) for v in check_dataset(tmp_path / "out")] == []
+    assert [str(v) for v in check_dataset(out)] == []
 
 
 def test_damage_beyond_the_last_wanted_grasp_is_nobodys(
@@ -251,11 +255,11 @@ def test_other_configuration_is_refused_and_nothing_changes(
 def test_refused_meshes_are_listed_and_the_others_go_on(tmp_path: Path) -> None:
     meshes = tmp_path / "meshes"
     meshes.mkdir()
-    trimesh.creation.box([0.06, 0.06, 0.09]).export(meshes / "1_box_a.obj")
+    trimesh.creation.box([0.3, 0.3, 0.09]).export(meshes / "1_box_a.obj")
     trimesh.creation.box([5.0, 5.0, 5.0]).export(meshes / "2_house_a.obj")
     (meshes / "3_text_a.obj").write_text("no mesh at all\n")
     out = tmp_path / "out"
-    config = load_config(overrides=["candidates.max=2"])
+    config = load_config(overrides=["candidates.max=1"])
     report = build(find_meshes(meshes), out, config, run_here, show=False)
     assert report.objects == 1
     assert [entry.name for entry in report.refused] == ["2_house_a", "3_text_a"]
@@ -289,9 +293,9 @@ def test_names_with_spaces_and_other_alphabets_work(tmp_path: Path) -> None:
     meshes = tmp_path / "Möbel und Töpfe"
     meshes.mkdir()
     for name in ("1_чашка большая_a", "2_crème brûlée_b"):
-        trimesh.creation.box([0.06, 0.06, 0.12]).export(meshes / f"{name}.obj")
+        trimesh.creation.box([0.3, 0.3, 0.12]).export(meshes / f"{name}.obj")
     out = tmp_path / "Daten ü"
-    config = load_config(overrides=["candidates.max=2"])
+    config = load_config(overrides=["candidates.max=1"])
     build(find_meshes(meshes), out, config, run_here, show=False)
     assert count_funnel(out).names == ("1_чашка большая_a", "2_crème brûlée_b")
     assert count_funnel(out).classes == ("чашка большая", "crème brûlée")
@@ -355,7 +359,7 @@ def test_wrong_use_of_workers_is_refused(tmp_path: Path, small_meshes: Path) -> 
 def test_scheduler_that_is_not_there_is_named(
     tmp_path: Path, small_meshes: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("drakegrasp.cluster.connect.CONNECT_SECONDS", 1.0)
+    monkeypatch.setattr("drakegrasp.cluster.connect.CONNECT_SECONDS", 0.2)
     with pytest.raises(MachineError, match="must be a running Dask scheduler"):
         build_dataset(small_meshes, tmp_path / "out", scheduler="tcp://127.0.0.1:9", tls=False)
     with pytest.raises(ConfigError, match=r"begins with tls://, got tcp://127\.0\.0\.1:9: anybody"):

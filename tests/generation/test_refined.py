@@ -60,7 +60,7 @@ def config() -> Config:
             *("candidates.max=16", "unit_candidates=8", "candidates.method=[normals, rotations]"),
             *(f"refine.children={CHILDREN}", "refine.generations=2", "objects.resting_poses=3"),
             *("filters.outlier_sigma=0", "split.by=object", "objects.mass=0.2"),
-            "physics.friction_hand=1.5",
+            *("physics.friction_hand=1.5", "lift.max_speed=2", "lift.max_acceleration=20"),
         ]
     )
 
