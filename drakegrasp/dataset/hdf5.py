@@ -190,7 +190,7 @@ def sizes_in(group: h5py.Group, fields: Iterable[Field]) -> dict[str, int]:
     """Return the lengths of the letters in the shapes of the fields that a group has."""
     found: dict[str, int] = {}
     for field in fields:
-        if field.name in group:
+        if any(isinstance(axis, str) for axis in field.axes) and field.name in group:
             axes = zip(field.axes, group[field.name].shape[1:], strict=False)
             found |= {axis: length for axis, length in axes if isinstance(axis, str)}
     return {"k": found["6k"] // 6, **found} if "6k" in found else found

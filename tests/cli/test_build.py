@@ -171,7 +171,11 @@ def samples(out: Path) -> list[int]:
 
 @pytest.mark.parametrize(
     ("command", "rename"),
-    [("stats", k) for k in range(RENAMES)] + [(c, LISTED + 1) for c in ("check", "assemble")],
+    [
+        *(("stats", k) for k in (0, LISTED, RENAMES - 1)),
+        *((command, LISTED + 1) for command in ("check", "assemble")),
+        *(in_second_tier(("stats", k)) for k in range(1, RENAMES - 1) if k != LISTED),
+    ],
 )
 def test_files_appear_together_whenever_assembling_is_killed(
     killed: list[Path], tmp_path: Path, rename: int, command: str, monkeypatch: pytest.MonkeyPatch

@@ -35,6 +35,7 @@ def _name(dask_worker: Worker) -> str:
     return str(dask_worker.name)
 
 
+@pytest.mark.nightly
 def test_machine_without_opengl_is_left_out_and_one_must_be_left(
     capfd: pytest.CaptureFixture[str],
 ) -> None:

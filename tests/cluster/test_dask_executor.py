@@ -134,7 +134,7 @@ def test_where_no_worker_comes_back_it_says_so(cluster: LocalCluster) -> None:
         execute = DaskExecutor(client)
         changes: list[tuple[int, int]] = []
         execute.pool.on_change = lambda joined, left: changes.append((len(joined), len(left)))
-        results = execute(time.sleep, [0.0, 5.0])
+        results = execute(time.sleep, [0.0, 2.5])
         assert next(results) is None
         cluster.scale(0)
         with pytest.raises(MachineError, match=r"no worker for 0\.5 s; the same"):

@@ -198,7 +198,7 @@ def test_a_sound_hand_passes_whatever_else_its_model_has(tmp_path: Path, case: s
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    [name if name in ("barrett", "franka") else in_second_tier(name) for name in hand_names()],
+    [name if name == "franka" else in_second_tier(name) for name in hand_names()],
 )
 def test_every_hand_of_the_package_passes(name: str) -> None:
     reported: list[Finding] = []

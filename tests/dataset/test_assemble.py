@@ -386,6 +386,7 @@ def test_files_do_not_depend_on_the_order_of_the_tasks(out: Path) -> None:
     np.testing.assert_equal({name: arrays_of(out / name) for name in FILES}, before)
 
 
+@pytest.mark.nightly
 def test_files_do_not_depend_on_the_number_of_processes(out: Path) -> None:
     before = [(out / name).read_bytes() for name in FILES]
     with processes(2) as execute:

@@ -20,6 +20,7 @@ import pytest
 import trimesh
 from helpers.commands import run
 from helpers.datasets import OTO
+from helpers.tiers import in_second_tier
 from scipy.spatial.transform import Rotation
 
 from drakegrasp import registry
@@ -169,14 +170,15 @@ def in_order(samples: Trials, X_OG: np.ndarray) -> list[int]:
 @pytest.mark.sim
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("form", "whole"),
+    ("form", "by_mesh", "whole"),
     [
-        *(("dexgraspbench", True), ("hdf5", False), ("isaac_grasp", False)),
-        *(pytest.param(form, True, marks=pytest.mark.nightly) for form in BACK[1:]),
+        *(("dexgraspbench", False, True), ("hdf5", False, False), ("isaac_grasp", True, False)),
+        *(in_second_tier((form, True, True)) for form in BACK),
     ],
 )
 def test_what_goes_out_comes_in_again(
     form: str,
+    by_mesh: bool,
     whole: bool,
     meshes: Path,
     out: Path,
@@ -197,7 +199,7 @@ def test_what_goes_out_comes_in_again(
     ways: list[tuple[str | Path, ...]] = [("--dataset", out / OTO)]
     if form in OWN:
         ways[0] += ("--split", "train")
-    else:
+    elif by_mesh:
         ways.append(
             ("--object", meshes / f"{NAME}.obj", "--units", "cm", "--config", "fast", *rules)
         )
@@ -238,8 +240,10 @@ def test_what_names_no_resting_pose_is_tried_in_all_and_the_best_is_told(
 ) -> None:
     path, poses = tmp_path / "p.npz", len(read_manifest(out).objects[0].resting)
     with np.load(written("npz")) as known:
-        untold = {name: known[name] for name in known if name not in ("resting", "row", "object")}
-        np.savez(path, **untold, object=["other"] * len(samples))
+        untold = {n: known[n][:3] for n in known if n not in ("resting", "row", "object")}
+        np.savez(path, **untold, object=["other"] * 3)
+    samples = samples[:3]
+    assert len(set(samples["resting"].tolist())) == 3
     rules = [word for rule in (*RULES, *OBJECTS) for word in ("--set", rule)]
     mesh = ("--object", meshes / f"{NAME}.obj", "--units", "cm", "--config", "fast", *rules)
     result = run("verify", path, *mesh, "--quiet", "--workers", 1)
@@ -249,7 +253,7 @@ def test_what_names_no_resting_pose_is_tried_in_all_and_the_best_is_told(
     best = [
         f"(the best of {poses} resting poses, as none is named: {k})" for k in samples["resting"]
     ]
-    assert [v["reason"].endswith(told) for v, told in zip(found, best, strict=True)].count(True) > 3
+    assert [v["reason"].endswith(told) for v, told in zip(found, best, strict=True)].count(True) > 1
 
     # In a build each is an attempt of the row.
     table = read_attempts(path, load_hand(HAND), of=NAME)

@@ -103,6 +103,7 @@ def test_its_grasps_are_verified(passed_on: Path) -> None:
     assert verdicts and all(verdict["outcome"] != "invalid" for verdict in verdicts)
 
 
+@pytest.mark.nightly
 def test_figures_show_the_hand(passed_on: Path, tmp_path: Path) -> None:
     result = run("figures", passed_on, "--out", tmp_path / "drawn", "--quiet")
     assert result.exit_code == 0, result.output

@@ -34,6 +34,7 @@ def scenes(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / "scenes.hdf5"
 
 
+@pytest.mark.nightly
 def test_bytes_do_not_depend_on_the_number_of_workers(scenes: Path, out: Path) -> None:
     with processes(2) as execute:
         make_scenes(out, execute=execute)

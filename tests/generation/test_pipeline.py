@@ -98,13 +98,13 @@ def test_dataset_keeps_every_invariant(small_dataset: Path) -> None:
 def test_number_of_workers_changes_nothing(
     small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path
 ) -> None:
-    """One of three objects is left for the workers to prepare and to try."""
+    """One of three objects is left for the workers to prepare, and two of its units to try."""
     out = tmp_path / "out"
-    for name in ("objects", "shards"):
-        left_out = shutil.ignore_patterns("11_box_slim*")
-        shutil.copytree(small_dataset / name, out / name, ignore=left_out)
+    for name, left_out in (("objects", "11_box_slim*"), ("shards", "000000[48]*.h5")):
+        ignore = shutil.ignore_patterns(left_out)
+        shutil.copytree(small_dataset / name, out / name, ignore=ignore)
     report = build_dataset(small_meshes, out, config=small_config, workers=2, show=False)
-    assert report.simulated == 4
+    assert report.simulated == 6
     assert_same_dataset(small_dataset, out)
 
 

@@ -155,6 +155,7 @@ def test_dataset_without_the_columns_reads_as_one_of_samplers(dataset, tmp_path)
     assert np.isnan(older["posture_row"]).all()
 
 
+@pytest.mark.nightly
 def test_more_rows_complete_the_dataset_of_fewer(meshes, table, dataset, tmp_path):
     fewer = load_config(overrides=["candidates.max=2"])
     out = built(meshes, tmp_path / "out", table, fewer)

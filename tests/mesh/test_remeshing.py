@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from helpers.meshes import assert_sound, prepare, solid_of, write
 from helpers.scripts import load_script
+from helpers.tiers import few
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -105,7 +106,7 @@ def test_surface_with_few_faces_stays_as_it_is() -> None:
 
 
 @pytest.mark.usefixtures("few_faces")
-@pytest.mark.parametrize("subdivisions", [4, 5])
+@pytest.mark.parametrize("subdivisions", few([5, 4], 1))
 def test_ball_stays_a_ball(subdivisions: int) -> None:
     """5,120 faces are decimated; 20,480 are clustered before."""
     vertices, faces, (note,) = coarsen(*arrays(ball(subdivisions)))

@@ -190,6 +190,7 @@ def test_export_round_trip(tmp_path: Path) -> None:
         np.testing.assert_array_equal(loaded.faces, built.faces)
 
 
+@pytest.mark.nightly
 def test_another_process_writes_the_same_bytes(tmp_path: Path) -> None:
     here = export_builtin(tmp_path / "here", SOME)
     script = (

@@ -68,6 +68,7 @@ def test_progress_ends_at_the_total(sound: Path) -> None:
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
 
 
+@pytest.mark.nightly
 def test_two_processes_find_what_one_does(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Small tasks, with faults in the first and the last rows, in an object and in a shard."""
     (out / "shards/2_box_b/0000002-0000004.h5").unlink()

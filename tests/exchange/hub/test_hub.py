@@ -61,6 +61,7 @@ def folder(exported: Callable[[str], Path]) -> Path:
     return exported("hf")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_official_loaders_read_what_the_dataset_holds(
     dataset: Path, folder: Path, tmp_path: Path
