@@ -1,7 +1,7 @@
-"""Simulated multi-finger grasps with the images of every one, from a directory of meshes.
+"""Simulated multi-finger grasps and their images, from a directory of meshes.
 
-The names below are loaded when they are first used, so reading a dataset needs h5py and
-NumPy only, and importing this package starts neither Drake nor Dask.
+The names below are loaded when they are first used. So reading a dataset needs only h5py and
+NumPy, and importing this package starts neither Drake nor Dask.
 """
 
 from __future__ import annotations

@@ -76,36 +76,48 @@ class Limit:
 
 #: The settings of the filters; those of the hold are own choices, see docs/reference/outcomes.md.
 LIMITS = {
-    "max_slip": Limit(0.010, "positive", "[m], of the object in the hand during the lift", "null"),
-    "max_turn_deg": Limit(10.0, "positive", "of the object in the hand during the lift", "null"),
-    "other_links": Limit(0, "count", "that touch the object after the lift, at most", "null"),
+    "max_slip": Limit(
+        0.010, "positive", "motion of the object in the hand in the lift [m]", "null"
+    ),
+    "max_turn_deg": Limit(10.0, "positive", "turn of the object in the hand in the lift", "null"),
+    "other_links": Limit(0, "count", "links that touch the object after the lift", "null"),
     "min_depth_variance": Limit(
-        1e-3, "not negative", "[m^2], flatter otm depth images are removed", "zero"
+        1e-3,
+        "not negative",
+        "variance of an otm depth image [m^2]; flatter ones are removed",
+        "zero",
     ),
     "min_camera_height": Limit(
-        0.01, "number", "[m] above the table; lower cameras see the table edge-on"
+        0.01,
+        "number",
+        "height of the camera above the table [m]; from below it sees the table edge-on",
     ),
     "outlier_sigma": Limit(
-        4.0, "not negative", "deviations, per object and component of the grasp", "zero"
+        4.0, "not negative", "standard deviations, per object and component of the grasp", "zero"
     ),
     "max_surface_distance": Limit(
-        2e-3, "positive", "[m], of a contact point from the object's surface"
+        2e-3, "positive", "distance of a contact point from the object's surface [m]"
     ),
     # The paper removed such grasps by eye.
     "max_normal_angle_deg": Limit(
-        30.0, "positive", "between a contact's mean normal and the object's nearest face", "null"
+        30.0,
+        "positive",
+        "angle between a contact's mean normal and the object's nearest face",
+        "null",
     ),
     # As thresholds, the score and its parts would also remove good grasps, so they are off.
     "max_suspicion": Limit(None, "positive", "score of dataset/quality.py", "null"),
-    "max_penetration": Limit(None, "positive", "[m], of the object in a fingertip", "null"),
+    "max_penetration": Limit(
+        None, "positive", "penetration of the object in a fingertip [m]", "null"
+    ),
     "max_imbalance": Limit(
-        None, "positive", "of the fingertips' forces, as a share of the weight", "null"
+        None, "positive", "imbalance of the fingertips' forces, as a fraction of the weight", "null"
     ),
     "max_normal_sum": Limit(
-        None, "positive", "of the contact normals, per finger: 0 balanced, 1 not", "null"
+        None, "positive", "sum of the contact normals, per finger: 0 balanced, 1 not", "null"
     ),
     "max_slip_use": Limit(
-        None, "positive", "share of its friction cone that a fingertip uses", "null", later=True
+        None, "positive", "fraction of its friction cone that a fingertip uses", "null", later=True
     ),
 }
 

@@ -1,1 +1,1 @@
-"""What attempts cost, how much labels depend on choices, and the same attempts in MuJoCo."""
+"""The cost of attempts, and the same attempts in MuJoCo."""

@@ -1,1 +1,1 @@
-"""Proving a hand before it is used: files, motion, and a grasp of two simple objects."""
+"""Checks of a hand before it is used: files, motion, and grasps of simple objects."""

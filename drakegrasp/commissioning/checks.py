@@ -300,7 +300,6 @@ def check_order(hand: Hand) -> Finding:
     fingers, every order is correct.
     """
     # Angles of the pad points about Gz, measured from the first finger, must increase.
-    # Angles of the pad points about Gz: from the first one on, they rise to a full turn.
     points = pad_points_at(hand, np.zeros(hand.num_fingers))[:, :2]
     centred = points - points.mean(axis=0)
     angles = np.arctan2(centred[:, 1], centred[:, 0])

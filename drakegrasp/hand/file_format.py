@@ -71,7 +71,7 @@ class Coupling:
 
 
 class DrivenBy(BaseModel):
-    """The finger that drives another finger: closing = ratio times the closing of `finger`."""
+    """How another finger drives a finger: the closing is `ratio` times the closing of `finger`."""
 
     model_config = _STRICT
     finger: Name
@@ -111,7 +111,7 @@ class Finger:
     holding_force: Positive | None = None  # largest load of a stalled worm, sliding joint [N]
     coupled: tuple[Coupling, ...] = ()
     driven_by: DrivenBy | None = None  # None: the finger has its own motor
-    pad_region: tuple[HalfSpace, ...] = ()  # in Fi [m]; contact outside it is not the fingertip's
+    pad_region: tuple[HalfSpace, ...] = ()  # in Fi [m]; contact outside it is of another link
     pad_point: Vector  # usual contact point, in Fi [m]
     required: bool = True  # whether a grasp needs this fingertip on the object
 
@@ -120,7 +120,7 @@ class Finger:
             raise ValueError(fault)
 
     def _faults(self) -> Iterator[str]:
-        """Yield the faults of the finger that need no other part of the file to be seen."""
+        """Yield the faults of the finger alone, without the rest of the file."""
         # A finger either turns or slides; a driven finger does what its driver does.
         limits = self.torque_limit, self.force_limit
         if limits.count(None) != 1 and not (self.driven_by and limits.count(None) == 2):
@@ -297,7 +297,7 @@ class HandFile(BaseModel):
 
     def _faults(self) -> Iterator[str]:
         """Yield faults of the drive, the closing speeds, the frames and the spread."""
-        # Worms of unknown strength.
+        # A worm drive needs the holding efforts of all motors.
         own = [(i, f) for i, f in enumerate(self.fingers) if f.driven_by is None]
         for i, finger in own:
             if self.drive == "worm" and finger.holding_effort is None:

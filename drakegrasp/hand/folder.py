@@ -42,7 +42,8 @@ from drakegrasp.hand.files import (
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
 from drakegrasp.yaml_text import parse_yaml, parse_yaml_once
 
-#: Limits of a hand's files: total size [byte], YAML size [byte], number. A stranger may write them.
+#: Maximum total size [byte], YAML size [byte] and number of a hand's files; a stranger may have
+#: written them.
 LARGEST, LARGEST_YAML, MOST_FILES = 2**29, 2**18, 1000
 #: Names of licence files next to a hand file or its model; files whose lines may mention a licence.
 _LICENCE = re.compile(r"(LICEN[CS]E|COPYING|NOTICE)([._ -].*)?", re.IGNORECASE)
@@ -58,7 +59,7 @@ _PACKAGES_LINES = re.compile(r"^packages:.*\n(?:[ \t]+\S.*\n)*", re.MULTILINE)
 def hand_digest(source: HandSource) -> str:
     """Return a hash (16 hex digits) of a hand's files, see `HandFolder.digest`.
 
-    Two hands of the same name differ in it. A missing file has the hash of an empty file;
+    It differs between two hands of the same name. A missing file has the hash of an empty file;
     `description.load_hand` rejects missing files.
 
     Raises:
@@ -152,7 +153,7 @@ class HandFolder:
         return _digest(map(self.content, self.counted))
 
     def place_of(self, reference: str, base: str) -> str | None:
-        """Return the place of what a file in the folder `base` names; None if outside the folder.
+        """Return the place of a file that a file in the folder `base` names; None if outside.
 
         Raises:
             HandError: If it is outside, and the hand is a dataset's.
@@ -357,7 +358,7 @@ def carried_hand(out: Path, hand: str, digest: str) -> CarriedHand | None:
 
 
 def hand_places(config: Config) -> dict[str, Path]:
-    """Return the files of the hand that a dataset carries, by their places in its directory."""
+    """Return the files of the hand that a dataset contains, by their places in its directory."""
     carried = config.hand_source
     if not isinstance(carried, CarriedHand):
         return {}
@@ -367,7 +368,7 @@ def hand_places(config: Config) -> dict[str, Path]:
 
 
 def moved_hand(config: Config, folder: Path) -> Config:
-    """Return a configuration whose hand is a copy in another directory, at `hand_places`."""
+    """Return a configuration whose hand is a copy in another directory, at its `hand_places`."""
     carried = config.hand_source
     if not isinstance(carried, CarriedHand):
         return config

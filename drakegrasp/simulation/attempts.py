@@ -56,7 +56,6 @@ UNTOLD = -1
 #: Value of `preshape` if a row without joints is tried in each preshape of the hand.
 EACH = "each"
 #: Largest allowed difference between the length of a quaternion and one.
-#: How far the length of a quaternion may be from one.
 UNIT_TOLERANCE = 1e-3
 #: Columns of a table of postures that decide a build. The reason why a row is bad follows from the
 #: others and from the meshes; a build draws its own conditions.
@@ -274,14 +273,14 @@ class Attempts:
 
 
 def ranked(table: Attempts, of: Sequence[Any] | npt.NDArray[Any]) -> Attempts:
-    """Return a table with the rank of each row among those that are for the same.
+    """Return a table with the rank of each row among the rows with the same target.
 
-    The best is first, by its confidence; of equals the one that was given first. Confidence that is
-    no finite number becomes -inf.
+    The row with the greatest confidence is first; of equal ones, the row that was given first.
+    Confidence that is not a finite number becomes -inf.
 
     Args:
         table: The attempts.
-        of: (n,), what each is for.
+        of: (n,), target of each row, e.g. a row of a dataset.
     """
     stated = table.confidence
     if stated is not None:

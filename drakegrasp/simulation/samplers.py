@@ -35,7 +35,7 @@ R_OG0 = np.diag([1.0, -1.0, -1.0])
 #: the object's size. Different Euler angles give equal rotations only up to rounding.
 SAME_POSE = 1e-6
 #: A palm this far below the table, or a palm ray this far beside the bounding box, is still valid
-#: [m]. It is far above rounding errors and too small to matter.
+#: [m]. This distance is far above rounding errors and too small to matter.
 EDGE = 1e-6
 #: Number of combinations whose poses are computed together, which bounds the memory. With
 #: `jitter_deg` it also decides which word of the stream jitters which angle, so another number

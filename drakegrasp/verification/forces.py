@@ -271,7 +271,7 @@ def grasp_map(p_OcmQ: Array) -> Array:
 #: Edges of the pyramid that approximates a friction cone from inside. With 16 edges, epsilon is
 #: about 2 % too small and varies by as much with the frame; the hull takes 15 ms.
 FRICTION_EDGES = 16
-#: An epsilon below this is rounding: the origin is on the surface of the hull.
+#: An epsilon below this is a rounding error: the origin is on the surface of the hull.
 ROUNDING = 1e-9
 #: Largest friction coefficient that is tried, and the tolerance of the smallest one.
 MAX_FRICTION, FRICTION_TOLERANCE = 10.0, 1e-4
@@ -514,7 +514,7 @@ ENOUGH_POINTS = 3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ForceVerdict:
-    """What forces at the contacts that a prediction selects can do.
+    """What forces can do at the contacts that a prediction selects.
 
     Attributes:
         contacts: Contacts on the surface, see `surface_contacts`.

@@ -46,7 +46,6 @@ MAX_CLOSINGS = 5000
 #: a fist.
 MAX_SPREAD, MAX_CLOSING = np.deg2rad(45.0), np.deg2rad(112.0)
 #: Lever that converts angles between normals to lengths when contacts are compared [m].
-#: Lever by which normals are weighed against points when contacts are compared [m].
 LEVER = 0.02
 #: Number of postures that are aligned with the contacts.
 NEAREST = 96
@@ -64,11 +63,12 @@ Start: TypeAlias = tuple[Array, Array]
 class Postures:
     """N postures of a hand.
 
-    coordinates: (N, 1 + m), see `HandConstants.limits` [rad or m].
-    p_GP: (N, k, 3), nominal contact points in {G} [m].
-    n_G: (N, k, 3), outward pad normals there, in {G}.
-    units: (1 + m,), see `HandConstants.units` [rad or m].
-    tree: Tree of their features, see `_features`.
+    Attributes:
+        coordinates: (N, 1 + m), see `HandConstants.limits` [rad or m].
+        p_GP: (N, k, 3), nominal contact points in {G} [m].
+        n_G: (N, k, 3), outward pad normals there, in {G}.
+        units: (1 + m,), see `HandConstants.units` [rad or m].
+        tree: Tree of their features, see `_features`.
     """
 
     coordinates: Array

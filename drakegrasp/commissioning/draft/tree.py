@@ -58,7 +58,6 @@ SIDES = ("left", "right")
 NOTED = 0.01
 #: By index of a finger: the finger whose motor closes it, and its closing per that finger's
 #: closing.
-#: By number of a finger: the finger whose motor closes it, and its closing per that one's.
 _Drivers = Mapping[int, tuple[int, float]]
 
 
