@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.hdf5 import ImageRows, open_hdf5, read_rows, says_damage, write_field
 from drakegrasp.dataset.opening import open_samples
+from drakegrasp.dataset.remote import local_file
 from drakegrasp.dataset.schema import DATA_FIELDS, PREDICTED_ROW_FIELDS, SPLITS
 from drakegrasp.errors import DataError, MachineError, first_line
 from drakegrasp.grasp import unpack_grasp, unused_fingers
@@ -89,7 +90,8 @@ class GraspDataset:
     because its rows may differ. `to_torch` returns tensors for torch's DataLoader.
 
     Args:
-        path: `grasping_oto.hdf5` or `grasping_otm.hdf5`.
+        path: `grasping_oto.hdf5` or `grasping_otm.hdf5`, or its address in an object store, see
+            `dataset.remote`.
         split: `train`, `valid` or `test`.
         fewer_fingers: Whether to read a split in which some grasps leave fingers out. The contacts
             of these fingers are NaN and must not enter training unnoticed, so such a split is
@@ -116,7 +118,7 @@ class GraspDataset:
     ) -> None:
         if split not in SPLITS:
             raise DataError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
-        self.path, self.split = Path(path).absolute(), split
+        self.path, self.split = local_file(path), split
         self._file: h5py.File | None = None
         self._fields: dict[str, h5py.Dataset | ImageRows | npt.NDArray[Any]] = {}
         self._process = -1

@@ -25,6 +25,7 @@ from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.dataset.hdf5 import AnyArray, ImageRows, read_rows, read_texts
 from drakegrasp.dataset.opening import SCENE_TABLES, open_scenes, opened, refuse_other_codes
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.remote import local_file
 from drakegrasp.dataset.schema import DEPTH_UNIT, SCENE_GRASP_FIELDS, SPLITS
 from drakegrasp.dataset.trials import Trials, reopened, stamp
 from drakegrasp.errors import DataError
@@ -151,7 +152,7 @@ class SceneDataset:
                 raise DataError(f"{name} must be 1 or more, got {count}")
         if not 0.0 <= on_object <= 1.0:
             raise DataError(f"on_object must be 0 to 1, got {on_object}")
-        self.path = Path(path).absolute()
+        self.path = local_file(path)
         self.split, self.frame, self.epoch = split, frame, 0
         self._points, self._grasps, self._seed = points, grasps, seed
         self._on_object, self._noise, self._cache = on_object, noise, cache
