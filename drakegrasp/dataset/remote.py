@@ -40,7 +40,7 @@ def local_file(path: str | Path) -> Path:
         extra = "pip install 'drakegrasp[remote]'"
         raise MachineError(f"{address} needs a package: {extra} ({one_line(error)})") from None
     except Exception as error:  # each store has its own exceptions
-        got = one_line(error) or type(error).__name__
+        got = f"{type(error).__name__}: {one_line(error)}"
         raise DataError(f"{address}: must be a file that can be read, got none ({got})") from None
 
 

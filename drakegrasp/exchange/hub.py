@@ -199,8 +199,9 @@ def _croissant_type(field: Field) -> str:
 
 #: Fields by the names of columns; those that are images (`sample`) are PNG files.
 Columns = Mapping[str, Field]
-#: Rows in a file, which takes about 150 MB, and in a group of rows, which is read as a whole.
-FILE_ROWS, GROUP_ROWS = 4000, 100
+#: Size of a file [byte] after which the next one begins, as the Hub recommends it, and rows in a
+#: group, which is read as a whole.
+FILE_BYTES, GROUP_ROWS = 500_000_000, 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,17 +234,24 @@ class HubTable:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        schema, files = _schema(self.columns), -(-self.count // FILE_ROWS)
-        for number in range(files):
-            rows = range(number * FILE_ROWS, min((number + 1) * FILE_ROWS, self.count))
-            path = f"{self.config}/{self.split}-{number:05d}-of-{files:05d}.parquet"
-            (folder / self.config).mkdir(exist_ok=True)
-            with pq.ParquetWriter(folder / path, schema) as writer:
-                for start in rows[::GROUP_ROWS]:
-                    content = self.read(start, min(start + GROUP_ROWS, rows.stop))
+        schema, parts, start = _schema(self.columns), list[Path](), 0
+        (folder / self.config).mkdir(exist_ok=True)
+        while start < self.count:
+            parts.append(folder / self.config / f"{self.split}-{len(parts):05d}")
+            with parts[-1].open("wb") as file, pq.ParquetWriter(file, schema) as writer:
+                for first in range(start, self.count, GROUP_ROWS):
+                    content = self.read(first, min(first + GROUP_ROWS, self.count))
                     group = pa.Table.from_pydict(dict(content), schema=schema)
                     writer.write_table(group, row_group_size=GROUP_ROWS)
                     wrote(len(group))
+                    start = first + len(group)
+                    if file.tell() >= FILE_BYTES:
+                        break
+
+        # Their names say how many they are.
+        for number, part in enumerate(parts):
+            path = f"{self.config}/{self.split}-{number:05d}-of-{len(parts):05d}.parquet"
+            part.rename(folder / path)
             yield self, path
 
 

@@ -46,13 +46,19 @@ for camera in ("oto", "otm"):
             }
             for row in rows
         ]
+streamed = {
+    f"{camera}/{split}": [row["trial_id"] for row in rows]
+    for camera in ("oto", "otm")
+    for split, rows in datasets.load_dataset(folder, camera, streaming=True).items()
+}
 records = mlcroissant.Dataset(f"{folder}/croissant.json")
 issues = records.metadata.ctx.issues
 counts = {
     each.uuid: sum(1 for _ in records.records(each.uuid)) for each in records.metadata.record_sets
 }
 complaints = sorted(issues.errors | issues.warnings)
-print(json.dumps({"rows": found, "croissant": counts, "complaints": complaints}))
+known = {"rows": found, "streamed": streamed, "croissant": counts, "complaints": complaints}
+print(json.dumps(known))
 """
 
 
@@ -83,6 +89,7 @@ def test_official_loaders_read_what_the_dataset_holds(
             data = GraspDataset(dataset / f"grasping_{camera}.hdf5", split=split)
             rows = found["rows"][f"{camera}/{split}"]
             assert [row["trial_id"] for row in rows] == data.column("trial_id").tolist()
+            assert found["streamed"][f"{camera}/{split}"] == data.column("trial_id").tolist()
             assert found["croissant"][f"{camera}/{split}-00000-of-00001"] == len(data) > 0
             for row, sample in zip(rows, data, strict=True):
                 assert row["object_name"] == sample.props["object_name"]
@@ -187,8 +194,8 @@ def test_long_splits_are_cut_into_files(
 ) -> None:
     import pyarrow.parquet as pq
 
-    monkeypatch.setattr(table, "FILE_ROWS", 2)
-    monkeypatch.setattr(table, "GROUP_ROWS", 1)
+    monkeypatch.setattr(table, "FILE_BYTES", 1)
+    monkeypatch.setattr(table, "GROUP_ROWS", 2)
     export_dataset(dataset, tmp_path / "to", "hf")
     data = GraspDataset(dataset / "grasping_oto.hdf5", split="test")
     files = sorted((tmp_path / "to" / "oto").glob("test-*.parquet"))
