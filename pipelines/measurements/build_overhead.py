@@ -4,12 +4,12 @@
     python pipelines/measurements/speed.py build [--objects MESH_DIR] [--candidates N]
         [--set KEY=VALUE]
 
-The script builds the same dataset with one worker and with two and reads the logs. With one
-worker, all time that is not spent on scenes, attempts or images is overhead: scheduling,
-shards, the log, and waiting. It also measures how long it takes to check all shards when the
-build is asked for again. Two busy cores of one machine are slower than one: two builds of half
-the objects each, with one worker each and at the same time, show what the cores can. Prints
-JSON. It needs two idle cores.
+The script builds the same dataset with one worker and with two, and reads the logs. With one
+worker, all time that is not spent on scenes, attempts or images is overhead: scheduling, shards,
+the log, and waiting. The script also measures how long it takes to check all shards when the same
+build is requested again. Two busy cores of one machine are slower than one. To show what the cores
+can achieve, two builds of half the objects each run at the same time, with one worker each. The
+script prints JSON. It needs two idle cores.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.shapes.catalog import export_builtin
 
-#: Stages of a work unit that a plain loop without files would have as well.
+#: Stages of a work unit that a plain loop without files would also have.
 WORK = ("build", "try", "look")
 #: The built-in objects that are used by default.
 OBJECTS = (
@@ -48,13 +48,13 @@ OBJECTS = (
 
 
 def work_seconds(events: Iterable[dict[str, Any]]) -> float:
-    """Return the seconds of work in a log."""
+    """Return the seconds of work that a log reports."""
     done = (event for event in events if event["event"] == "unit done")
     return float(sum(event["seconds"][stage] for event in done for stage in WORK))
 
 
 def independent_builds(objects: str | Path, units: str, config: Config) -> list[float]:
-    """Return the seconds that two builds with one worker took, each of every other object."""
+    """Return the seconds of two simultaneous builds with one worker, of every other object each."""
     names = [source.name for source in find_meshes(objects, units=units)]
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         halves = [pool.submit(seconds, objects, units, config, 1, names[i::2]) for i in (0, 1)]
@@ -64,7 +64,7 @@ def independent_builds(objects: str | Path, units: str, config: Config) -> list[
 def seconds(
     objects: str | Path, units: str, config: Config, workers: int, only: Sequence[str] = ()
 ) -> float:
-    """Return the seconds of a whole build, the start of its workers included."""
+    """Return the seconds of a whole build, including the start of its workers."""
     with tempfile.TemporaryDirectory() as folder:
         begin = time.monotonic()
         build_dataset(
@@ -80,8 +80,8 @@ def seconds(
 
 
 def measure(objects: str | Path, units: str, config: Config, workers: int) -> dict[str, float]:
-    """Return the seconds of wall clock that the parts of a build took."""
-    # Build, and ask for the same build again.
+    """Return the wall-clock seconds of the parts of a build."""
+    # Build, and request the same build again.
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out"
         build_dataset(objects, out, config=config, units=units, workers=workers, show=False)
@@ -126,7 +126,7 @@ def measure(objects: str | Path, units: str, config: Config, workers: int) -> di
     help="[six built-in objects]",
 )
 @shared("--units", "--set")
-@click.option("--candidates", default=100, show_default=True, help="Per object.")
+@click.option("--candidates", default=100, show_default=True, help="Palm poses per object.")
 def main(objects: Path | None, units: str, overrides: tuple[str, ...], candidates: int) -> None:
     """Run the script."""
     # Both builds and the plain loops use the same meshes.

@@ -1,13 +1,14 @@
-"""Try stored lifts of a dataset again in MuJoCo, and count in how many both simulators agree.
+"""Try stored lifts of a dataset again in MuJoCo, and count how often both simulators agree.
 
     python pipelines/measurements/cross_check.py OUT 600 --out report.json
 
-The lifts are drawn with the dataset's seed, the same on every machine: in turns from samples, from
-held grasps that the filters removed, and from lost lifts, and within these from all objects. Each
-is tried from the stored palm pose and spread, with the dataset's configuration and drive. Needs the
-extra `[peer]`. Prints JSON for each group: how many lifts were drawn, are lifted in MuJoCo (all
-pads touch after closing there, and nothing else) and hold there, the shares with their 95 %
-confidence intervals, and why the others were not lifted. The report has a row per lift as well.
+The lifts are drawn with the dataset's seed, so that every machine draws the same. They are drawn in
+turn from samples, from held grasps that the filters removed, and from lost lifts, and within each
+group in turn from all objects. Each lift is tried from the stored palm pose and spread, with the
+dataset's configuration and drive. The script needs the extra `[peer]`. It prints JSON for each
+group: how many lifts were drawn, how many are lifted in MuJoCo (after closing all pads touch, and
+nothing else), how many hold there, the fractions with their 95 % confidence intervals, and why the
+others were not lifted. The report also has one row per lift.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ from drakegrasp.simulation.conditions import Materials, usual_conditions
 from drakegrasp.simulation.drive import drive_of
 
 T = TypeVar("T")
-#: What a lift is in the dataset: a sample, held but removed by the filters, or lost.
+#: Result of a lift in the dataset: a sample, held but removed by the filters, or lost.
 Group = Literal["sample", "removed", "lost"]
 GROUPS: tuple[Group, ...] = get_args(Group)
-#: Outcomes of lifts that were lost; after closing, `table_contact` is no lift. What `moved` has no
-#: verdict to compare, and is in no group.
+#: Outcomes of lifts that were lost. `table_contact` after closing is not a lift. An attempt that
+#: `moved` has no verdict to compare, and belongs to no group.
 ENDS = (*LOST, Outcome.TABLE_CONTACT)
-#: Last number of the place of the stream that draws lifts: the split's is 1.
+#: Last number of the key of the random stream that draws lifts; the split's number is 1.
 _PLACE = 2
 
 
@@ -57,13 +58,13 @@ class StoredLift:
     """A lift of a dataset.
 
     Attributes:
-        trial_id: Its row.
-        object_name: Its object.
-        group: What it is in the dataset.
-        outcome: Its verdict there.
+        trial_id: Row of the trial.
+        object_name: Name of the object.
+        group: Result of the lift in the dataset.
+        outcome: Outcome of the lift in the dataset.
         resting: Index of the object's resting pose.
-        pregrasp: The palm pose and the spread from which the hand closed.
-        materials: The friction and mass with which it was tried.
+        pregrasp: Palm pose and spread from which the hand closed.
+        materials: Friction and mass with which the lift was tried.
     """
 
     trial_id: int
@@ -76,13 +77,13 @@ class StoredLift:
 
 
 def draw_lifts(out: Path, count: int) -> list[StoredLift]:
-    """Return lifts of a dataset, in equal numbers of each group and object as far as there are any.
+    """Return lifts of a dataset, in equal numbers of each group and object as far as available.
 
-    The draw depends on the dataset and its seed alone.
+    The selection depends only on the dataset and its seed.
 
     Args:
         out: Directory of the dataset.
-        count: How many; all of them if there are fewer.
+        count: Number of lifts; all lifts are returned if there are fewer.
 
     Raises:
         DataError: If there is no dataset, or no lift in it.
@@ -93,7 +94,7 @@ def draw_lifts(out: Path, count: int) -> list[StoredLift]:
     if not lifts:
         raise DataError(f"{out}: must be a dataset with lifts, got one in which nothing was lifted")
 
-    # Each group deals its objects in turns, and the groups are dealt in turns.
+    # Each group takes its objects in turn, and the groups are taken in turn.
     piles = []
     for number, group in enumerate(GROUPS):
         members = [lift for lift in lifts if lift.group == group]
@@ -112,12 +113,12 @@ def cross_check(out: Path, count: int) -> dict[str, Any]:
 
     Args:
         out: Directory of the dataset.
-        count: How many lifts, see `draw_lifts`.
+        count: Number of lifts, see `draw_lifts`.
     """
     manifest = read_manifest(out)
     config, lifts, rows = manifest.config, draw_lifts(out, count), list[dict[str, Any]]()
 
-    # An object is cut into convex parts once.
+    # Each object is cut into convex parts only once.
     with progress_bar("cross-check", "lifts") as progress:
         for name, same in groupby(sorted(lifts, key=_by_object), key=lambda x: x.object_name):
             for row in _try_object(out, name, list(same), manifest.config_of(name)):
@@ -140,11 +141,12 @@ def agreement(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return how many lifts of a group are lifted in MuJoCo, and how many of these hold.
 
     Args:
-        rows: Of `cross_check`, under "lifts".
+        rows: Rows of the report of `cross_check`, under "lifts".
 
     Returns:
-        Numbers of lifts drawn, lifted and held; of all that were drawn and of those lifted there,
-        the share that holds with its interval, None of nothing; the outcomes of the others.
+        Numbers of lifts that were drawn, lifted and held; the fractions that hold of all drawn
+        lifts and of those lifted in MuJoCo, with their intervals (None if there are no lifts); and
+        the outcomes of the others.
     """
     lifted = [row for row in rows if row["lifted"]]
     held = sum(_holds(row) for row in lifted)
@@ -159,7 +161,7 @@ def agreement(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _share(hits: int, count: int) -> dict[str, float] | None:
-    """Return a share with its interval, None of nothing."""
+    """Return a fraction with its interval, or None if `count` is 0."""
     if not count:
         return None
     low, high = wilson_interval(hits, count)
@@ -167,15 +169,15 @@ def _share(hits: int, count: int) -> dict[str, float] | None:
 
 
 def _read_lifts(out: Path) -> list[StoredLift]:
-    """Return all lifts of a dataset, in the order of its rows: objects are together."""
-    # Only what was lifted has the time of a lift.
+    """Return all lifts of a dataset in the order of its rows: lifts of an object are together."""
+    # Only attempts that were lifted have a lift time.
     trials = Trials(out).where(outcome=[Outcome.SUCCESS, *ENDS])
-    # A hand with a motor for each joint is not in MuJoCo.
+    # The MuJoCo model does not support hands with a motor for each joint.
     trials = trials[np.isfinite(trials["time_lift"]) & ~trials["own_motors"]]
     names = [field.name for field in fields(Materials)]
     columns = ("outcome", "object_name", "removal", "X_OG", "spread", "resting", *names)
 
-    # Each lift with its group.
+    # Assign each lift to its group.
     lifts = []
     for trial_id, *values in zip(
         trials.trial_ids.tolist(), *trials.columns(columns).values(), strict=True
@@ -198,7 +200,7 @@ def _read_lifts(out: Path) -> list[StoredLift]:
 
 
 def _in_turns(piles: Iterable[Iterable[T]]) -> Iterator[T]:
-    """Yield the first of each pile, then the second of each, until all are empty."""
+    """Yield the first item of each pile, then the second of each, until all are empty."""
     nothing = object()
     every = chain.from_iterable(zip_longest(*piles, fillvalue=nothing))
     return (item for item in every if item is not nothing)  # type: ignore[misc]
@@ -208,7 +210,7 @@ def _try_object(
     out: Path, name: str, lifts: Sequence[StoredLift], config: Config
 ) -> Iterator[dict[str, Any]]:
     """Yield a row of the report for each lift of one object."""
-    # Lifts can be drawn without the extra.
+    # Imported here, so that lifts can be drawn without the extra.
     from drakegrasp.bench.mujoco_baseline import MujocoBaseline
 
     prepared = load_prepared(out, name, config)

@@ -1,11 +1,12 @@
-"""Draw faults in the rules that decide labels, as a table for `planted_faults.py`.
+"""Draw faults in the rules that decide labels, and write them as a table for `planted_faults.py`.
 
-A fault changes one operator, number, condition, call or result in a module of nine rooms: `<`
+A fault changes one operator, number, condition, call or result in a module of nine packages: `<`
 becomes `>=`, `+` becomes `-`, 0 becomes 1, `and` becomes `or`. Half of the faults are in simulation
-and verification. Texts of messages and annotations are left alone, and so are the modules that
-only draw or tell. The same seed draws the same faults of the same source. Writes YAML. The tests
-of a fault are those of its module, then others of its room, then those that import it from other
-rooms. Faults that were looked at and change no result are named in `equivalent_faults.yaml`.
+and verification. Texts of messages and annotations stay unchanged, and so do modules that only draw
+or describe. The same seed draws the same faults from the same source. The script writes YAML. The
+tests of a fault are those of its module, then others of its package, then tests of other packages
+that import the module. Faults that were examined and change no result are listed in
+`equivalent_faults.yaml`.
 """
 
 from __future__ import annotations
@@ -23,17 +24,17 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 EQUIVALENT = Path(__file__).with_name("equivalent_faults.yaml")
-#: The rooms that half of the faults are drawn from, and the others.
+#: The packages from which half of the faults are drawn, and the other packages.
 JUDGES = ("simulation", "verification")
 OTHERS = ("hand", "mesh", "objects", "vision", "dataset", "generation", "scoring")
-#: Modules and folders that draw a picture or tell a story: they decide nothing.
+#: Modules and folders that draw a picture or describe results: they decide nothing.
 _TELLING = {
     *("dataset/card.py", "generation/cautions.py", "hand/files.py", "scoring/card.py"),
     *("verification/figure.py", "vision/probe_image.py"),
 }
-#: How many imports may lie between a module and a test, in its room and elsewhere.
+#: Maximum number of imports between a module and a test, in its package and elsewhere.
 NEAR, NEAR_ELSEWHERE = 2, 1
-#: At most so many files of tests for a fault.
+#: Maximum number of test files for a fault.
 MOST_TESTS = 16
 #: An option of pytest that leaves slow tests out.
 QUICK = "-mnot server and not slow"
@@ -65,7 +66,7 @@ _NAMES |= {"maximum": "minimum", "argmin": "argmax", "argmax": "argmin", "floor"
 
 
 def modules(rooms: Sequence[str]) -> list[str]:
-    """Return the modules of rooms in which faults are drawn, in the order of their paths."""
+    """Return the modules of packages in which faults are drawn, in the order of their paths."""
     found = sorted(
         path.relative_to(ROOT / "drakegrasp")
         for room in rooms
@@ -80,7 +81,7 @@ def modules(rooms: Sequence[str]) -> list[str]:
 
 @cache
 def _imports(name: str) -> frozenset[str]:
-    """Return the files of the package that a file imports itself."""
+    """Return the files of the package that a file imports directly."""
     named: set[str] = set()
     for node in ast.walk(ast.parse((ROOT / name).read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module:
@@ -93,7 +94,7 @@ def _imports(name: str) -> frozenset[str]:
 
 @cache
 def _distances(test: str) -> dict[str, int]:
-    """Return how many modules lie between a test and each module that it needs."""
+    """Return how many modules lie between a test and each module that the test needs."""
     distances: dict[str, int] = {}
     due = deque((path, 0) for path in sorted(_imports(test)))
     while due:
@@ -105,7 +106,7 @@ def _distances(test: str) -> dict[str, int]:
 
 
 def tests_of(name: str) -> list[str]:
-    """Return the files of tests that must notice a fault of a module, the nearest first."""
+    """Return the test files that must notice a fault of a module, the nearest first."""
     room, stem = name.split("/")[1], Path(name).stem
     ranked = []
     for path in sorted((ROOT / "tests").rglob("test_*.py")):
@@ -118,7 +119,7 @@ def tests_of(name: str) -> list[str]:
 
 
 def faults_of(name: str) -> Iterator[dict[str, object]]:
-    """Yield every fault of a module as an entry of a table, in the order of its text."""
+    """Yield every fault of a module as a table entry, in the order of the source text."""
     text = (ROOT / name).read_text(encoding="utf-8")
     tests = tests_of(name)
     tree = ast.parse(text)
@@ -139,7 +140,7 @@ def faults_of(name: str) -> Iterator[dict[str, object]]:
 
 
 def _deciding(node: ast.AST) -> Iterator[ast.expr | ast.stmt]:
-    """Yield the nodes of a tree in which a fault may be; annotations and texts have none."""
+    """Yield the nodes of a tree that may have a fault; annotations and texts are left out."""
     for field, value in ast.iter_fields(node):
         if field in ("annotation", "returns", "decorator_list"):
             continue
@@ -154,7 +155,7 @@ def _deciding(node: ast.AST) -> Iterator[ast.expr | ast.stmt]:
 
 
 def _changes(node: ast.AST, text: str) -> Iterator[str]:
-    """Yield the texts by which a fault replaces a node."""
+    """Yield the texts with which faults replace a node."""
 
     def own(part: ast.AST) -> str:
         return ast.get_source_segment(text, part) or ""
@@ -187,7 +188,7 @@ def _changes(node: ast.AST, text: str) -> Iterator[str]:
 
 
 def name_equivalent(faults: Sequence[dict[str, object]]) -> None:
-    """Write into faults why they change no result, if someone looked and found that."""
+    """Add to faults why they change no result, if somebody has examined them."""
     known = {(e["file"], e["new"]): e["why"] for e in yaml.safe_load(EQUIVALENT.read_text())}
     for fault in faults:
         if why := known.get((fault["file"], str(fault["new"]).strip())):
@@ -198,7 +199,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the script; return its exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=150, help="number of faults (default: 150)")
-    parser.add_argument("--seed", type=int, default=0, help="of the draw (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random draw (default: 0)")
     arguments = parser.parse_args(argv)
     drawn, stream = [], random.Random(arguments.seed)
     for rooms, count in ((JUDGES, (arguments.count + 1) // 2), (OTHERS, arguments.count // 2)):

@@ -1,12 +1,13 @@
-"""Simulate attempts in other ways, and count how many labels that changes.
+"""Simulate attempts under other settings, and count how many labels change.
 
 \b
     python pipelines/measurements/fidelity.py G3DB --units cm --candidates 600 --number 600
 
-Of each mesh some attempts whose palm ray meets it are drawn with the seed, and simulated to a
-verdict: as the configuration says, without the screen, at half the time step, with four times the
-faces, with Drake's other solvers, and with the other drives of the fingers. Prints JSON: the counts
-of each variant with their shares, and how many labels depend on the drive.
+For each mesh, some attempts whose palm ray meets it are drawn with the seed, and simulated to a
+verdict: as the configuration specifies, without the screen, at half the time step, with four times
+as many faces, with Drake's other solvers, and with the other drives of the fingers. The script
+prints JSON: the counts of each variant with their fractions, and how many labels depend on the
+drive.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -41,11 +42,11 @@ from drakegrasp.simulation.drive import drive_of
 
 @dataclass(frozen=True)
 class Variant:
-    """Another way to simulate the same attempts, with which their labels are compared.
+    """Other settings for the same attempts, with which their labels are compared.
 
     Attributes:
         overrides: Changes of the configuration; `{half}` stands for half of its time step.
-        fine: Whether to cut each face of the object into four, so that edges are half as long.
+        fine: Whether each face of the object is cut into four, so that edges are half as long.
     """
 
     overrides: tuple[str, ...] = ()
@@ -60,12 +61,12 @@ VARIANTS = {
     "similar": Variant(("physics.solver=similar",)),
     "sap": Variant(("physics.solver=sap",)),
 }
-#: Drives of the fingers, of which those that were not measured are variants as well.
+#: Drives of the fingers; the drives that were not used for the labels are also variants.
 DRIVES = {f"drive_{drive}": drive for drive in ("worm", "torque", "locked")}
 
 
 def variants(config: Config) -> dict[str, Variant]:
-    """Return the variants of a configuration by name: `VARIANTS`, and its hand's other drives."""
+    """Return the variants of a configuration by name: `VARIANTS`, and the hand's other drives."""
     hand = load_hand(config.hand_source)
     own, others = drive_of(hand, config.lift), {}
     for name, drive in DRIVES.items():
@@ -80,9 +81,10 @@ def variants(config: Config) -> dict[str, Variant]:
 
 
 def compare_labels(setup: TrialSetup, attempts: Sequence[Attempt]) -> dict[str, Counter[str]]:
-    """Return how labels of an object's attempts differ, by variant; `drive`: if any drive does.
+    """Return how labels of an object's attempts differ, by variant.
 
-    Verdicts are compared: each closed hand lifts until it is certain whether it holds.
+    `drive` counts the attempts whose label changes with any drive. Verdicts are compared, so each
+    closed hand lifts until it is certain whether it holds.
     """
     setup = replace(setup, config=with_whole_lifts(setup.config))
     predictions = predict_attempts(setup, attempts)
@@ -102,13 +104,13 @@ def compare_labels(setup: TrialSetup, attempts: Sequence[Attempt]) -> dict[str, 
 
 
 def simulate(setup: TrialSetup, attempts: Sequence[Attempt], variant: Variant) -> Iterator[Outcome]:
-    """Yield the outcomes of attempts by a variant."""
-    # The screen works on the original surface, also if the variant has finer faces.
+    """Yield the outcomes of attempts under a variant."""
+    # The screen works on the original surface, even if the variant has finer faces.
     half = setup.config.physics.time_step / 2.0
     other = override_config(setup.config, [t.format(half=half) for t in variant.overrides])
     predictions = predict_attempts(replace(setup, config=other), attempts)
 
-    # The scene is the variant's.
+    # Build the scene of the variant.
     prepared = setup.prepared
     if variant.fine:
         prepared = replace(prepared, model=finer(prepared.model))
@@ -119,14 +121,14 @@ def simulate(setup: TrialSetup, attempts: Sequence[Attempt], variant: Variant) -
 
 
 def finer(model: ObjectModel) -> ObjectModel:
-    """Return an object whose collision surface is the same in four times as many faces."""
+    """Return an object with the same collision surface, cut into four times as many faces."""
     vertices, faces = trimesh.remesh.subdivide(model.collision_vertices, model.collision_faces)
     return replace(model, collision_vertices=vertices, collision_faces=faces.astype(np.int32))
 
 
 def differ(a: Outcome, b: Outcome) -> bool:
     """Return whether two outcomes are different labels."""
-    # Screened attempts stand for missing fingertips, so the two are the same label.
+    # A screened attempt would have been a missing fingertip, so the two are the same label.
     alike = {Outcome.SCREENED: Outcome.MISSING_FINGERTIP}
     return alike.get(a, a) is not alike.get(b, b)
 
@@ -134,7 +136,7 @@ def differ(a: Outcome, b: Outcome) -> bool:
 def count(
     pairs: Sequence[tuple[Outcome, Outcome]], decided: Sequence[bool], lifted: Sequence[bool]
 ) -> Counter[str]:
-    """Return how often labels differ, from pairs of outcomes: as configured, by the variant.
+    """Return how often labels differ in pairs of outcomes: as configured, and under the variant.
 
     Args:
         pairs: The outcomes.
@@ -159,7 +161,7 @@ def count(
 
 
 def summary(objects: Sequence[dict[str, Counter[str]]]) -> dict[str, dict[str, Any]]:
-    """Return the counts of all objects by variant, with shares."""
+    """Return the counts of all objects by variant, with fractions."""
     sums: dict[str, dict[str, Any]] = {}
     for name in objects[0]:
         n = {key: sum(each[name][key] for each in objects) for key in objects[0][name]}
@@ -172,7 +174,7 @@ def summary(objects: Sequence[dict[str, Counter[str]]]) -> dict[str, dict[str, A
         if "simulated" in n:
             sums[name]["flip_share_of_simulated"] = n["flips"] / max(1, n["simulated"])
 
-    # Without the screen, the successes show what the screen loses.
+    # The successes without the screen show what the screen loses.
     off = sums["screen_off"]
     lost, successes = off["successes_lost_by_screen"], off["successes_other"]
     off["recall"] = 1.0 - lost / successes if successes else None
@@ -186,7 +188,7 @@ def summary(objects: Sequence[dict[str, Counter[str]]]) -> dict[str, dict[str, A
 @click.option("--config", help="Preset or YAML file.  [default: paper]")
 @click.option("--set", "overrides", multiple=True, help="Change one setting, KEY=VALUE.")
 @click.option("--candidates", default=100, show_default=True, help="Palm poses per object.")
-@click.option("--number", default=100, show_default=True, help="Attempts of each object.")
+@click.option("--number", default=100, show_default=True, help="Number of attempts per object.")
 @one_thread
 def main(
     meshes: Path,

@@ -1,13 +1,14 @@
-"""Try to deceive method `forces`: predictions that lie, made of a dataset's own grasps.
+"""Try to deceive the method `forces` with false predictions, made of a dataset's own grasps.
 
 \b
     python pipelines/measurements/forces_gaming.py OUT --number 24 > forces_gaming.json
 
-OUT is an assembled dataset. The script takes samples of as many objects as it can, and spoils each
-in several ways: normals along the forces of the simulation, or along forces that balance the load
-at the dataset's friction, points in the air or inside, mirrored or permuted contacts, and so on. It
-asks what forces hold at each friction coefficient, beside the grasps as they are. `gained` counts
-what holds although the grasp as it is does not. Prints JSON.
+OUT is an assembled dataset. The script takes samples of as many objects as possible, and falsifies
+each in several ways: normals along the forces of the simulation, or along forces that balance the
+load at the dataset's friction, points in the air or inside the object, mirrored or permuted
+contacts, and so on. It judges whether the false and the original grasps hold at each friction
+coefficient. `gained` counts false grasps that hold although the original grasp does not. The script
+prints JSON.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -42,9 +43,9 @@ from drakegrasp.verification.forces import (
 
 #: Friction coefficients that are tried.
 FRICTIONS = (0.05, 0.71)
-#: Distances of points in the air and inside, along the surface, and of contacts on one side [m].
+#: Distances of points above and below the surface, along it, and between contacts on one side [m].
 OFF, SLID, APART = 0.009, 0.02, 0.02
-#: Predictions near the grasp of which the best one counts, and how far they stray [m, rad].
+#: Number of predictions near a grasp, of which the best counts, and their deviations [m, rad].
 DRAWS, STRAY, TILT = 30, 0.005, np.deg2rad(40.0)
 
 Array = npt.NDArray[np.float64]
@@ -91,8 +92,8 @@ def main(out: Path, number: int) -> None:
 
 
 def some_grasps(out: Path, number: int) -> list[Grasp]:
-    """Return samples of a dataset, of each object in turn."""
-    # The first sample of each object, then the second, and so on.
+    """Return samples of a dataset, taken from each object in turn."""
+    # The first sample of each object comes first, then the second, and so on.
     samples = Trials(out).where(sample=True)
     names = samples.objects["name"][samples["object"]]
     turn = np.array([int((names[:i] == name).sum()) for i, name in enumerate(names)])
@@ -119,7 +120,7 @@ def some_grasps(out: Path, number: int) -> list[Grasp]:
 
 
 def judge(grasp: Grasp, friction: float, contacts: Contacts) -> ForceVerdict:
-    """Return what forces hold at contacts on the object of a grasp."""
+    """Return the verdict of the method `forces` on contacts on the object of a grasp."""
     p, n = contacts
     return judge_forces(
         grasp.model,
@@ -131,7 +132,7 @@ def judge(grasp: Grasp, friction: float, contacts: Contacts) -> ForceVerdict:
 
 
 def summary(verdicts: list[ForceVerdict], honest: list[ForceVerdict]) -> dict[str, Any]:
-    """Return how many hold, how many only because they lie, and why the others fail."""
+    """Return how many grasps hold, how many only as false ones, and why the others fail."""
     patches = [v.on_surface and v.patches.share <= 1.0 for v in verdicts]
     return {
         "held": sum(v.held for v in verdicts),
@@ -150,16 +151,16 @@ def _cause(verdict: ForceVerdict) -> str:
     return "no forces" if np.isinf(verdict.planned_share) else "too weak"
 
 
-# Ways to lie
+# Ways to falsify a grasp
 
 
 def along_stored_forces(grasp: Grasp) -> Contacts:
-    """Normals against the forces with which the simulated fingertips press."""
+    """Normals opposite to the forces with which the simulated fingertips press."""
     return grasp.p, -grasp.f
 
 
 def along_balancing_forces(grasp: Grasp) -> Contacts:
-    """Normals against forces that carry the load at the dataset's own friction."""
+    """Normals opposite to forces that support the load at the dataset's own friction."""
     contacts = GraspContacts(grasp.p, grasp.n, grasp.model.p_OOcm, 20.0)
     wrenches = lift_path(grasp.placed.X_TO_simulated, grasp.config).wrenches(grasp.model)
     forces = hardest_forces(ForceProgram(contacts, grasp.config.physics.friction_hand), wrenches)
@@ -167,12 +168,12 @@ def along_balancing_forces(grasp: Grasp) -> Contacts:
 
 
 def mirrored(grasp: Grasp) -> Contacts:
-    """The contacts in a mirror through the middle of the object."""
+    """The contacts mirrored at the plane x = 0 of the object's frame."""
     return grasp.p * [-1.0, 1.0, 1.0], grasp.n * [-1.0, 1.0, 1.0]
 
 
 def slid(grasp: Grasp) -> Contacts:
-    """Each contact moved along the surface, with the normal that it had."""
+    """Each contact moved along the surface, with its original normal."""
     away = np.cross(grasp.n, grasp.rng.normal(size=grasp.n.shape))
     away *= SLID / np.linalg.norm(away, axis=1, keepdims=True)
     points, _, _ = grasp.model.collision.nearest.on_surface(grasp.p + away)
@@ -180,7 +181,7 @@ def slid(grasp: Grasp) -> Contacts:
 
 
 def on_one_side(grasp: Grasp) -> Contacts:
-    """All contacts beside the first, with the surface's normals there."""
+    """All contacts beside the first one, with the surface's normals there."""
     _, _, (_, along, across) = np.linalg.svd(grasp.n[:1])
     beside = grasp.p[0] + APART * np.array([0.0 * along, along, across])[: len(grasp.p)]
     points, _, faces = grasp.model.collision.nearest.on_surface(beside)
@@ -205,7 +206,7 @@ SPOILT: dict[str, Callable[[Grasp], Contacts]] = {
 
 
 def best_of_draws(grasp: Grasp, friction: float) -> ForceVerdict:
-    """Return the best verdict of predictions near a grasp: what choosing the numbers can gain."""
+    """Return the best verdict of predictions near a grasp: the gain from choosing among them."""
     rng = np.random.default_rng(1)
     verdicts = []
     for _ in range(DRAWS):

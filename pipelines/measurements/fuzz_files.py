@@ -1,16 +1,16 @@
-"""Spoil the files of a dataset by chance; whoever reads it must get equal values, or one line.
+"""Damage the files of a dataset at random; every reader must return equal values or one error line.
 
 \b
     python pipelines/measurements/fuzz_files.py OUT --count 3000 --seed 0 > fuzz.jsonl
 
-Each case spoils one file of a copy of OUT in one way: a bit is flipped, the end is cut off, all
-columns are made longer, a column is put in the place of another, JSON gets another value or another
-structure, another kind of file (a pipe, a device, a folder, a file of 1 TB) takes the place. Then
-the loaders, `stats` and `check` read the copy, each in a process of its own with 2 GB of memory and
-20 s of CPU time; with `--all` every command that reads a dataset does. What a command prints and
-the files that it writes are compared with those of the sound dataset. Prints a line of JSON for
-each finding: a traceback, a hang, memory, a signal, or other values without a word. The same seed
-spoils the same bytes of the same dataset. Exit code 1 if there is a finding.
+Each case damages one file of a copy of OUT: a bit is flipped, the end is cut off, all columns are
+made longer, two columns are swapped, JSON gets another value or another structure, or another kind
+of file (a pipe, a device, a folder, a file of 1 TB) replaces the file. Then the loaders, `stats`
+and `check` read the copy, each in its own process with 2 GB of memory and 20 s of CPU time; with
+`--all` every command that reads a dataset reads it. The output of a command and the files that it
+writes are compared with those of the sound dataset. The script prints a line of JSON for each
+finding: a traceback, a hang, excessive memory, a signal, or other values without a message. The
+same seed damages the same bytes of the same dataset. The exit code is 1 if there is a finding.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -49,22 +49,22 @@ from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.runtime.progress import progress_bar
 
-#: What a process may take beside what this one has [byte], how long it may compute [s of CPU time],
-#: and how long it may last on a machine that has other work [s].
+#: Memory that a process may use in addition to this one's [byte], its CPU time [s], and the
+#: wall-clock time that it may take on a busy machine [s].
 MEMORY, CPU_SECONDS, SECONDS = 2**31, 20, 600.0
 #: Files of a dataset that hold columns.
 COLUMNS = ("trials.hdf5", "grasping_oto.hdf5", "grasping_otm.hdf5")
-#: Files of which a dataset has several, that commands read one by one.
+#: Files that a dataset has several of and that commands read one by one.
 PARTS = ("shards/*/*.h5", "objects/*.plan.h5")
-#: Rows that columns are made to claim.
+#: Numbers of rows that columns are made to claim.
 CLAIMS = (400_000_000, 2**50)
-#: What a line of a progress bar has: the bar, or the sign that turns.
+#: Characters that only a line of a progress bar has: the bar, or the rotating sign.
 BAR = re.compile("[━\u2800-\u28ff]")
-#: Most lines of an error, and the code of a traceback.
+#: Maximum number of lines of an error, and the exit code of a traceback.
 LINES, UNEXPECTED = 1, 99
 
 
-# --- Ways to spoil a file ---
+# --- Methods that damage a file ---
 
 
 def flip(path: Path, draw: random.Random) -> str:
@@ -88,7 +88,7 @@ def truncate(path: Path, draw: random.Random) -> str:
 
 
 def stretch(path: Path, draw: random.Random) -> str:
-    """Let all columns of a group claim more rows than there are."""
+    """Make all columns of a group claim more rows than they have."""
     rows = draw.choice(CLAIMS)
     with h5py.File(path, "r+") as file:
         group = file[draw.choice([name for name in file if len(file[name])])]
@@ -102,7 +102,7 @@ def stretch(path: Path, draw: random.Random) -> str:
 
 
 def swap(path: Path, draw: random.Random) -> str:
-    """Put two columns of a file in each other's place."""
+    """Swap two columns of a file."""
     with h5py.File(path, "r+") as file:
         names: list[str] = []
         file.visititems(
@@ -116,7 +116,7 @@ def swap(path: Path, draw: random.Random) -> str:
 
 
 def restructure(path: Path, draw: random.Random) -> str:
-    """Put another value somewhere into a JSON file."""
+    """Change one value of a JSON file to another value."""
     tree = json.loads(path.read_text(encoding="utf-8"))
     said = change_tree(tree, draw)
     path.write_text(json.dumps(tree), encoding="utf-8")
@@ -124,7 +124,7 @@ def restructure(path: Path, draw: random.Random) -> str:
 
 
 def change_tree(tree: Any, draw: random.Random) -> str:
-    """Put another value somewhere into what JSON says."""
+    """Change one value of parsed JSON to another value."""
     values: list[Any] = [None, [], {}, "", -1, 1e300, True, "\x1b[31m", "../../x", [[]] * 3]
     value = draw.choice([*values, 2**70, "x" * 100_000])
     steps: list[Any] = []
@@ -148,19 +148,19 @@ def nest(path: Path, draw: random.Random) -> str:
 
 
 def other_kind(path: Path, draw: random.Random) -> str:
-    """Put another kind of file in the place of one."""
+    """Replace a file by another kind of file."""
     return put(path, draw.choice(list(KINDS)))
 
 
 def put(path: Path, kind: str) -> str:
-    """Put a kind of file in the place of one, or where none is."""
+    """Create a kind of file at a path, in place of the file there if there is one."""
     path.unlink(missing_ok=True)
     KINDS[kind](path)
     return f"replaced by {kind}"
 
 
 def _listen(path: Path) -> None:
-    """Make a socket; by a relative path, because names of sockets are short."""
+    """Create a socket by a relative path, because names of sockets must be short."""
     with socket.socket(socket.AF_UNIX) as connection:
         connection.bind(os.path.relpath(path))
 
@@ -170,7 +170,7 @@ def _sparse(path: Path) -> None:
     os.truncate(path, 2**40)
 
 
-#: What may be in the place of a file, and what makes it.
+#: Kinds of files that may replace a file, and the functions that create them.
 KINDS: dict[str, Callable[[Path], Any]] = {
     "a pipe": os.mkfifo,
     "a folder": Path.mkdir,
@@ -187,7 +187,7 @@ SPOIL_OTHERS = (flip, truncate, other_kind)
 
 
 def ways(path: Path) -> tuple[Callable[[Path, random.Random], str], ...]:
-    """Return the ways to spoil a file, those drawn more often several times."""
+    """Return the methods that can damage a file; the frequent ones are repeated."""
     if path.suffix == ".json":
         return SPOIL_JSON
     return SPOIL_HDF5 if path.name in COLUMNS else SPOIL_OTHERS
@@ -197,7 +197,7 @@ def ways(path: Path) -> tuple[Callable[[Path, random.Random], str], ...]:
 
 
 def load(out: Path) -> None:
-    """Print a hash of all that the loaders give."""
+    """Print a hash of everything that the loaders return."""
     digest = hashlib.sha256()
     for camera in COLUMNS[1:]:
         for split in SPLITS:
@@ -212,11 +212,11 @@ def load(out: Path) -> None:
 
 
 def commands(everything: bool, assembled: bool) -> dict[str, Callable[[Path], object]]:
-    """Return what reads a dataset, by its name; `assemble`, which writes what is read, comes last.
+    """Return the readers of a dataset by name; `assemble`, which also writes, comes last.
 
     Args:
-        everything: Whether each command that reads a dataset is one.
-        assembled: Whether `assemble` is one.
+        everything: Whether to include each command that reads a dataset.
+        assembled: Whether to include `assemble`.
     """
 
     def say(*line: str) -> Callable[[Path], object]:
@@ -246,7 +246,7 @@ def commands(everything: bool, assembled: bool) -> dict[str, Callable[[Path], ob
 
 
 def _child(run: Callable[[Path], object], out: Path, folder: Path) -> None:
-    """Run a reader with its output in files and its memory bounded, and end the process."""
+    """Run a reader with its output in files and its memory limited, and end the process."""
     faulthandler.disable()
     for number, name in ((1, "out"), (2, "err")):
         os.dup2(os.open(folder / name, os.O_WRONLY | os.O_CREAT), number)
@@ -275,10 +275,10 @@ def _child(run: Callable[[Path], object], out: Path, folder: Path) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Said:
-    """How a reader ended: its exit code, None if it did not end, what it printed and wrote.
+    """Result of a reader: its exit code, None if it did not end, and what it printed and wrote.
 
-    `written` has a hash of each file of the dataset's folder that is new or was replaced, `pages`
-    the text of the web pages among them.
+    `written` contains a hash of each file of the dataset's folder that is new or was replaced, and
+    `pages` the text of the web pages among them.
     """
 
     code: int | None
@@ -290,17 +290,17 @@ class Said:
 
     @property
     def lines(self) -> set[str]:
-        """The lines that it printed or wrote on pages."""
+        """The lines that the reader printed or wrote on pages."""
         return set((self.out + self.err + self.pages).splitlines())
 
     def says_as(self, sound: Said) -> bool:
-        """Return whether it printed the same, and wrote what is sound in the same way."""
+        """Return whether the output is the same, and the files of `sound` were written equally."""
         same = all(self.written.get(name) == digest for name, digest in sound.written.items())
         return self.out == sound.out and same
 
 
 def read(run: Callable[[Path], object], out: Path) -> Said:
-    """Let a reader read a dataset in a process of its own."""
+    """Let a reader read a dataset in a separate process."""
     with tempfile.TemporaryDirectory() as name:
         folder, before = Path(name), dict(times(out))
         process = multiprocessing.get_context("fork").Process(
@@ -325,17 +325,17 @@ def read(run: Callable[[Path], object], out: Path) -> Said:
 
 
 def times(out: Path) -> Iterator[tuple[Path, int]]:
-    """Yield the regular files of a folder, and when each was last written [ns]."""
+    """Yield the regular files of a folder with the time of their last change [ns]."""
     for path in sorted(out.rglob("*")):
         if path.is_file() and not path.is_symlink():
             yield path, path.stat().st_mtime_ns
 
 
 def preload(read_soundly: Iterable[Said]) -> None:
-    """Import here, once, what readers of sound files imported: a fork of this process has it.
+    """Import once the modules that readers of sound files imported, for forks of this process.
 
     Raises:
-        RuntimeError: If a sound file was not read.
+        RuntimeError: If a sound file could not be read.
     """
     for said in read_soundly:
         if said.code != 0:
@@ -348,12 +348,12 @@ def preload(read_soundly: Iterable[Said]) -> None:
 
 
 def judge(said: Said, sound: Said | None = None, name: Path = Path()) -> str | None:
-    """Return what is wrong with how a reader took a spoilt file; None if nothing is.
+    """Return what is wrong with a reader's result for a damaged file; None if nothing is.
 
     Args:
-        said: What it said.
-        sound: What it said of the sound file, if it must say the same, or name the file.
-        name: Of the spoilt file, in the dataset's folder.
+        said: Result for the damaged file.
+        sound: Result for the sound file, if the reader must produce the same or name the file.
+        name: Path of the damaged file in the dataset's folder.
     """
     lines = [line for line in said.err.strip().splitlines() if not BAR.search(line)]
     if said.code is None:
@@ -371,7 +371,7 @@ def judge(said: Said, sound: Said | None = None, name: Path = Path()) -> str | N
     if said.code == 0:
         if sound is None or said.says_as(sound):
             return None
-        # The files of a hand, or of an object, may be named together.
+        # A reader may name the files of a hand, or of an object, together.
         words = (name.name, f"{name.parts[0]}: ", f"{name.parts[0]} of {name.parent.name}")
         named = any(word in line for word in words for line in said.lines - sound.lines)
         return None if named else "other values without a word"
@@ -384,7 +384,7 @@ def judge(said: Said, sound: Said | None = None, name: Path = Path()) -> str | N
 
 
 def files(out: Path) -> list[Path]:
-    """Return the files of a dataset that are spoilt, relative to it; those with data twice."""
+    """Return the paths of files that are damaged, in the dataset; those with data several times."""
     found = sorted(path.relative_to(out) for path in out.rglob("*") if path.is_file())
     main = [path for path in found if path.name in COLUMNS or path.name == "manifest.json"]
     others = [path for path in found if path not in main and path.suffix != ".jsonl"]
@@ -392,14 +392,14 @@ def files(out: Path) -> list[Path]:
 
 
 def every_kind(out: Path) -> list[tuple[Path, str]]:
-    """Return each file that commands read by itself, with each kind that may be in its place."""
+    """Return each file that commands read separately, with each kind that may replace it."""
     parts = [next(iter(sorted(out.glob(name)))).relative_to(out) for name in PARTS]
     named = map(Path, ("manifest.json", *COLUMNS[:2], "reject.json", "replacement.json"))
     return [(name, kind) for name in (*named, *parts) for kind in KINDS]
 
 
 def assemble(out: Path) -> None:
-    """Assemble, with the rejections of a dataset if it has any."""
+    """Assemble the dataset, with its rejections if it has any."""
     rejected = (
         ["--reject", str(out / "reject.json")] if os.path.lexists(out / "reject.json") else []
     )
@@ -407,7 +407,7 @@ def assemble(out: Path) -> None:
 
 
 def anew(out: Path, copy: Path) -> None:
-    """Copy a dataset in the place of what is there."""
+    """Replace a folder by a new copy of a dataset."""
     shutil.rmtree(copy, ignore_errors=True)
     shutil.copytree(out, copy)
 
@@ -415,12 +415,12 @@ def anew(out: Path, copy: Path) -> None:
 def read_soundly(
     out: Path, copy: Path, readers: dict[str, Callable[[Path], object]]
 ) -> dict[str, Said]:
-    """Return what readers say of a sound dataset, and import here what they import.
+    """Return the results of readers for a sound dataset, and import the modules that they import.
 
-    Files that differ between two readings, as those with times do, are not among those written.
+    Files that differ between two readings, such as files with times, are left out of `written`.
 
     Raises:
-        RuntimeError: If a sound file was not read, or was read twice with other values.
+        RuntimeError: If a sound file could not be read, or two readings printed different values.
     """
     sound: dict[str, Said] = {}
     for _ in range(2):
@@ -444,15 +444,15 @@ def fuzz(
     first: int = 0,
     kinds: bool = False,
 ) -> Iterator[dict[str, Any] | None]:
-    """Yield for each case and reader what is wrong, or None.
+    """Yield for each case and reader the finding, or None.
 
     Args:
         out: A sound dataset; it is only read.
         count: Number of cases.
-        seed: Of all draws.
+        seed: Seed of all random draws.
         everything: Whether every command reads, or only the loaders, `stats` and `check`.
         first: Number of the first case.
-        kinds: Whether cases are those of `every_kind`, of all of which there are so many.
+        kinds: Whether to use the cases of `every_kind`; `count` is then their number.
     """
     readers = commands(everything, everything or kinds)
     table = every_kind(out) if kinds else []
@@ -482,7 +482,7 @@ def fuzz(
 
 
 def say_findings(cases: Iterator[dict[str, Any] | None], count: int) -> NoReturn:
-    """Print findings and how many there are, and end with code 1 if there are any."""
+    """Print findings and their number, and end with code 1 if there are any."""
     findings = 0
     with progress_bar("fuzz", "reads") as progress:
         for number, finding in enumerate(cases, 1):
@@ -498,7 +498,7 @@ def say_findings(cases: Iterator[dict[str, Any] | None], count: int) -> NoReturn
 @click.argument("out", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--count", default=300, show_default=True, help="Number of cases.")
 @click.option("--first", default=0, show_default=True, help="Number of the first case.")
-@click.option("--seed", default=0, show_default=True, help="Of all draws.")
+@click.option("--seed", default=0, show_default=True, help="Seed of all random draws.")
 @click.option("--all", "everything", is_flag=True, help="Read with every command.")
 @click.option("--kinds", is_flag=True, help="Try all kinds of files instead, also on `assemble`.")
 def main(out: Path, count: int, first: int, seed: int, everything: bool, kinds: bool) -> None:

@@ -1,15 +1,15 @@
-"""Spoil meshes and hands by chance; whoever reads one takes it, or refuses it in one line.
+"""Damage meshes and hands at random; every reader must accept them, or reject them in one line.
 
 \b
     python pipelines/measurements/fuzz_models.py --meshes 200 --hands 100 --seed 0 > models.jsonl
 
-A mesh is a small solid with faults of geometry (missing, doubled and turned faces, NaN, indices
-that are not there), written as OBJ, STL (text, binary), PLY (text, binary), GLB or OFF, and spoilt
-again as a file: bits, ends, numbers, lines, headers, another format's name, another kind of file.
-`drakegrasp audit` reads it. A hand is one of the package's; its hand file, its model or a mesh of
-it is spoilt, and it is loaded and checked without trial grasps. Or it is a vendor's URDF, SDFormat
-or MJCF, as `hand new` reads it. Prints a line of JSON for each finding, as `fuzz_files.py` does.
-Exit code 1 if there is one.
+A mesh is a small solid with geometric faults (missing, doubled and reversed faces, NaN, indices
+that do not exist). It is written as OBJ, STL (text, binary), PLY (text, binary), GLB or OFF, and
+then damaged as a file: bits, ends, numbers, lines, headers, another format's name, another kind of
+file. `drakegrasp audit` reads it. A hand is one of the package's hands with a damaged hand file,
+model or mesh; it is loaded and checked without trial grasps. Or it is a vendor's URDF, SDFormat or
+MJCF model, which is read as `hand new` reads it. The script prints a line of JSON for each finding,
+as `fuzz_files.py` does. The exit code is 1 if there is a finding.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.mesh.loading import load_mesh
 
-#: Numbers and words that take the place of others in a text.
+#: Numbers and words that replace others in a text.
 ODD = ("nan", "inf", "-1", "0", "1e999", "1e-320", "99999999999999", "4294967295", "x", "", "-0.5")
-#: Faces of a claim.
+#: Sizes that a header is made to claim.
 CLAIMS = (0, 3, 10**6, 2**31 - 1, 2**32 - 1)
 HANDS = ("allegro", "barrett", "franka", "leap")
-#: A gripper as MJCF.
+#: A gripper in MJCF.
 GRIPPER = """<mujoco model="jaws">
   <default><geom condim="4"/><default class="jaw"><geom mass="0.05"/></default></default>
   <worldbody><body name="body">
@@ -62,11 +62,11 @@ GRIPPER = """<mujoco model="jaws">
 """
 
 
-# --- Spoilt meshes ---
+# --- Damaged meshes ---
 
 
 def draw_mesh(draw: random.Random) -> tuple[str, np.ndarray, np.ndarray]:
-    """Return a name, vertices (n, 3) [m] and faces (m, 3) of a solid, perhaps with faults."""
+    """Return a name, vertices (n, 3) [m] and faces (m, 3) of a solid, possibly with faults."""
     kind = draw.choice(["box", "ball", "ring", "two", "soup", "fan"])
     generator = np.random.default_rng(draw.randrange(2**32))
     make: dict[str, Callable[[], trimesh.Trimesh]] = {
@@ -125,7 +125,7 @@ def off(vertices: np.ndarray, faces: np.ndarray) -> bytes:
 
 
 def ply(vertices: np.ndarray, faces: np.ndarray, binary: bool) -> bytes:
-    """Return a mesh as PLY, of text or binary."""
+    """Return a mesh as PLY, as text or binary."""
     header = (
         f"ply\nformat {'binary_little_endian' if binary else 'ascii'} 1.0\n"
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
@@ -139,7 +139,7 @@ def ply(vertices: np.ndarray, faces: np.ndarray, binary: bool) -> bytes:
 
 
 def stl(vertices: np.ndarray, faces: np.ndarray, binary: bool) -> bytes:
-    """Return a mesh as STL, of text or binary; faces without vertices use the first one."""
+    """Return a mesh as STL, as text or binary; indices without a vertex use the first vertex."""
     corners = vertices[np.where((faces >= 0) & (faces < len(vertices)), faces, 0)]
     if binary:
         record = np.zeros(len(faces), dtype=[("n", "<f4", 3), ("p", "<f4", (3, 3)), ("a", "<u2")])
@@ -181,7 +181,7 @@ def glb(vertices: np.ndarray, faces: np.ndarray) -> bytes:
 
 
 def pack_glb(tree: Any, data: bytes) -> bytes:
-    """Return a GLB of a description and its data."""
+    """Return a GLB built from a description and its data."""
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)
     data += b"\0" * (-len(data) % 4)
@@ -190,7 +190,7 @@ def pack_glb(tree: Any, data: bytes) -> bytes:
     return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
 
 
-#: Formats by name: the suffix of the file and what writes it.
+#: Formats by name: the suffix of the file and the function that writes it.
 FORMATS: dict[str, tuple[str, Callable[[np.ndarray, np.ndarray], bytes]]] = {
     "obj": (".obj", obj),
     "ascii stl": (".stl", lambda v, f: stl(v, f, False)),
@@ -202,11 +202,11 @@ FORMATS: dict[str, tuple[str, Callable[[np.ndarray, np.ndarray], bytes]]] = {
 }
 
 
-# --- Ways to spoil a file of text, or one with a header ---
+# --- Methods that damage a text file, or a file with a header ---
 
 
 def change_number(path: Path, draw: random.Random) -> str:
-    """Put an odd value in the place of a number, or swap two."""
+    """Replace a number by an odd value, or swap two numbers."""
     content = path.read_bytes()
     found = list(re.finditer(rb"(?<![\w.])-?\d+(\.\d+)?(e-?\d+)?(?![\w.])", content))
     if len(found) < 2:
@@ -222,7 +222,7 @@ def change_number(path: Path, draw: random.Random) -> str:
 
 
 def change_lines(path: Path, draw: random.Random) -> str:
-    """Delete some lines, repeat them, or put them elsewhere."""
+    """Delete some lines, repeat them, or move them."""
     lines = path.read_bytes().splitlines(keepends=True)
     start = draw.randrange(len(lines))
     some = lines[start : start + draw.choice([1, 1, 3, 10])]
@@ -238,7 +238,7 @@ def change_lines(path: Path, draw: random.Random) -> str:
 
 
 def delete_bytes(path: Path, draw: random.Random) -> str:
-    """Delete some bytes in the middle of a file."""
+    """Delete some bytes inside a file."""
     content = path.read_bytes()
     start, count = draw.randrange(len(content)), draw.choice([1, 4, 100])
     path.write_bytes(content[:start] + content[start + count :])
@@ -246,7 +246,7 @@ def delete_bytes(path: Path, draw: random.Random) -> str:
 
 
 def change_word(path: Path, draw: random.Random) -> str:
-    """Put a word of a file in the place of another one."""
+    """Replace a word of a file by another word of the file."""
     content = path.read_bytes()
     found = list(re.finditer(rb"[A-Za-z_]\w+", content))
     one, other = draw.choice(found), draw.choice(found)
@@ -255,7 +255,7 @@ def change_word(path: Path, draw: random.Random) -> str:
 
 
 def claim_size(path: Path, draw: random.Random) -> str:
-    """Let the header of a binary STL, a GLB, a PLY or an OFF claim other sizes."""
+    """Make the header of a binary STL, a GLB, a PLY or an OFF claim another size."""
     content, size = path.read_bytes(), draw.choice(CLAIMS)
     if path.suffix == ".stl":
         content = content[:80] + struct.pack("<I", size) + content[84:]
@@ -269,7 +269,7 @@ def claim_size(path: Path, draw: random.Random) -> str:
 
 
 def change_description(path: Path, draw: random.Random) -> str:
-    """Put another value somewhere into the description of a GLB."""
+    """Change one value of the description of a GLB to another value."""
     content = path.read_bytes()
     size = int.from_bytes(content[12:16], "little")
     tree = json.loads(content[20 : 20 + size])
@@ -290,7 +290,7 @@ ANY = (flip, truncate, rename, other_kind)
 
 
 def spoil_mesh(folder: Path, draw: random.Random) -> str:
-    """Write a spoilt mesh to an empty folder, and return how."""
+    """Write a damaged mesh to an empty folder, and return how it was damaged."""
     name = draw.choice(list(FORMATS))
     suffix, write = FORMATS[name]
     kind, vertices, faces = draw_mesh(draw)
@@ -308,7 +308,7 @@ def spoil_mesh(folder: Path, draw: random.Random) -> str:
 
 
 def spoil_hand(folder: Path, draw: random.Random) -> str:
-    """Write a hand with a spoilt file, or a spoilt model, to an empty folder, and return how."""
+    """Write a hand with a damaged file, or a damaged model, to an empty folder; return how."""
     ways = (*TEXT, *TEXT, flip, flip, truncate, other_kind)
     if draw.random() < 0.4:
         path = folder / draw.choice(["hand.xml", "franka_hand.urdf", "allegro_hand.sdf"])
@@ -321,7 +321,7 @@ def spoil_hand(folder: Path, draw: random.Random) -> str:
     name = draw.choice(HANDS)
     _copy(name, folder)
     found = sorted(folder.iterdir())
-    # The hand file is the smallest and has the most rules.
+    # The hand file is the smallest file and has the most rules, so it is chosen often.
     path = draw.choice([*found, *[folder / "hand.yaml"] * len(found)])
     return f"{name}/{path.name}: {draw.choice(ways)(path, draw)}"
 
@@ -338,7 +338,7 @@ def _copy(name: str, folder: Path) -> None:
 
 
 def audit(folder: Path) -> None:
-    """Audit the mesh of a folder; one of a format that is not listed is loaded alone."""
+    """Audit the mesh of a folder; a format that `audit` does not list is loaded directly."""
     (path,) = folder.iterdir()
     if path.suffix == ".off":
         load_mesh(path)
@@ -347,7 +347,7 @@ def audit(folder: Path) -> None:
 
 
 def check(folder: Path) -> None:
-    """Load and check a hand without trial grasps; without a hand file, read the model."""
+    """Load and check a hand without trial grasps; if there is no hand file, read the model."""
     if not (folder / "hand.yaml").exists() and not (folder / "hand.yaml").is_symlink():
         (path,) = (p for p in folder.iterdir() if p.suffix in (".urdf", ".sdf", ".xml"))
         model = read_model(read_source(path, {}, ()))
@@ -362,12 +362,12 @@ def check(folder: Path) -> None:
 
 
 def fuzz(kind: str, count: int, seed: int, first: int = 0) -> Iterator[dict[str, Any] | None]:
-    """Yield for each case what is wrong, or None.
+    """Yield for each case the finding, or None.
 
     Args:
         kind: "meshes" or "hands".
         count: Number of cases.
-        seed: Of all draws.
+        seed: Seed of all random draws.
         first: Number of the first case.
     """
     spoil, run = {"meshes": (spoil_mesh, audit), "hands": (spoil_hand, check)}[kind]
@@ -394,7 +394,7 @@ def fuzz(kind: str, count: int, seed: int, first: int = 0) -> Iterator[dict[str,
 
 
 def _write_sound(kind: str, folder: Path) -> None:
-    """Write a mesh or a hand that is fit."""
+    """Write a sound mesh or hand."""
     if kind == "hands":
         _copy("franka", folder)
     else:
@@ -405,7 +405,7 @@ def _write_sound(kind: str, folder: Path) -> None:
 @click.option("--meshes", default=200, show_default=True, help="Number of meshes.")
 @click.option("--hands", default=100, show_default=True, help="Number of hands.")
 @click.option("--first", default=0, show_default=True, help="Number of the first case.")
-@click.option("--seed", default=0, show_default=True, help="Of all draws.")
+@click.option("--seed", default=0, show_default=True, help="Seed of all random draws.")
 def main(meshes: int, hands: int, first: int, seed: int) -> None:
     """Run the script."""
     counts = {"meshes": meshes, "hands": hands}

@@ -1,14 +1,15 @@
-"""Measure how often the grasp that `drakegrasp.rank` puts first holds, beside other choices.
+"""Measure how often the grasp that `drakegrasp.rank` puts first holds, compared with other choices.
 
 \b
     python pipelines/measurements/grasp_choice.py [--object NAME ...] [--set KEY=VALUE ...]
 
-Of each object one view is seen, from a drawn direction, by rays that meet its mesh. All grasps that
-`drakegrasp.propose` makes of it are tried, each once, on the object at rest. Prints a line per
-object, then JSON: for several choices the shares of objects held, and of stable precision grasps,
-each with the 95 % interval of a bootstrap over the objects; the area under the ROC curve of the
-score within objects; and CPU milliseconds per view. Without --object these are the first built-in
-objects of 40 classes; the weights of the score were fitted on second ones of the other 24 classes.
+One view of each object is taken from a drawn direction, by rays that meet its mesh. All grasps that
+`drakegrasp.propose` returns for it are tried, each once, on the object at rest. The script prints a
+line per object, then JSON: for several choices the fractions of objects that are held, and that are
+held in a stable precision grasp, each with the 95 % bootstrap interval over the objects; the area
+under the ROC curve of the score within objects; and the CPU milliseconds per view. Without
+`--object` it uses the first built-in objects of 40 classes; the weights of the score were fitted to
+second objects of the other 24 classes.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -33,20 +34,22 @@ from drakegrasp.simulation.attempts import Attempts
 from drakegrasp.simulation.placement import PlacedObject
 
 Array = npt.NDArray[np.float64]
-#: The camera: distance [m], least elevation and range of it [degree], half the width of the image
-#: at a distance of 1 [m/m], pixels along an edge.
+#: The camera: distance [m], minimum elevation and range of elevations [degree], half the width of
+#: the image at a distance of 1 m [m/m], pixels along an edge.
 DISTANCE, ELEVATION, RANGE, HALF, PIXELS = 0.65, 35.0, 30.0, 0.2, 96
-#: Points of the whole surface.
+#: Number of points on the whole surface.
 WHOLE = 4096
-#: Classes whose number leaves less than this when divided by eight served to fit the weights.
+#: Classes whose number modulo OF is less than FITTED served to fit the weights.
 FITTED, OF = 3, 8
-#: Draws of the bootstrap.
+#: Number of bootstrap resamplings.
 DRAWS = 10_000
 
 
 @click.command(help=__doc__)
 @click.option("--object", "names", multiple=True, help="Name of a built-in object.")
-@click.option("--set", "overrides", multiple=True, help="A setting, KEY=VALUE, of preset fast.")
+@click.option(
+    "--set", "overrides", multiple=True, help="Change one setting of preset fast, KEY=VALUE."
+)
 def main(names: tuple[str, ...], overrides: tuple[str, ...]) -> None:
     """Run the script."""
     kept = [each for each in draw_builtin() if each.object_class.number % OF >= FITTED]
@@ -57,7 +60,7 @@ def main(names: tuple[str, ...], overrides: tuple[str, ...]) -> None:
 
 
 def measure(name: str, config: dg.Config) -> dict[str, Any]:
-    """Return what choices are worth on an object, each as whether it holds and is stable."""
+    """Return for each choice of a grasp of an object whether it holds and whether it is stable."""
     hand = load_hand(config.hand_source)
     placed = dg.place_object(builtin_object(name).build(), config=config)
     triangles = transform_points(placed.X_TO_simulated, placed.model.visual_vertices)[
@@ -69,7 +72,7 @@ def measure(name: str, config: dg.Config) -> dict[str, Any]:
     ranking = dg.rank(grasps, cloud, hand)
     cpu = time.process_time() - begin
 
-    # Try all of them.
+    # Try all grasps.
     ends = np.array([tried(placed, grasps, i, config) for i in range(len(grasps))])
     faces = np.arange(3 * len(triangles)).reshape(-1, 3)
     whole, _ = on_faces(triangles.reshape(-1, 3), faces, even_points(WHOLE))
@@ -95,7 +98,7 @@ def tried(placed: PlacedObject, grasps: Attempts, i: int, config: dg.Config) -> 
 
 
 def seen(triangles: Array, name: str) -> Array:
-    """Return the points (n, 3) in {T} at which rays of a camera first meet triangles [m]."""
+    """Return the points (n, 3) in {T} [m] at which rays of a camera first meet triangles."""
     drawn = Stream(7, object_key(name)).uniform(2)
     azimuth, elevation = 2 * np.pi * drawn[0], math.radians(ELEVATION + RANGE * drawn[1])
     target = np.array([0.0, 0.0, triangles[..., 2].max() / 2.0])
@@ -112,7 +115,7 @@ def seen(triangles: Array, name: str) -> Array:
 
 
 def auc(score: Array, ends: Array) -> float:
-    """Return the area under the ROC curve; NaN if all ends are the same."""
+    """Return the area under the ROC curve; NaN if all results are the same."""
     good, bad = score[ends > 0], score[ends == 0]
     if not len(good) or not len(bad):
         return math.nan
@@ -133,7 +136,7 @@ def summary(found: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def interval(values: Array) -> list[float]:
-    """Return mean and 95 % interval of values of objects, without those that are not known."""
+    """Return the mean and the 95 % interval of values of objects, without unknown values."""
     known = values[np.isfinite(values)]
     drawn = np.random.default_rng(0).integers(len(known), size=(DRAWS, len(known)))
     low, high = np.quantile(known[drawn].mean(axis=1), [0.025, 0.975])

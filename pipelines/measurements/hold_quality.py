@@ -1,12 +1,13 @@
-"""How well a dataset's held grasps hold: words, slip and turn, and whether they balance gravity.
+"""Measure how firmly a dataset's held grasps hold: slip, turn, and whether they balance gravity.
 
 \b
     python pipelines/measurements/hold_quality.py OUT > hold_quality.json
 
-For every held grasp the script asks, without a simulation, whether forces in the friction cones
-can carry the object's weight: at the contacts after closing, in the resting pose, and at those
-after the lift, in the pose then. A contact is a point, or a patch: a disc of the stored area,
-whose rim carries the force. Friction is that of the dataset. Prints JSON.
+For every held grasp the script determines, without a simulation, whether forces in the friction
+cones can support the object's weight: at the contacts after closing, in the resting pose, and at
+the contacts after the lift, in the pose at that time. A contact is a point, or a patch: a disc of
+the stored area whose rim transmits the force. The friction is that of the dataset. The script
+prints JSON.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from drakegrasp.frames import unpack_pose
 from drakegrasp.objects.model import load_object
 from drakegrasp.outcomes import Outcome
 
-#: Edges of a linearised friction cone, and points on the rim of a patch.
+#: Number of edges of a linearised friction cone, and of points on the rim of a patch.
 EDGES, RIM = 16, 8
-#: Largest normal forces of a fingertip that are asked for [N].
+#: Maximum normal forces of a fingertip for which balance is tested [N].
 LIMITS = (20.0, 40.0, np.inf)
 GRAVITY = 9.81
 
@@ -57,7 +58,7 @@ def figures(
     stable = alone & (slip < 0.005) & (turn < 5.0)
     sample = removal == 0
 
-    # Balance of gravity, by grasp: after closing and after the lift, as points and as patches.
+    # Balance of gravity for each grasp: after closing and after the lift, as points and patches.
     balance: dict[str, dict[str, npt.NDArray[np.bool_]]] = {}
     models = {
         name: load_object(model_path(out, name)) for name in set(names[trials["object"][held]])
@@ -106,7 +107,10 @@ def figures(
 def _balances(
     trials: dict[str, Any], row: int, stage: str, pose: str, model: Any, kind: str
 ) -> float:
-    """Return the least limit of a fingertip's normal force [N] that carries the weight, or inf."""
+    """Return the smallest limit of the fingertips' normal forces [N] that supports the weight.
+
+    The result is inf if no forces support it.
+    """
     p, n = trials[f"{stage}_p_OQ"][row], trials[f"{stage}_nhat_Q_O"][row]
     if not (np.isfinite(p).all() and np.isfinite(n).all()):
         return np.inf
@@ -132,7 +136,7 @@ def _balances(
     f = np.array(forces)
     wrenches = np.vstack([f.T, np.cross(np.array(points) - model.p_OOcm, f).T * 10.0])
 
-    # Least t with the sum of each finger's normal forces at most t.
+    # Minimize t such that the sum of each finger's normal forces is at most t.
     R_TO = unpack_pose(trials[pose][row])[:3, :3]
     weight = np.concatenate([R_TO.T @ [0.0, 0.0, mass * GRAVITY], np.zeros(3)])
     fingers = np.eye(len(p))[np.array(finger)].T

@@ -1,12 +1,12 @@
-"""How fast `drakegrasp inspect` shows a large dataset, and its memory.
+"""Measure how fast `drakegrasp inspect` shows a large dataset, and its memory.
 
 \b
     python pipelines/measurements/speed.py page OUT --grasps 50000 > inspect_speed.json
 
 The script repeats the attempts of the dataset OUT, with their images, under new numbers until there
-are as many grasps as asked for, and serves the result from a process of its own. It prints the
+are as many grasps as requested, and serves the result from a separate process. It measures the
 wall-clock and CPU seconds of the server for each kind of request, and its peak memory. The large
-files are in a temporary folder, about 60 kB per grasp. Prints JSON.
+files are in a temporary folder and need about 60 kB per grasp. The script prints JSON.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SUCCESS_FIELDS, TRIA
 from drakegrasp.outcomes import Outcome
 from drakegrasp.page.catalog import Catalog
 
-#: Filters that are asked for, each new to the server.
+#: Filters that are requested, each new to the server.
 FILTERS = ("min_slip=5", "object=50_carton_final&sort=slip", "outcome=any&sort=penetration",
            "hold=stable&min_force=40", "outcome=dropped&sort=force", "decision=open")  # fmt: skip
-#: Grasps whose pages are asked for.
+#: Number of grasps whose pages are requested.
 PAGES = 20
 SERVE = "from drakegrasp.cli.main import run; run()"
 
@@ -53,12 +53,12 @@ def main(out: Path, grasps: int) -> None:
 
 
 def repeat_dataset(out: Path, large: Path, grasps: int) -> int:
-    """Write a dataset with the attempts of another, again and again; return their number.
+    """Write a dataset that repeats the attempts of another one; return their number.
 
-    Only whole chunks of its columns are taken, so that their compressed bytes can be copied.
+    Only whole chunks of the columns are taken, so that their compressed bytes can be copied.
     """
     with h5py.File(out / TRIALS_FILE) as source, h5py.File(large / TRIALS_FILE, "w") as target:
-        # As many copies as it takes.
+        # Number of copies that are needed.
         count = len(source["trials/outcome"]) // COLUMN_CHUNK * COLUMN_CHUNK
         hits = int(np.count_nonzero(source["trials/outcome"][:count] == Outcome.SUCCESS))
         if not hits:
@@ -67,7 +67,7 @@ def repeat_dataset(out: Path, large: Path, grasps: int) -> int:
         target.attrs.update(source.attrs)
         source.copy("objects", target)
 
-        # The numbers of trials and palm poses continue from copy to copy; the rest stays.
+        # The numbers of trials and palm poses continue from copy to copy; other values stay.
         poses = int(source["trials/candidate"][:].max()) + 1
         shifts = {"trial_id": count, "candidate": poses}
         group = target.create_group("trials")
@@ -96,7 +96,7 @@ def repeat_dataset(out: Path, large: Path, grasps: int) -> int:
 
 
 def _repeat_samples(old: Path, new: Path, copies: int, count: int) -> None:
-    """Write a data file with the samples of another, again and again."""
+    """Write a data file that repeats the samples of another one."""
     with h5py.File(old) as source, h5py.File(new, "w") as target:
         target.attrs.update(source.attrs)
         for split in source:
@@ -118,7 +118,7 @@ def _repeat_samples(old: Path, new: Path, copies: int, count: int) -> None:
 def _repeat_chunks(
     old: h5py.Dataset, new: h5py.Dataset, size: int, number: int, copies: int
 ) -> None:
-    """Copy the first chunks of a dataset, of a size in rows, again and again as they are."""
+    """Copy the first chunks of a dataset, each with `size` rows, repeatedly and unchanged."""
     place = (0,) * (old.ndim - 1)
     for k in range(number):
         mask, content = old.id.read_direct_chunk((k * size, *place))
@@ -127,14 +127,14 @@ def _repeat_chunks(
 
 
 def measure(out: Path) -> dict[str, Any]:
-    """Return seconds of requests by kind, and the memory of the server."""
+    """Return the seconds of requests by kind, and the memory of the server."""
     snapshot = Catalog(out).current()
     rng = np.random.default_rng(0)
     (hits,) = np.nonzero(snapshot.table.outcome == Outcome.SUCCESS)
     labels = [snapshot.label(int(i)) for i in rng.choice(hits, PAGES, replace=False)]
     del snapshot
 
-    # The server in a process of its own.
+    # Start the server in a separate process.
     start = time.perf_counter()
     command = [sys.executable, "-c", SERVE, "inspect", str(out), "--port", "0", "--no-browser"]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -147,7 +147,7 @@ def measure(out: Path) -> dict[str, Any]:
         }
 
         def ask(paths: list[str]) -> dict[str, float]:
-            """Return the largest seconds of the requests, wall-clock and CPU."""
+            """Return the largest and median seconds of the requests, wall-clock and CPU."""
             found = []
             for path in paths:
                 cpu, wall = _cpu_seconds(server.pid), time.perf_counter()
@@ -172,7 +172,7 @@ def measure(out: Path) -> dict[str, Any]:
 
 
 def _seen(address: str, labels: list[str]) -> list[str]:
-    """Return those of some grasps that have images."""
+    """Return those of the grasps that have images."""
     seen = []
     for label in labels:
         try:
@@ -184,6 +184,6 @@ def _seen(address: str, labels: list[str]) -> list[str]:
 
 
 def _cpu_seconds(pid: int) -> float:
-    """Return the CPU time of a process so far [s]."""
+    """Return the CPU time that a process has used [s]."""
     fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / 100.0

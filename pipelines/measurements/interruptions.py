@@ -1,15 +1,15 @@
-"""Interrupt builds in many places; the same command must then finish with equal arrays.
+"""Interrupt builds at many points; the same command must then finish with equal arrays.
 
 \b
     python pipelines/measurements/interruptions.py disk [--amounts N] [--only build|assemble]
     python pipelines/measurements/interruptions.py kills [--rounds N]
 
-`disk`, as root, gives a build and `assemble` a file system in memory (tmpfs) that is full at ever
-other moments: each must end with exit code 1 and one line, and keep what was there. `kills` ends
-the client of a build with SIGKILL at random moments, in each round twice while it prepares, twice
-while it simulates and twice while it assembles: the files are of one state at any time, and at
-the end nothing is left over. Both print a line of JSON for each interruption; exit code 1 if any
-is wrong.
+`disk`, which needs root, runs a build and `assemble` in a file system in memory (tmpfs) that
+becomes full at a different moment each time: each must end with exit code 1 and one line, and keep
+the previous files. `kills` ends the client of a build with SIGKILL at random moments, in each round
+twice while it prepares, twice while it simulates and twice while it assembles: the files must be in
+one consistent state at any time, and no temporary file may be left at the end. Both print a line of
+JSON for each interruption; the exit code is 1 if any is wrong.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from drakegrasp.dataset.lock import tidy
 
 DATA = ("trials.hdf5", "grasping_oto.hdf5", "grasping_otm.hdf5")
 PAGE, ROOM = 4096, 2**31
-#: Two boxes in as little time as gives some successes.
+#: Settings with which two boxes quickly yield some successes.
 SETTINGS = [
     "screen.mode=off",
     "candidates.max=4",
@@ -55,11 +55,11 @@ SETTINGS = [
 ]
 MAIN = [sys.executable, "-c", "from drakegrasp.cli.main import main; main()"]
 LINE = "the disk or the quota is full (No space left on device); make room"
-#: How long the workers of a client that was killed may live on [s]: they end their attempt.
+#: Time that the workers of a killed client may live on [s]: they finish their attempt.
 ORPHANED = 60.0
-#: Phases of a build, and how long after the beginning of one a kill comes at the latest [s].
+#: Phases of a build, and the longest time from the beginning of a phase to a kill [s].
 PHASES = {"prepare": 1.5, "simulate": 2.0, "assemble": 0.8}
-#: What each phase makes.
+#: Files that each phase writes.
 MADE = {"prepare": "objects/*.plan.h5", "simulate": "shards/*/*.h5", "assemble": "*.hdf5"}
 
 
@@ -110,7 +110,7 @@ def arrays(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def small_disk(folder: Path, size: int) -> Iterator[None]:
-    """Mount a file system of a size [B] on a folder while the block runs."""
+    """Mount a file system of a given size [B] on a folder while the block runs."""
     options = f"size={size // PAGE * PAGE},mode=700"
     subprocess.run(["mount", "-t", "tmpfs", "-o", options, "none", str(folder)], check=True)
     try:
@@ -120,13 +120,13 @@ def small_disk(folder: Path, size: int) -> Iterator[None]:
 
 
 def resize(folder: Path, size: int) -> None:
-    """Give a mounted file system another size [B]."""
+    """Change the size [B] of a mounted file system."""
     options = f"remount,size={size // PAGE * PAGE}"
     subprocess.run(["mount", "-o", options, str(folder)], check=True)
 
 
 def used(out: Path, names: Sequence[str] = ()) -> int:
-    """Return the bytes of all files below a folder, or of some of them, in pages."""
+    """Return the bytes of a folder's files, or of those with given names, in whole pages."""
     files = [path for path in out.rglob("*") if path.is_file()]
     chosen = [path for path in files if not names or path.name in names]
     return sum(-(-path.stat().st_size // PAGE) * PAGE for path in chosen)
@@ -135,12 +135,12 @@ def used(out: Path, names: Sequence[str] = ()) -> int:
 def fill_disk(
     command: Sequence[str], reference: Path, disk: Path, size: int, content: Path | None
 ) -> dict[str, Any]:
-    """Run a command with little room, and again with plenty; tell how both ended.
+    """Run a command with too little space, and again with enough; report how both ended.
 
     Args:
         command: The command, which writes to `out` on the disk.
-        reference: The dataset that it shall make.
-        disk: Where the disk is mounted.
+        reference: The dataset that the command should produce.
+        disk: Folder on which the disk is mounted.
         size: Free space [B].
         content: The dataset that is there before, if any.
     """
@@ -150,15 +150,15 @@ def fill_disk(
             shutil.copytree(content, out)
         before = {name: (out / name).read_bytes() for name in DATA if content is not None}
 
-        # With too little room.
+        # Run it with too little space.
         resize(disk, used(disk) + size)
         full = subprocess.run(command, capture_output=True, text=True)
-        # The state of the progress bar is no error.
+        # A line of the progress bar is not an error.
         lines = [line for line in full.stderr.splitlines() if "shards/s" not in line]
         left = [path.name for path in disk.rglob(".*.tmp")]
         kept = all((out / name).read_bytes() == text for name, text in before.items())
 
-        # With plenty.
+        # Run it with enough space.
         resize(disk, ROOM)
         again = subprocess.run(command, capture_output=True, text=True)
         equal = again.returncode == 0 and same_arrays(reference, out)
@@ -178,7 +178,7 @@ def fill_disk(
 
 
 def phase_of(out: Path, objects: int, units: int) -> str:
-    """Return what the client of a build is at, by its files."""
+    """Return the phase of a build's client, judged by its files."""
     if len(list(out.glob("objects/*.plan.h5"))) < objects:
         return "prepare"
     return "simulate" if len(list(out.glob("shards/*/*.h5"))) < units else "assemble"
@@ -187,11 +187,11 @@ def phase_of(out: Path, objects: int, units: int) -> str:
 def kill_in(
     phase: str, command: Sequence[str], out: Path, delay: float, objects: int, units: int
 ) -> dict[str, Any] | None:
-    """Kill a build in a phase, some seconds after the phase begins for it; None if it was quicker.
+    """Kill a build in a phase, some seconds after the phase begins.
 
     Returns:
-        The phase in which it died, how long its workers lived on [s], and whether the files were of
-        one state.
+        The phase in which it died, how long its workers lived on [s], and whether the files were in
+        one state; None if the build finished earlier.
     """
     since = time.time()
     signs = {
@@ -208,7 +208,7 @@ def kill_in(
     if process.wait() == 0:
         return None
 
-    # The workers end by themselves.
+    # The workers must end by themselves.
     died, end = phase_of(out, objects, units), time.monotonic() + ORPHANED
     start = time.monotonic()
     while any(map(runs, workers)) and time.monotonic() < end:
@@ -225,7 +225,7 @@ def kill_in(
 
 
 def has_newer(out: Path, pattern: str, since: float) -> bool:
-    """Return whether there is a file of a pattern that was changed since a time [s]."""
+    """Return whether a file that matches a pattern was changed since a given time [s]."""
     for path in out.glob(pattern):
         try:
             if path.stat().st_mtime >= since:
@@ -236,7 +236,7 @@ def has_newer(out: Path, pattern: str, since: float) -> bool:
 
 
 def has_one_state(out: Path) -> bool:
-    """Return whether all of the three files, or none, are there and made from the same."""
+    """Return whether all of the three files or none exist, and were made from the same shards."""
     there = [out / name for name in DATA if (out / name).exists()]
     states = set()
     for path in there:
@@ -246,7 +246,7 @@ def has_one_state(out: Path) -> bool:
 
 
 def children(client: int) -> list[int]:
-    """Return the processes that a process started."""
+    """Return the ids of the processes that a process started."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -259,7 +259,7 @@ def children(client: int) -> list[int]:
 
 
 def runs(pid: int) -> bool:
-    """Return whether a process still runs."""
+    """Return whether a process is still running."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
@@ -267,7 +267,7 @@ def runs(pid: int) -> bool:
 
 
 def leftovers(out: Path) -> list[str]:
-    """Return the files of a dataset that only a build that runs may have."""
+    """Return the files of a dataset that may exist only while a build is running."""
     patterns = (".*.tmp", "*.journal", "build.lock", "replacement.json")
     return sorted(path.name for pattern in patterns for path in out.rglob(pattern))
 
@@ -275,14 +275,15 @@ def leftovers(out: Path) -> list[str]:
 def kill_round(
     meshes: Path, reference: Path, out: Path, rng: random.Random, times: int = 2
 ) -> list[dict[str, Any]]:
-    """Kill a build some times in each phase, and let it finish; tell of each kill."""
+    """Kill a build several times in each phase, and let it finish; report each kill."""
     command = build_command(meshes, out, workers=2)
     objects, units = (len(list(reference.glob(p))) for p in ("objects/*.plan.h5", "shards/*/*.h5"))
     told: list[dict[str, Any]] = []
     for phase, longest in PHASES.items():
         killed = 0
         while killed < times:
-            # It does the phase again; before assembling, all that comes first is there.
+            # Remove the files of the phase, so that it runs again; `assemble` needs all earlier
+            # ones.
             if phase == "assemble" and phase_of(out, objects, units) != phase:
                 subprocess.run(command, check=True, capture_output=True)
             for path in out.glob(MADE[phase]):
@@ -293,7 +294,7 @@ def kill_round(
             killed += 1
             told.append({"meant": phase, **found})
 
-    # The same command finishes what is left.
+    # The same command completes the build.
     last = subprocess.run(command, capture_output=True, text=True)
     well = last.returncode == 0 and same_arrays(reference, out) and not leftovers(out)
     for line in told:
@@ -317,7 +318,7 @@ def disk(amounts: int, only: str | None) -> None:
     """Fill the disk under a build and under `assemble`."""
     wrong = 0
     with references() as (meshes, reference, folder):
-        # A build needs room for all of its files; `assemble` for new ones beside the old ones.
+        # A build needs space for all of its files; `assemble` for new ones beside the old ones.
         mounted = folder / "disk"
         mounted.mkdir()
         out = mounted / "out"
@@ -328,7 +329,7 @@ def disk(amounts: int, only: str | None) -> None:
                 continue
             content = reference if kind == "assemble" else None
             for number in range(amounts):
-                # From a page to just too little.
+                # Sizes from one page to slightly too little.
                 size = PAGE + int((needs[kind] - 6 * PAGE) * number / max(1, amounts - 1))
                 result = fill_disk(command, reference, mounted, size, content)
                 wrong += not result["well"]
@@ -338,7 +339,7 @@ def disk(amounts: int, only: str | None) -> None:
 
 
 @main.command()
-@click.option("--rounds", default=5, show_default=True, help="Of six kills.")
+@click.option("--rounds", default=5, show_default=True, help="Number of rounds of six kills.")
 @click.option("--seed", default=0, show_default=True)
 def kills(rounds: int, seed: int) -> None:
     """Kill the client of a build."""
@@ -354,7 +355,7 @@ def kills(rounds: int, seed: int) -> None:
 
 @contextmanager
 def references() -> Iterator[tuple[Path, Path, Path]]:
-    """Yield the meshes, their dataset, and a folder for more."""
+    """Yield the folder of the meshes, their dataset, and a folder for other files."""
     os.environ.setdefault("DRAKE_ALLOW_NETWORK", "none")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

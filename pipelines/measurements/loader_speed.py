@@ -1,15 +1,14 @@
-"""How many random samples per second torch's DataLoader reads, beside h5py alone.
+"""Measure how many random samples per second torch's DataLoader reads, compared with h5py alone.
 
 \b
     python pipelines/measurements/speed.py loader OUT --samples 6000 > loader_speed.json
 
-The samples of the dataset OUT, as they are compressed, are repeated until there are as many as
-asked for, in a temporary file of about 40 kB a sample. Images and grasps are read in random order:
-by `GraspDataset.to_torch` under a DataLoader with two workers, and by two processes that do nothing
-but read the same chunks with h5py. Both are timed in turns, after a first pass that starts their
-processes. Prints JSON: samples per second of wall clock of each turn, the median of the turns'
-ratios, and the same of CPU seconds, which say more on a machine that is busy otherwise. Needs the
-extra `[torch]`.
+The compressed samples of the dataset OUT are repeated until there are as many as requested, in a
+temporary file of about 40 kB per sample. Images and grasps are read in random order: by
+`GraspDataset.to_torch` under a DataLoader with two workers, and by two processes that only read the
+same chunks with h5py. Both are timed in turn, after a first pass that starts their processes. The
+script prints JSON: samples per wall-clock second of each turn, the median of the turns' ratios, and
+the same for CPU seconds, which are more reliable on a busy machine. It needs the extra `[torch]`.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -65,7 +64,7 @@ def main(out: Path, samples: int, rounds: int, batch_size: int) -> None:
 
 
 def repeat_samples(old: Path, new: Path, samples: int) -> None:
-    """Write a data file whose split `train` has the samples of all splits, again and again."""
+    """Write a data file whose split `train` repeats the samples of all splits."""
     with h5py.File(old) as source, h5py.File(new, "w") as target:
         target.attrs.update(source.attrs)
         places = [(split, row) for split in SPLITS for row in range(len(source[split]["grasps"]))]
@@ -91,7 +90,7 @@ def repeat_samples(old: Path, new: Path, samples: int) -> None:
 def _copy_chunks(
     source: h5py.File, taken: list[tuple[str, int]], name: str, made: h5py.Dataset
 ) -> None:
-    """Copy the compressed images of rows of the splits."""
+    """Copy the compressed images of the chosen rows of all splits."""
     place = (0,) * (made.ndim - 1)
     for k, (split, row) in enumerate(taken):
         mask, content = source[split][name].id.read_direct_chunk((row, *place))
@@ -119,12 +118,12 @@ def measure(
         if seen != samples:
             raise RuntimeError(f"the loader must give {samples} samples, got {seen}")
 
-    # The first round starts the processes.
+    # Leave out the first round, which starts the processes.
     return np.diff([*marks, _now()], axis=0).reshape(-1, 2, 2)[1:]
 
 
 def _now() -> tuple[float, float]:
-    """Return the wall clock and the CPU time of this process and its children [s]."""
+    """Return the wall clock, and the CPU time of this process and its children [s]."""
     children = Path(f"/proc/self/task/{os.getpid()}/children").read_text(encoding="utf-8").split()
     used = time.process_time()
     for pid in children:

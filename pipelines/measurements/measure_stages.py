@@ -4,8 +4,8 @@
     python pipelines/measurements/measure_stages.py MESH_DIR OUT --candidates 20 > times.json
     drakegrasp build --objects MESH_DIR ... --plan --times times.json
 
-The script builds a small dataset in this process alone, so that no other worker disturbs the
-clock. The defaults of `drakegrasp.generation.estimate` were measured with it.
+The script builds a small dataset in this process alone, so that no other worker disturbs the times.
+The defaults of `drakegrasp.generation.estimate` were measured with it.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from drakegrasp.outcomes import Outcome
 
 
 class Clock:
-    """An executor that keeps the time and the result of every task."""
+    """An executor that stores the time and the result of every task."""
 
     def __init__(self) -> None:
         self.prepare: list[float] = []
@@ -89,7 +89,7 @@ def main(
     build(sources, out, config, clock, show=False)
     end = time.perf_counter()
 
-    # The wall clock counts the time of other processes as well; CPU time is the share of this one.
+    # Wall-clock time includes waiting for other processes; CPU time counts only this process.
     core = (time.process_time() - begin_cpu) / (end - begin)
     times = stage_times(clock, core, assembled=end - clock.last, out=out)
     click.echo(json.dumps(asdict(times), indent=1))
@@ -99,12 +99,12 @@ def stage_times(clock: Clock, core: float, *, assembled: float, out: Path) -> St
     """Return the seconds of each stage of a build.
 
     Args:
-        clock: What the tasks took by the wall clock.
+        clock: Wall-clock times of the tasks.
         core: CPU time of this process per wall-clock time.
         assembled: Time from the last unit to the end [s].
-        out: The dataset.
+        out: Directory of the dataset.
     """
-    # Sum over all units, and over those of each object.
+    # Sum over all units.
     outcomes: Counter[Outcome] = Counter()
     seconds: Counter[str] = Counter()
     for unit in clock.units:
@@ -131,10 +131,10 @@ def stage_times(clock: Clock, core: float, *, assembled: float, out: Path) -> St
 
 
 def measure_storage(out: Path) -> dict[str, float]:
-    """Return the sizes that `StageTimes` has, of a finished dataset [B].
+    """Return the sizes in `StageTimes` for a finished dataset [B].
 
     Raises:
-        DataError: If there is none.
+        DataError: If there is no finished dataset.
     """
     try:
         with h5py.File(out / TRIALS_FILE, "r") as file:

@@ -1,9 +1,9 @@
-"""Drafts hands from the models of dex-urdf, builds a small dataset with each, and tries it again.
+"""Draft hands from the models of dex-urdf, build a small dataset with each, and try it again.
 
-In: a checkout of dexsuite/dex-urdf and a folder of meshes in metres. Out: a table in Markdown: what
-the first palm poses and those about samples give, and how many samples hold again when their palm
-and joints are given back as postures. What is there already is not done again. HAND may also be a
-hand of the package.
+In: a checkout of dexsuite/dex-urdf and a folder of meshes in metres. Out: a table in Markdown,
+which reports the results of the first palm poses and of those refined about samples, and how many
+samples hold again if their palm poses and joints are passed back as postures. Steps whose results
+already exist are skipped. HAND may also be a hand of the package.
 
     python pipelines/measurements/new_hands.py DEX_URDF MESHES [HAND...] --out FOLDER
 """
@@ -28,7 +28,7 @@ from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.posture import joint_order
 
-#: Models of the right hands, and what `hand new` asks of them.
+#: Models of the right hands, and the options with which `hand new` reads them.
 HANDS = {
     "Ability": ("ability_hand/ability_hand_right.urdf", ()),
     "Allegro": ("allegro_hand/allegro_hand_right.urdf", ()),
@@ -39,7 +39,7 @@ HANDS = {
     "SCHUNK SVH": ("schunk_hand/schunk_svh_hand_right.urdf", ("--effort", "0.5")),
     "Shadow": ("shadow_hand/shadow_hand_right.urdf", ()),
 }
-#: Mass of the objects [kg], and samples of a hand that are given back at most.
+#: Mass of the objects [kg], and maximum number of a hand's samples that are tried again.
 MASS, MOST_AGAIN = 0.3, 40
 HEADS = (
     *("hand", "attempts", "held", "precision", "stable", "samples"),
@@ -48,7 +48,7 @@ HEADS = (
 
 
 def main() -> None:
-    """Build what is missing, and print the table."""
+    """Build the missing datasets, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("models", type=Path, metavar="DEX_URDF")
     parser.add_argument("meshes", type=Path, metavar="MESHES")
@@ -71,7 +71,7 @@ def measure(name: str, arguments: argparse.Namespace) -> list[str]:
         if name in HANDS and not (folder / "hand").is_dir():
             path = arguments.models / "robots/hands" / model
             _run("hand", "new", str(path), "--out", str(folder / "hand"), *answers)
-        # Those of the package need no draft.
+        # Hands of the package need no draft.
         (hand,) = (folder / "hand").glob("*_hand.yaml") if name in HANDS else [name]
         build = ["--objects", arguments.meshes, "--config", "fast", "--set", f"hand={hand}"]
         build += ["--set", f"objects.mass={MASS}", "--workers", arguments.workers, "--quiet"]
@@ -88,7 +88,7 @@ def measure(name: str, arguments: argparse.Namespace) -> list[str]:
 
 
 def _counts(out: Path) -> list[str]:
-    """Return what the first palm poses of a dataset give, and what all give."""
+    """Return the results of a dataset's first palm poses, and of all its palm poses."""
     funnel = count_funnel(out)
     first = (
         funnel.outcomes.sum(),
@@ -105,7 +105,7 @@ def _counts(out: Path) -> list[str]:
 
 
 def write_postures(out: Path, path: Path) -> int:
-    """Write samples, evenly chosen, as postures that begin with the open hand; return how many."""
+    """Write evenly chosen samples as postures that begin with the open hand; return the count."""
     trials = Trials(out)
     kept = np.flatnonzero(trials["removal"] == Removal.KEPT)
     if not len(kept):
@@ -137,7 +137,7 @@ def write_postures(out: Path, path: Path) -> int:
 
 
 def _run(*words: Any) -> None:
-    """Run a command of drakegrasp."""
+    """Run a drakegrasp command."""
     code = "from drakegrasp.cli.main import run; run()"
     command = [sys.executable, "-c", code, *map(str, words)]
     subprocess.run(command, check=True, capture_output=True, text=True)

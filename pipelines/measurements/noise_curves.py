@@ -1,14 +1,15 @@
-"""How many grasps still hold when their points or normals are wrong by some noise.
+"""Measure how many grasps still hold when their points or normals have errors.
 
 \b
     python pipelines/measurements/noise_curves.py OUT noise.jsonl --number 60 > noise.json
     python pipelines/measurements/noise_curves.py OUT noise.jsonl --figure docs/images/noise.png
 
-OUT is an assembled dataset. The script moves the contact points of samples by normal noise of
-several sizes (per coordinate), and verifies them as they are and with `snap_points`; and it tilts
-normals by a given angle in a random direction. Each line of noise.jsonl is a verdict; a run that is
-stopped continues where it was, and another run with a larger number adds to it. Prints JSON: the
-share of grasps that hold, with the first wrist pose, and its interval of 95 %.
+OUT is an assembled dataset. The script moves the contact points of samples by Gaussian noise of
+several sizes (per coordinate), and verifies them unchanged and with `snap_points`. It also tilts
+normals by a given angle in a random direction. Each line of noise.jsonl is a verdict: a run that
+was stopped continues with the missing verdicts, and a run with a larger number adds more. The
+script prints JSON: the fraction of grasps that hold with the first wrist pose, and its 95 %
+interval.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from drakegrasp.hand.settings import override_config
 
 #: Standard deviations of each coordinate of a point [mm], and angles of the normals [deg].
 POINTS, NORMALS = (0.0, 2.5, 5.0, 10.0, 15.0, 20.0), (10.0, 20.0, 30.0, 40.0)
-#: Distances d of the curve held(d) [mm]: a grasp counts if it holds within d of what was asked for.
+#: Distances d of the curve held(d) [mm]: a grasp counts if it holds within d of the request.
 WITHIN = (5.0, 10.0, 20.0, 40.0, np.inf)
 
 Array = npt.NDArray[np.float64]
@@ -43,8 +44,8 @@ Array = npt.NDArray[np.float64]
 @click.command(help=__doc__)
 @click.argument("out", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.argument("lines", type=click.Path(path_type=Path, dir_okay=False))
-@click.option("--number", type=int, default=0, help="Grasps to verify; 0: only what is there.")
-@click.option("--tries", type=int, default=1, show_default=True, help="Wrist poses of a grasp.")
+@click.option("--number", type=int, default=0, help="Grasps to verify; 0: only those in the file.")
+@click.option("--tries", type=int, default=1, show_default=True, help="Wrist poses per grasp.")
 @click.option("--figure", type=click.Path(path_type=Path), help="Draw the curves to this file.")
 def main(out: Path, lines: Path, number: int, tries: int, figure: Path | None) -> None:
     """Run the script."""
@@ -63,23 +64,23 @@ def main(out: Path, lines: Path, number: int, tries: int, figure: Path | None) -
 
 
 def read(lines: Path) -> list[dict[str, Any]]:
-    """Return the verdicts in a file, if there is one."""
+    """Return the verdicts in a file; none if the file does not exist."""
     if not lines.exists():
         return []
     return [json.loads(line) for line in lines.read_text(encoding="utf-8").splitlines()]
 
 
 def key_of(line: dict[str, Any]) -> tuple[int, str, float]:
-    """Return what a verdict is of: the attempt, the kind of noise, its size."""
+    """Return the key of a verdict: the attempt, the kind of noise and its size."""
     return line["trial"], line["kind"], line["noise"]
 
 
 def verdicts(
     out: Path, config: Config, number: int, done: set[tuple[int, str, float]]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the verdicts that are missing, grasp by grasp."""
+    """Yield the missing verdicts, grasp by grasp."""
     for data, row, trial, p, n in some_grasps(out, number):
-        # The same directions at every size, so that a curve is of one error that grows.
+        # The directions are the same at every size, so that a curve shows one growing error.
         rng = np.random.default_rng(trial)
         away, beside = rng.normal(size=p.shape), np.cross(n, rng.normal(size=n.shape))
         beside /= np.linalg.norm(beside, axis=1, keepdims=True)
@@ -116,9 +117,9 @@ def verdicts(
 
 
 def some_grasps(out: Path, number: int) -> Iterator[tuple[GraspDataset, int, int, Array, Array]]:
-    """Yield data file, row, attempt, points and normals (k, 3) in {O} of samples, in turn.
+    """Yield data file, row, attempt, points and normals (k, 3) in {O} of samples.
 
-    The first sample of each object comes first, then the second of each.
+    The first sample of each object comes first, then the second sample of each.
     """
     trials = Trials(out)
     contacts = trials.contacts(frame="O")
@@ -134,14 +135,14 @@ def some_grasps(out: Path, number: int) -> Iterator[tuple[GraspDataset, int, int
 
 
 def summary(lines: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the curves: what holds at each size of noise, at all and within each distance."""
+    """Return the curves: how many grasps hold at each size of noise, in total and by distance."""
     figures: dict[str, Any] = {
         "grasps": len({line["trial"] for line in lines}),
         "objects": len({line["object"] for line in lines}),
         "verdicts": len(lines),
     }
     for kind in ("raw", "snapped", "normals"):
-        # Without noise there is no normal that is tilted: these are the grasps as they are.
+        # The unchanged grasps are also the grasps with normals tilted by zero.
         same = {kind, "raw"} if kind == "normals" else {kind}
         sizes = (0.0, *NORMALS) if kind == "normals" else POINTS
         figures[kind] = [
@@ -178,7 +179,7 @@ def _point(size: float, group: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _far(line: dict[str, Any]) -> float:
-    """Return the largest distance of a contact from what was asked for [mm]; inf if unknown."""
+    """Return the largest distance of a contact from the requested one [mm]; inf if unknown."""
     return np.inf if line["error_mm"] is None else float(line["error_mm"])
 
 

@@ -1,12 +1,13 @@
-"""Show lifts whose verdicts differ in Drake and MuJoCo, and print what happened in both.
+"""Show lifts whose verdicts differ in Drake and MuJoCo, and print the motion in both.
 
     python pipelines/measurements/peer_pictures.py lines.jsonl --dataset OUT --sheet sheet.png
     python pipelines/measurements/peer_pictures.py lines.jsonl --dataset OUT --set lift.hold_time=1
 
-`lines.jsonl` is that of peer_settings.py. Half of the lifts are samples that fall in MuJoCo, as far
-as there are any, the others lost lifts that hold there, drawn at random. The sheet has each lift in
-Drake and beside it in MuJoCo, in the palm's frame: the closed hand, and the last touch of a
-fingertip. Without a sheet Drake alone tries them again, with the settings that are given.
+`lines.jsonl` is the output of peer_settings.py. Half of the lifts are samples that fall in MuJoCo,
+as far as available; the others are lost lifts that hold there. Both are drawn at random. The sheet
+shows each lift in Drake and beside it in MuJoCo, in the palm's frame: the closed hand, and the last
+instant at which a fingertip touches. Without a sheet only Drake tries the lifts again, with the
+given settings.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ from drakegrasp.simulation.contacts import read_contacts
 from drakegrasp.simulation.scene import Scene, hand_positions, palm_pose
 from drakegrasp.simulation.trial import run_attempt
 
-#: Last number of the place of the stream that draws the lifts.
+#: Last number of the key of the random stream that draws the lifts.
 PLACE = 26
 
 
 @dataclass(frozen=True)
 class Instant:
-    """Time [s] and X_GO, joints, force [N] of each fingertip, deepest contact [m], other links."""
+    """Time [s], X_GO, joints, force [N] per fingertip, deepest contact [m], other links."""
 
     time: float
     X_GO: Array
@@ -59,7 +60,7 @@ class Instant:
 
 
 class Watched(MujocoBaseline):
-    """MuJoCo with what was seen at each check of a lift, first of the closed hand."""
+    """MuJoCo baseline that stores the closed hand and the state at each check of a lift."""
 
     seen: list[Instant]
 
@@ -81,7 +82,7 @@ class Watched(MujocoBaseline):
 
 
 class Monitor(lifting._Monitor):
-    """Drake's checks of a lift, with what was seen at each, first of the closed hand."""
+    """Drake's monitor of a lift, which also stores the closed hand and the state at each check."""
 
     seen: ClassVar[list[Instant]] = []
 
@@ -101,7 +102,7 @@ class Monitor(lifting._Monitor):
 
 
 def chosen(out: Path, lines: Path, count: int) -> list[StoredLift]:
-    """Return lifts whose verdicts differ, object by object."""
+    """Return lifts whose verdicts differ, sorted by object."""
     rows = [json.loads(line) for line in lines.read_text(encoding="utf-8").splitlines()]
     held = {row["trial_id"]: row["there"]["usual"] == Outcome.SUCCESS.label for row in rows}
     lifts = [lift for lift in draw_lifts(out, 1 << 62) if lift.trial_id in held]
@@ -113,7 +114,7 @@ def chosen(out: Path, lines: Path, count: int) -> list[StoredLift]:
 
 
 def said(name: str, seen: Sequence[Instant]) -> Iterator[str]:
-    """Yield what was seen in a simulator, instant by instant."""
+    """Yield the stored states of a simulator as lines of text, instant by instant."""
     for now in seen:
         motion = invert_pose(seen[0].X_GO) @ now.X_GO
         slip, turn = 1e3 * norm(motion[:3, 3]), np.rad2deg(rotation_angle(motion[:3, :3]))
@@ -130,7 +131,7 @@ def pictures(
     """Return pictures of the closed hand and of the last touch in each simulator."""
     X_WG, X_WC, found = X_WT @ make_pose(np.eye(3), [0.0, 0.0, 1.0]), None, []
     for instants in seen:
-        # An attempt that ended before the hand was closed was not seen.
+        # An attempt that ended before the hand was closed has no stored states.
         if not instants:
             found += 2 * [Image.new("RGB", (edge, edge), "white")]
             continue
@@ -145,7 +146,7 @@ def pictures(
 
 
 def watch(lifts: Sequence[StoredLift], arguments: argparse.Namespace) -> Iterator[str]:
-    """Yield what happened in lifts, in both simulators and in pictures if there is a sheet."""
+    """Yield the motion of lifts as text, in both simulators and in pictures if there is a sheet."""
     out, edge, before, drawn = arguments.dataset, arguments.edge, "", list[Any]()
     manifest = read_manifest(out)
     for number, lift in enumerate(lifts, 1):
@@ -160,7 +161,7 @@ def watch(lifts: Sequence[StoredLift], arguments: argparse.Namespace) -> Iterato
                 peer = Watched(model, prepared.X_TO, config)
                 still = StillScene(hand, model, table_size=1e-3)
         X_TO, usual = prepared.resting_poses[lift.resting], usual_conditions(model, config.physics)
-        # Settings that are given hold for all, in place of what was drawn.
+        # Given settings hold for all lifts, and replace the drawn values.
         own = usual if arguments.overrides else replace(usual, materials=lift.materials)
         attempt = replace(lift.pregrasp, conditions=own)
         Monitor.seen.clear()
@@ -192,10 +193,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the script; return its exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("lines", type=Path, help="file with a line per lift")
-    parser.add_argument("--dataset", type=Path, required=True, help="of these lifts")
+    parser.add_argument("--dataset", type=Path, required=True, help="dataset of these lifts")
     parser.add_argument("--sheet", type=Path, help="PNG to write")
-    parser.add_argument("--count", type=int, default=20, help="lifts (default: 20)")
-    parser.add_argument("--edge", type=int, default=150, help="of a picture [px] (default: 150)")
+    parser.add_argument("--count", type=int, default=20, help="number of lifts (default: 20)")
+    parser.add_argument(
+        "--edge", type=int, default=150, help="edge of a picture [px] (default: 150)"
+    )
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     arguments = parser.parse_args(argv)
     lifts = chosen(arguments.dataset, arguments.lines, arguments.count)

@@ -1,12 +1,12 @@
-"""Measure what a lift's verdict in MuJoCo depends on: stored lifts again, with other settings.
+"""Measure what a lift's verdict in MuJoCo depends on: try stored lifts with other settings.
 
     python pipelines/measurements/peer_settings.py lines.jsonl --dataset OUT --count 100
     python pipelines/measurements/peer_settings.py lines.jsonl
 
-Samples and lost lifts are drawn from random objects of a dataset that have both, some of each. Each
-is tried with torsion radii of 1, 2 and 5 mm, with 10 % less and more friction with
-the hand, and at half the step. The first call writes a line per lift; the second prints the shares
-that hold, with their intervals, and how many verdicts are others than with the usual settings.
+Samples and lost lifts are drawn from random objects of a dataset that have both. Each lift is tried
+with torsion radii of 1, 2 and 5 mm, with 10 % less and more friction between object and hand, and
+at half the time step. The first call writes a line per lift. The second prints the fractions that
+hold with their intervals, and how many verdicts differ from those with the usual settings.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from drakegrasp.seeding import Stream
 from drakegrasp.simulation.conditions import usual_conditions
 
 GROUPS: tuple[Group, ...] = ("sample", "lost")
-#: Last number of the place of the stream that draws objects.
+#: Last number of the key of the random stream that draws objects.
 PLACE = 25
-#: Torsion radius [m], factor of the friction with the hand, and of the time step, by setting.
+#: Torsion radius [m], factor of the friction with the hand, and divisor of the time step.
 SETTINGS = {
     "usual": (links.TORSION_RADIUS, 1.0, 1),
     "torsion radius 1 mm": (1e-3, 1.0, 1),
@@ -51,9 +51,9 @@ SETTINGS = {
 
 
 def with_step(stack: ExitStack, finer: int) -> None:
-    """Let MuJoCo take steps that are shorter by a factor, until the stack closes.
+    """Make MuJoCo take time steps that are shorter by a factor, until the stack closes.
 
-    Contacts keep their time constant, and checks their period.
+    Contacts keep their time constant, and checks keep their period.
     """
     for module in (scene, mujoco_baseline):
         stack.enter_context(mock.patch.object(module, "TIME_STEP", links.TIME_STEP / finer))
@@ -96,7 +96,7 @@ def measure(out: Path, count: int, each: int, lines: Path) -> None:
     for lift in draw_lifts(out, 1 << 62):
         by_object.setdefault(lift.object_name, []).append(lift)
 
-    # Objects in random order: what is there after a while is a fair share.
+    # Objects come in random order, so that partial results are representative.
     names, left = sorted(by_object), dict.fromkeys(GROUPS, count)
     with lines.open("w", encoding="utf-8") as file:
         for i in Stream(config.seed, PLACE).permutation(len(names)).tolist():
@@ -112,7 +112,7 @@ def measure(out: Path, count: int, each: int, lines: Path) -> None:
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> Iterator[str]:
-    """Yield the table of what was measured, as lines of Markdown."""
+    """Yield the table of the results as lines of Markdown."""
     held = Outcome.SUCCESS.label
     for group in GROUPS:
         own = [row["there"] for row in rows if row["group"] == group]
@@ -129,8 +129,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("lines", type=Path, help="file with a line per lift")
     parser.add_argument("--dataset", type=Path, help="measure lifts of this dataset")
-    parser.add_argument("--count", type=int, default=100, help="of each group (default: 100)")
-    parser.add_argument("--each", type=int, default=4, help="of each object (default: 4)")
+    parser.add_argument("--count", type=int, default=100, help="lifts per group (default: 100)")
+    parser.add_argument(
+        "--each", type=int, default=4, help="lifts per object and group (default: 4)"
+    )
     arguments = parser.parse_args(argv)
     if arguments.dataset is not None:
         measure(arguments.dataset, arguments.count, arguments.each, arguments.lines)

@@ -1,9 +1,10 @@
-"""Plant faults in a copy of the source, one at a time, and say which of them the tests find.
+"""Plant faults in a copy of the source, one at a time, and report which of them the tests find.
 
-The table `planted_faults.yaml` has faults that were once planted by hand and that no test saw;
-`draw_faults.py` draws others. A fault is a text that is replaced in one file, and the tests that
-must notice. Prints JSON: for each fault whether a test failed, and the seconds that took. Exits
-with 1 if a fault was not found that is not called equivalent.
+The table `planted_faults.yaml` contains faults that were once planted by hand and that no test
+found; `draw_faults.py` draws others. A fault is a text that is replaced in one file, together with
+the tests that must notice it. The script prints JSON: for each fault whether a test failed, and how
+many seconds that took. The exit code is 1 if a fault was not found that is not marked as
+equivalent.
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ from typing import Any
 import pytest
 import yaml
 
-#: Times of change, a second apart [s].
+#: Modification times for written files, one second apart [s].
 _TIMES = count(1_000_000_000)
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = Path(__file__).with_suffix(".yaml")
-#: Exit codes: of pytest if all tests passed, and of a run that was killed.
+#: Exit codes: pytest's code if all tests passed, and the code of a run that was killed.
 PASSED, KILLED = 0, -1
-#: A run may take as many times as long as one test may.
+#: Maximum duration of a run, as a multiple of the maximum duration of one test.
 HANG = 4.0
-#: What the tests load; a fork of this process need not load it again.
+#: Libraries that the tests load; a fork of this process need not load them again.
 LIBRARIES = (
     *("h5py", "networkx", "numpy", "pydantic", "rich.table", "trimesh", "yaml"),
     *("scipy.ndimage", "scipy.optimize", "scipy.spatial", "pydrake.multibody.plant"),
@@ -43,7 +44,7 @@ LIBRARIES = (
 
 
 def copy_source(folder: Path) -> None:
-    """Copy the files that Git knows of, with what has changed in them, into a folder."""
+    """Copy the files that Git knows, including uncommitted changes, into a folder."""
     listed = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT,
@@ -58,14 +59,15 @@ def copy_source(folder: Path) -> None:
 
 
 def with_fault(text: str, fault: dict[str, Any]) -> str:
-    """Return a file's text with a fault in it.
+    """Return a file's text with a fault planted in it.
 
     Args:
-        text: Of the file.
-        fault: Has `old` and `new`; `line` says where `old` begins if it occurs several times.
+        text: Text of the file.
+        fault: The fault with `old` and `new`; `line` states where `old` begins if it occurs several
+            times.
 
     Raises:
-        ValueError: If the text is not there, or not only once.
+        ValueError: If the text does not contain `old`, or contains it several times.
     """
     lines = text.splitlines(keepends=True)
     start = sum(map(len, lines[: fault.get("line", 1) - 1]))
@@ -76,15 +78,15 @@ def with_fault(text: str, fault: dict[str, Any]) -> str:
 
 
 def try_fault(folder: Path, fault: dict[str, Any], timeout: float) -> dict[str, Any]:
-    """Plant a fault in a copy, run its tests, and take it out again.
+    """Plant a fault in a copy, run its tests, and remove it again.
 
     Args:
-        folder: The copy.
-        fault: Of a table.
-        timeout: For one test [s]; a test that hangs has found the fault.
+        folder: Folder of the copy.
+        fault: Fault from a table.
+        timeout: Maximum duration of one test [s]; a test that hangs has found the fault.
 
     Returns:
-        What was found: `found`, the first test that failed, and `seconds`.
+        The result: `found`, the first test that failed as `by`, and `seconds`.
     """
     path, began = folder / fault["file"], time.monotonic()
     original = path.read_text(encoding="utf-8")
@@ -106,16 +108,16 @@ def try_fault(folder: Path, fault: dict[str, Any], timeout: float) -> dict[str, 
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a module, with another time of change than ever: compiled code is told by it."""
+    """Write a module with a new modification time, by which Python detects stale compiled code."""
     path.write_text(text, encoding="utf-8")
     changed = next(_TIMES)
     os.utime(path, (changed, changed))
 
 
 def run_tests(folder: Path, tests: Sequence[str], timeout: float) -> tuple[int, str]:
-    """Run tests in a copy until one fails; return pytest's exit code and what it said.
+    """Run tests in a copy until one fails; return pytest's exit code and its output.
 
-    In a fork of this process, which has the libraries loaded.
+    The tests run in a fork of this process, in which the libraries are loaded.
     """
     with tempfile.TemporaryFile() as output:
         child = get_context("fork").Process(
@@ -161,7 +163,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         folder = Path(name)
         copy_source(folder)
 
-        # Without a fault all tests must pass, or nothing is learnt.
+        # Without a fault all tests must pass, otherwise a failed test proves nothing.
         tests = sorted({test for fault in chosen for test in fault["tests"]})
         code, said = (PASSED, "") if arguments.trust else run_tests(folder, tests, 600.0)
         if code != PASSED:

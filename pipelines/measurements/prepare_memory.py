@@ -1,11 +1,12 @@
-"""Measure how much memory preparing a mesh takes, by its faces: each mesh in a process of its own.
+"""Measure how much memory the preparation of a mesh needs, by its number of faces.
 
 \b
     python pipelines/measurements/speed.py prepare [--subdivisions N ...] [--kind KIND ...]
 
-Balls of 10 cm are written as STL, OBJ and PLY (`stl`, `obj`, `ply`), and as PLY with noise and six
-holes (`open`). Prints a line of JSON for each: peak memory before and in all, what `drakegrasp
-audit` forecasts, and seconds. Processes have jemalloc where it is installed, as workers do.
+Each mesh is prepared in a separate process. Balls of 10 cm diameter are written as STL, OBJ and PLY
+(`stl`, `obj`, `ply`), and as PLY with noise and six holes (`open`). The script prints a line of
+JSON for each: the peak memory before and in total, the memory that `drakegrasp audit` forecasts,
+and the seconds. The processes use jemalloc if it is installed, as workers do.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from drakegrasp.runtime.allocator import jemalloc_environment
 
 KINDS = ("stl", "obj", "ply", "open")
 RADIUS = 0.05
-#: Runs in the process of a mesh; what is imported there is not the mesh's memory.
+#: Code that runs in the process of a mesh; memory of the imports is not counted for the mesh.
 _CHILD = """
 import json, re, sys, time
 from pathlib import Path
@@ -49,7 +50,7 @@ print(json.dumps({
 
 
 def ball(subdivisions: int, kind: str) -> trimesh.Trimesh:
-    """Return a ball of 20 * 4^subdivisions faces; of the kind "open" with noise and holes."""
+    """Return a ball of 20 * 4^subdivisions faces; the kind "open" has noise and holes."""
     mesh = trimesh.creation.icosphere(subdivisions, radius=RADIUS)
     if kind != "open":
         return mesh

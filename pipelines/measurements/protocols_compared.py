@@ -1,14 +1,16 @@
-"""The grasps that DexGraspBench publishes, by its own code and under our protocols, grasp by grasp.
+"""Compare the verdicts on DexGraspBench's published grasps by its own code and by our protocols.
 
 In: the folder of DexGraspBench, whose own evaluation has been run (`task=eval exp_name=example`),
 and the results of `drakegrasp verify --protocol`, one file of JSON lines per protocol. Out: a table
-in Markdown: held, with Wilson's interval, and how many verdicts agree with those of its code.
+in Markdown with the number of held grasps, Wilson's interval, and how many verdicts agree with
+those of the benchmark's code.
 
     python pipelines/measurements/protocols_compared.py DEXGRASPBENCH RESULTS.jsonl...
 
-Its repository needs the meshes of the Shadow Hand in `third_party/mujoco_menagerie`; those of the
-fingertips collide, the others are only seen. With DexGraspNet, `--dexgraspnet FOLDER --count N
---out FOLDER` writes N of its grasps, in equal numbers of each object, as files of the benchmark.
+The benchmark's repository needs the meshes of the Shadow Hand in `third_party/mujoco_menagerie`;
+the meshes of the fingertips collide, and the others are only visual. With `--dexgraspnet FOLDER
+--count N --out FOLDER` the script writes N grasps of DexGraspNet, in equal numbers of each object,
+as files of the benchmark.
 """
 
 from __future__ import annotations
@@ -27,13 +29,13 @@ from drakegrasp.dataset.quality import wilson_interval
 from drakegrasp.exchange.dexgraspbench import write_object
 from drakegrasp.protocols.files import read_dictionary
 
-#: Where the benchmark's example is, and its verdicts on it.
+#: Folders of the benchmark's example grasps, and of its verdicts on them.
 GRASPS, VERDICTS = "output/example_shadow/graspdata", "output/example_shadow/evaluation"
-#: DexGraspNet has one posture. Pregrasp and squeeze open and close the joints that bend by so
-#: much [rad].
+#: DexGraspNet has one posture per grasp. Pregrasp and squeeze open and close the bending joints by
+#: this angle [rad].
 APART = 0.1
 _BENDING = {*(f"{f}J{j}" for f in ("FF", "MF", "RF", "LF") for j in range(3)), "THJ0", "THJ1"}
-#: Joints of DexGraspNet's hand that turn the other way in the benchmark's.
+#: Joints of DexGraspNet's hand that turn in the opposite direction in the benchmark's hand.
 _OPPOSITE = {"FFJ3", "MFJ3", "THJ0", "THJ1"}
 
 
@@ -47,7 +49,7 @@ def read_own_verdicts(folder: Path) -> dict[str, bool]:
 
 
 def compare(own: dict[str, bool], lines: list[dict[str, Any]]) -> str:
-    """Return the row of a protocol: held, interval, agreement."""
+    """Return the table row of a protocol: held, interval, agreement."""
     held = sum(line["success"] for line in lines)
     low, high = wilson_interval(held, len(lines))
     row = f"{lines[0]['protocol']} | {lines[0]['simulator']} {lines[0]['versions']['mujoco']} | "
@@ -81,14 +83,14 @@ def table(folder: Path, results: list[Path]) -> str:
 
 
 def convert_dexgraspnet(folder: Path, out: Path, count: int) -> int:
-    """Write grasps of DexGraspNet as the benchmark has them, and return their number.
+    """Write grasps of DexGraspNet in the benchmark's format, and return their number.
 
     The palm of the benchmark's MJCF is 34 mm above its root. Both hands have the same joints in the
-    same order; those of `_OPPOSITE` turn the other way.
+    same order; the joints in `_OPPOSITE` turn in the opposite direction.
     """
     files = sorted((folder / "data/dataset").glob("*.npy"))
     for file in files:
-        # The object's convex parts, of which its mesh consists.
+        # The object's convex parts, which make up its mesh.
         mesh = trimesh.load_mesh(folder / f"data/meshdata/{file.stem}/coacd/decomposed.obj")
         parts = mesh.split(only_watertight=False)
         write_object(out / "objects" / file.stem, [np.asarray(part.vertices) for part in parts])
@@ -103,7 +105,7 @@ def convert_dexgraspnet(folder: Path, out: Path, count: int) -> int:
 
 
 def _as_benchmark(grasp: dict[str, Any], path: str) -> dict[str, Any]:
-    """Return a grasp of DexGraspNet as the benchmark has it."""
+    """Return a grasp of DexGraspNet in the benchmark's format."""
     q = grasp["qpos"]
     R = Rotation.from_euler("xyz", [q[f"WRJR{axis}"] for axis in "xyz"])
     root = np.array([q[f"WRJT{axis}"] for axis in "xyz"]) - R.apply([0.0, 0.0, 0.034])

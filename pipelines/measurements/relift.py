@@ -1,21 +1,23 @@
-"""Try stored attempts of a dataset again with something changed, and tell what becomes of them.
+"""Try stored attempts of a dataset again under changed conditions, and report how they end.
 
     python pipelines/measurements/relift.py OUT --count 256 --set physics.time_step=0.002
     python pipelines/measurements/relift.py OUT --rows both --count 300 --set lift.stop_when=never
     python pipelines/measurements/relift.py OUT --rows attempts --set lift.stop_when=lost_sample
     python pipelines/measurements/relift.py OUT --rows samples --count 100 --disturbed
 
-Each attempt is tried as it is stored, then with the settings of `--set`, or with `--disturbed` once
-for each disturbance: friction and mass changed by their share, up and down; half the time step; the
-palm off by 3 mm in a random direction and 3 degrees about a random axis; `together` changes
-friction, mass and palm, with random signs. Disturbed lifts are whole ones.
+Each attempt is tried as it is stored, and then with the settings of `--set`, or with `--disturbed`
+once for each disturbance: friction and mass changed by a fraction, up and down; half the time step;
+the palm displaced by 3 mm in a random direction and turned by 3 degrees about a random axis; and
+`together`, which changes friction, mass and palm, with random signs. Disturbed lifts always run to
+their end.
 
-Prints JSON, for each change: the lifts, with a verdict; those that are held, and that are samples
-by the filters but for those of pictures, of outliers, and the user's own, with their intervals; the
-outcomes that are others than as stored; CPU seconds; of lifts also the medians of slip, turn, force
-and of how far a closing joint opened. With `--disturbed`, also how well numbers of the stored lift
-tell the samples of which half of the lifts `palm` and `together` or more are samples (area under
-the ROC curve).
+The script prints JSON for each change: the number of lifts with a verdict; the numbers that are
+held and that are samples, with their intervals; the outcomes that differ from those as stored; and
+CPU seconds. Samples are judged by the filters except those that need pictures, the outlier filter
+and user-defined filters. For lifts it also prints the medians of slip, turn, force and of how far a
+closing joint opened. With `--disturbed` it also reports how well numbers of the stored lift predict
+the samples for which at least half of the lifts `palm` and `together` are samples (area under the
+ROC curve).
 """
 
 from __future__ import annotations
@@ -60,19 +62,19 @@ from drakegrasp.simulation.conditions import usual_conditions
 from drakegrasp.simulation.scene_cache import cached_scene
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
-#: What becomes of an attempt with one change, and this of all changes.
+#: Results of an attempt under one change, or of all attempts.
 Found = dict[str, Any]
-#: Changes of friction and mass as shares, and of the palm.
+#: Changes of friction and mass as fractions, and of the palm's position [m] and rotation [rad].
 FRICTION, MASS, SHIFT, TURN = 0.15, 0.20, 3e-3, np.deg2rad(3.0)
-#: Lifts of each sample with the palm off, and with all changes.
+#: Number of lifts of each sample with only the palm displaced, and with all changes.
 PALMS, TOGETHER = 2, 4
-#: Last number of the place of the streams that are drawn from.
+#: Last number of the keys of the random streams.
 PLACE = 25
 STORED, SET = "as stored", "as set"
 
 
 def disturbances(stream: Stream) -> Iterator[tuple[str, float, float, bool]]:
-    """Yield the name of each change, the factors of friction and mass, whether the palm is off."""
+    """Yield each change: its name, factors of friction and mass, whether the palm is displaced."""
     yield "half step", 1.0, 1.0, False
     for sign in (-1.0, 1.0):
         yield f"friction {sign * FRICTION:+.0%}", 1.0 + sign * FRICTION, 1.0, False
@@ -85,14 +87,14 @@ def disturbances(stream: Stream) -> Iterator[tuple[str, float, float, bool]]:
 
 
 def palm_off(attempt: Attempt, stream: Stream) -> Attempt:
-    """Return an attempt with the palm off, in a direction and about an axis that are drawn."""
+    """Return an attempt with the palm displaced in a random direction and about a random axis."""
     shift, axis = (v / np.linalg.norm(v) for v in stream.normal(6).reshape(2, 3))
     X_GH = make_pose(rotation_about(axis, TURN), SHIFT * shift)
     return replace(attempt, X_OG=multiply(attempt.X_OG, X_GH))
 
 
 def chosen_rows(out: Path, kind: str, count: int, seed: int) -> npt.NDArray[np.int64]:
-    """Return ids of attempts that are drawn: of one kind, or as many samples as other lifts."""
+    """Return ids of drawn attempts of one kind, or of equally many samples and other lifts."""
     trials = Trials(out)
     ids, is_lift = trials.trial_ids, np.isfinite(trials["time_lift"])
     is_sample = np.isin(ids, trials.where(sample=True).trial_ids)
@@ -112,14 +114,14 @@ def chosen_rows(out: Path, kind: str, count: int, seed: int) -> npt.NDArray[np.i
 def try_again(
     out: Path, trial_id: int, stored: Config, other: Config | None, prepared: Any
 ) -> list[Found]:
-    """Return what becomes of an attempt as stored, and with each change.
+    """Return the results of an attempt as stored, and under each change.
 
     Args:
         out: Directory of the dataset.
-        trial_id: The attempt.
-        stored: The configuration of the dataset.
-        other: With the settings that are changed; None: disturb it.
-        prepared: Returns a prepared object of the dataset by its name.
+        trial_id: Id of the attempt.
+        stored: Configuration of the dataset.
+        other: Configuration with the changed settings; None to disturb the attempt instead.
+        prepared: Function that returns a prepared object of the dataset by its name.
     """
     row = Trials(out).trial(trial_id)
     model = prepared(row["object_name"])
@@ -139,8 +141,8 @@ def try_again(
         return {"change": change, **told, "seconds": spent, **measured(hand, record)}
 
     if other is not None:
-        # Hands that may lift do, whatever their chance: verdicts are compared.
-        # Friction and mass are those asked for.
+        # Every hand that may lift does so, whatever its chance, because verdicts are compared.
+        # Friction and mass are those of the requested settings.
         asked = {"physics": other.physics, "randomize": other.randomize}
         rules = stored.model_copy(update=asked)
         again = find_attempt(model, candidate, standoff, child, rules)
@@ -163,7 +165,7 @@ def try_again(
 
 
 def measured(hand: Hand, record: TrialRecord) -> Found:
-    """Return slip [mm], turn [deg], sum of forces [N] and widest opening [deg] of a lift."""
+    """Return slip [mm], turn [deg], sum of forces [N] and largest opening [deg] of a lift."""
     if record.lift is None or record.closed is None:
         return {}
     joints = [hand.joint_names.index(finger.closing_joint) for finger in hand.fingers]
@@ -177,7 +179,7 @@ def measured(hand: Hand, record: TrialRecord) -> Found:
 
 
 def summary(rows: Sequence[Sequence[Found]]) -> dict[str, Found]:
-    """Return by change what became of all attempts."""
+    """Return the results of all attempts by change."""
     by_change: dict[str, list[tuple[Found, Found]]] = {}
     for row in rows:
         for found in row:
@@ -210,7 +212,7 @@ def _of_change(pairs: Sequence[tuple[Found, Found]]) -> Found:
 
 
 def _share(hits: Sequence[bool]) -> list[float]:
-    """Return the count, the share, and its interval."""
+    """Return the count, the fraction, and its interval."""
     low, high = wilson_interval(sum(hits), len(hits)) if hits else (np.nan, np.nan)
     return [
         sum(hits),
@@ -219,7 +221,7 @@ def _share(hits: Sequence[bool]) -> list[float]:
 
 
 def ranking(out: Path, ids: npt.NDArray[np.int64], rows: Sequence[Sequence[Found]]) -> Found:
-    """Return how well numbers of stored lifts tell which samples bear half or more of the noise."""
+    """Return how well numbers of stored lifts predict which samples survive half of the noise."""
     noisy = [[x["sample"] for x in row if x["change"] in ("palm", "together")] for row in rows]
     much = np.array([np.mean(own) >= MUCH for own in noisy])
     told = predictors(Trials(out)[ids].columns(PREDICTED_BY))
@@ -236,9 +238,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("dataset", type=Path, help="directory of a dataset")
     parser.add_argument("--rows", default="lifts", choices=("attempts", "lifts", "samples", "both"))
-    parser.add_argument("--count", type=int, default=100, help="of each kind (default: 100)")
+    parser.add_argument("--count", type=int, default=100, help="rows of each kind (default: 100)")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings")
-    parser.add_argument("--disturbed", action="store_true", help="disturb each, instead of --set")
+    parser.add_argument(
+        "--disturbed", action="store_true", help="disturb each attempt, instead of --set"
+    )
     arguments = parser.parse_args(argv)
     if arguments.disturbed and arguments.settings:
         parser.error("--disturbed must be used without --set")

@@ -1,12 +1,13 @@
-"""Whether many trials of a dataset come out the same, bit for bit, when they are run again.
+"""Check whether many trials of a dataset are reproduced bit for bit when they are run again.
 
 \b
     python pipelines/measurements/replay_many.py OUT 100 > replay_many.json
 
-Of N trials at least a half were lifted and three in ten ended while the fingers closed; the others
-are any. They are drawn with a seed, spread over the objects as the dataset is. Each is run as
-`drakegrasp replay` does and every stored value is compared. Prints JSON: how many of each kind were
-run and are equal, and what differs in the others. Exit code 1 if one differs.
+Of N trials at least half were lifted, and three in ten ended while the fingers closed; the others
+are of any kind. They are drawn with a seed from all trials of the dataset. Each trial is run as
+`drakegrasp replay` does, and every stored value is compared. The script prints JSON: how many
+trials of each kind were run and are equal, and which values differ in the others. The exit code is
+1 if any trial differs.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.generation.replay import Replay, replay_trial
 from drakegrasp.runtime.progress import progress_bar
 
-#: Shares of the trials that were lifted, and that ended while closing.
+#: Fractions of the trials that were lifted, and that ended while closing.
 SHARES = {"lifted": 0.5, "closing": 0.3}
 
 
@@ -65,7 +66,7 @@ def choose_trials(out: Path, number: int, seed: int) -> dict[int, str]:
         lifted = np.isfinite(file["trials/time_lift"][:])
     kind = np.where(lifted, "lifted", np.where(closed, "closing", "placed"))
 
-    # The kinds that must be there, then any.
+    # Draw the required kinds first, then any kind.
     rng = np.random.default_rng(seed)
     chosen: dict[int, str] = {}
     for name, share in SHARES.items():
@@ -90,7 +91,7 @@ def _draw(
 
 
 def summarise(kinds: dict[int, str], found: list[Replay]) -> dict[str, Any]:
-    """Return the counts of trials that were run and that are equal, and what differs."""
+    """Return the counts of trials that were run and that are equal, and the differences."""
     equal = [again for again in found if again.same]
     return {
         "trials": len(found),

@@ -1,10 +1,10 @@
-"""How the objects of a directory come to rest: a line for each.
+"""Describe how the objects of a directory come to rest, one line per object.
 
 \b
     python pipelines/measurements/resting.py MESHES --units cm
 
-Prints the faces of its collision mesh, how deep it sinks into the table, its tilt, the simulated
-time until it rests, and notes.
+The script prints the number of faces of each collision mesh, how deep the object sinks into the
+table, its tilt, the simulated time until it rests, and notes.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations

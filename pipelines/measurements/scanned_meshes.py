@@ -1,13 +1,13 @@
-r"""Make ten meshes with the faults of 3-D scans, and measure what becomes of them.
+r"""Create ten meshes with the faults of 3-D scans, and measure how they are prepared.
 
 \b
     python pipelines/measurements/scanned_meshes.py DIR
 
-Each is a household object of about 16,000 faces, like those of the YCB object set: marched
-through a grid of voxels, with its ripple and 0.2 to 0.5 mm of noise on the surface; reduced to
-its number of faces; welded where two sheets of the surface touch; without the face that stood
-on the turntable. Four are thin-walled, as a mug is. Prints a line per mesh: status, collision
-faces, deviation of the collision surface, seconds, notes.
+Each is a household object of about 16,000 faces, like those of the YCB object set. It is created by
+marching through a grid of voxels, with their ripple and 0.2 to 0.5 mm of noise on the surface; then
+it is reduced to its number of faces, welded where two sheets of the surface touch, and opened at
+the bottom that stood on the turntable. Four objects are thin-walled, like a mug. The script prints
+a line per mesh: status, collision faces, deviation of the collision surface, seconds, notes.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from drakegrasp.objects.sources import find_meshes
 #: Signed distance of a point (x, y, z) from a surface [m], positive inside.
 Shape = Callable[[float, float, float], float]
 
-#: Faces of each mesh, about, and before it was reduced to so many.
+#: Approximate number of faces of each mesh, and the number before it is reduced.
 FACES, MARCHED = 16_500, 50_000
 #: Height above the table below which the scanner sees nothing [m].
 UNSEEN = 1.5e-3
-#: Vertices of two sheets nearer than this are welded: the surface touches itself [m].
+#: Vertices of two sheets closer than this are welded, so that the surface touches itself [m].
 TOUCHING = 5e-4
 #: Amplitude of the voxels' ripple, and its period in voxels [m, -].
 RIPPLE, PERIOD = 2e-4, 2.3
 
 
 def main(folder: Path) -> None:
-    """Make the meshes in a folder and print how each fares."""
+    """Create the meshes in a folder and print the result of each."""
     folder.mkdir(parents=True, exist_ok=True)
     for number, (name, (shape, box, noise)) in enumerate(SCANS.items(), start=1):
         scan(shape, box, noise, seed=number).export(folder / f"{number}_{name}_scan.ply")
@@ -69,10 +69,10 @@ def scan(shape: Shape, box: tuple[float, ...], noise: float, *, seed: int) -> tr
     Args:
         shape: Signed distance [m].
         box: Bounds (x, y, z, x, y, z) [m].
-        noise: Standard deviation of the surface [m].
-        seed: Of the noise.
+        noise: Standard deviation of the surface noise [m].
+        seed: Seed of the noise.
     """
-    # March through the voxels; their size gives the wanted number of faces.
+    # March through the voxels; their size is adapted to the wanted number of faces.
     voxel = 5e-3
     for _ in range(3):
         solid = manifold3d.Manifold.level_set(_rippled(shape, voxel), list(box), voxel)
@@ -80,13 +80,13 @@ def scan(shape: Shape, box: tuple[float, ...], noise: float, *, seed: int) -> tr
     mesh = solid.to_mesh64()
     vertices, faces = np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, np.int64)
 
-    # Noise along the normals; then fewer faces.
+    # Add noise along the normals, then reduce the number of faces.
     surface = trimesh.Trimesh(vertices, faces, process=False)
     rng = np.random.default_rng(seed)
     vertices = vertices + noise * rng.standard_normal((len(vertices), 1)) * surface.vertex_normals
     vertices, faces = fast_simplification.simplify(vertices, faces, target_count=FACES)
 
-    # Weld what touches, and open the bottom.
+    # Weld sheets that touch, and open the bottom.
     faces = _weld_touching(trimesh.Trimesh(vertices, faces, process=False))
     seen = (vertices[faces][:, :, 2] > UNSEEN).any(axis=1)
     scanned = trimesh.Trimesh(vertices, faces[seen], process=False)
@@ -95,7 +95,7 @@ def scan(shape: Shape, box: tuple[float, ...], noise: float, *, seed: int) -> tr
 
 
 def _rippled(shape: Shape, voxel: float) -> Shape:
-    """Return a shape with the ripple of its voxels."""
+    """Return a shape with the ripple that its voxels cause."""
     wave = 2.0 * math.pi / (PERIOD * voxel)
 
     def rippled(x: float, y: float, z: float) -> float:
@@ -106,7 +106,7 @@ def _rippled(shape: Shape, voxel: float) -> Shape:
 
 
 def _weld_touching(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Return faces whose corners are one where two sheets of a surface touch."""
+    """Return the faces after welding corners where two sheets of the surface touch."""
     normals, merged = mesh.vertex_normals, np.arange(len(mesh.vertices))
     pairs = cKDTree(mesh.vertices).query_pairs(TOUCHING, output_type="ndarray")
     for a, b in np.sort(pairs).tolist():
@@ -116,11 +116,11 @@ def _weld_touching(mesh: trimesh.Trimesh) -> np.ndarray:
     return np.asarray(faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)])
 
 
-# Shapes: positive inside [m]
+# Shapes: signed distances, positive inside [m]
 
 
 def _tube(x: float, y: float, z: float, radius: float, wall: float, height: float) -> float:
-    """Return the distance inside a cup: open above, with a floor as thick as its wall."""
+    """Return the signed distance of a cup that is open above, with a floor as thick as its wall."""
     r = math.hypot(x, y)
     outer = min(radius - r, z, height - z)
     inner = min(radius - wall - r, z - wall)
@@ -128,19 +128,19 @@ def _tube(x: float, y: float, z: float, radius: float, wall: float, height: floa
 
 
 def _ring(x: float, y: float, z: float, radius: float, tube: float) -> float:
-    """Return the distance inside a ring about the y axis."""
+    """Return the signed distance of a ring about the y axis."""
     return tube - math.hypot(math.hypot(x, z) - radius, y)
 
 
 def _segment(x: float, y: float, z: float, end: tuple[float, float, float], r: float) -> float:
-    """Return the distance inside a capsule from the origin."""
+    """Return the signed distance of a capsule that begins at the origin."""
     ex, ey, ez = end
     t = min(1.0, max(0.0, (x * ex + y * ey + z * ez) / (ex * ex + ey * ey + ez * ez)))
     return r - math.sqrt((x - t * ex) ** 2 + (y - t * ey) ** 2 + (z - t * ez) ** 2)
 
 
 def _block(x: float, y: float, z: float, a: float, b: float, c: float) -> float:
-    """Return the distance inside a box that stands on the table."""
+    """Return the signed distance of a box that stands on the table."""
     return min(a - abs(x), b - abs(y), z, c - z)
 
 

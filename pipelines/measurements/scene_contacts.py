@@ -1,13 +1,14 @@
-"""Whether the contacts in scenes.hdf5 lie where a camera's mask says, by code of its own.
+"""Check whether the contacts in scenes.hdf5 lie where a camera's mask shows the object.
 
 \b
     python pipelines/measurements/scene_contacts.py OUT --rows 4000
 
-Of some rows of /visible, drawn at random, each contact is projected with K and X_TC and compared
-with the mask, and the line from it to the camera is cut with the triangles of the object's mesh.
-Needs h5py and NumPy, and nothing of drakegrasp. Prints JSON: how many contacts are told visible and
-hidden, pixels between visible ones and the mask, and by millimetres of mesh that do not count the
-share of the hidden that have a free line, and of the visible that have none.
+For some random rows of /visible, each contact is projected with K and X_TC and compared with the
+mask, and the line from it to the camera is intersected with the triangles of the object's mesh. The
+check is independent of drakegrasp and needs only h5py and NumPy. The script prints JSON: how many
+contacts are stored as visible and as hidden, and the pixels between visible ones and the mask. It
+also prints, for several distances within which mesh near the contact is ignored, the fraction of
+hidden contacts that have a free line, and of visible contacts that have none.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[Any]
-#: Mesh that is nearer to the contact than this does not count [m].
+#: Distances from the contact within which mesh is ignored [m].
 NEARER = (1e-3, 2e-3, 3e-3, 5e-3)
 
 
@@ -34,7 +35,7 @@ def main(out: Path, rows: int) -> None:
     with h5py.File(out / "scenes.hdf5") as file:
         views = file["visible/view"][:]
         chosen = np.random.default_rng(0).permutation(len(views))[:rows]
-        # Those of a view together, in the order of the views.
+        # Rows of a view are together, in the order of the views.
         chosen = chosen[np.argsort(views[chosen], kind="stable")]
         parts = [look(out, file, int(view), chosen) for view in np.unique(views[chosen])]
     told, pixels, free = (np.concatenate(columns) for columns in zip(*parts, strict=True))
@@ -49,13 +50,13 @@ def main(out: Path, rows: int) -> None:
 
 
 def shares(cases: Array) -> dict[str, float]:
-    """Return the share of cases (n, m) by the millimetres of NEARER."""
+    """Return the fractions of cases (n, m) by the distances of NEARER in millimetres."""
     found = cases.mean(axis=0).tolist()
     return {f"{1e3 * d:g} mm": round(s, 4) for d, s in zip(NEARER, found, strict=True)}
 
 
 def look(out: Path, file: h5py.File, view: int, rows: Array) -> tuple[Array, Array, Array]:
-    """Return what the file says of a view's contacts, pixels from the mask, and free lines."""
+    """Return the stored visibility of a view's contacts, pixels from the mask, and free lines."""
     own = rows[file["visible/view"][:][rows] == view]
     grasps = file["visible/grasp"][:][own]
     contacts = file["grasps/p_TQ"][:][grasps].astype(float).reshape(-1, 3)
@@ -63,7 +64,7 @@ def look(out: Path, file: h5py.File, view: int, rows: Array) -> tuple[Array, Arr
     there = np.isfinite(contacts).all(axis=1)
     contacts, told = contacts[there], told[there]
 
-    # The mesh in {T}, and the camera.
+    # The mesh in {T}, and the pose of the camera.
     scene = int(file["views/scene"][view])
     name = file["objects/name"].asstr()[int(file["scenes/object"][scene, 0])]
     X_TO, X_TC = (
@@ -82,7 +83,7 @@ def look(out: Path, file: h5py.File, view: int, rows: Array) -> tuple[Array, Arr
 
 
 def free_lines(point: Array, camera: Array, corners: Array) -> Array:
-    """Return whether no triangle (m, 3, 3) is on the way to the camera, from NEARER on."""
+    """Return per distance of NEARER whether triangles (m, 3, 3) beyond it leave a free line."""
     way = camera - point
     length = np.linalg.norm(way)
     a, b, c = np.moveaxis(corners, 1, 0)

@@ -1,12 +1,12 @@
-"""How many items per second `SceneDataset` gives to two processes.
+"""Measure how many items per second `SceneDataset` returns to two processes.
 
 \b
     python pipelines/measurements/speed.py scenes OUT
 
-Two processes take turns in the items of the training scenes of OUT: one round while views are read
-first, and one after that, for point clouds and for images. Prints JSON: items per second of wall
-clock, and per CPU second of both processes times two, which says more on a machine that is busy
-otherwise.
+Two processes share the items of the training scenes of OUT, for point clouds and for images: one
+round reads each view for the first time, and another round reads it again. The script prints JSON:
+items per wall-clock second, and items per CPU second of both processes times two, which is more
+reliable on a busy machine.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations

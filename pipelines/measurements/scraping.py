@@ -1,14 +1,15 @@
-"""How near hands come to the table while they close and lift, beside what a dataset stores.
+"""Compare how close hands come to the table while closing and lifting with the stored values.
 
 \b
     python pipelines/measurements/scraping.py OUT 200 > scraping.json
 
-Of N samples, and of all hands that were refused for scraping the table up to N, each trial is run
-again and the joints are noted after every time step. The heights follow from the hand's SDF file by
-kinematics of this script alone: of the poses, joints and shapes in it, and of the corners of its
-meshes. What a screened attempt skips is a straight way of the joints. Only hands with worm drives.
-Prints JSON: the largest differences from `clearance_close` and `clearance_lift` [m], and how many
-trials are on the other side of `close.scrape_depth`. Exit code 1 if a sample is.
+For N samples, and for up to N hands that were rejected because they scraped the table, the script
+runs each trial again and stores the joints after every time step. It computes the heights from the
+hand's SDF file with its own kinematics, which use only the poses, joints and shapes in this file
+and the corners of its meshes. The part of the motion that a screened attempt skips is a straight
+path of the joints. Only hands with worm drives are supported. The script prints JSON: the largest
+differences from `clearance_close` and `clearance_lift` [m], and how many trials are on the other
+side of `close.scrape_depth`. The exit code is 1 if a sample is.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ from drakegrasp.simulation.scene_cache import cached_scene
 
 Array = npt.NDArray[np.float64]
 
-#: Steps of the way that a screened attempt skips.
+#: Number of steps of the motion that a screened attempt skips.
 SKIPPED_STEPS = 400
 
 
@@ -93,7 +94,7 @@ def choose_trials(out: Path, number: int, seed: int) -> dict[int, str]:
 
 
 def summarise(rows: list[dict[str, Any]], limit: float) -> dict[str, Any]:
-    """Return how measured and stored heights differ, and where one alone is below the limit."""
+    """Return how measured and stored heights differ, and how often only one is below the limit."""
     found: dict[str, Any] = {"trials": len(rows), "objects": len({row["object"] for row in rows})}
     found |= {"largest_difference": {}, "least": {}, "other_side": {}}
     for when in ("close", "lift"):
@@ -107,7 +108,7 @@ def summarise(rows: list[dict[str, Any]], limit: float) -> dict[str, Any]:
 
 
 def measure(out: Path, trials: list[int]) -> Iterator[dict[str, Any]]:
-    """Yield the heights of each trial, here and as stored [m], by "close" and "lift"."""
+    """Yield the computed and stored heights of each trial [m], by "close" and "lift"."""
     manifest, names = read_manifest(out), ("object", "candidate", "standoff_index", "child")
     with h5py.File(out / TRIALS_FILE, "r") as file:
         objects = file["objects/name"].asstr()[:]
@@ -150,7 +151,7 @@ class Notes:
         self.names, self._scene, self._states = hand_joint_names(scene), scene, list[Array]()
 
     def __enter__(self) -> None:
-        # Worms take the monitor's place when the lift begins.
+        # The worm drives replace the monitor when the lift begins.
         turn = self._turn = drive._turn_worms
 
         def turn_and_note(scene: Scene, _: Any) -> Any:
@@ -169,9 +170,9 @@ class Notes:
         self._states.append(np.array([scene.time, *p_WG, *hand_positions(scene)]))
 
     def split(self, closed: float) -> tuple[Array, Array]:
-        """Return the states of closing and of lifting, without times; the hand closed at a time.
+        """Return the states of closing and of lifting, without times; `closed` separates them.
 
-        The first state is the open hand, the second that from which a screened attempt begins.
+        The first state is the open hand; the second is the one at which a screened attempt begins.
         """
         states = np.array(self._states)
         begun = np.flatnonzero(states[:, 0] == 0.0)
@@ -196,7 +197,7 @@ class _Link:
 
 
 class Kinematics:
-    """Links of an SDF file whose frames are those of their joints."""
+    """Kinematics of an SDF file whose link frames coincide with those of their joints."""
 
     def __init__(self, path: Path) -> None:
         (model,) = ET.parse(path).getroot().iter("model")
@@ -207,14 +208,14 @@ class Kinematics:
         }
 
     def least(self, states: Array, R_WG: Array, names: list[str], X_BG: Array) -> float:
-        """Return the least height above the table's top [m] of states (n, 3 + j): p_WG and q."""
+        """Return the minimum height above the table's top [m] of states (n, 3 + j): p_WG and q."""
         if not len(states):
             return np.nan
         q = dict(zip(names, states[:, 3:].T, strict=True))
         X_GB, lowest, posed = np.linalg.inv(X_BG), np.inf, dict[str, Array]()
         X_WG = np.tile(np.eye(4), (len(states), 1, 1))
         X_WG[:, :3, :3], X_WG[:, :3, 3] = R_WG, states[:, :3]
-        for name, link in self._links.items():  # each after its parent
+        for name, link in self._links.items():  # each link comes after its parent
             X = link.X_PL
             if link.joint is not None:
                 turn = np.tile(np.eye(4), (len(states), 1, 1))
@@ -249,7 +250,7 @@ def _read_link(link: ET.Element, joint: ET.Element | None, folder: Path) -> _Lin
 
 
 def _shape(collision: ET.Element, folder: Path) -> tuple[Array, float, Array]:
-    """Return the corners of a shape, radius of the discs about them, and these discs' axis."""
+    """Return the corners of a shape, the radius of the discs about them, and the discs' axis."""
     X, axis, radius = _pose(collision.find("pose")), np.zeros(3), 0.0
     if collision.find("geometry/mesh") is not None:
         mesh = trimesh.load(folder / _text(collision, "geometry/mesh/uri"), force="mesh")

@@ -1,16 +1,18 @@
-"""Tries grasps of the Shadow Hand that others publish in Drake, as DexGraspBench tries them.
+"""Try published grasps of the Shadow Hand in Drake, by the rules of DexGraspBench.
 
 In: the MJCF of DexGraspBench's Shadow Hand, and folders of its grasp files, with objects in its
-layout below `--assets`. Out: a line of JSON per grasp, and how many are held. With verdicts of
-`drakegrasp verify --protocol dexgraspbench` of the same files, how many are the same.
+layout below `--assets`. Out: a line of JSON per grasp, and the number of held grasps. If verdicts
+of `drakegrasp verify --protocol dexgraspbench` on the same files are given, also the number of
+equal verdicts.
 
-A grasp is held if the object stays in the hand whichever of its six axes points up: the closed
-hand is lifted by 10 cm six times, with an object of 0.1 kg and a friction of 0.6, and the object
-moves by less than 5 cm and turns by less than 15 degrees in the hand. As there any link may touch
-it, and it floats, here fixed while the hand closes. Motors are the benchmark's: 5 N m/rad, at most
-3 N m; the last two joints of a finger have 10 N m/rad each for those of their tendon. Other than
-there the hand may overlap the object at the start, and contacts are Drake's: a pair has no
-coefficient of torsion, it follows from the patch.
+A grasp is held if the object stays in the hand whichever of its six axes points up. The closed hand
+is lifted by 10 cm six times, with an object of 0.1 kg and a friction of 0.6, and the object must
+move by less than 5 cm and turn by less than 15 degrees in the hand. As in the benchmark, any link
+may touch the object. In the benchmark the object floats while the hand closes; here it is fixed.
+The motors are those of the benchmark: 5 N m/rad, at most 3 N m; the last two joints of a finger
+have 10 N m/rad each instead of those of their tendon. Unlike in the benchmark, the hand may overlap
+the object at the start, and contacts follow Drake's model: a pair has no coefficient of torsion,
+because torsion follows from the patch.
 
     python pipelines/measurements/shadow_in_drake.py HAND.xml GRASPS --assets DIR --out LINES.jsonl
         [--root DIR] [--mujoco VERDICTS.jsonl]
@@ -51,14 +53,14 @@ from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.posture import make_posture, start_of
 from drakegrasp.simulation.scene import Scene
 
-#: The palm in the root of the benchmark's hand [m]; its fingers, first the joint that closes one.
+#: The palm link and its position in the root of the hand [m]; fingers with their closing joints.
 PALM, p_RB = "rh_palm", (0.0, 0.0, 0.034)
 FINGERS = {"ff": "FFJ3", "mf": "MFJ3", "rf": "RFJ3", "lf": "LFJ3", "th": "THJ2"}
-#: Motors [N m], [rad].
+#: Maximum torque of a motor [N m], and the joint error at which it is reached [rad].
 EFFORT, SATURATED = 3.0, 0.6
-#: Joints of fingers that have one motor, whose torque turns both by what both are off together.
+#: Last two joints of a finger, which share a motor; its torque depends on the sum of their errors.
 TENDON = ("J1", "J2")
-#: By so much the object may move [m] and turn [rad]; the lift [m].
+#: Limits of the object's displacement [m] and rotation [rad]; height of the lift [m].
 MOVED, TURNED, LIFT = 0.05, np.deg2rad(15.0), 0.1
 SETTINGS = (
     *("objects.mass=0.1", "physics.friction_hand=0.6", "lift.stop_when=never", "lift.hold_time=1"),
@@ -67,13 +69,17 @@ SETTINGS = (
 
 
 def main() -> None:
-    """Try each grasp, or go on where it stopped; print how many are held."""
+    """Try each grasp, or continue a stopped run; print how many grasps are held."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("hand", type=Path, metavar="HAND.xml")
     parser.add_argument("grasps", type=Path, metavar="GRASPS")
-    parser.add_argument("--assets", type=Path, required=True, help="where obj_path begins")
+    parser.add_argument(
+        "--assets", type=Path, required=True, help="folder at which obj_path begins"
+    )
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--root", type=Path, action="append", default=[], help="of the meshes")
+    parser.add_argument(
+        "--root", type=Path, action="append", default=[], help="folder of the meshes"
+    )
     parser.add_argument("--mujoco", type=Path, help="verdicts of verify --protocol")
     given = parser.parse_args()
 
@@ -96,7 +102,7 @@ def main() -> None:
 
 
 def _replace_rules() -> None:
-    """Let any link touch, and motors be those of the benchmark."""
+    """Allow any link to touch, and use the motors of the benchmark."""
     rules: Any = trial
     rules.open_hand_collides = lambda scene: False
     rules.judge_closed = rules.judge_lifted = lambda *_, **__: Outcome.SUCCESS
@@ -112,7 +118,7 @@ def _replace_rules() -> None:
 
 
 def make_hand(path: Path, roots: list[Path], folder: Path) -> tuple[Hand, list[str]]:
-    """Return the benchmark's hand, of whose fingers no link is apart, and its joints in order."""
+    """Return the benchmark's hand and its joints in order; all links of a finger may touch."""
     source = read_source(path, {}, roots)
     write_urdf(read_model(source), folder / "shadow.urdf", [])
     (world,) = source.root.iter("worldbody")
@@ -147,14 +153,14 @@ def make_hand(path: Path, roots: list[Path], folder: Path) -> tuple[Hand, list[s
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bench:
-    """What all grasps are tried with.
+    """Everything that is shared by the trials of all grasps.
 
     Attributes:
         hand: The hand.
-        joints: Its joints in the order of the files.
+        joints: Names of the hand's joints in the order of the files.
         assets: Folder at which the paths of objects begin.
-        scratch: Folder of object files.
-        config: The rules.
+        scratch: Folder for object files.
+        config: Configuration of the trials.
     """
 
     hand: Hand
@@ -164,7 +170,7 @@ class Bench:
     config: Config
 
     def try_grasp(self, path: Path) -> dict[str, Any]:
-        """Return whether the grasp of a file is held, also with the fingertips alone."""
+        """Return whether the grasp of a file is held, and whether by the fingertips alone."""
         stored = read_grasp_file(path)
         scene, X_OM = self.scene_of(stored.object_path, float(stored.object_scale[0]))
         X_WM, X_WR = (
@@ -177,7 +183,7 @@ class Bench:
         posture = make_posture(self.hand, X_OB, **q, joints=self.joints)
         attempt = replace(start_of(posture, self.hand), audited=True)
 
-        # Each axis of the object's frame points up once, until one lets it fall.
+        # Each axis of the object's frame points up once, until the object falls.
         found: dict[str, Any] = {"held": True, "tips": True, "axes": 0, "slip": 0.0}
         for axis in range(6):
             record = trial.run_attempt(
@@ -197,10 +203,10 @@ class Bench:
         return found
 
     def pose_of(self, axis: int, X_OG: Array) -> Array:
-        """Return the pose of an object, one of whose six axes points up, below the lift's target.
+        """Return X_TO with one of the object's six axes up, so that the lift ends at its target.
 
         Args:
-            axis: 0 to 2: x, y, z; 3 to 5: the opposite.
+            axis: Number of the axis: 0 to 2 for x, y, z; 3 to 5 for the opposite directions.
             X_OG: Pose of the palm.
         """
         up = np.eye(3)[axis % 3] * (1.0 if axis < 3 else -1.0)
@@ -211,7 +217,7 @@ class Bench:
 
     @cache  # noqa: B019
     def scene_of(self, folder: str, scale: float) -> tuple[Scene, Array]:
-        """Return the scene of an object of convex parts, and the pose X_OM of their frame."""
+        """Return the scene of an object made of convex parts, and the pose X_OM of their frame."""
         parts = read_object_folder(self.assets / folder, scale).parts
         hulls: Any = [trimesh.load_mesh(part).convex_hull for part in parts]
         path = self.scratch / f"{Path(folder).name}.obj"
@@ -222,7 +228,7 @@ class Bench:
 
 
 def _say(found: list[dict[str, Any]], mujoco: Path | None, grasps: Path) -> None:
-    """Print how many are held, and how many have the verdict of MuJoCo."""
+    """Print how many grasps are held, and how many have the same verdict in MuJoCo."""
     held, tips = (sum(each[key] for each in found) for key in ("held", "tips"))
     sys.stdout.write(f"held {held} of {len(found)}, with fingertips alone {tips}\n")
     if mujoco is None:

@@ -1,10 +1,10 @@
-"""Measure how fast the parts of the package are, and how much memory they take.
+"""Measure how fast the parts of the package are, and how much memory they need.
 
 \b
     python pipelines/measurements/speed.py COMMAND ...
 
-Each command prints JSON. Wall-clock times need an idle machine; where CPU seconds stand beside
-them, these say more on a busy one.
+Each command prints JSON. Wall-clock times need an idle machine; on a busy machine the CPU seconds
+are more reliable, if they are printed.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations

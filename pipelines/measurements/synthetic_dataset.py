@@ -1,12 +1,12 @@
-"""Make a dataset of any size out of a small one, to measure what size costs.
+"""Create a dataset of any size from a small one, to measure how costs grow with size.
 
 \b
     python pipelines/measurements/synthetic_dataset.py SMALL OUT --objects 500
 
-Each object is one of SMALL under a new name, with 10,000 palm poses: those of SMALL again and
-again, in another order each time, with the colour of the new name. Shards are written as a build
-writes them; the first copies of an object are made from rows, the others from its shards. The files
-are not assembled: the next command is `drakegrasp assemble OUT`.
+Each object is an object of SMALL under a new name, with 10,000 palm poses. These repeat the palm
+poses of SMALL, in another order each time, with the colour of the new name. Shards are written as a
+build writes them. The first copy of an object is made from rows, and the other copies from the
+shards of the first. The files are not assembled: the next command is `drakegrasp assemble OUT`.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Rows = tuple[dict[str, AnyArray], dict[str, AnyArray]]
 @click.argument("out", type=click.Path(path_type=Path))
 @click.option("--objects", type=int, default=50, show_default=True, help="Number of objects.")
 @click.option(
-    "--different", type=int, default=25, show_default=True, help="Of these made from rows."
+    "--different", type=int, default=25, show_default=True, help="Objects that are made from rows."
 )
 @click.option(
     "--candidates", type=int, default=10_000, show_default=True, help="Palm poses per object."
@@ -50,7 +50,7 @@ def main(
     overrides = [f"candidates.max={candidates}", f"unit_candidates={unit or 'null'}"]
     config = override_config(source.config, overrides)
 
-    # Objects whose attempts are complete in SMALL, evenly over its classes.
+    # Objects of SMALL, taken evenly from its classes.
     entries = source.objects[:: max(1, len(source.objects) // different)][:different]
     names = [f"{i:05d}_{entries[i % len(entries)].name}" for i in range(objects)]
     manifest = replace(source, config=config, objects=(), refused=(), rejected=())
@@ -76,7 +76,7 @@ def main(
 
 
 def repeated(prepared: PreparedObject, name: str, count: int) -> PreparedObject:
-    """Return an object under another name, with its palm poses in turn up to a number."""
+    """Return an object under another name, whose palm poses are repeated up to a number."""
     candidates = prepared.candidates
     rows = np.arange(count) % len(candidates)
     columns = ("X_OG", "distance", "resting", "source", "log_density")
@@ -88,7 +88,7 @@ def repeated(prepared: PreparedObject, name: str, count: int) -> PreparedObject:
 
 
 def load_rows(small: Path, source: Manifest, entry: ObjectEntry) -> Rows:
-    """Return the columns of all attempts of an object, and of its looks."""
+    """Return the columns of all attempts of an object, and those of its looks."""
     own = [header for header in source.headers() if header.object_name == entry.name]
     shards = [read_shard(header.path(small), header) for header in own]
     return joined([dict(shard.trials) for shard in shards]), joined(
@@ -97,12 +97,12 @@ def load_rows(small: Path, source: Manifest, entry: ObjectEntry) -> Rows:
 
 
 def shard_of_rows(header: ShardHeader, rows: Rows, order: Iterator[int]) -> Shard:
-    """Return a shard of rows of another object, drawn without return in turn."""
+    """Return a shard with rows of another object; the order in each round is random."""
     trials, looks = rows
     success = np.flatnonzero(trials["outcome"] == Outcome.SUCCESS)
     look_of = {int(row): k for k, row in enumerate(success)}
 
-    # Another order in each round: a column must not compress because it repeats itself.
+    # Each round has another order, so that a column does not compress well by repeating itself.
     standoffs = int(trials["standoff_index"].max()) + 1
     poses = np.array([next(order) for _ in range(header.stop - header.start)])
     chosen = (poses[:, None] * standoffs + np.arange(standoffs)).ravel()
@@ -118,27 +118,27 @@ def shard_of_rows(header: ShardHeader, rows: Rows, order: Iterator[int]) -> Shar
 
 
 def drawn(count: int, seed: int) -> Iterator[int]:
-    """Yield the numbers below a count without end, in another order each round."""
+    """Yield the numbers below `count` endlessly, in another order each round."""
     generator = np.random.default_rng(seed)
     while True:
         yield from generator.permutation(count).tolist()
 
 
 def copy_of_shard(out: Path, header: ShardHeader, first: str) -> Shard:
-    """Return the shard of the first copy of an object, for another one."""
+    """Return the shard of the first copy of an object, with the header of another copy."""
     own = replace(header, object_name=first)
     return replace(read_shard(own.path(out)), header=header)
 
 
 def with_colour(shard: Shard, colour: AnyArray) -> Shard:
-    """Return a shard whose object has a colour (3,)."""
+    """Return a shard whose object has the given colour (3,)."""
     column = np.array(shard.trials["object_colour"])
     column[:] = colour
     return replace(shard, trials={**shard.trials, "object_colour": column})
 
 
 def joined(parts: list[dict[str, AnyArray]]) -> dict[str, AnyArray]:
-    """Return the columns of several tables as those of one."""
+    """Return the concatenated columns of several tables."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 

@@ -1,11 +1,12 @@
-"""Print how far from the centre of its pressure a fingertip's patch carries, on a dataset.
+"""Measure the torsion radius of the contact patches of fingertips in a dataset.
 
     python pipelines/measurements/torsion_radius.py OUT --every 2
 
-A patch under the normal force f resists twisting with at most mu f r, where its torsion radius r is
-the mean distance of its pressure from the centre of its pressure. For a disc of radius R it is 2/3
-R under even pressure, and 8/15 R where pressure falls to the rim as a paraboloid does. Held trials
-are simulated again; a patch is that of a fingertip after closing, or at the end of the lift.
+A patch under the normal force f resists twisting with a torque of at most mu f r, where its torsion
+radius r is the mean distance of its pressure from the centre of pressure. For a disc of radius R, r
+is 2/3 R under uniform pressure, and 8/15 R if the pressure falls to zero at the rim as a
+paraboloid. Held trials are simulated again. Each patch is that of a fingertip after closing, or at
+the end of the lift.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with h5py.File(arguments.dataset / TRIALS_FILE) as file:
         held = np.flatnonzero(file["trials/outcome"][()] == Outcome.SUCCESS)[:: arguments.every]
 
-    # What the simulation reads of each patch, noted on the way.
+    # Record the faces of each patch while the simulation reads them.
     read, patches = contacts._read_faces, []
 
     def note(surface: Any, object_is_M: bool) -> Any:
@@ -46,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for trial in held.tolist():
             dg.replay_trial(arguments.dataset, trial)
 
-    # Torsion radius, and radius of the disc of the same area.
+    # Torsion radius, and radius of a disc of the same area.
     radii, discs = [], []
     for areas, centres, _, pressures, _ in patches:
         weights = areas * pressures

@@ -1,11 +1,11 @@
-"""Verify the grasps of a dataset, and spoilt ones that must fail.
+"""Verify the grasps of a dataset, and corrupted grasps that must fail.
 
 \b
     python pipelines/measurements/verify_round_trip.py OUT [OUT ...] --workers 2 > round_trip.json
 
-The script verifies the grasp of every sample in the frames of both cameras and of the object, by
+The script verifies the grasp of every sample in the frames of both cameras and of the object, with
 both methods, at the dataset's own friction. Then it verifies the contacts at the end of the lift
-(`grasps_held`), and the grasps spoilt in three ways. Prints JSON.
+(`grasps_held`), and grasps that are corrupted in three ways. It prints JSON.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import CAMERAS, SPLITS
 from drakegrasp.verification.result import Verification
 
-#: Distance of spoilt contacts from the surface, and from each other on one side [m].
+#: Distance of corrupted contacts from the surface, and between contacts on one side [m].
 OFF, APART = 0.03, 0.02
 
 #: Key of the contacts at the end of the lift.
@@ -44,7 +44,7 @@ Array = npt.NDArray[np.float64]
 @click.option("--every", type=int, default=1, show_default=True, help="Verify each n-th sample.")
 def main(outs: tuple[Path, ...], workers: int, every: int) -> None:
     """Run the script."""
-    # Datasets that cannot be read are refused before anything is simulated.
+    # Reject datasets that cannot be read before anything is simulated.
     for out in outs:
         GraspDataset(out / DATA_FILES["oto"])
 
@@ -79,8 +79,8 @@ def main(outs: tuple[Path, ...], workers: int, every: int) -> None:
 
 
 def spoil(out: Path, data: GraspDataset, rows: list[int]) -> dict[str, Array]:
-    """Return the grasps of rows in {O}, (n, 6k), as they are and spoilt in three ways."""
-    # Contacts as stored, and the meshes of their objects.
+    """Return the grasps of rows in {O}, (n, 6k), unchanged and corrupted in three ways."""
+    # The stored contacts, and the meshes of their objects.
     config = read_manifest(out).config
     with h5py.File(out / TRIALS_FILE, "r") as file:
         trials = data.column("trial_id")[rows]
@@ -89,7 +89,7 @@ def spoil(out: Path, data: GraspDataset, rows: list[int]) -> dict[str, Array]:
     names = data.column("object_props/object_name")[rows]
     meshes = {name: load_prepared(out, name, config).model.collision for name in set(names)}
 
-    # Two normals reversed; all contacts on one side, beside the first.
+    # Reverse two normals; put all contacts on one side, beside the first.
     backwards = n.copy()
     backwards[:, :2] *= -1.0
     one_side_p, one_side_n = p.copy(), n.copy()
@@ -114,7 +114,7 @@ def spoil(out: Path, data: GraspDataset, rows: list[int]) -> dict[str, Array]:
 
 def figures(by_key: dict[str, list[Verification]]) -> dict[str, Any]:
     """Return the figures of one method."""
-    # Outcomes by frame; errors of the fitted palm poses.
+    # Outcomes by frame, and errors of the fitted palm poses.
     plain = by_key["object"]
     frames = [[v.outcome for v in by_key[key]] for key in ("object", *CAMERAS)]
     fits = [v.fit for v in plain if v.fit is not None]
@@ -156,7 +156,7 @@ def figures(by_key: dict[str, list[Verification]]) -> dict[str, Any]:
 
 
 def share(verdicts: list[Verification]) -> float:
-    """Return the share of successes."""
+    """Return the fraction of successes."""
     return float(np.mean([v.success for v in verdicts]))
 
 

@@ -1,11 +1,11 @@
-"""Measure how much a verdict costs over mixed objects, by how many grasps an object has.
+"""Measure the cost of a verdict over mixed objects, with one or several grasps per object.
 
 \b
     python pipelines/measurements/speed.py verdicts OUT [OUT]... > speed.json
 
-The script verifies samples of the datasets by method `hand` in this process: one of each object,
-then the others of each, at most six. A quarter of them are moved by 8 mm (standard deviation), so
-that some fail. Prints JSON.
+The script verifies samples of the datasets with the method `hand` in this process: first one of
+each object, then at most six others of each object. A quarter of them are moved by 8 mm (standard
+deviation), so that some fail. The script prints JSON.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.verification.placing import PlacedGrasp, place_on_rows
 from drakegrasp.verification.verify import verify_placed
 
-#: Most grasps of an object in the second measurement.
+#: Maximum number of grasps per object in the second measurement.
 SEVERAL = 6
-#: Share of the grasps that are moved, and by how much [m].
+#: Fraction of the grasps that are moved, and the standard deviation of the shift [m].
 MOVED, SIGMA = 0.25, 0.008
 
 
@@ -37,7 +37,7 @@ def main(outs: tuple[Path, ...]) -> None:
     one = list(_grasps(outs, lambda rows: rows[:1]))
     several = list(_grasps(outs, lambda rows: rows[1 : 1 + SEVERAL]))
 
-    # The first grasp also pays for imports and tables.
+    # The first verdict also includes the time of imports and tables, so it is not measured.
     verify_placed(several[-1])
     result = {"one grasp of each object": _measure(one), "several of each": _measure(several)}
     click.echo(json.dumps(result, indent=1))
@@ -46,7 +46,7 @@ def main(outs: tuple[Path, ...]) -> None:
 def _grasps(
     outs: tuple[Path, ...], choose: Callable[[list[int]], list[int]]
 ) -> Iterator[PlacedGrasp]:
-    """Yield grasps of all objects, those of an object together."""
+    """Yield grasps of all objects; grasps of an object are together."""
     generator = np.random.default_rng(0)
     for out in outs:
         for split in SPLITS:
@@ -66,7 +66,7 @@ def _grasps(
 
 
 def _measure(grasps: list[PlacedGrasp]) -> dict[str, object]:
-    """Return the CPU seconds of verdicts, and how many grasps succeed."""
+    """Return the CPU seconds of verdicts, and the number of grasps that succeed."""
     seconds, success = [], 0
     for grasp in grasps:
         start = time.process_time()

@@ -1,4 +1,4 @@
-"""Measure how much memory one worker holds while it tries attempts on many objects.
+"""Measure how much memory one worker uses while it tries attempts on many objects.
 
 \b
     python pipelines/measurements/speed.py worker MESH_DIR [--only NAME ...]
@@ -6,7 +6,7 @@
 
 The script builds a dataset with one worker process and reads its memory after every work unit,
 until the given number of trials (attempts whose palm ray meets the object) is done. It mixes the
-units of the objects, so that the worker builds and drops scenes all the time. Prints JSON.
+units of the objects, so that the worker constantly builds and drops scenes. It prints JSON.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from drakegrasp.outcomes import Outcome
 T = TypeVar("T")
 R = TypeVar("R")
 NO_TRIAL = (Outcome.RAY_MISS, Outcome.BELOW_TABLE)
-#: Units of one object in a row, before the next object's.
+#: Number of successive units of one object, before those of the next object.
 RUN = 2
 
 
@@ -51,7 +51,7 @@ class Scale:
         self.weights: list[tuple[int, float]] = []
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-        """Yield results, of the units of all objects in turn."""
+        """Yield the results of the units of all objects in turn."""
         done = 0
         for result in self._execute(function, mixed(items)):
             if isinstance(result, UnitSummary):
@@ -103,13 +103,13 @@ def main(
     every = find_meshes(meshes, units=units, manifest=manifest)
     sources = [s for s in every if not only or s.name.startswith(only)]
 
-    # The build is a means only: it ends after enough trials.
+    # The build only serves the measurement: it ends after enough trials.
     with tempfile.TemporaryDirectory() as folder, connect(1) as client:
         scale = Scale(client, trials)
         with suppress(EnoughError):
             build(sources, Path(folder) / "out", config, scale, show=False)
 
-    # Memory that still grows over the second half would be a leak.
+    # If memory still grew over the second half, that would be a leak.
     done, weights = zip(*scale.weights, strict=True)
     half = next(weight for n, weight in scale.weights if n >= done[-1] / 2)
     late = [weight for n, weight in scale.weights if n >= done[-1] / 2]
