@@ -1,9 +1,10 @@
-"""Opens HDF5 files of a dataset to read them: one that differs from the schema is refused.
+"""Opens HDF5 files of a dataset for reading, and rejects files that differ from the schema.
 
-In: a path, or an open file and the fields of its groups. Out: an open file in which every group,
-dataset and attribute of the schema is there, of its type and shape; or every `Difference`. Only
-headers are read; `read_codes` refuses numbers of things that do not exist. Commands refuse the
-first difference, `drakegrasp check` lists all of them. Needs no more than NumPy and h5py.
+In: a path, or an open file and the fields of its groups. Out: an open file that contains every
+group, dataset and attribute of the schema with its type and shape; or every `Difference`. Only
+headers are read; `read_codes` also rejects numbers without a defined meaning. Commands reject a
+file at the first difference, and `drakegrasp check` lists all of them. The module needs only NumPy
+and h5py.
 """
 
 from __future__ import annotations
@@ -58,13 +59,13 @@ SCENE_TABLES: Tables = {
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """How a file differs from the schema.
+    """A difference between a file and the schema.
 
     Attributes:
         path: Path of the group or the dataset; empty for the whole file.
-        what: What must be there, in words.
-        got: What is there instead.
-        text_only: Whether it is in the words beside the values: the rows can be read.
+        what: What the file must have there, in words.
+        got: What the file has there instead.
+        text_only: Whether only descriptions differ, not values: the rows can be read.
     """
 
     path: str = ""
@@ -84,12 +85,12 @@ def opened(path: Path, what: str, *, again: bool = False) -> Iterator[h5py.File]
     """Open an HDF5 file while the block runs; HDF5 errors in the block become a DataError.
 
     Args:
-        path: Of the file.
-        what: What it must be, in words.
+        path: Path of the file.
+        what: What the file must be, in words.
         again: See `open_hdf5`.
 
     Raises:
-        DataError: If it is missing or damaged.
+        DataError: If the file is missing or damaged.
     """
     if path.is_dir():
         raise DataError(f"{path}: must be {what}, got a folder; name the file in it")
@@ -108,7 +109,7 @@ def opened(path: Path, what: str, *, again: bool = False) -> Iterator[h5py.File]
 def _opened_whole(
     path: Path, what: str, rules: Mapping[str, Rule], tables: Tables
 ) -> Iterator[h5py.File]:
-    """Open a file that must not differ from the schema, see `opened`."""
+    """Open a file, see `opened`, and reject it if it differs from the schema."""
     with opened(path, what) as file:
         refuse_other_attributes(path, file, rules)
         refuse_first(path, differences(file, tables))
@@ -116,10 +117,10 @@ def _opened_whole(
 
 
 def refuse_first(path: Path, mistakes: Iterable[object]) -> None:
-    """Refuse a file with any mistake; the first is told.
+    """Reject a file that has any mistake; the error reports the first one.
 
     Raises:
-        DataError: If there is one.
+        DataError: If there is a mistake.
     """
     if (first := next(iter(mistakes), None)) is not None:
         raise DataError(f"{path}: {printable(str(first))}")
@@ -128,15 +129,15 @@ def refuse_first(path: Path, mistakes: Iterable[object]) -> None:
 def read_codes(
     dataset: h5py.Dataset, codes: int | Sequence[int], rows: slice = slice(None)
 ) -> npt.NDArray[Any]:
-    """Return a column (n,) of numbers that stand for something.
+    """Return a column (n,) of codes, and reject codes without a defined meaning.
 
     Args:
         dataset: The column.
-        codes: How many things there are, counted from 0, or the numbers of those that there are.
-        rows: Those that are read.
+        codes: The number of valid codes, which are counted from 0, or the valid codes themselves.
+        rows: The rows that are read.
 
     Raises:
-        DataError: If a number stands for nothing.
+        DataError: If a code has no defined meaning.
     """
     values: npt.NDArray[Any] = dataset[rows]
     path = Path(dataset.file.filename)
@@ -151,10 +152,10 @@ def refuse_other_codes(
     codes: int | Sequence[int],
     first: int = 0,
 ) -> None:
-    """Refuse numbers that stand for nothing, see `read_codes`; `first` is the row of the first.
+    """Reject codes without a defined meaning, see `read_codes`; `first` is the first row.
 
     Raises:
-        DataError: If there is one.
+        DataError: If there is such a code.
     """
     if isinstance(codes, int):
         bad, must = (values < 0) | (values >= codes), f"0 to {codes - 1}"
@@ -167,7 +168,7 @@ def refuse_other_codes(
 
 # Attributes
 
-#: A rule: what the value must be, in words, and whether it is.
+#: A rule: a description of the valid values, and a function that checks a value.
 Rule = tuple[str, Callable[[Any], bool]]
 
 
@@ -178,7 +179,7 @@ def _is_text(value: Any) -> bool:
 def _is_json(
     kind: type[dict[str, Any] | list[Any]], each: Callable[[Any], bool] = lambda value: True
 ) -> Callable[[Any], bool]:
-    """Return the rule that a value is JSON text of a mapping or a list of such values."""
+    """Return a check for JSON text that holds a mapping or a list of such values."""
 
     def obeys(value: Any) -> bool:
         try:
@@ -203,7 +204,7 @@ def _is_matrix(value: Any) -> bool:
 
 TEXT: Rule = ("a text", _is_text)
 COUNT: Rule = ("a whole number that is not negative", _is_whole)
-#: Attributes of all three files.
+#: Rules of the attributes of all three files.
 ORIGIN: Mapping[str, Rule] = {
     **dict.fromkeys(("config", "versions"), ("a mapping in JSON", _is_json(dict))),
     **dict.fromkeys(("config_hash", "signature", "shards"), TEXT),
@@ -222,20 +223,20 @@ ORIGIN: Mapping[str, Rule] = {
         ),
     ),
 }
-#: Those that files of before they were written may lack.
+#: Attributes that files from older versions may lack.
 _YOUNG = ("fingers", "joints", "split_by")
-#: And of the data files.
+#: Rules of the attributes of the data files.
 OF_CAMERA: Mapping[str, Rule] = {
     **ORIGIN,
     "camera": (f"one of {', '.join(CAMERAS)}", lambda v: isinstance(v, str) and v in CAMERAS),
     "split_by": ("class or object", lambda v: isinstance(v, str) and v in ("class", "object")),
 }
-#: Of scenes.hdf5, whose views have their own camera matrices.
+#: Rules of the attributes of scenes.hdf5, whose views have their own camera matrices.
 OF_SCENES: Mapping[str, Rule] = {key: rule for key, rule in ORIGIN.items() if key != "K"}
 
-#: Each opens a file of a dataset, given its path, while a block runs: grasping_oto.hdf5 or
-#: grasping_otm.hdf5, trials.hdf5, scenes.hdf5. One that is missing, damaged, or differs from the
-#: schema is a DataError.
+#: Context managers that open a file of a dataset, given its path: grasping_oto.hdf5 or
+#: grasping_otm.hdf5, trials.hdf5, scenes.hdf5. They raise a DataError if the file is missing,
+#: damaged, or differs from the schema.
 open_samples, open_trials, open_scenes = (
     partial(_opened_whole, what=what, rules=rules, tables=tables)
     for what, rules, tables in (
@@ -247,11 +248,11 @@ open_samples, open_trials, open_scenes = (
 
 
 def attribute_mistakes(file: h5py.File, rules: Mapping[str, Rule]) -> dict[str, Difference]:
-    """Return by their names the attributes that are missing or break their rules.
+    """Return the attributes that are missing or break their rules, by name.
 
     Args:
         file: The file.
-        rules: By the attributes' names.
+        rules: Rules by the attributes' names.
     """
     mistakes = {}
     for key, (must, obeys) in rules.items():
@@ -265,17 +266,18 @@ def attribute_mistakes(file: h5py.File, rules: Mapping[str, Rule]) -> dict[str, 
 
 
 def refuse_other_attributes(path: Path, file: h5py.File, rules: Mapping[str, Rule]) -> None:
-    """Refuse a file of another version of the schema, or with an attribute that breaks its rule.
+    """Reject a file of another schema version, or with an attribute that breaks its rule.
 
     Args:
-        path: Of the file, for the message.
+        path: Path of the file, for the message.
         file: The file.
-        rules: By the attributes' names.
+        rules: Rules by the attributes' names.
 
     Raises:
-        DataError: If there is one; the first is told.
+        DataError: If the file is rejected; the error reports the first mistake.
     """
-    # The version first: another schema may have other attributes, and a stranger's file has none.
+    # Check the version first: another version may have other attributes, and a foreign file has
+    # none.
     if "schema_version" not in file.attrs:
         raise DataError(f"{path}: must be a data file of drakegrasp, got another HDF5 file")
     refuse_other_schema(path, file.attrs["schema_version"])
@@ -288,16 +290,16 @@ def refuse_other_attributes(path: Path, file: h5py.File, rules: Mapping[str, Rul
 def differences(
     file: h5py.File, tables: Tables, *, image: int | None = None, thorough: bool = False
 ) -> Iterator[Difference]:
-    """Yield how the groups and datasets of a file differ from the schema.
+    """Yield the differences between the groups and datasets of a file and the schema.
 
     Args:
         file: The file.
-        tables: Fields of each group; of the whole file under "/".
-        image: Size of the images [px]; what most datasets say if None.
+        tables: Fields of each group; the fields of the whole file are under "/".
+        image: Edge length of the images [px]; if None, the one that most datasets have.
         thorough: Whether to report harmless differences as well: additional fields, and other
             attributes of fields.
     """
-    # The headers of all datasets, each looked at once.
+    # The headers of all datasets; each is read once.
     headers = {name: _datasets(file, name, fields) for name, fields in tables.items()}
     lengths = _lengths(tables, headers)
     if image is not None:
@@ -311,14 +313,14 @@ def differences(
             yield Difference(path=place, what="the group must be there", got="none")
             continue
 
-        # Each field by itself; the number of rows is that of most datasets.
+        # Check each field by itself; the number of rows must be that of most datasets.
         meanings = {f.meaning: f.name for f in fields}
         rows = _most_frequent([dataset.shape[0] for dataset in datasets.values() if dataset.shape])
         for f in fields:
             dataset = datasets.get(f.name)
             if dataset is not None:
                 yield from _of_field(f"{place}/{f.name}", dataset, f, rows, lengths)
-                words = h5py.Dataset(dataset).attrs  # each is read when it is asked for
+                words = h5py.Dataset(dataset).attrs  # each attribute is read when it is used
                 yield from _of_words(f"{place}/{f.name}", words, f, meanings, thorough)
             elif not f.optional or f.name in file[name]:
                 path = f"{place}/{f.name}"
@@ -328,7 +330,7 @@ def differences(
 def _datasets(
     file: h5py.File, name: str, fields: Iterable[Field]
 ) -> dict[str, h5py.h5d.DatasetID] | None:
-    """Return the datasets of a group that are fields; None if there is no such group."""
+    """Return the datasets of a group that are fields; None if the group does not exist."""
     group = file.get(name)
     if not isinstance(group, h5py.Group):
         return None
@@ -344,7 +346,7 @@ def _datasets(
 
 
 def _extras(file: h5py.File, tables: Tables) -> Iterator[Difference]:
-    """Yield the groups and datasets that are no fields."""
+    """Yield a difference for each group and dataset that is not in the schema."""
     for extra in sorted(set(file) - set(tables)):
         yield Difference(what="groups must be those of the schema", got=f"/{extra} too")
     for name, fields in tables.items():
@@ -363,7 +365,7 @@ def _extras(file: h5py.File, tables: Tables) -> Iterator[Difference]:
 def _lengths(
     tables: Tables, headers: Mapping[str, dict[str, h5py.h5d.DatasetID] | None]
 ) -> dict[str, int]:
-    """Return the lengths of the letters in the shapes that most datasets of a file agree on."""
+    """Return the lengths of the letters in shapes, as most datasets of a file have them."""
     votes: dict[str, list[int]] = {}
     for name, fields in tables.items():
         datasets = headers[name] or {}
@@ -389,14 +391,14 @@ def _of_field(
     rows: int,
     lengths: Mapping[str, int],
 ) -> Iterator[Difference]:
-    """Yield how the type and shape of a dataset differ from its field.
+    """Yield the differences between the type and shape of a dataset and its field.
 
     Args:
         path: Path of the dataset.
         dataset: The dataset.
         field: The field.
-        rows: Number of rows that it must have.
-        lengths: Of the letters in the shapes, where they are known.
+        rows: Number of rows that the dataset must have.
+        lengths: Lengths of the letters in the shapes, as far as they are known.
     """
     dtype, stored = dataset.dtype, dataset.shape
     text = h5py.check_string_dtype(dtype) is not None
@@ -405,7 +407,7 @@ def _of_field(
     try:
         shape = (rows, *field.row_shape(lengths))
     except KeyError:
-        # No sound dataset tells the length of a letter; one without a space has no shape.
+        # No sound dataset determines the letter; a dataset without a dataspace has no shape.
         shape = (rows, *(stored or ())[1:])
     if stored != shape:
         yield Difference(path=path, what=f"shape must be {shape}", got=str(stored))
@@ -414,17 +416,17 @@ def _of_field(
 def _of_words(
     path: str, attrs: Mapping[str, Any], field: Field, meanings: Mapping[str, str], thorough: bool
 ) -> Iterator[Difference]:
-    """Yield how the attributes of a dataset differ from its field.
+    """Yield the differences between the attributes of a dataset and its field.
 
     Args:
         path: Path of the dataset.
-        attrs: Its attributes.
+        attrs: Attributes of the dataset.
         field: The field.
         meanings: Names of the fields of the group by their meanings.
-        thorough: Whether unit and frame must be the field's, and a meaning be there.
+        thorough: Whether unit and frame must also match the field, and a meaning must exist.
     """
-    # Wording may improve without a new version of the schema: only what is another's is told, as
-    # two fields were swapped then.
+    # Wording may improve without a new version of the schema. Only the meaning of another field is
+    # reported, because two fields were swapped then.
     said = attrs.get("meaning")
     if isinstance(said, str) and said != field.meaning and said in meanings:
         yield Difference(path=path, what=f"must be {field.name}", got=meanings[said])
@@ -447,8 +449,8 @@ def _array(name: str, shape: str, dtype: str, optional: bool = False) -> Field:
     return Field(name, shape, dtype, "-", "-", "", optional=optional)
 
 
-#: The arrays of a plan of an object, `objects/NAME.plan.h5`, in tables of as many rows: of resting
-#: poses, and of palm poses.
+#: Arrays of an object's plan, `objects/NAME.plan.h5`, in two tables whose columns have equally many
+#: rows: resting poses and palm poses.
 PLAN_TABLES: Sequence[tuple[Field, ...]] = (
     (
         _array("X_TO", "4 4", "float64"),
@@ -464,12 +466,12 @@ PLAN_TABLES: Sequence[tuple[Field, ...]] = (
         _array("log_density", "", "float64"),
     ),
 )
-#: Those of a plan of postures from outside, in addition to the palm poses.
+#: Additional arrays of a plan with external postures; they have as many rows as the palm poses.
 POSTURE_FIELDS = (
     *(_array(name, "j", "float64") for name in ("q_grasp", "q_pregrasp", "q_squeeze")),
     _array("row", "", "int64"),
 )
-#: Lists of texts as JSON; `preshape` is left out where all are empty.
+#: Lists of texts in JSON; `preshape` is left out if all its texts are empty.
 POSTURE_TEXTS = (_array("said", "", "uint8"), _array("preshape", "", "uint8", optional=True))
 _PLAN_ATTRIBUTES = {
     **dict.fromkeys(("model_sha256", "config_hash", "mesh_sha256"), TEXT),
@@ -478,10 +480,10 @@ _PLAN_ATTRIBUTES = {
 
 
 def refuse_other_plan(path: Path, file: h5py.File) -> None:
-    """Refuse a file that is no plan of an object.
+    """Reject a file that is not a plan of an object.
 
     Raises:
-        DataError: If it is none; the first difference is told.
+        DataError: If the file is rejected; the error reports the first difference.
     """
     refuse_first(path, attribute_mistakes(file, _PLAN_ATTRIBUTES).values())
     resting, palms = PLAN_TABLES

@@ -11,18 +11,18 @@ from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import NAME_RULE, is_name, read_content
 from drakegrasp.runtime.files import refuse_broken_seal
 
-#: The file of all attempts, the two of samples by camera, that of scenes, and the manifest.
+#: Files of all attempts, of samples by camera and of scenes, and the manifest.
 TRIALS_FILE = "trials.hdf5"
 DATA_FILES = {camera: f"grasping_{camera}.hdf5" for camera in CAMERAS}
 SCENES_FILE = "scenes.hdf5"
 FILE_NAME = "manifest.json"
-#: What assembling writes: these files are of one state.
+#: Files that `assemble` writes; they always belong to one state.
 ASSEMBLED_FILES = (TRIALS_FILE, *DATA_FILES.values())
-#: What the dataset is, for programs and for people.
+#: Data cards that describe the dataset, for programs and for people.
 CARD_FILES = ("DATACARD.json", "DATACARD.md")
 #: Folder of the meshes of the built-in objects, in a dataset that is built from them.
 BUILTIN_FOLDER = "builtin"
-#: In it: what the frozen benchmark says of itself.
+#: File in this folder in which the frozen benchmark describes itself.
 BENCHMARK_FILE = "benchmark.json"
 
 
@@ -42,7 +42,7 @@ def object_files(out: Path, name: str) -> tuple[Path, Path]:
 
 
 def places(out: Path, *paths: Path) -> dict[str, Path]:
-    """Return those of some files in a dataset's directory that are there, by their places."""
+    """Return the existing files among `paths`, by their paths in the dataset's directory."""
     return {path.relative_to(out).as_posix(): path for path in paths if path.is_file()}
 
 
@@ -52,10 +52,10 @@ def shards_folder(out: Path, name: str) -> Path:
 
 
 def _file_name(name: str) -> str:
-    """Return a name that leads to no other folder.
+    """Return a name after checking that it leads to no other folder.
 
     Raises:
-        DataError: If it might.
+        DataError: If the name might lead to another folder.
     """
     if not is_name(name):
         raise DataError(f"the name of an object must be {NAME_RULE}, got {name!r}")
@@ -63,12 +63,12 @@ def _file_name(name: str) -> str:
 
 
 def model_file_sha256(out: Path, name: str) -> str:
-    """Return the hash of the file of an object's meshes, hexadecimal."""
+    """Return the hexadecimal hash of the file of an object's meshes."""
     return hashlib.sha256(read_content(model_path(out, name))).hexdigest()
 
 
 def recorded_model(out: Path, name: str) -> str:
-    """Return the hash of the file of an object's meshes that its plan holds, hexadecimal.
+    """Return the hexadecimal hash of an object's mesh file that its plan stores.
 
     The plan is sealed.
 
@@ -83,10 +83,10 @@ def recorded_model(out: Path, name: str) -> str:
 
 
 def refuse_changed_model(out: Path, name: str, expected: str) -> None:
-    """Refuse the file of an object's meshes if it is missing, or its hash is not as expected.
+    """Reject the file of an object's meshes if it is missing or its hash differs from `expected`.
 
     Raises:
-        DataError: If it is.
+        DataError: If the file is rejected.
     """
     model = model_path(out, name)
     if not model.is_file() or model_file_sha256(out, name) != expected:
