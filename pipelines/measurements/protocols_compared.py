@@ -111,7 +111,7 @@ def _as_benchmark(grasp: dict[str, Any], path: str) -> dict[str, Any]:
     root = np.array([q[f"WRJT{axis}"] for axis in "xyz"]) - R.apply([0.0, 0.0, 0.034])
     pose = np.array([*root, *R.as_quat(scalar_first=True)])
 
-    # A joint of theirs bends towards larger angles, one that turns the other way does so for us.
+    # In the benchmark's hand, all bending joints bend towards larger angles.
     names = [name.removeprefix("robot0:") for name in q if name.startswith("robot0:")]
     sign = np.array([-1.0 if name in _OPPOSITE else 1.0 for name in names])
     closed = sign * np.array([q[f"robot0:{name}"] for name in names])
