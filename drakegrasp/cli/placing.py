@@ -75,12 +75,12 @@ def _dataset_of(request: VerifyRequest, postures: bool) -> Path | None:
     """
     path = _posture_dataset(request) if postures else _contact_dataset(request)
     if path is not None:
-        _refuse_given("given with --object only", units=request.units)
+        _refuse_given("left out without --object", units=request.units)
     elif postures or request.grasps.suffix.lower() not in HDF5_SUFFIXES:
-        only = "given with --dataset or grasps in an HDF5 file only"
-        _refuse_given("given with --dataset only" if postures else only, split=request.split)
+        others = "" if postures else ", or grasps in an HDF5 file"
+        _refuse_given(f"left out without --dataset{others}", split=request.split)
     if path is not None or request.frame != "camera":
-        _refuse_given("given with --object and --frame camera only", camera=request.camera)
+        _refuse_given("left out without --object and --frame camera", camera=request.camera)
     elif request.camera is None:
         raise GraspError("--camera FILE must be given with --object and --frame camera, got none")
     return path
@@ -108,7 +108,7 @@ def _posture_dataset(request: VerifyRequest) -> Path | None:
 
 def _contact_dataset(request: VerifyRequest) -> Path | None:
     """Return the data file whose rows give the objects: --dataset, or GRASPS itself."""
-    _refuse_given("given with postures only", link=request.link, preshape=request.preshape)
+    _refuse_given("left out without postures", link=request.link, preshape=request.preshape)
     if request.mesh is not None and request.dataset is not None:
         raise GraspError("--object or --dataset must be given, got both")
     if request.mesh is not None or request.dataset is not None:
@@ -130,7 +130,7 @@ def _place_on_mesh(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config, N
     config = config if request.hand is None else override_config(config, [], hand=request.hand)
     name = find_mesh(request.mesh, units=request.units or "m").name
     table = _of_object(request, name, load_hand(config.hand_source))
-    _refuse_given("given with --dataset only", rows=request.rows)
+    _refuse_given("left out without --dataset", rows=request.rows)
     if table.of_row is not None:
         raise GraspError("rows must be in a file of grasps for --dataset only, got rows")
     placed = place_on_object(
@@ -165,7 +165,8 @@ def _place_on_rows(
         of=data,
         read_as=chosen_reading(vars(request)),
     )
-    rows = choose_rows(data, _rows_of(request, table.of_row), len(table))
+    said = "`rows` in the file, or --rows, says for which rows they are"
+    rows = choose_rows(data, _rows_of(request, table.of_row), len(table), said=said)
     placed = place_on_rows(
         _ranked(table, rows),
         data,
@@ -207,7 +208,7 @@ def _rows_of(
     if known is not None:
         _refuse_given("left out with a file that has rows", rows=text)
     if request.dataset is None:
-        _refuse_given("given with --dataset only", rows=text)
+        _refuse_given("left out without --dataset", rows=text)
     if text.endswith(".npy"):
         rows = read_numbers(Path(text)).ravel()
         if not (np.isfinite(rows).all() and (rows == np.floor(rows)).all()):

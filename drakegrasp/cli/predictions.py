@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import click
+from click.core import ParameterSource
 
 from drakegrasp.cli.console import Command, progress_bar, say
 from drakegrasp.cli.options import (
@@ -35,7 +36,7 @@ PLACES = ("grasps", "mesh", "units", "dataset", "split", "frame", "camera", "han
 _USUAL = {"method": "hand", "overrides": (), "snap_points": False, "tls": True}
 _CALLED = {"mesh": "object", "overrides": "set", "tls": "no-tls", "tls_files": "tls-ca-file"}
 #: Options of `score` that change no verdict.
-_IDLE = {"out", "as_json", "quiet", "tls", *(n[2:].replace("-", "_") for n in CONNECTION)}
+_IDLE = {"as_json", "quiet", "tls", *(n[2:].replace("-", "_") for n in CONNECTION)}
 
 
 @click.command(cls=Command)
@@ -379,11 +380,12 @@ def score(
 
 
 def _command(context: click.Context) -> str:
-    """Return the command that makes the card again, without what changes no verdict."""
+    """Return the command that makes the card again: what was given and changes verdict or place."""
     words = ["drakegrasp", "score"]
     for parameter in context.command.params:
-        value = context.params[str(parameter.name)]
-        if parameter.name in _IDLE or value == parameter.get_default(context):
+        name = str(parameter.name)
+        source, value = context.get_parameter_source(name), context.params[name]
+        if name in _IDLE or source is not ParameterSource.COMMANDLINE or value is None:
             continue
         option = () if isinstance(parameter, click.Argument) else parameter.opts[:1]
         for each in value if isinstance(value, tuple) else (value,):

@@ -72,6 +72,8 @@ OVERLAP = 0.002
 WIDTH = 0.02
 #: Largest distance of a pad point from the surface of its fingertip [m].
 ON_SURFACE = 0.003
+#: Places are the same within this [m].
+SAME_PLACE = 1e-7
 #: Required room behind a pad's face [m], and the cosine above which a border is parallel to it.
 LEEWAY, FACING = 0.003, 0.95
 
@@ -356,9 +358,24 @@ def _turned_round(hand: Hand, i: int) -> str:
     if np.linalg.norm(moved[i] - others) <= np.linalg.norm(start[i] - others):
         return "check the pad_region, and the axis of the closing joint"
     lower, upper = hand.joint_limits[hand.joint_names.index(finger.closing_joint)]
+    mend = f"; reverse its axis, and keep limits {lower:g}..{upper:g}"
+
+    # Next to the others at 0 the hand is closed there, so its new zero is where it is open now.
+    away, travel = moved[i] - start[i], pad_points_at(hand, closed_positions(hand))[i] - start[i]
+    gap = float((start[i] - others) @ away / np.linalg.norm(away))
+    if gap < 0.5 * np.linalg.norm(travel):
+        shift = (
+            f"move its origin by {upper:g} m along"
+            if finger.slides
+            else (f"turn its origin by {upper:g} rad about")
+        )
+        mend = (
+            f", and it is closed at 0; reverse its axis, {shift} the old axis, and take limits "
+            f"0..{upper - lower:g}"
+        )
     return (
-        f"a positive position of joint {finger.closing_joint!r} opens the hand; reverse its axis, "
-        f"limits ({-upper + 0.0:g}..{-lower + 0.0:g}) and origin, or take `drakegrasp hand new`"
+        f"a positive position of joint {finger.closing_joint!r} opens the hand{mend}, or take "
+        "`drakegrasp hand new`"
     )
 
 
@@ -387,19 +404,29 @@ def _normals(triangles: Array) -> Array:
     return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
 
 
+def _face_at(triangles: Array, point: Array) -> Array:
+    """Return those of the triangles (n, 3, 3) that are closest to a point (3,) [m]."""
+    near = trimesh.triangles.closest_point(triangles, np.tile(point, (len(triangles), 1)))
+    distance = np.linalg.norm(near - point, axis=1)
+    return np.asarray(triangles[distance <= distance.min() + SAME_PLACE])
+
+
 def _facing(hand: Hand) -> Array:
     """Return the cosine (k,) between each pad's normal and its motion, when half closed."""
     # Motion of the pad points as the fingers close.
     half, step = 0.5 * closed_positions(hand), 1e-4 * hand.closing_unit
     motion = pad_points_at(hand, half + step) - pad_points_at(hand, half)
 
-    # Mean normal of each pad's surface, out of the fingertip.
+    # Mean normal of each pad's surface, out of the fingertip. Without a region the pad is the whole
+    # closed surface, which faces no way as a whole; its face is at the pad point.
     X_GF, shapes = fingertip_poses(hand, spread=0.0, closing=half), link_shapes(hand.model)
     cosines = np.zeros(hand.num_fingers)
     for i, pad in enumerate(pad_surfaces(hand.model, hand.fingers)):
         corners = shapes[hand.fingers[i].fingertip]
         if not len(pad) or not corners:
             continue
+        if not hand.fingers[i].pad_region:
+            pad = _face_at(pad, hand.fingers[i].p_FiP)
         normals, centre = _normals(pad), np.concatenate(corners).mean(axis=0)
         inward = np.einsum("ij,ij->i", normals, pad.mean(axis=1) - centre) < 0.0
         normals[inward] *= -1.0

@@ -89,8 +89,8 @@ def read_attempts(
         hand: The hand.
         of: Name of the object of rows that name none; None: each must. Or the split of a dataset
             whose rows they are for: then `row` says which, or they are one for each row, or
-            exported samples, of which those of the split count, or isaac_grasp files of others, in
-            which each grasp is for every row of its object. Objects and the poses of the frame
+            exported samples, of which those of the split count, or files that name objects alone,
+            in which each grasp is for every row of its object. Objects and the poses of the frame
             "camera" are those of the rows; `Attempts.of_row` has the rows. Contacts name no object,
             so they must be of something.
         split: Group of an HDF5 file of contacts; that of the dataset if it is for one.
@@ -244,12 +244,15 @@ def _of_split(raw: dict[str, Any], data: GraspDataset) -> dict[str, Any]:
     """Return postures that are of the split, with their rows; where nobody knows, as they are.
 
     The trial of an exported sample says which row it is. What is for an object is for each of its
-    rows.
+    rows; so are postures that all name an object, unless there is one for each row of the split.
     """
-    if raw.get("of_row") is not None or not (raw.get("of_objects") or "trial" in raw):
-        return raw
     told, column = raw["objects"], "object_props/object_name"
-    if not raw.get("of_objects"):
+    of_objects = raw.get("of_objects") or (
+        all(told) and len(told) != len(data) and "trial" not in raw and raw["frame"] != "camera"
+    )
+    if raw.get("of_row") is not None or not (of_objects or "trial" in raw):
+        return raw
+    if not of_objects:
         if raw["trial"] is None:
             return raw
         told, column = raw["trial"].tolist(), "trial_id"
@@ -262,14 +265,16 @@ def _of_split(raw: dict[str, Any], data: GraspDataset) -> dict[str, Any]:
         name: value if value is None or name in _OF_FILE else taken(value, there)
         for name, value in raw.items()
     }
-    return {**known, "of_row": np.array([row for _, row in pairs], np.int64)}
+    of_row = np.array([row for _, row in pairs], np.int64)
+    return {**known, "of_row": of_row, "of_objects": of_objects}
 
 
 def _on_rows(raw: dict[str, Any], data: GraspDataset, hand: Hand) -> Attempts:
     """Return the postures of a file on their rows."""
     if raw.get("X_TC") is not None:
         raise GraspError("X_TC must be left out: the camera is that of the row; got it")
-    rows = choose_rows(data, raw.get("of_row"), len(raw["objects"]))
+    said = "`row` in the file says for which row each is, or `object` for which object"
+    rows = choose_rows(data, raw.get("of_row"), len(raw["objects"]), said=said)
 
     # What the rows say of object and camera.
     objects = data.column("object_props/object_name")[rows].tolist()

@@ -270,8 +270,16 @@ def _drawn(dataset: GraspDataset, rows: npt.NDArray[np.int64]) -> Array:
     return told
 
 
-def choose_rows(dataset: GraspDataset, rows: RowChoice, count: int) -> npt.NDArray[np.int64]:
+def choose_rows(
+    dataset: GraspDataset,
+    rows: RowChoice,
+    count: int,
+    *,
+    said: str = "`rows` says for which rows they are",
+) -> npt.NDArray[np.int64]:
     """Return the row (n,) of the dataset's split for each of `count` grasps; one may be for all.
+
+    `said` is what an error says of how to give rows.
 
     Raises:
         GraspError: If there is not exactly one row per grasp, or a row does not exist.
@@ -289,8 +297,7 @@ def choose_rows(dataset: GraspDataset, rows: RowChoice, count: int) -> npt.NDArr
     if rows is None and count != len(dataset):
         raise GraspError(
             f"without rows there must be a grasp for each of the {len(dataset)} rows of "
-            f"{dataset.split} in {dataset.path.name}, got {count} grasps (`rows` in the file, or "
-            "--rows, says for which rows they are)"
+            f"{dataset.split} in {dataset.path.name}, got {count} grasps ({said})"
         )
 
     # Rows that exist.

@@ -146,7 +146,7 @@ REFUSED = [
     ("verify a.npy --dataset a.npy", "a.npy: must be a data file of drakegrasp"),
     ("verify other.h5", "other.h5: must be a data file of drakegrasp"),
     ("verify other.h5 --frame object", "--frame must be camera for a dataset's own grasps"),
-    ("verify other.h5 --units cm", "--units must be given with --object only, got cm"),
+    ("verify other.h5 --units cm", "--units must be left out without --object, got cm"),
     ("verify a.npy --object o.obj --out .", "must be a name for files, got a folder"),
     ("verify a.npy --object o.obj --out a.npy/x", "must be in a folder that can be"),
     ("verify a.npy --object o.obj --assets .", "--assets must be used with another --protocol"),

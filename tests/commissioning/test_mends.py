@@ -45,6 +45,20 @@ def test_a_border_on_the_pads_face_is_moved_behind_it(tmp_path: Path) -> None:
     assert checked([0.0, -1.0, 0.0, -0.003]).ok
 
 
+def test_a_jaw_that_opens_from_0_gets_a_new_zero_where_it_is_open(tmp_path: Path) -> None:
+    """The gripper as many vendors write it: closed at 0, a positive position opens."""
+    for name in ("franka_hand.yaml", "franka_hand.urdf"):
+        shutil.copy(MODELS / name, tmp_path)
+    model = tmp_path / "franka_hand.urdf"
+    text = model.read_text().replace('"0 1 0"', '"0 x 0"').replace('"0 -1 0"', '"0 1 0"')
+    text = text.replace('"0 x 0"', '"0 -1 0"').replace(" 0.04 0.0584", " 0 0.0584")
+    model.write_text(text.replace(" -0.04 0.0584", " 0 0.0584"))
+    assert (
+        "a positive position of joint 'left_joint' opens the hand, and it is closed at 0; reverse "
+        "its axis, move its origin by 0.04 m along the old axis, and take limits 0..0.04"
+    ) in check_pads(load_hand(tmp_path / "franka_hand.yaml")).text
+
+
 def test_a_palm_that_cannot_face_a_table_is_found(tmp_path: Path) -> None:
     """A post beside the fingers, which nothing else meets."""
     path = write_tongs(tmp_path)

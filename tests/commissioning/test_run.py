@@ -105,8 +105,8 @@ FAULTS = {
     "finger that opens": (
         "franka", ".urdf", '<axis xyz="0 1 0"/>', '<axis xyz="0 -1 0"/>', "pads",
         r"the pad of finger 'right' must face where the finger closes, got its back: a positive "
-        r"position of joint 'right_joint' opens the hand; reverse its axis, limits \(-0\.04\.\.0\) "
-        "and origin"),
+        r"position of joint 'right_joint' opens the hand; reverse its axis, and keep limits "
+        r"0\.\.0\.04"),
     "another coupling in the model": (
         "allegro", ".sdf", "<xyz>0 1 0</xyz>\n        <limit><lower>-0.174",
         '<xyz>0 1 0</xyz><mimic joint="index_mcp_joint"><multiplier>-1</multiplier>'
@@ -192,6 +192,12 @@ def test_a_sound_hand_passes_whatever_else_its_model_has(tmp_path: Path, case: s
     assert [finding.text for finding in check_hand(path) if not finding.ok] == []
     # What is checked can be used.
     assert len(hand_constants(load_hand(path)).palm) == 8 or name != "tongs"
+
+
+def test_the_hand_of_the_example_plugin_passes() -> None:
+    """Its pads have no region, so they are the whole surface of the fingertips."""
+    path = Path(__file__).parents[2] / "docs/examples/plugin/example_plugin/jaw_hand.yaml"
+    assert [finding.text for finding in check_hand(path) if not finding.ok] == []
 
 
 @pytest.mark.sim

@@ -100,6 +100,22 @@ def test_what_belongs_to_no_row_is_refused(data, tmp_path, changes, words):
     assert str(caught.value).startswith(str(tmp_path / "p.npz"))
 
 
+def test_postures_that_name_objects_alone_are_for_each_of_their_rows(data, tmp_path):
+    names = data.column("object_props/object_name")
+    given = own_postures(data, np.array([0, 0]))
+    del given["row"]
+    np.savez(tmp_path / "p.npz", **given, object=[names[0]] * 2, confidence=[0.1, 0.9])
+    ranked, rows = rank_file(tmp_path / "p.npz", data), np.flatnonzero(names == names[0])
+    assert len(data) != 2
+    assert ranked.of_row.tolist() == np.repeat(rows, 2).tolist()
+    assert ranked.confidence.tolist() == [0.9, 0.1] * len(rows)
+
+    # Nobody knows the rows of postures that name neither.
+    np.savez(tmp_path / "p.npz", **given)
+    with pytest.raises(GraspError, match=r"\(`row` in the file says for which row each is, or `ob"):
+        rank_file(tmp_path / "p.npz", data)
+
+
 @pytest.mark.nightly
 @pytest.mark.sim
 @pytest.mark.slow
