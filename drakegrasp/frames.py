@@ -138,7 +138,7 @@ def as_numbers(value: npt.ArrayLike, must: str) -> Array:
         array = np.asarray(without_torch(value))
     except (TypeError, ValueError, RuntimeError) as error:
         raise GraspError(
-            f"{must}, got a {type(value).__name__} that is none ({first_line(error)})"
+            f"{must}, got a {type(value).__name__} that cannot be read ({first_line(error)})"
         ) from None
     # An empty list is accepted: NumPy gives it real numbers.
     if array.dtype.kind not in "fiu":

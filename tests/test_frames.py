@@ -139,7 +139,7 @@ def changed(X: Array, index: Any, value: npt.ArrayLike) -> Array:
 BAD_POSES: dict[str, tuple[Any, str]] = {
     "text": ("abc", "X_TC must be a pose, 4 x 4 numbers, got text"),
     "nothing": (None, "X_TC must be a pose, 4 x 4 numbers, got None"),
-    "ragged": ([[1, 2], [3]], "X_TC must be a pose, 4 x 4 numbers, got a list that is none"),
+    "ragged": ([[1, 2], [3]], "X_TC must be a pose, 4 x 4 numbers, got a list that cannot be read"),
     "rotation": (np.eye(3), "X_TC must be a pose, 4 x 4 numbers, got an array of shape (3, 3)"),
     "vector": (np.zeros(16), "X_TC must be a pose, 4 x 4 numbers, got an array of shape (16,)"),
     "too deep": (

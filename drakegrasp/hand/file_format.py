@@ -317,7 +317,7 @@ class HandFile(BaseModel):
 
         # Names that files already use for the palm frame and the palm link.
         for name in {"palm", self.palm.link} & set(self.frames):
-            yield f"frames.{name} must have another name, got that of the palm"
+            yield f"frames.{name} must have another name, got the name of the palm"
 
         # Spread angles of a hand without spread joints.
         if not self.spread.joints and set(self.spreads_deg) != {0.0}:

@@ -215,7 +215,7 @@ def card_text(card: Mapping[str, Any]) -> str:
     lines += _table(["set", *measures, "predictions"], rows)
     drawn, level = card["intervals"]["drawn"], card["intervals"]["level"]
     within = (
-        f"A contact must be within {card['limit_mm']:g} mm of the one asked for in the first two "
+        f"A contact must be within {card['limit_mm']:g} mm of the requested one in the first two "
         "columns."
         if protocol is None
         else f"Of {protocol['source']}."
@@ -243,7 +243,7 @@ def _more(card: Mapping[str, Any]) -> list[str]:
     if "protocol" not in card["settings"]:
         curves = [each["held_within_mm"] for each in sets.values()]
         rows = [[d, *(_percent(each[d]) for each in curves)] for d in map(str, CURVE_MM)]
-        words = "Held with every contact within d of the one asked for [%]."
+        words = "Held with every contact within d of the requested one [%]."
         lines += ["## held(d)", "", words, "", *_table(["d [mm]", *sets], rows)]
     rows = []
     for name, each in sets.items():

@@ -355,7 +355,7 @@ def _misplaced(verified: Verification) -> Iterator[str]:
     # State what is off and how far.
     distance = verified.surface_distance
     all_far = bool(np.all(distance > FAR))
-    more = ", so the grasp that was asked for does not touch it"
+    more = ", so the requested grasp does not touch it"
     if verified.fingertip_distance is not None:
         distance, all_far = verified.fingertip_distance, True
         what, more = "The posture's fingertips are", ""
@@ -404,8 +404,8 @@ def _contacts(verified: Verification) -> Iterator[str]:
     if verified.held and not verified.success:
         finger = int(np.nanargmax(errors[0])) + 1
         yield (
-            f"It is no success: fingertip {finger} is more than {in_mm(limit)} from its point, so "
-            "another grasp holds than the one asked for."
+            f"It is not a success: fingertip {finger} is more than {in_mm(limit)} from its point, "
+            "so another grasp holds than the requested one."
         )
 
 

@@ -108,7 +108,7 @@ def test_contacts_in_the_air_are_tried_and_told(cube, grasp):
     assert found.held and not found.success
     assert found.farthest_contact == pytest.approx(0.03, abs=1e-3)
     assert found.words.endswith("not as asked")
-    assert "It is no success: fingertip" in found.explain()
+    assert "It is not a success: fingertip" in found.explain()
 
 
 def test_points_may_be_moved_to_the_surface(held, cube, grasp):

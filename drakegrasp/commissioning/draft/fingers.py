@@ -104,8 +104,8 @@ def find_palm(model: VendorModel, answers: Answers) -> str:
         link = bearing[0]
     if not bearing:
         raise HandError(
-            "model: must have two fingers or more, got one chain of links: say which link "
-            f"carries the fingers with --palm LINK ({', '.join(model.links)})"
+            "model: must have two fingers or more, got one chain of links: name the "
+            f"link from which the fingers branch with --palm LINK ({', '.join(model.links)})"
         )
     return link
 

@@ -381,7 +381,7 @@ def _write(draft: Draft, folder: Path, path: Path, *, drawn: bool = True) -> Pat
     file = folder / f"{stem}.yaml"
     lines = [
         f"Drafted from {path.name} by `drakegrasp hand new`. Values with a comment were guessed:",
-        "look at the picture, mend them, and run `drakegrasp hand check` again.",
+        "look at the picture, correct them, and run `drakegrasp hand check` again.",
         "Units: m, rad, N, N m, kg; degrees in keys that end in _deg.",
     ]
     text = hand_text({**draft.tree, "model": model.name}, draft.reasons, lines)

@@ -378,8 +378,8 @@ def _reasons(model: VendorModel, grip: Grip, frame: PalmFrame, answers: Answers)
         "drive": "guessed: most gears cannot be pushed open; else `torque`",
         "closing_speed_deg": "usual, or what the motors need",
         "closing_speed": "usual, or what the motors need [m/s]",
-        "standoffs": "shares of the height of the pinch above the palm [m]",
-        "payload": "half of what friction carries at these efforts [kg]",
+        "standoffs": "fractions of the height of the pinch above the palm [m]",
+        "payload": "half of the mass that friction supports at these efforts [kg]",
     }
 
     # For each finger.
