@@ -1,4 +1,4 @@
-"""`drakegrasp bench`: what attempts cost on this machine."""
+"""`drakegrasp bench`: the cost of attempts on this machine."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def bench(
         --candidates N: Palm poses per object.
         --peer (mujoco): Run the same attempts in MuJoCo as well.
         --compare FILE: Print the ratios to this earlier report.
-        --out FILE: Where the report goes, as JSON.
+        --out FILE: File of the report, as JSON.
         --units, --manifest, --quiet
     """
     import json
@@ -57,12 +57,12 @@ def bench(
     from drakegrasp.objects.sources import find_meshes
     from drakegrasp.shapes.catalog import builtin_sources
 
-    # What cannot be used is refused before the measurement, which takes a while.
+    # Unusable options are rejected before the measurement, which takes a while.
     if not os.access(out if out.exists() else out.absolute().parent, os.W_OK):
         raise click.UsageError(f"--out must be a file that can be written, got {out}")
     if mujoco:
         require_mujoco("mujoco", "coacd")
-    # The time of OpenGL's threads would count as this core's.
+    # The time of OpenGL's threads would be counted for this core.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     options |= {"objects": objects, "candidates": candidates}
     rules = load_config(config, chosen_settings(options))
@@ -97,7 +97,7 @@ def _read_report(path: Path) -> dict[str, Any]:
     """Return an earlier report.
 
     Raises:
-        click.UsageError: If the file is none.
+        click.UsageError: If the file is not a report.
     """
     from drakegrasp.foreign_files import read_json
 

@@ -1,8 +1,8 @@
-"""How commands speak and end, and their help.
+"""Output, errors, exit codes and help of the commands.
 
 Every error is one line on standard error and an exit code: 0 done, 1 the work failed, 2 wrong
-usage, 130 Ctrl-C, 143 SIGTERM. What is printed has no control characters, whatever names are in it.
-In a help the options of everyday come first, and rare ones under a heading of their own.
+usage, 130 Ctrl-C, 143 SIGTERM. Printed text has no control characters, whatever names it contains.
+In a help text common options come first, and rare options follow under a separate heading.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
     from drakegrasp.runtime.progress import Report
 
 _UTF8, _STREAMS = "PYTHONUTF8", "PYTHONIOENCODING"
-#: A signal that comes while a module is imported is sent again after this time [s].
+#: A signal that arrives while a module is imported is sent again after this time [s].
 AGAIN_SECONDS = 0.05
-#: How much a known option must be like an unknown one to be proposed [ratio of `difflib`].
+#: Minimum similarity of a known option to an unknown one to be proposed [ratio of `difflib`].
 ALIKE = 0.75
-#: Commands that go on where they were stopped.
+#: Commands that continue where they were stopped.
 RESUMABLE = ("build", "score")
-#: Errors in what the user asked for. All other errors are failures of the work.
+#: Errors in the user's input. All other errors are failures of the work.
 WRONG_USAGE = (ConfigError, GraspError, HandError, MeshError)
 
 
@@ -52,7 +52,7 @@ def say_finding(ok: bool, bad: str, text: str) -> None:
 
 
 def say(text: str, *, err: bool = False) -> None:
-    """Print a text; what would steer the terminal is shown as its code.
+    """Print a text; control characters are shown as their codes.
 
     Args:
         text: One line or more.
@@ -62,12 +62,12 @@ def say(text: str, *, err: bool = False) -> None:
 
 
 def say_json(document: Mapping[str, Any]) -> None:
-    """Print a document of strict JSON on one line."""
+    """Print a document as strict JSON on one line."""
     click.echo(json.dumps(document, allow_nan=False))
 
 
 def progress_bar(title: str, unit: str, *, show: bool = True) -> AbstractContextManager[Report]:
-    """Return the progress bar of `runtime.progress`; what it needs is loaded now."""
+    """Return the progress bar of `runtime.progress`, whose libraries are loaded only now."""
     from drakegrasp.runtime import progress
 
     return progress.progress_bar(title, unit, show=show)
@@ -91,22 +91,22 @@ class Command(click.Command):
 
 
 class OneCommand(Command):
-    """The only command of a script that builds, with errors in one line."""
+    """The only command of a script, with errors on one line; also the base of `Commands`."""
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
-        """Read the command line; of a group, the options before the command's name."""
+        """Read the command line; for a group, the options before the name of the command."""
         with one_line_errors():
             return super().make_context(*args, **kwargs)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command that was asked for."""
+        """Run the requested command."""
         of_group = isinstance(self, click.Group)
         with one_line_errors(lambda: not of_group or ctx.invoked_subcommand in RESUMABLE):
             return super().invoke(ctx)
 
 
 class Commands(OneCommand, click.Group):
-    """Commands in the order of their definition, and errors in one line."""
+    """Commands in the order of their definition, with errors on one line."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the commands' names."""
@@ -122,7 +122,7 @@ def one_line_errors(resumable: Callable[[], bool] = lambda: False) -> Iterator[N
     """Turn errors within the block into one line on standard error and an exit code.
 
     Args:
-        resumable: Says whether the command can be given again after Ctrl-C to go on.
+        resumable: Function that tells whether the same command continues after Ctrl-C.
     """
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     signal.signal(signal.SIGTERM, _stop)
@@ -134,7 +134,7 @@ def one_line_errors(resumable: Callable[[], bool] = lambda: False) -> Iterator[N
         raise
     except click.UsageError as error:
         if isinstance(error, click.NoSuchOption):
-            # Click compares the dashes as well: any two short names are alike then.
+            # Click also compares the dashes, so any two short names are similar.
             names = {each.lstrip("-"): each for each in error.possibilities or ()}
             near = get_close_matches(error.option_name.lstrip("-"), names, cutoff=ALIKE)
             error = click.NoSuchOption(error.option_name, possibilities=[names[n] for n in near])
@@ -143,7 +143,7 @@ def one_line_errors(resumable: Callable[[], bool] = lambda: False) -> Iterator[N
         code = 2 if isinstance(error, WRONG_USAGE) else 1
         _end(f"error: {_one_line(str(error))}", code)
     except (click.Abort, click.exceptions.Exit, BrokenPipeError):
-        # Click handles these: a reader that closes the pipe has what it wanted.
+        # Click handles these; a reader that closes the pipe needs no more output.
         raise
     except (OSError, RuntimeError) as error:
         text = str(error).strip() or type(error).__name__
@@ -169,14 +169,14 @@ def _one_line(text: str) -> str:
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM, which is handled as Ctrl-C is: what was begun is put in order."""
+    """SIGTERM, which is handled like Ctrl-C: the command cleans up before it ends."""
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
-    """Stop what runs, but no import of a module.
+    """Stop the running command, but not during the import of a module.
 
-    A library may swallow the exception while it is imported, as trimesh does; the command would go
-    on with half of it. So the signal is sent again a moment later.
+    A library may swallow the exception while it is imported, as trimesh does; the command would
+    continue with a partly imported library. So the signal is sent again a moment later.
     """
     if _is_importing(frame):
         again = threading.Timer(AGAIN_SECONDS, os.kill, (os.getpid(), number))
@@ -195,10 +195,10 @@ def _is_importing(frame: FrameType | None) -> bool:
 
 
 def restart_with_utf8() -> None:
-    """Start this program again in Python's UTF-8 mode, where the locale has another encoding.
+    """Start this program again in Python's UTF-8 mode if the locale has another encoding.
 
-    Under such a locale Drake cannot be imported, and the files of an object cannot be opened whose
-    name it cannot encode. The streams keep the encoding of the terminal.
+    Under such a locale Drake cannot be imported, and files with names that the locale cannot encode
+    cannot be opened. The streams keep the encoding of the terminal.
     """
     if sys.getfilesystemencoding() == "utf-8" or os.environ.get(_UTF8) == "1":
         return

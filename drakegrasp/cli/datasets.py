@@ -1,4 +1,4 @@
-"""The commands that make datasets and count what is in them: `build`, `stats`, `check` and more."""
+"""The commands that build datasets and count their content: `build`, `stats`, `check` and more."""
 
 from __future__ import annotations
 
@@ -39,8 +39,9 @@ def build(times: Path | None, plan: bool = False, part: str | None = None, **opt
 
     Options:
         BUILD, CONNECTION
-        --part I/N: Only do every Nth work unit from the Ith on; `merge` joins the OUT of all N.
-        --plan: Only print the hours and bytes that the build would take.
+        --part I/N: Only run every Nth work unit, starting with the Ith; `merge` joins the OUT of
+            all N.
+        --plan: Only print the hours and bytes that the build would need.
         --times
     """
     from drakegrasp.api.building import build_dataset
@@ -82,11 +83,12 @@ def bench_set(
     quiet: bool,
     **options: Any,
 ) -> None:
-    """Make the frozen benchmark drakegrasp-bench-1 in OUT.
+    """Build the frozen benchmark drakegrasp-bench-1 in OUT.
 
-    256 built-in objects with masses and frictions of their own, all for testing. Their meshes are
-    compared with the published hashes. With --only or --set it is a part of the benchmark or
-    another one, and each card says so. The same command continues an interrupted build.
+    The benchmark has 256 built-in objects, each with its own mass and friction, all for testing.
+    Their meshes are compared with the published hashes. With --only or --set the result is a part
+    or a variant of the benchmark, and each card reports this. The same command continues an
+    interrupted build.
 
     Options:
         --only, --set
@@ -120,7 +122,7 @@ def assemble(
 
     Options:
         --reject FILE: Trials that must not become samples: the reject.json of an inspection, or a
-            text file with an id per line; # starts a comment.
+            text file with one id per line; # starts a comment.
         ASSEMBLED, --workers
     """
     from drakegrasp.cli import tables
@@ -148,10 +150,10 @@ def assemble(
 @described
 @dataset_argument()
 def scenes(out: Path, workers: int | None, quiet: bool, overrides: tuple[str, ...] = ()) -> None:
-    """Render views of scenes to train on, independent of grasps.
+    """Render views of training scenes, independent of grasps.
 
     The command writes OUT/scenes.hdf5: each object of OUT in each resting pose, seen by sixteen
-    cameras (five fixed ones to test), with all hands that closed on it.
+    cameras (five fixed cameras for testing), with all attempts that closed the hand on it.
 
     Options:
         --set KEY=VALUE (overrides): Change a key of `scenes`, e.g. scenes.views=8; may be given
@@ -191,10 +193,11 @@ def write_scenes(
 def merge(
     into: Path, outs: tuple[Path, ...], overrides: tuple[str, ...], workers: int | None
 ) -> None:
-    """Make one dataset of several that were built apart.
+    """Merge several datasets that were built separately.
 
-    Only their objects, their seeds, their parts (`build --part`), and what --set sets for all of
-    them may differ. INTO must be new or empty, and appears when it is complete; OUTS do not change.
+    The datasets may differ only in their objects, their seeds, their parts (`build --part`), and
+    the settings that --set changes for all of them. INTO must be new or empty, and appears when it
+    is complete; OUTS do not change.
 
     Options:
         ASSEMBLED, --workers
@@ -213,7 +216,7 @@ def merge(
 def stats(out: Path, as_json: bool) -> None:
     """Count outcomes, how well grasps hold, and samples.
 
-    While a build runs, or after it was stopped, the command counts what is done so far.
+    While a build runs, or after it was stopped, the command counts the finished work units.
     """
     from drakegrasp.cli import tables
     from drakegrasp.dataset.statistics import counts_as_dict
@@ -230,8 +233,8 @@ def stats(out: Path, as_json: bool) -> None:
 def check(path: Path, workers: int | None, as_json: bool) -> None:
     """Check every invariant of a dataset.
 
-    OUT is a dataset's directory; FILE is one of its HDF5 files. Exit code 1 if an invariant is
-    broken.
+    OUT is the directory of a dataset; FILE is one of its HDF5 files. The exit code is 1 if an
+    invariant is broken.
     """
     from drakegrasp.dataset.checks.run import check_dataset
 
@@ -254,7 +257,7 @@ def check(path: Path, workers: int | None, as_json: bool) -> None:
 def replay(out: Path, *, trial: int, html: Path | None = None) -> None:
     """Run a trial again and compare every value.
 
-    Exit code 1 if any value differs from the stored one.
+    The exit code is 1 if any value differs from the stored one.
 
     Options:
         --trial ID: Row of trials.hdf5.
@@ -262,7 +265,7 @@ def replay(out: Path, *, trial: int, html: Path | None = None) -> None:
     """
     from drakegrasp.generation.replay import record_trial, replay_trial
 
-    # Whatever differs is printed: values first, then versions, which may explain them.
+    # All differences are printed: values first, then versions, which may explain them.
     again = replay_trial(out, trial)
     say(f"trial {trial} of {again.object_name}: was {again.recorded.label}, is {again.found.label}")
     for other, links in again.meetings.items():
@@ -281,7 +284,7 @@ def replay(out: Path, *, trial: int, html: Path | None = None) -> None:
 
 
 def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -> None:
-    """Print how long a requested build is expected to take, and its size."""
+    """Print the expected duration and size of a requested build."""
     from drakegrasp.generation.estimate import logged_times, plan_lines, plan_request, read_times
 
     logged = logged_times(request.out, request.config)
@@ -290,11 +293,11 @@ def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -
 
 
 def print_report(report: BuildReport) -> None:
-    """Print what a build did, and the paths of its files.
+    """Print the results of a build, and the paths of its files.
 
     Raises:
-        click.exceptions.Exit: With code 1 if the machine must have spoiled labels; a line on
-            standard error has said so.
+        click.exceptions.Exit: With code 1 if the machine has probably spoiled labels, which a line
+            on standard error has reported.
     """
     from drakegrasp.cli import tables
 

@@ -1,7 +1,7 @@
-"""Checks whether this machine meets every need of drakegrasp, and says how to meet it.
+"""Checks whether this machine meets the requirements of drakegrasp, with a remedy for each.
 
-This module imports no library that might be missing: a library that cannot be loaded is a
-finding, not an error.
+This module imports no library that may be missing: a library that cannot be loaded is a finding,
+not an error.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ PYTHON = (3, 11)
 #: Drake's wheels are built for this C library (manylinux_2_34).
 GLIBC = (2, 34)
 DRAKE = (1, 51, 1)
-#: Segfaults when it makes a renderer on Linux (RobotLocomotion/drake#24421).
+#: This version segfaults when it creates a renderer on Linux (RobotLocomotion/drake#24421).
 BROKEN_DRAKE = (1, 52, 0)
-#: With the last Drake for Python 3.11, which is 1.51.1, attempts take up to a tenth longer.
+#: With Drake 1.51.1, the last version for Python 3.11, attempts take up to a tenth longer.
 FAST_DRAKE, FAST_PYTHON = (1, 58, 0), (3, 12)
 DRAKE_REQUIREMENT = "drake>=1.51.1,!=1.52.0"
 EGL_LIBRARY = "libEGL.so.1"
 EGL_PACKAGES = "apt-get install libegl1 libgl1-mesa-dri"
 JEMALLOC_PACKAGE = "apt-get install libjemalloc2"
-#: Room for about 3,500 successes: two images of 128 x 128 pixels of 17 bytes, uncompressed [B].
+#: Space for about 3,500 successes: two images of 128 x 128 pixels of 17 bytes, uncompressed [B].
 FREE_BYTES = 2e9
-#: Memory of a worker, which holds the scenes of a few objects [B].
+#: Memory of a worker, which keeps the scenes of a few objects [B].
 BYTES_PER_CORE = 1e9
 #: Memory limits of the control group, version 2 and 1; containers have one of them.
 CGROUP_LIMITS = (
@@ -46,13 +46,13 @@ MEMINFO = Path("/proc/meminfo")
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One need of drakegrasp and whether this machine meets it.
+    """One requirement of drakegrasp, and whether this machine meets it.
 
     Attributes:
-        name: Name of the need.
-        ok: Whether it is met.
-        what: What was measured.
-        remedy: How to meet it; empty if it is met.
+        name: Name of the requirement.
+        ok: Whether the requirement is met.
+        what: Measured state.
+        remedy: How to meet the requirement; empty if it is met.
     """
 
     name: str
@@ -62,11 +62,11 @@ class Finding:
 
 
 def diagnose(directory: Path | None = None) -> list[Finding]:
-    """Return a finding on every need, met or not.
+    """Return a finding for every requirement, met or not.
 
     Args:
-        directory: Where datasets will be written; the current directory if None. If it does
-            not exist, its nearest existing parent is checked.
+        directory: Directory for datasets; the current directory if None. If it does not exist, its
+            nearest existing parent is checked.
     """
     place = _existing(Path.cwd() if directory is None else Path(directory))
     return [
@@ -84,7 +84,7 @@ def diagnose(directory: Path | None = None) -> list[Finding]:
 
 
 def check_python() -> Finding:
-    """Return whether Python is new enough."""
+    """Return the finding on the version of Python."""
     return _finding(
         "Python",
         sys.version_info[:2] >= PYTHON,
@@ -107,7 +107,7 @@ def check_glibc() -> Finding:
 
 
 def check_drake() -> Finding:
-    """Return whether a Drake that works is installed."""
+    """Return whether a working version of Drake is installed."""
     try:
         version = metadata.version("drake")
     except metadata.PackageNotFoundError:
@@ -121,7 +121,7 @@ def check_drake() -> Finding:
 
 
 def check_allocator() -> Finding:
-    """Return which allocator the workers have; any will do, but jemalloc is the fastest."""
+    """Return the allocator of the workers; any allocator works, but jemalloc is the fastest."""
     from drakegrasp.runtime.allocator import LIBRARY, allocator, jemalloc_environment
 
     if jemalloc_environment():
@@ -150,7 +150,7 @@ def check_image() -> Finding:
 
 
 def check_writing(directory: Path) -> Finding:
-    """Return whether a file can be written in a directory, by writing one."""
+    """Return whether a file can be written to a directory, by writing one."""
     try:
         with tempfile.TemporaryFile(dir=directory) as file:
             file.write(b"drakegrasp")
@@ -163,7 +163,7 @@ def check_writing(directory: Path) -> Finding:
 
 
 def check_disk(directory: Path) -> Finding:
-    """Return whether a directory's disk has room for a small dataset."""
+    """Return whether the disk of a directory has space for a small dataset."""
     try:
         free = shutil.disk_usage(directory).free
     except OSError as error:
@@ -178,12 +178,12 @@ def check_disk(directory: Path) -> Finding:
 
 
 def check_cores() -> Finding:
-    """Return how many cores this process may use; any number will do."""
+    """Return how many cores this process may use; any number is sufficient."""
     return Finding(name="cores", ok=True, what=str(available_cores()))
 
 
 def check_memory() -> Finding:
-    """Return whether there is memory for a worker on every core."""
+    """Return whether the memory is sufficient for a worker on every core."""
     total, cores = _memory(), available_cores()
     if total is None:
         return Finding(name="memory", ok=True, what="unknown")
@@ -200,7 +200,7 @@ def _finding(name: str, ok: bool, what: str, remedy: str) -> Finding:
 
 
 def _existing(directory: Path) -> Path:
-    """Return the path itself or its nearest parent that exists, which may be a file."""
+    """Return the path or its nearest existing parent, which may be a file."""
     path = directory.absolute()
     while not os.path.lexists(path) and path != path.parent:
         path = path.parent
@@ -218,7 +218,7 @@ def _dotted(version: tuple[int, ...]) -> str:
 
 
 def _memory() -> int | None:
-    """Return the memory [B] that this machine, or its container, has; None if unknown."""
+    """Return the memory [B] of this machine or its container; None if unknown."""
     limits = []
     try:
         match = re.search(r"^MemTotal:\s*(\d+) kB", MEMINFO.read_text(), re.MULTILINE)
@@ -226,7 +226,7 @@ def _memory() -> int | None:
     except OSError:
         pass
     for path in CGROUP_LIMITS:
-        # "max", or a number near 2^63, is no limit.
+        # "max", or a number near 2^63, means no limit.
         try:
             limits.append(int(path.read_text()))
         except (OSError, ValueError):

@@ -1,8 +1,8 @@
 """The command line: the group of all commands.
 
-Results go to standard output, progress and errors to standard error. Exit codes: 0 done,
-1 the work failed, 2 wrong usage. Commands import heavy libraries when they run, so that
-`--help` answers at once.
+Results go to standard output, progress and errors to standard error. Exit codes: 0 done, 1 the work
+failed, 2 wrong usage. Commands import heavy libraries only when they run, so that `--help` answers
+immediately.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ def main() -> None:
 def doctor(directory: Path) -> None:
     """Check that this machine can run drakegrasp.
 
-    The command names what is missing and how to get it. DIRECTORY is where a dataset would be
-    written. Exit code 1 if anything is missing.
+    The command reports what is missing and how to install it. DIRECTORY is the directory in which a
+    dataset would be written. The exit code is 1 if anything is missing.
     """
     from drakegrasp.cli.doctor import diagnose
 
-    # A line per need, and one more with the remedy where it is not met.
+    # One line per requirement, and a second line with the remedy if it is not met.
     findings = diagnose(directory)
     for finding in findings:
         say_finding(finding.ok, "MISSING", f"{finding.name:<18} {finding.what}")
@@ -60,7 +60,7 @@ def doctor(directory: Path) -> None:
         sys.exit(1)
 
 
-# The help lists them in this order.
+# The help lists the commands in this order.
 for _command in (
     *(doctor, objects, audit, hand, build, submit, assemble, merge, scenes, check, stats, inspect_),
     *(figures, replay, verify, score, bench_set, export, bench),
@@ -69,9 +69,9 @@ for _command in (
 
 
 def run() -> None:
-    """Run the program; commands that may simulate in this process have jemalloc for it."""
+    """Run the program; commands that may simulate in this process do so with jemalloc."""
     restart_with_utf8()
-    # A terminal of another encoding shows ? where it has no such character.
+    # A terminal with another encoding shows ? for characters that it does not have.
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")

@@ -1,4 +1,4 @@
-"""The commands of what is simulated: `audit` and `objects` of meshes, `hand` of hands."""
+"""The commands for objects and hands: `audit`, `objects` and `hand`."""
 
 from __future__ import annotations
 
@@ -31,13 +31,14 @@ def audit(
 ) -> None:
     """Check which meshes are fit, repaired or refused.
 
-    Meshes are prepared as in a build with the default configuration. A build also drops each
-    object on the table, and refuses one that does not come to rest.
-    Exit code 1 if every mesh is refused.
+    Meshes are prepared as in a build with the default configuration. A build also drops each object
+    on the table, and refuses objects that do not come to rest. The exit code is 1 if every mesh is
+    refused.
 
     Options:
         --units, --manifest
-        --hand HAND: Hand with whose opening and stand-offs sizes are compared. [default: barrett]
+        --hand HAND: Hand whose opening and stand-offs are compared with the objects' sizes.
+            [default: barrett]
         --json FILE (json_file): Write all findings as JSON.
         --sheet FILE: Write a picture of every object with its status (.png).
     """
@@ -73,12 +74,12 @@ def audit(
 
 @click.group()
 def objects() -> None:
-    """List or export the built-in objects, or make morphs of meshes."""
+    """List or export the built-in objects, or create morphs of meshes."""
 
 
 @objects.command("list")
 def list_objects() -> None:
-    """Print every built-in class, with the parameters that are drawn."""
+    """Print every built-in class with its drawn parameters."""
     from drakegrasp.shapes.catalog import CLASSES
 
     for item in CLASSES:
@@ -92,7 +93,7 @@ def list_objects() -> None:
 def export_objects(directory: Path, **options: Any) -> None:
     """Write the built-in objects' meshes (.obj, metres) to DIRECTORY.
 
-    Equal options write equal bytes on every machine.
+    The same options write the same bytes on every machine.
     """
     from drakegrasp.generation.request import BUILTIN
     from drakegrasp.hand.settings import load_config
@@ -116,14 +117,14 @@ def morph(
     seed: Annotated[int, click.IntRange(min=0)] = 0,
     out: Path,
 ) -> None:
-    """Make objects of other proportions from meshes.
+    """Create objects with other proportions from meshes.
 
     Each mesh of MESH_DIR is widened, narrowed and stretched along a random axis. The morphs (.obj,
-    metres, +z up) stand on the table as the mesh does, and an objects.yaml in DIR keeps their
-    classes. The same seed gives the same files.
+    metres, +z up) stand on the table like the mesh, and an objects.yaml in DIR keeps their classes.
+    The same seed writes the same files.
 
     Options:
-        --per-mesh N: Morphs of each mesh.
+        --per-mesh N: Number of morphs of each mesh.
         --seed S: Seed of the draws.
         --out DIR: Directory of the morphs; new or empty.
         --units, --manifest
@@ -182,29 +183,29 @@ def new_hand(
 ) -> None:
     """Draft a hand file from a model, and draw it.
 
-    MODEL is a URDF, SDFormat or MJCF file as its vendor ships it. FOLDER gets the hand file, in
-    which each guess has a comment, the model, its meshes and a picture. Options override guesses.
-    Exit code 1 if a check of the drafted hand fails.
+    MODEL is a URDF, SDFormat or MJCF file as its vendor ships it. The command writes the hand file,
+    in which each guess has a comment, the model, its meshes and a picture to FOLDER. Options
+    override guesses. The exit code is 1 if a check of the drafted hand fails.
 
     Options:
         --out FOLDER: A new folder for the hand's files.
-        --palm LINK: The link that carries the fingers.
-        --approach X,Y,Z: Where the palm faces: +Gz, in the axes of the palm link.
-        --fingers LINK,LINK: The fingertip links that grasp.
+        --palm LINK: The link from which the fingers branch.
+        --approach X,Y,Z: Direction that the palm faces: +Gz, in the axes of the palm link.
+        --fingers LINK,LINK: The fingertip links of the grasping fingers.
         --joint NAME=POSITION (joints): The position of a joint that does not close [rad or m], as
             in the vendor's model.
-        --reverse JOINT: A joint whose positive position opens.
-        --effort E: What each motor gives at its joint [N m, or N].
+        --reverse JOINT: A joint whose positive position opens the hand.
+        --effort E: Largest effort of each motor at its joint [N m, or N].
         --set KEY=VALUE (settings): A key of the hand file, as in --set drive=torque.
-        --package NAME=FOLDER (packages): Where package://NAME/ is.
-        --root FOLDER (roots): A folder outside of the model's whose meshes it may use.
+        --package NAME=FOLDER (packages): Folder of package://NAME/.
+        --root FOLDER (roots): A folder outside the model's folder whose meshes the model may use.
     """
     import numpy as np
 
     from drakegrasp.commissioning.draft.fingers import Answers
     from drakegrasp.commissioning.draft.run import draft_hand
 
-    # What a person says.
+    # The user's answers.
     answers = Answers(
         approach=None if approach is None else np.array(_numbers(approach)),
         fingers=tuple(fingers.split(",")) if fingers else (),
@@ -217,7 +218,7 @@ def new_hand(
     folders = {name: Path(text) for name, text in _pairs("--package", packages)}
     drafted = draft_hand(model, out, answers=answers, packages=folders, roots=roots)
 
-    # What was made of it.
+    # The drafted hand.
     for note in drafted.notes:
         say(f"note  {note}")
     for finding in drafted.findings:
@@ -232,7 +233,7 @@ def new_hand(
 
 
 def _pairs(option: str, texts: Sequence[str]) -> list[tuple[str, str]]:
-    """Return name and value of each NAME=VALUE."""
+    """Return the name and the value of each NAME=VALUE."""
     for text in texts:
         if not all(text.partition("=")):
             raise click.BadParameter(f"{option} must be NAME=VALUE, got {text!r}")
@@ -259,8 +260,8 @@ def _numbers(text: str) -> list[float]:
 def check_hand_file(hand_file: str, picture: Annotated[Path | None, NEW_FILE] = None) -> None:
     """Check a hand before it is used, with trial grasps.
 
-    Files, motion, strength and trial grasps in simulation are checked. NAME is a hand that comes
-    with the package, YAML a hand file. Exit code 1 if anything is wrong.
+    The command checks files, motion, strength and trial grasps in simulation. NAME is a hand that
+    comes with the package, YAML is a hand file. The exit code is 1 if anything is wrong.
 
     Options:
         --picture PNG: Write a picture of the hand, open and closed, with pads and palm frame.
@@ -269,7 +270,7 @@ def check_hand_file(hand_file: str, picture: Annotated[Path | None, NEW_FILE] = 
 
     findings = check_hand(hand_file, report=_print)
 
-    # A hand whose files can be read can be drawn.
+    # If the files of the hand can be read, it can be drawn.
     if picture is not None and findings[0].ok:
         _draw(hand_file, picture)
         say(str(picture))

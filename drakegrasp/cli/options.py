@@ -1,15 +1,16 @@
-"""The options of commands, made from signatures and docstrings, and the request of a build.
+"""The options of commands, created from signatures and docstrings, and the request of a build.
 
-In: what click parsed. Out: a `BuildRequest`, with the configuration resolved.
+In: option values that click parsed. Out: a `BuildRequest` with the resolved configuration.
 
-A command says its options in the section `Options` of its docstring, in the order of its help:
+A command lists its options in the section `Options` of its docstring, in the order of its help:
 
     --port N: Port on this machine; 0 takes any that is free.
     --json FILE (json_file): Write all findings as JSON as well.
     --units, --manifest
 
-The first has a parameter `port`, whose annotation and default say the rest; the second one of
-another name; the third line names options that several commands have, which stand in `_shared`.
+The first option belongs to the parameter `port`, whose annotation and default supply the rest. The
+second option belongs to a parameter of another name, `json_file`. The third line names options that
+several commands share; they are defined in `_shared`.
 """
 
 from __future__ import annotations
@@ -34,18 +35,18 @@ if sys.flags.optimize > 1:
     sys.exit("error: python must run without -OO, which leaves out the docstrings with the options")
 
 F = TypeVar("F", bound=Callable[..., Any])
-#: An option in a docstring: its names, what stands for the value, its parameter, and its help.
+#: An option in a docstring: its names, the placeholder of its value, its parameter, and its help.
 _ENTRY = re.compile(r"(--[^\s:]+(?: --[^\s:]+)*)(?: ([^()]+?))?(?: \((\w+)\))?: (.+)")
 _SECTION = "\n\nOptions:\n"
 
 
 class Option(click.Option):
-    """An option that the help lists under a heading, and that may name what the registry has."""
+    """An option that the help lists under a heading, and whose help may name registry entries."""
 
     heading = "Options"
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
-        """Return the words of the option and its help; called by click."""
+        """Return the names of the option and its help; called by click."""
         self.help = re.sub(
             r"\{(\w+)\}",
             lambda kind: ", ".join(registry.names(kind[1])),  # type: ignore[arg-type]
@@ -58,7 +59,7 @@ class PathType(click.Path):
     """A path that a file can have."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Refuse an empty path, e.g. of an unset shell variable, and impossible names."""
+        """Reject an empty path, e.g. from an unset shell variable, and impossible names."""
         text = os.fspath(value)
         if not text.strip():
             self.fail(f"must be a path, got {text!r}", param, ctx)
@@ -75,12 +76,12 @@ class FrameType(click.Choice[str]):
     """The frames of grasps; `workspace` is an earlier name of `table`."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        """Return the frame of a word."""
+        """Return the frame that a word names."""
         return super().convert("table" if value == "workspace" else value, param, ctx)
 
 
 class Named(click.Choice[str]):
-    """A name of the registry; it is asked when the option is used, or its help is printed."""
+    """A name of the registry, which is read only when the option is used or its help is printed."""
 
     def __init__(self, kind: registry.Kind) -> None:
         self.kind, self.case_sensitive = kind, True
@@ -91,7 +92,7 @@ class Named(click.Choice[str]):
         return registry.names(self.kind)
 
 
-#: Types of options: any path, a file to write, a file that is there, any path that is.
+#: Types of options: any path, a file to write, an existing file, any existing path.
 PATH = PathType(path_type=Path)
 NEW_FILE = PathType(path_type=Path, dir_okay=False)
 FILE = PathType(path_type=Path, exists=True, dir_okay=False)
@@ -102,7 +103,7 @@ SPLITS = click.Choice(["train", "valid", "test"])
 
 @dataclass(frozen=True, kw_only=True)
 class VerifyRequest:
-    """What is verified, see the help of the command; None for options that were not given."""
+    """The options of `verify`, see the help of the command; None if an option was not given."""
 
     grasps: Path
     mesh: Path | None = None
@@ -123,11 +124,11 @@ class VerifyRequest:
 
 
 def described(function: F, request: type | None = None) -> F:
-    """Give a command the options of its docstring, whose rest is its help.
+    """Give a command the options of its docstring; the rest of the docstring is its help.
 
     Args:
         function: The command.
-        request: Dataclass whose fields are added to its parameters.
+        request: Dataclass whose fields are added to the parameters of the command.
     """
     text, _, section = inspect.cleandoc(function.__doc__ or "").partition(_SECTION)
     function.__doc__ = text
@@ -136,13 +137,13 @@ def described(function: F, request: type | None = None) -> F:
 
 
 def shared(*names: str) -> Callable[[F], F]:
-    """Give a command some of the options that several have; its help lists them in this order."""
+    """Give a command some of the shared options; its help lists them in this order."""
     return _with_options([_SHARED[name] for name in names])
 
 
 def _with_options(options: list[Option]) -> Callable[[F], F]:
     def give(function: F) -> F:
-        # Click takes them as decorators come: the last one first.
+        # Click expects them in the order of decorators: the last one first.
         vars(function).setdefault("__click_params__", []).extend(reversed(options))
         return function
 
@@ -150,7 +151,7 @@ def _with_options(options: list[Option]) -> Callable[[F], F]:
 
 
 def _options(section: str, *signatures: Callable[..., Any]) -> Iterator[Option]:
-    """Yield the options of a section of a docstring, given what has their parameters."""
+    """Yield the options of a section of a docstring; `signatures` have their parameters."""
     parameters = dict[str, inspect.Parameter]()
     for each in signatures:
         parameters |= inspect.signature(each, eval_str=True).parameters
@@ -167,7 +168,7 @@ def _options(section: str, *signatures: Callable[..., Any]) -> Iterator[Option]:
 
 
 def _attributes(parameter: inspect.Parameter) -> dict[str, Any]:
-    """Return what click shall know of the option of a parameter."""
+    """Return the attributes of the click option of a parameter."""
     kind, default, attributes = parameter.annotation, parameter.default, dict[str, Any]()
     if get_origin(kind) is Annotated:
         kind, attributes["type"] = get_args(kind)
@@ -187,7 +188,7 @@ def _attributes(parameter: inspect.Parameter) -> dict[str, Any]:
 
 
 def _parameter(name: str) -> str:
-    """Return the name of the parameter that click makes of an option's name."""
+    """Return the name of the parameter that click derives from an option's name."""
     return name.removeprefix("--").replace("-", "_")
 
 
@@ -222,46 +223,47 @@ def _shared(
     quiet: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Say the options that more than one command has.
+    """Define the options that more than one command has.
 
     Options:
         --objects MESH_DIR|builtin: A directory of .obj, .stl, .ply or .glb files, or the built-in
             objects.
-        --per-class N: Built-in objects of each class. [default: 2]
+        --per-class N: Number of built-in objects of each class. [default: 2]
         --objects-seed S: Seed of the sizes of the built-in objects. [default: 0]
         --units m|cm|mm: Unit of length of the meshes.
         --manifest FILE: YAML file with units and classes by mesh. [default: objects.yaml in the
             directory of the meshes]
         --postures FILE|DIR: Try these postures (wrist and joints) instead of drawn palm poses, on
-            the objects that they name: .npz, .hdf5, .csv, .parquet, DexGraspBench .npy or
+            the objects that the postures name: .npz, .hdf5, .csv, .parquet, DexGraspBench .npy or
             isaac_grasp .yaml.
-        --link NAME: Of what the poses in files of postures are, whatever these say: palm, the palm
-            link, or a frame of another tool that the hand file names, e.g. graspgen.
-        --preshape NAME: Preshape of the rows of postures that name none; each, for palm poses
-            alone: all of them in turn.
+        --link NAME: Frame or link of the poses in files of postures, which overrides the files:
+            palm, the palm link, or a frame of another tool that the hand file names, e.g. graspgen.
+        --preshape NAME: Preshape for rows of postures that name none; the value each, for palm
+            poses alone, tries all preshapes in turn.
         --only NAME: Build this object only; may be given several times.
         --out DIR: Directory of the dataset. The same command continues an interrupted build.
         --config YAML|PRESET: Configuration: a file, or the preset paper, fast, randomized or
             released. [default: paper, but with split.by=auto]
         --set KEY=VALUE (overrides): Change one setting, e.g. lift.hold_time=1; may be given several
             times.
-        --candidates N: Palm poses per object. [default: 10000]
+        --candidates N: Number of palm poses per object. [default: 10000]
         --max-grasps N: Stop an object after N successes. [default: no limit]
-        --samples N: Stop when all objects together have N samples; a larger N continues from
-            there. [default: no limit]
+        --samples N: Stop when all objects together have N samples; a larger N continues the build.
+            [default: no limit]
         --samples-per-object N: Stop an object when it has N samples. [default: no limit]
-        --certify K: Repeat each sample K times, disturbed, and store how many hold. [default: 0]
+        --certify K: Repeat the lift of each sample K times with disturbances, and store how many
+            hold. [default: 0]
         --seed S: Seed of all random draws. [default: 0]
-        --workers N: Processes on this machine. [default: one per core]
+        --workers N: Number of processes on this machine. [default: one per core]
         --scheduler ADDRESS: Use the running Dask scheduler at this address.
         --scheduler-file FILE: Use the running Dask scheduler that wrote this file.
-        --tls-ca-file FILE: Your own certificate authority (PEM), as a running scheduler needs it;
-            with the next two options.
+        --tls-ca-file FILE: Your own certificate authority (PEM), if a running scheduler needs one;
+            requires the next two options.
         --tls-cert FILE: Certificate of client, scheduler and workers, signed by that authority.
-        --tls-key FILE: The certificate's private key.
+        --tls-key FILE: Private key of the certificate.
         --tls/--no-tls: Whether connections need a certificate. Workers that the command starts get
-            one that is made for the run.
-        --times FILE: Estimate from these times, which measure_stages.py of pipelines/measurements
+            a certificate that is created for the run.
+        --times FILE: Estimate with the times that measure_stages.py of pipelines/measurements
             printed. [default: OUT/log.jsonl, else times measured on other meshes]
         --quiet: Show no progress.
         --json (as_json): Print one document of JSON instead of text.
@@ -269,22 +271,22 @@ def _shared(
 
 
 def _assembled(*, overrides: tuple[str, ...] = ()) -> None:
-    """Say the settings of what is assembled.
+    """Define the option for settings of filters and split.
 
     Options:
         --set KEY=VALUE (overrides): Change a setting of the filters or the split, e.g.
-            filters.outlier_sigma=3; may be given several times. Filters of your own must be given
+            filters.outlier_sigma=3; may be given several times. Your own filters must be given
             again: filters.own=FILE.py:NAME.
     """
 
 
 def _said(function: Callable[..., Any]) -> tuple[Option, ...]:
-    """Return the options of a docstring that names no other ones."""
+    """Return the options that the docstring of a function defines."""
     section = inspect.cleandoc(function.__doc__ or "").partition(_SECTION)[2]
     return tuple(_options(section, function))
 
 
-#: The options that stand for `--set KEY=VALUE`, and their keys.
+#: The options that are short forms of `--set KEY=VALUE`, and their keys.
 SETTINGS = {
     "--per-class": "builtin.per_class",
     "--objects-seed": "builtin.seed",
@@ -295,7 +297,7 @@ SETTINGS = {
     "--certify": "certify.repeats",
     "--seed": "seed",
 }
-#: Names of options: of a build, and of who does the work.
+#: Names of options: of a build, and of the workers.
 BUILD = (
     *("--objects", "--per-class", "--objects-seed", "--out", "--config", "--set", "--candidates"),
     *("--max-grasps", "--samples", "--samples-per-object", "--postures", "--link", "--preshape"),
@@ -318,7 +320,7 @@ GROUPS = {
 
 
 def _tidied(context: click.Context, parameter: click.Parameter, out: Path) -> Path:
-    """Put in order what a dead process left in a dataset, before a command looks at it."""
+    """Clean up what a dead process left in a dataset, before a command reads the dataset."""
     from drakegrasp.dataset.lock import tidy
 
     if not context.resilient_parsing and out.is_dir():
@@ -327,24 +329,24 @@ def _tidied(context: click.Context, parameter: click.Parameter, out: Path) -> Pa
 
 
 def dataset_argument(name: str = "out", metavar: str = "OUT") -> Callable[[F], F]:
-    """Give a command the directory of a dataset, or one of its files."""
+    """Give a command an argument for the directory of a dataset, or one of its files."""
     return click.argument(name, type=PATH, metavar=metavar, callback=_tidied)
 
 
 def chosen_workers(options: dict[str, Any]) -> dict[str, Any]:
-    """Take the values of `CONNECTION` out of a command's options: arguments of `connect`."""
+    """Remove the values of `CONNECTION` from a command's options, and return them for `connect`."""
     names = map(_parameter, CONNECTION[:3])
     return {**{name: options.pop(name) for name in names}, **chosen_tls(options)}
 
 
 def chosen_tls(options: dict[str, Any]) -> dict[str, Any]:
-    """Take the values of `TLS` out of a command's options.
+    """Remove the values of `TLS` from a command's options, and return them.
 
     Returns:
-        `tls`, and `tls_files`: the authority, the certificate and its key, or None.
+        `tls`, and `tls_files`: the paths of authority, certificate and key, or None.
 
     Raises:
-        click.UsageError: If only some are given.
+        click.UsageError: If only some of the files are given.
     """
     files = tuple(options.pop(_parameter(name)) for name in _TLS_FILES)
     if None in files and any(files):
@@ -355,14 +357,14 @@ def chosen_tls(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def parse_request(options: Mapping[str, Any]) -> BuildRequest:
-    """Return what the options of `BUILD` ask for, given their values by parameter.
+    """Return the request that the options of `BUILD` describe, given their values by parameter.
 
     Raises:
         click.UsageError: If options of the built-in objects are given with other meshes.
         ConfigError: If a value of the configuration cannot be used.
         HandError: If the hand's file cannot be read.
     """
-    # Loading pydantic takes a while, and `--help` must answer at once.
+    # Loading pydantic takes a while, and `--help` must answer immediately.
     from drakegrasp.hand.settings import load_config
 
     return BuildRequest(
@@ -379,17 +381,17 @@ def parse_request(options: Mapping[str, Any]) -> BuildRequest:
 
 
 def chosen_reading(options: Mapping[str, Any]) -> dict[str, str]:
-    """Return what options say of all postures, see `exchange.attempts.read_attempts`."""
+    """Return the options that apply to all postures, see `exchange.attempts.read_attempts`."""
     names = ("frame", "link", "preshape")
     return {name: options[name] for name in names if options.get(name) is not None}
 
 
 def chosen_settings(options: Mapping[str, Any]) -> list[str]:
-    """Return the changes of the configuration that a command's options ask for, as `KEY=VALUE`.
+    """Return the changes of the configuration that a command's options request, as `KEY=VALUE`.
 
     Args:
-        options: Values by parameter: of `--set` and the options of `SETTINGS`, as far as the
-            command has them, and of `--objects`.
+        options: Values by parameter: of `--set` and those options of `SETTINGS` that the command
+            has, and of `--objects`.
 
     Raises:
         click.UsageError: If options of the built-in objects are given with a directory of meshes.

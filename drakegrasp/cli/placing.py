@@ -1,7 +1,7 @@
-"""Turns files and options of `drakegrasp verify` into placed grasps. Nothing is simulated.
+"""Converts files and options of `drakegrasp verify` to placed grasps. Nothing is simulated.
 
-Whatever is wrong with the files or the options is a `GraspError`, `MeshError`, `ConfigError` or
-`HandError`, that is wrong usage.
+Any mistake in the files or the options raises a `GraspError`, `MeshError`, `ConfigError` or
+`HandError`, which counts as wrong usage.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from drakegrasp.verification.placing import (
 )
 from drakegrasp.verification.result_files import refuse_unwritable
 
-#: No split has so many rows.
+#: Upper bound of the number of rows of a split.
 MOST_ROWS = 10_000_000
 #: The split of a dataset if none is named.
 DEFAULT_SPLIT = "test"
@@ -44,16 +44,17 @@ DEFAULT_SPLIT = "test"
 def place_requested(
     request: VerifyRequest,
 ) -> tuple[list[PlacedGrasp], Config, PredictedRows | None]:
-    """Return the grasps of a request on their objects, at least one, and its configuration.
+    """Return the grasps of a request on their objects, the configuration, and the rows.
 
-    The configuration of a grasp is another one where friction was drawn for its row. Third are the
-    rows of a dataset that the grasps are for, in the order of the file; None where they are none.
+    There is at least one grasp. If friction was drawn for the row of a grasp, the grasp has its own
+    configuration. The rows are the rows of a dataset to which the grasps belong, in the order of
+    the file; None if the grasps belong to no rows.
 
     Raises:
         GraspError, MeshError, ConfigError, HandError: If a file or an option cannot be used.
     """
     try:
-        # Refuse results that could not be written, and options without effect.
+        # Reject results that could not be written, and options without effect.
         if request.out is not None:
             refuse_unwritable(request.out)
         postures = holds_postures(request.grasps)
@@ -68,10 +69,10 @@ def place_requested(
 
 
 def _dataset_of(request: VerifyRequest, postures: bool) -> Path | None:
-    """Return the data file or directory on whose objects grasps are tried; None: on --object.
+    """Return the data file or directory whose objects are grasped; None for --object.
 
     Raises:
-        GraspError: If it is not clear, or an option is without effect.
+        GraspError: If the choice is not clear, or an option is without effect.
     """
     path = _posture_dataset(request) if postures else _contact_dataset(request)
     if path is not None:
@@ -87,8 +88,8 @@ def _dataset_of(request: VerifyRequest, postures: bool) -> Path | None:
 
 
 def _posture_dataset(request: VerifyRequest) -> Path | None:
-    """Return --dataset, on which postures are tried if there is no --object."""
-    # Their camera is that of a row, and they need no fit.
+    """Return --dataset, on whose objects postures are tried if there is no --object."""
+    # The camera of a posture is that of its row, and postures need no fit.
     _refuse_given(
         "left out with postures",
         frame="camera" if request.frame == "camera" else None,
@@ -107,7 +108,7 @@ def _posture_dataset(request: VerifyRequest) -> Path | None:
 
 
 def _contact_dataset(request: VerifyRequest) -> Path | None:
-    """Return the data file whose rows give the objects: --dataset, or GRASPS itself."""
+    """Return the data file whose rows specify the objects: --dataset, or GRASPS itself."""
     _refuse_given("left out without postures", link=request.link, preshape=request.preshape)
     if request.mesh is not None and request.dataset is not None:
         raise GraspError("--object or --dataset must be given, got both")
@@ -124,7 +125,7 @@ def _contact_dataset(request: VerifyRequest) -> Path | None:
 
 
 def _place_on_mesh(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config, None]:
-    """Return all grasps on the one object, which they need not name, and the configuration."""
+    """Return all grasps on the object of --object, which they need not name, and the settings."""
     assert request.mesh is not None
     config = load_config(request.config, request.overrides)
     config = config if request.hand is None else override_config(config, [], hand=request.hand)
@@ -149,12 +150,12 @@ def _place_on_mesh(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config, N
 def _place_on_rows(
     request: VerifyRequest, path: Path
 ) -> tuple[list[PlacedGrasp], Config, PredictedRows]:
-    """Return grasps on the rows of a dataset, with the friction and mass that were drawn there."""
-    # Of rows for the grasps of others only objects and cameras are needed.
+    """Return grasps on the rows of a dataset, with the friction and mass drawn for each row."""
+    # For grasps from outside, only the objects and cameras of the rows are needed.
     others = path != request.grasps
     data = GraspDataset(path, split=request.split or DEFAULT_SPLIT, fewer_fingers=others)
 
-    # A configuration that is given is used as it is; that of a dataset with what its rows drew.
+    # A given configuration is used as it is; that of a dataset is combined with the rows' draws.
     given, overrides = None, request.overrides
     if request.config is not None:
         given, overrides = load_config(request.config, overrides), ()
@@ -201,7 +202,7 @@ def _place_on_objects(
 def _rows_of(
     request: VerifyRequest, known: npt.NDArray[np.int64] | None
 ) -> list[int] | npt.NDArray[np.int64] | None:
-    """Return the row of each grasp, as the file or the option says; None if neither does."""
+    """Return the row of each grasp, from the file or the option; None if neither specifies it."""
     text = request.rows
     if text is None:
         return known
@@ -228,12 +229,12 @@ def _rows_of(
 
 
 def _of_object(request: VerifyRequest, name: str, hand: Hand) -> Attempts:
-    """Return the grasps of a file or a folder that are of an object, and say which are not.
+    """Return the grasps of a file or a folder that belong to an object, and print the others.
 
-    A file in which all rows name one other object is taken to be for this one.
+    If all rows of a file name one other object, the file is used for this object.
 
     Raises:
-        GraspError: If none is of it.
+        GraspError: If no grasp belongs to the object.
     """
     path = request.grasps
     table = read_attempts(
@@ -262,13 +263,13 @@ def _ranked(table: Attempts, of: Sequence[str] | npt.NDArray[np.int64]) -> Attem
 
 
 def _say_nameless(table: Attempts) -> None:
-    """Say how many postures name no resting pose, and how many no joints."""
+    """Print how many postures specify no resting pose, and how many have no joints."""
     for told in filter(None, (table.nameless, table.bare)):
         say(told, err=True)
 
 
 def _refuse_given(how: str, **options: object) -> None:
-    """Refuse options that are given, and must be otherwise."""
+    """Reject given options; `how` states how they must be given."""
     for name, value in options.items():
         if value is not None:
             raise GraspError(f"--{name.replace('_', '-')} must be {how}, got {value}")

@@ -1,4 +1,4 @@
-"""`drakegrasp verify`: a line of JSON per predicted grasp. `score`: a card with reference rows."""
+"""`verify` prints a line of JSON per predicted grasp; `score` writes a card with reference rows."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from drakegrasp.runtime.progress import Report
     from drakegrasp.verification.result import Verification
 
-#: Options that say what the grasps are and where; a protocol of MuJoCo answers all others.
+#: Options that specify the grasps and their places; a protocol in MuJoCo determines all others.
 PLACES = ("grasps", "mesh", "units", "dataset", "split", "frame", "camera", "hand")
-#: What those others are if they are not given, and how the command line calls them.
+#: Values of these others if they are not given, and their names on the command line.
 _USUAL = {"method": "hand", "overrides": (), "snap_points": False, "tls": True}
 _CALLED = {"mesh": "object", "overrides": "set", "tls": "no-tls", "tls_files": "tls-ca-file"}
 #: Options of `score` that change no verdict.
@@ -52,50 +52,50 @@ def verify(
 ) -> None:
     """Try predicted grasps in the simulator.
 
-    The command says whether each grasp holds its object, and if not, why.
+    The command reports whether each grasp holds its object, and if not, why.
 
-    GRASPS is a .npy array with a row per grasp, a .csv file with a line per grasp, or an HDF5
+    GRASPS is a .npy array with one row per grasp, a .csv file with one line per grasp, or an HDF5
     file with an array `grasps` at its root or in a group. An array `rows` in the same place names
     the rows of the dataset. A grasp has 6 numbers per finger (18 for the Barrett Hand): the contact
-    points in metres, then the unit normals out of the object, in the order of the hand's
-    fingers.
+    points in metres, then the outward unit normals, in the order of the hand's fingers.
 
     GRASPS may also be a file or a folder of postures, as for `build --postures`. They are tried on
-    --object, or on the objects of --dataset that the file names or gives by `row`; with --split on
-    the rows of their objects, as by `drakegrasp score`. Confidence that a file states ranks them.
+    --object, or on the objects of --dataset that the file specifies by name or by `row`; with
+    --split on the rows of these objects, as in `drakegrasp score`. They are ranked by the
+    confidence that the file states.
 
-    With a protocol other than lift, only the first wrist pose that fits the contacts is tried.
+    With a protocol other than lift, only the wrist pose that fits the contacts best is tried.
     GRASPS may then be a .npy file of DexGraspBench or a folder of such files, and --hand an MJCF
     whose world is the hand's root.
 
     If GRASPS is a data file of a dataset, and neither --object nor --dataset is given, the
     command tries the grasps of that dataset.
 
-    One line of JSON per grasp goes to standard output or NAME.jsonl, a table of the outcomes to
-    standard error. A row that is not a grasp has the outcome `invalid`. Exit code: 0 if every grasp
-    has a verdict, whatever it is; 2 for input that cannot be used.
+    One line of JSON per grasp is written to standard output or NAME.jsonl, and a table of the
+    outcomes to standard error. A row that is not a valid grasp has the outcome `invalid`. The exit
+    code is 0 if every grasp has a verdict, whatever it is, and 2 if the input cannot be used.
 
     Options:
         --object MESH (mesh): The object: a .obj, .stl, .ply or .glb file.
         --units m|cm|mm: Unit of length of the mesh. [default: m]
         --dataset FILE: Instead of --object: the data file OUT/grasping_oto.hdf5 or _otm. Each row
-            gives the object, its pose and the camera's pose.
+            specifies the object, its pose and the camera's pose.
         --split: Rows of the dataset, and group in an HDF5 file of grasps. [default: test]
-        --rows 0,4,7-9|FILE.npy: With --dataset: the row of the split that each grasp is for, where
-            the file does not say. [default: all rows]
-        --frame: Frame of the grasps; mesh, with --object, has the axes and the origin of the file.
-            [default: object; with --dataset camera; of postures as the file says]
+        --rows 0,4,7-9|FILE.npy: With --dataset: for each grasp its row of the split, if the file
+            does not specify it. [default: all rows]
+        --frame: Frame of the grasps; mesh, with --object, has the axes and the origin of the mesh
+            file. [default: object; with --dataset camera; for postures as the file specifies]
         --link, --preshape
         --camera FILE: With --object and --frame camera: .npy file with the camera's pose in the
             table-top frame X_TC, as (4, 4), or per grasp as (n, 4, 4) or (n, 12).
-        --method: hand: close a simulated hand on the contacts and lift. forces: ask whether forces
-            at the points of the surface that the contacts select can lift the object.
-        --snap-points: Move the points, not the normals, to the surface of the object first.
-        --protocol NAME|FILE.py:NAME: The rule of the verdict: {protocols}, or a class of your own.
-            All but lift run in MuJoCo.
-        --simulator: Refuse a protocol that runs in the other simulator. [default: either]
-        --assets DIR: With files of DexGraspBench: the folder in which they name their objects.
-            [default: .]
+        --method: hand: close a simulated hand on the contacts and lift. forces: compute whether
+            forces at the points of the surface that the contacts select can lift the object.
+        --snap-points: First move the points, but not the normals, to the surface of the object.
+        --protocol NAME|FILE.py:NAME: The rule of the verdict: {protocols}, or your own class. All
+            protocols except lift run in MuJoCo.
+        --simulator: Reject a protocol that runs in the other simulator. [default: either]
+        --assets DIR: With files of DexGraspBench: the folder to which their object paths are
+            relative. [default: .]
         --hand NAME|YAML|XML: The hand. [default: that of the configuration]
         --config YAML|PRESET: Configuration: a file, or the preset paper, fast, randomized or
             released. [default: that of the dataset, else the defaults]
@@ -103,7 +103,7 @@ def verify(
         --out NAME: Write NAME.jsonl and NAME.h5 instead of printing lines of JSON.
         CONNECTION
         --quiet: Show neither progress nor the table.
-        --json (as_json): Print the lines of JSON also with --out, and no progress or table.
+        --json (as_json): Print the lines of JSON even with --out, without progress and table.
     """
     from drakegrasp.protocols.protocol import find_protocol
 
@@ -125,7 +125,7 @@ def verify(
 
 
 def _refuse_options(protocol: str, **options: Any) -> None:
-    """Refuse options that the protocol answers by itself.
+    """Reject options that the protocol determines itself.
 
     Raises:
         click.UsageError: If one is given.
@@ -158,7 +158,7 @@ def _verify_by_lift(
     def deliver(index: int, result: Verification) -> None:
         write(json_line(index, result))
 
-    # Lines are written as verdicts arrive, so an interrupted run leaves those that are done.
+    # Lines are written as verdicts arrive, so an interrupted run keeps the finished ones.
     try:
         with text_lines(out, echo=as_json) as write:
             results = run_verification(grasps, **workers, on_result=deliver, show=not quiet)
@@ -195,7 +195,7 @@ def _verify_by_protocol(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Write the verdicts, and how many hold."""
+    """Write the verdicts, and print how many grasps hold."""
     from drakegrasp.protocols.postures import json_line, prepare_trials, verify_postures
     from drakegrasp.verification.result_files import refuse_unwritable, result_paths, text_lines
 
@@ -210,7 +210,7 @@ def _verify_by_protocol(
                 hand, folder, files = _own_files(request, Path(scratch), execute, report)
         trials = prepare_trials(protocol, hand, folder)
 
-        # A line per verdict as it comes.
+        # Write one line per verdict as soon as it is known.
         with (
             text_lines(out, echo=as_json) as write,
             progress_bar("verify", "grasps", show=show) as report,
@@ -238,12 +238,12 @@ def _is_foreign(request: VerifyRequest, assets: Path | None) -> bool:
     return path.suffix == ".npy" and is_grasp_file(path)
 
 
-#: The MJCF of the hand, the folder of objects, and the file of each grasp, or why it has none.
+#: The MJCF of the hand, the folder of objects, and for each grasp its file or the reason for none.
 _Files: TypeAlias = tuple[Path, Path, list[Path | str]]
 
 
 def _foreign_files(request: VerifyRequest, protocol: str, assets: Path | None) -> _Files:
-    """Return files of DexGraspBench as they are."""
+    """Return files of DexGraspBench unchanged."""
     from drakegrasp.errors import DataError, HandError
 
     given = {name: getattr(request, name) for name in PLACES if name not in ("grasps", "hand")}
@@ -260,7 +260,7 @@ def _foreign_files(request: VerifyRequest, protocol: str, assets: Path | None) -
 
 
 def _own_files(request: VerifyRequest, folder: Path, execute: Executor, report: Report) -> _Files:
-    """Write postures or contacts as files of DexGraspBench, in their order."""
+    """Write postures or contacts as files of DexGraspBench, and return them in order."""
     from drakegrasp.cli.placing import place_requested
     from drakegrasp.exchange.dexgraspbench import fitted_postures, write_grasps
     from drakegrasp.hand.description import load_hand
@@ -301,30 +301,31 @@ def score(
     """Score predicted grasps against reference rows, and write a card.
 
     Each of PREDICTIONS is a .npy, HDF5 or Parquet file of (n, 6k) numbers, one grasp per row of the
-    split, or (n, m, 6k), m per row, in the camera's frame. It may also be a file of postures with
-    the `row` that each is for, or a file or folder of exported samples. Several files are taken as
-    one method that was trained several times. Without PREDICTIONS the reference rows are scored
-    alone.
+    split, or (n, m, 6k), m grasps per row, in the camera's frame. It may also be a file of postures
+    with the `row` of each, or a file or folder of exported samples. Several files are treated as
+    several training runs of one method. Without PREDICTIONS only the reference rows are scored.
 
-    DIR gets card.json, card.md, card.png, and the verdicts, so that an interrupted score continues.
+    The command writes card.json, card.md, card.png and the verdicts to DIR, so that an interrupted
+    score can continue.
 
     Options:
-        --dataset FILE: The data file OUT/grasping_oto.hdf5 or _otm, or OUT/scenes.hdf5, whose rows
-            or views the predictions are for.
+        --dataset FILE: The data file of the predicted rows or views: OUT/grasping_oto.hdf5, _otm,
+            or OUT/scenes.hdf5.
         --split: Rows of the dataset.
-        --against FILE: Predictions of another method for the same rows: the card has the difference
-            of the headlines. May be given several times, for a method that was trained several
-            times.
-        --train FILE: Data file whose training rows give the reference rows. [default: --dataset]
+        --against FILE: Predictions of another method for the same rows: the card contains the
+            difference of the headlines. May be given several times, once per training run of that
+            method.
+        --train FILE: Data file whose training rows are used for the reference rows. [default:
+            --dataset]
         --reference NAME (references): Score these reference rows only; may be given several times:
             own, nearest image, constant, random, top-down, closing, palm normals, surface.
             [default: all]
-        --per-object N: Rows of each object, at most.
-        --frame: Frame of all postures, whatever their files say.
+        --per-object N: Maximum number of rows of each object.
+        --frame: Frame of all postures, which overrides their files.
         --link, --preshape, --set
-        --protocol NAME|FILE.py:NAME: The rule of a verdict, see `drakegrasp verify`. All but lift
-            try the first wrist pose of a prediction in MuJoCo.
-        --out DIR: Folder of the card and of the verdicts; the same command continues from there.
+        --protocol NAME|FILE.py:NAME: The rule of a verdict, see `drakegrasp verify`. All protocols
+            except lift try the first wrist pose of a prediction in MuJoCo.
+        --out DIR: Folder of the card and of the verdicts, from which the same command continues.
         --json (as_json): Print the card as JSON.
         CONNECTION
         --quiet: Show neither progress nor the table.
@@ -380,7 +381,7 @@ def score(
 
 
 def _command(context: click.Context) -> str:
-    """Return the command that makes the card again: what was given and changes verdict or place."""
+    """Return the command that reproduces the card, with all given options that affect it."""
     words = ["drakegrasp", "score"]
     for parameter in context.command.params:
         name = str(parameter.name)

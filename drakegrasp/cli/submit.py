@@ -1,4 +1,4 @@
-"""The command `submit`: a build whose workers the command starts as well."""
+"""The command `submit`: a build whose workers the command also starts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from drakegrasp.cli.options import NEW_FILE, Named, chosen_tls, described, parse
 if TYPE_CHECKING:
     from drakegrasp.cluster.kinds import Local
 
-#: Options that say where the workers are, with a value each, and without.
+#: Options that specify the workers: those with a value, and those without.
 _WHERE = (
     *("cluster", "workers", "cores", "memory", "walltime", "interface", "host", "with"),
     "script",
@@ -44,7 +44,7 @@ def submit(
     script: Annotated[Path | None, NEW_FILE] = None,
     **options: Any,
 ) -> None:
-    """Build a dataset on a cluster, whose workers the command starts.
+    """Build a dataset on a cluster; the command starts the workers.
 
     \b
         drakegrasp submit --cluster local OPTIONS
@@ -52,9 +52,9 @@ def submit(
         drakegrasp submit --cluster slurm --workers 200 OPTIONS
         drakegrasp submit --address tls://10.0.0.1:8786 OPTIONS
 
-    The command first prints what will run and how long it is expected to take; --dry-run stops
-    there. The same command continues an interrupted build, on any cluster. See
-    docs/how-to/clusters.md for the details and pipelines/recipes/ for an example of each.
+    The command first prints what will run and the expected duration; with --dry-run it stops then.
+    The same command continues an interrupted build, on any cluster. See docs/how-to/clusters.md for
+    the details and pipelines/recipes/ for an example of each.
 
     Options:
         --cluster KIND (kind): Where the work runs: local, ssh, slurm, pbs, lsf, sge, htcondor, oar,
@@ -62,16 +62,16 @@ def submit(
             an address follows scheduler, and a path follows scheduler-file.
         --address ADDRESS: Use the running Dask scheduler at this address, instead.
         BUILD
-        --workers N: Processes in all. [default with local: one per core]
-        --cores N: Cores of each SSH host or job, a worker on each.
+        --workers N: Total number of processes. [default with local: one per core]
+        --cores N: Number of cores of each SSH host or job, with a worker on each core.
         --memory SIZE: Memory of each worker, e.g. 2GB.
         --walltime TIME: Time limit of each job, [D-]HH:MM:SS.
         --interface NAME: Network interface on which scheduler and workers listen.
         --host ADDRESS: Address on which the scheduler listens, instead.
-        --with KEY=VALUE (own): A setting that only this kind of cluster has, e.g. image of
+        --with KEY=VALUE (own): A setting that only this kind of cluster has, e.g. image for
             kubernetes; may be given several times.
         TLS, --times
-        --dry-run: Only print what would run, with the script of a job.
+        --dry-run: Only print what would run, and the script of a job.
         --script FILE: Only write the script of a job, or the manifest of kubernetes.
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.api.building import build_on, find_sources
@@ -89,7 +89,7 @@ def submit(
     request = parse_request(options)
     cluster = cluster_of(kind, own, where=where, **given, **tls)
 
-    # Say what will run before anything starts.
+    # Print what will run before anything starts.
     say("\n".join(describe(cluster)))
     if request.postures is None:
         print_plan(request, cluster.count(), times)
@@ -122,7 +122,7 @@ def submit(
 
 
 def _give_script(cluster: Local, out: Path, file: Path | None) -> None:
-    """Print what another program is given to start the workers, or write it, and what follows."""
+    """Print or write the script for the program that starts the workers, and the next step."""
     script = cluster.script(out)
     if not script:
         if file is not None:
@@ -137,7 +137,7 @@ def _give_script(cluster: Local, out: Path, file: Path | None) -> None:
 
 
 def _client_command(cluster: Local, words: Sequence[str]) -> str:
-    """Return the command of the process that hands out the work, which has these words now."""
+    """Return the command of the process that distributes the work, from the present words."""
     without = [f"--{name}" for name in (("script",) if cluster.starts else _WHERE)]
     flags = _ALONE[:1] if cluster.starts else _ALONE
     kept, left = list[str](), iter(words)

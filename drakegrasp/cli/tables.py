@@ -43,15 +43,14 @@ from drakegrasp.outcomes import GROUPS, Outcome
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
 
-#: Outcomes in the order of the funnel, and their groups for terminals that are too narrow for a
-#: column of each; in verdicts alone are others.
+#: Outcomes in the order of the funnel. Outcomes that only verdicts have are not among them.
 _FUNNEL = [o for group in GROUPS for o in Outcome if o.group == group]
 _RARE = ("left", "moved")
-#: Objects without samples of which it is said why.
+#: Maximum number of objects without samples whose reasons are printed.
 BARREN = 10
-#: Width of a terminal from which the audit has all of its columns [characters].
+#: Smallest width of a terminal for which the audit has all of its columns [characters].
 ROOMY = 110
-#: Width of the console where standard output is not a terminal [characters]: tables fit always.
+#: Width of the console if standard output is not a terminal [characters]: every table fits.
 WIDTH = 1000
 
 
@@ -62,14 +61,15 @@ def make_table(
     *totals: Sequence[Sequence[str]],
     caption: str = "",
 ) -> Table:
-    """Return a table: a column of names and columns of numbers.
+    """Return a table with a column of names and columns of numbers.
 
     Args:
-        title: Of the table.
-        heads: Of its columns.
-        rows: Its cells. Names are shown as they are: they neither style it nor steer the terminal.
-        totals: More rows, each group below a line.
-        caption: What is said below it.
+        title: Title of the table.
+        heads: Heads of the columns.
+        rows: Cells of each row. Names are shown literally: they can neither style the table nor
+            control the terminal.
+        totals: Groups of further rows, each group below a line.
+        caption: Text below the table.
     """
     table = Table(
         title=title,
@@ -98,10 +98,10 @@ def _table_of_objects(
     row: Callable[[slice], list[str]],
     caption: str = "",
 ) -> Table:
-    """Return a table with a row per object and one of all, given the cells of some objects.
+    """Return a table with a row per object and a row for all objects.
 
-    Its last columns are how many samples are refined ones, if any attempt is, and how many
-    samples there are.
+    `row` returns the cells for a range of objects. The last columns are the number of refined
+    samples, if any attempt is refined, and the number of samples.
     """
     some = bool(funnel.refined.any())
 
@@ -121,17 +121,17 @@ def _head(outcome: Outcome) -> str:
 
 
 def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
-    """Return the funnel, a row per object and one of all.
+    """Return the funnel, with a row per object and a row for all objects.
 
     Args:
         funnel: The counts.
-        compact: Whether to group outcomes; otherwise columns that are all zero are left out.
+        compact: Whether to group outcomes; if not, columns that contain only zeros are left out.
     """
     shown = [o for o in _FUNNEL if funnel.outcomes[:, o].any() or o is Outcome.SUCCESS]
     groups = {_head(o): [o] for o in shown}
     removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
     if compact:
-        # Room is scarce, and few datasets have lifts that were ended or left out.
+        # Space is scarce, and few datasets have lifts that were ended early or left out.
         there, removed = funnel.outcomes.sum(axis=0), []
         groups = {name: [o for o in _FUNNEL if o.group == name] for name in GROUPS}
         groups = {h: g for h, g in groups.items() if h not in _RARE or there[g].any()}
@@ -157,12 +157,12 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
 
 
 def hold_table(funnel: Funnel) -> Table:
-    """Return how well the successes hold, a row per object and one of all."""
+    """Return how well the successes hold, with a row per object and a row for all objects."""
     notes = [
         "held: the outcome success; precision: with the fingertips alone; stable: of these, moved "
         "by less than 5 mm and 5° in the hand"
     ]
-    # Where the chance of a sample chose the lifts, only the audited ones tell the share.
+    # If lifts were chosen by their predicted probability, only audited lifts yield the fraction.
     held, stable, head = funnel.outcomes[:, Outcome.SUCCESS], funnel.stable, "stable\nof held"
     whole, part = held, stable
     if not funnel.all_lifted:
@@ -187,7 +187,7 @@ def hold_table(funnel: Funnel) -> Table:
 
 
 def preshape_table(counts: Sequence[PreshapeCount]) -> Table:
-    """Return how the attempts of each preshape ended, a row per preshape."""
+    """Return how the attempts of each preshape ended, with one row per preshape."""
     columns = ["attempts", "held", "stable", "refined", "samples"]
     if not any(count.refined for count in counts):
         columns.remove("refined")
@@ -199,7 +199,7 @@ def preshape_table(counts: Sequence[PreshapeCount]) -> Table:
 
 
 def split_table(counts: Sequence[SplitCount]) -> Table:
-    """Return the paper's Table III with a column of objects."""
+    """Return the paper's Table III with an additional column of objects."""
     rows = (
         [c.split, *(_number(n, ",.0f") for n in (c.samples, c.effective, c.objects, c.classes))]
         for c in counts
@@ -210,17 +210,17 @@ def split_table(counts: Sequence[SplitCount]) -> Table:
 
 
 def split_line(rule: str, funnel: Funnel, counts: Sequence[SplitCount]) -> str:
-    """Return by what the samples are split, and how many objects are tested, as a line."""
+    """Return a line with the rule of the split and the number of tested objects."""
     objects = {count.split: count.objects for count in counts}
     total = np.count_nonzero(funnel.samples)
-    # By class the objects that validate are those that train.
+    # In a split by class, the objects for validation are those for training.
     valid = f", {objects['valid']:,} valid" if rule == "object" else ""
     some = counted(int(total), "object")
     return f"split by {rule}: {some} with samples, {objects['test']:,} of them test{valid}"
 
 
 def barren_lines(funnel: Funnel, config: Config) -> list[str]:
-    """Return why objects have no sample, a line for each of the first and one for the others."""
+    """Return why objects have no sample: a line for each of the first, and one for the others."""
     why = [
         f"no sample of {_safe(name)}: {found.reason}. What may help: {found.advice}"
         for name, found in objects_without_samples(funnel, config).items()
@@ -244,7 +244,7 @@ def unfinished_line(unfinished: Unfinished) -> str:
     )
 
 
-#: Columns of the audit: head, cell, and whether a narrow terminal has it as well.
+#: Columns of the audit: head, cell, and whether a narrow terminal also shows it.
 _AUDIT: tuple[tuple[str, Callable[[AuditRow], str], bool], ...] = (
     ("faces", lambda row: _number(row.faces, ","), True),
     ("size [mm]", lambda row: "x".join(f"{1e3 * e:.0f}" for e in row.extents or ()) or "-", True),
@@ -258,13 +258,13 @@ _AUDIT: tuple[tuple[str, Callable[[AuditRow], str], bool], ...] = (
 
 
 def audit_table(rows: Sequence[AuditRow], *, compact: bool = False) -> Table:
-    """Return the findings on each mesh, a row per mesh.
+    """Return the findings of an audit, with one row per mesh.
 
     Args:
         rows: The findings.
-        compact: Whether to leave out what warnings tell anyway.
+        compact: Whether to leave out columns whose unusual values also appear in warnings.
     """
-    # Few columns on a narrow terminal; what is unusual is in words in any case.
+    # A narrow terminal has few columns; unusual values are reported in words in any case.
     columns = [column for column in _AUDIT if column[2] or not compact]
     heads = ("object", "status", *(head for head, _, _ in columns))
     table = make_table("Meshes", heads, ())
@@ -284,12 +284,12 @@ def _count(number: int) -> str:
 
 
 def _number(value: float | None, form: str, unit: float = 1) -> str:
-    """Return a number in another unit, or a dash."""
+    """Return a number times a unit as text, or a dash if it is unknown."""
     return "-" if value is None or np.isnan(value) else f"{unit * value:{form}}"
 
 
 def _safe(text: str) -> str:
-    """Return a text that neither styles the table nor steers the terminal."""
+    """Return a text that neither styles the table nor controls the terminal."""
     return escape(printable(text))
 
 
@@ -302,7 +302,7 @@ def audit_line(rows: Sequence[AuditRow]) -> str:
 
 
 def memory_line(rows: Sequence[AuditRow]) -> str:
-    """Return what a worker must have to prepare the largest mesh; empty if none can be read."""
+    """Return the memory to prepare the largest mesh, as a line; empty if no mesh can be read."""
     known = {row.name: row.preparing for row in rows if row.preparing is not None}
     if not known:
         return ""
@@ -315,7 +315,7 @@ def memory_line(rows: Sequence[AuditRow]) -> str:
 
 
 def verdict_table(results: Sequence[Verification]) -> Table:
-    """Return what became of grasps, with shares of those that the simulator could judge."""
+    """Return the outcomes of grasps, with fractions of the grasps that could be judged."""
     counts = Counter(result.outcome for result in results)
     judged = sum(n for outcome, n in counts.items() if not outcome.inconclusive)
     others = sorted(counts.keys() - {Outcome.SUCCESS}, key=lambda o: (-counts[o], o))
@@ -323,7 +323,7 @@ def verdict_table(results: Sequence[Verification]) -> Table:
     def row(label: str, count: int, known: bool = True) -> list[str]:
         return [label, _count(count), f"{count / judged:.1%}" if known and judged else "-"]
 
-    # How the first trials ended; what is more, and what is less than held.
+    # The outcomes of the first trials; then stricter and weaker criteria than held.
     ended = [row("held", counts[Outcome.SUCCESS])]
     ended += [row(o.label, counts[o], not o.inconclusive) for o in others]
     more = [row(words, sum(getattr(r, n) for r in results)) for n, words in _VERDICTS.items()]
@@ -331,7 +331,7 @@ def verdict_table(results: Sequence[Verification]) -> Table:
     return make_table("Verdicts", ("outcome", "grasps", "share"), ended, [total], more)
 
 
-#: Words of a verdict, as a table calls them.
+#: Labels in a table for the attributes of a verdict.
 _VERDICTS = {
     "success": "success: as asked for",
     "precision": "precision",
@@ -381,7 +381,7 @@ def bench_lines(report: Mapping[str, Any]) -> list[str]:
 
 
 def score_table(card: Mapping[str, Any], seconds: Mapping[str, float]) -> Table:
-    """Return the sets of a score card beside each other, with seconds per verdict of the lift."""
+    """Return the sets of a score card, one row per set, with seconds per verdict of the lift."""
     names = [name for name in card["measures"] if name != "headline"]
     protocol = card["settings"].get("protocol")
     counts = "Sample" if protocol is None else f"By {protocol['protocol']}"
@@ -400,7 +400,7 @@ def score_table(card: Mapping[str, Any], seconds: Mapping[str, float]) -> Table:
 
 
 def make_console(*, stderr: bool = False) -> Console:
-    """Return a console for tables; off a terminal it is wide enough for any."""
+    """Return a console for tables; if the output is not a terminal, every table fits."""
     console = Console(stderr=stderr)
     return console if console.is_terminal else Console(width=WIDTH, stderr=stderr)
 
@@ -415,7 +415,7 @@ def print_stats(out: Path) -> None:
     console, unfinished = make_console(), count_unfinished(out)
     funnel = count_funnel(out) if unfinished is None else unfinished.funnel
     table = funnel_table(funnel)
-    # Rich would cut numbers in a narrow terminal; the compact table has fewer columns.
+    # Rich would truncate numbers in a narrow terminal; the compact table has fewer columns.
     natural = Measurement.get(console, console.options.update(max_width=WIDTH), table).maximum
     if natural > console.width:
         table = funnel_table(funnel, compact=True)

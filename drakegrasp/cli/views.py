@@ -1,4 +1,4 @@
-"""The commands that show a dataset in a browser, as figures, and in the formats of other tools."""
+"""The commands that show a dataset in a browser or in figures, or export it to other formats."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from drakegrasp.cli.console import Command, progress_bar, say
 from drakegrasp.cli.options import PATH, Named, dataset_argument, described
 from drakegrasp.errors import counted
 
-#: Port without --port; the same every time, so that a tunnel to another machine can stay.
+#: Default of --port: a fixed number, so that a tunnel to another machine can stay open.
 PORT = 8321
 
 
@@ -30,15 +30,15 @@ def inspect_(
     """Look at grasps in a browser, and reject them.
 
     The page shows every attempt in OUT with images, contacts, forces and a 3D view, the most
-    suspicious first. Rejections are written to OUT/reject.json at once; assemble --reject reads
-    that file. It also works while a build runs. The page can be reached from this machine
-    only. Ctrl-C ends it.
+    suspicious first. Rejections are written to OUT/reject.json immediately; assemble --reject reads
+    that file. The page also works while a build runs. It can be reached from this machine only.
+    Ctrl-C ends the command.
 
     Options:
-        --predictions RESULTS (results): Show predictions with the rows that they are for: the
+        --predictions RESULTS (results): Show predictions next to their rows of the dataset: the
             results that verify --dataset FILE --out NAME wrote.
-        --port N: Port on this machine; 0 takes any that is free.
-        --static DIR (folder): Write the pages to DIR as files that open without a server, and end.
+        --port N: Port on this machine; 0 selects any free port.
+        --static DIR (folder): Only write the pages to DIR, as files that open without a server.
         --no-browser: Only print the address.
     """
     from drakegrasp.errors import DataError
@@ -89,10 +89,10 @@ def figures(
     views          views of scenes with a sample of each, if there are scenes
 
     Options:
-        --out DIR (folder): Where to write. [default: OUT/figures]
-        --trial ID: The grasp whose phases are drawn: row of trials.hdf5.
-        --compare OTHER: A dataset of the same objects by the other method of palm poses
-            (candidates.method).
+        --out DIR (folder): Folder of the figures. [default: OUT/figures]
+        --trial ID: Row of trials.hdf5 with the grasp whose phases are drawn.
+        --compare OTHER: A dataset of the same objects that was built with the other sampler of palm
+            poses (candidates.method).
         --quiet
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.foreign_files import refuse_link
@@ -115,10 +115,10 @@ def figures(
 
 
 class _Export(Command):
-    """The command, whose help lists the exporters."""
+    """The command `export`, whose help lists the exporters."""
 
     def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the text, and a paragraph of the formats; called by click."""
+        """Write the text, and a paragraph with the formats; called by click."""
         super().format_help_text(ctx, formatter)
         formatter.write_paragraph()
         for name in registry.names("exporters"):
@@ -158,7 +158,7 @@ def export(
     )
     from drakegrasp.foreign_files import refuse_link
 
-    # What is said of the publishers; the option is stronger than the file.
+    # Data about the publishers; the option overrides the file.
     publishes = names_publishers(form)
     for option, value in (("--about", about), ("--licence", licence)):
         if value and not publishes:
