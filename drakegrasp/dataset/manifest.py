@@ -134,8 +134,8 @@ class ObjectEntry:
         up: Axis of the mesh file that is +z of {O}.
         mass: Mass [kg].
         density: Mass over volume [kg/m^3].
-        friction: The object's own coefficient of friction with hand and table; None: those of the
-            configuration.
+        friction: The object's own coefficient of friction with hand and table; None: the
+            configuration's coefficients.
         collision_error: Largest distance between mesh and collision surface [m].
         resting: Resting poses of the object.
         candidates: Number of palm poses to try, drawn from the distinct ones.
@@ -147,7 +147,7 @@ class ObjectEntry:
         tried: Number of palm poses after which a target of samples was met; None: all.
         group: Name shared by objects of the same mesh, which stay in one split; None: the object's
             name.
-        seed: Seed of the object's draws, in a merged dataset; None: that of the configuration.
+        seed: Seed of the object's draws, in a merged dataset; None: the configuration's seed.
         drawn_as: Name of the object in its files, if a merged dataset has the mesh under several
             seeds; None: the object's name.
     """

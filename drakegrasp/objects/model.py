@@ -71,7 +71,7 @@ class ObjectModel:
         collision_error: Largest distance between visual and collision surface.
         notes: What was repaired, and what is unexpected about how the object rests, in sentences.
         friction: The object's own effective coefficient of friction with hand and table; None:
-            those of the configuration.
+            the configuration's coefficients.
         scale: Metres per unit of length of the source file.
         up: Axis of the source file that is +z of {O}.
     """

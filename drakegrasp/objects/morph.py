@@ -9,9 +9,9 @@ Axis and origin are our own choice: the axis is x, y or z, and passes through th
 footprint at the height of the base. So what is flat at the base stays flat and on the table.
 
 `morph_meshes` writes morphs of all meshes of a directory: `<class>_<name>_m<k>.obj` in metres, +z
-up. An `objects.yaml` in their folder gives each morph the class of its mesh (else each would be its
-own class) and the name of the mesh as its group: in a split by object all morphs of a mesh, and the
-mesh itself, stay together.
+up. An `objects.yaml` in their folder assigns to each morph the class of its mesh (otherwise each
+morph would be its own class) and the name of the mesh as its group: in a split by object all morphs
+of a mesh, and the mesh itself, stay together.
 """
 
 from __future__ import annotations

@@ -68,10 +68,10 @@ class MeshSource:
         path: The mesh file.
         scale: Metres per unit of length of the file.
         up: Axis of the file that points up, e.g. "+y"; it becomes +z of {O}.
-        mass: Mass [kg]; None: that of the density, or of the configuration.
+        mass: Mass [kg]; None: it follows from the density, or from the configuration.
         density: Density [kg/m^3], instead of the mass.
-        friction: Effective coefficient of friction with hand and table; None: those of the
-            configuration.
+        friction: Effective coefficient of friction with hand and table; None: the
+            configuration's coefficients.
         licence: Identifier of the mesh's licence, e.g. one of spdx.org/licenses; None: not stated.
         group: Name shared by objects of the same mesh; None: the object's name.
     """

@@ -82,7 +82,7 @@ def rod(
         start: Centre (3,) of one end [m].
         end: Centre (3,) of the other end [m].
         radius: Radius at the start [m].
-        end_radius: Radius at the end [m]; that at the start if None.
+        end_radius: Radius at the end [m]; None: the same as at the start.
         edge: Edge length [m].
     """
     p, q = np.asarray(start, dtype=float), np.asarray(end, dtype=float)

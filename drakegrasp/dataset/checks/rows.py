@@ -118,7 +118,7 @@ class Findings:
         return bool(self._listed)
 
     def add(self, violations: Iterable[Violation]) -> set[int]:
-        """Collect violations; return the rows in which they are."""
+        """Collect violations; return the rows that have a violation."""
         rows = set()
         for violation in violations:
             key = (violation.file, violation.group, violation.what)
@@ -442,7 +442,7 @@ class Batch:
 
         Args:
             name: Name of the field.
-            due: (n, ...), the values derived again; NaN where there is no value.
+            due: (n, ...), the values derived again; NaN if a row has no value.
             what: What the values follow from, in words.
             tolerance: Maximum difference of a number; `LAST_PLACES` of rounding if None.
         """
