@@ -68,7 +68,7 @@ def build_dataset(
     Args:
         objects: Directory of meshes, or "builtin" for the built-in objects, whose number
             `config.builtin` specifies.
-        out: Directory of the dataset; it must be visible to every worker.
+        out: Directory of the dataset. Files travel over the network if a worker does not see it.
         config: All the rules; None for the defaults.
         units: Unit of length of the meshes: m, cm or mm.
         manifest: YAML file with units and classes per mesh, if it is not beside the meshes.
@@ -142,7 +142,7 @@ def build_on(
     The directory is locked before the workers start, so a second build is rejected before that.
 
     Args:
-        cluster: Starts workers that can all read `out`, and yields their client, e.g. `connect(2)`.
+        cluster: Starts workers, and yields their client, e.g. `connect(2)`.
             Give an existing client as `contextlib.nullcontext(client)`.
         sources: The meshes; None for the built-in objects.
         out: Directory of the dataset, absolute.

@@ -24,7 +24,7 @@ from distributed import Client, Scheduler, Worker, WorkerPlugin
 from drakegrasp.cluster.connect import SATURATION, SILENCE_SECONDS, WORKER_ENVIRONMENT
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import REQUIRED_VERSIONS, installed_versions, package_versions
-from drakegrasp.errors import MachineError, counted, printable
+from drakegrasp.errors import HandError, MachineError, counted, printable
 from drakegrasp.runtime.files import probe_folder, temporary_name
 from drakegrasp.vision.probe_image import probe_image
 
@@ -82,8 +82,8 @@ class Admission(WorkerPlugin):  # type: ignore[misc]
         if self._shared is not None and not self._shared.is_seen():
             fault = f"must see {self._shared.probe.parent} like those at the start"
         if fault is None:
-            known = package_versions() if self._travels else installed_versions(self._config)
-            fault = unfitness(worker.state.nthreads, {**self._versions, **known}, self._versions)
+            theirs = {**self._versions, **_own_versions(self._config, travels=self._travels)}
+            fault = unfitness(worker.state.nthreads, theirs, self._versions)
         if fault is None and _host() not in self._hosts:
             fault = _image_fault()
         if fault is not None:
@@ -115,7 +115,7 @@ def admitted_workers(
 
         # Refuse what the user must change. A hand that travels is the client's.
         versions = installed_versions(config)
-        theirs = client.run(package_versions) if travels else client.run(installed_versions, config)
+        theirs = client.run(_own_versions, config, travels=travels)
         for address, threads in client.nthreads().items():
             fault = unfitness(threads, {**versions, **theirs.get(address, {})}, versions)
             if fault is not None:
@@ -167,6 +167,16 @@ def _must_travel(client: Client, shared: Shared) -> bool:
         what = f"{blind} of {counted(len(seen), 'worker')} {see}"
     sys.stderr.write(f"{what}: files travel over the network\n")
     return True
+
+
+def _own_versions(config: Config, *, travels: bool) -> dict[str, str]:
+    """Return the versions of this process; without that of the hand if its files travel."""
+    if travels:
+        return package_versions()
+    try:
+        return installed_versions(config)
+    except HandError as error:
+        return {**package_versions(), "hand": f"none ({error})"}
 
 
 def unfitness(threads: int, theirs: Mapping[str, str], ours: Mapping[str, str]) -> str | None:

@@ -1,6 +1,6 @@
 """A cluster of pods: the manifest of dask-kubernetes' operator, which starts them.
 
-In: an image with drakegrasp, and a claim of a volume that holds OUT. Out: a `DaskCluster` of
+In: an image with drakegrasp, and a claim of a volume if one holds OUT. Out: a `DaskCluster` of
 kubernetes.dask.org/v1 (dask-kubernetes 2025.7), for `kubectl apply -f -`. Nothing is started from
 here: whoever applies it then connects by the scheduler's address. Scheduler and workers ask for a
 certificate, which a secret of the namespace holds.
@@ -39,6 +39,7 @@ class Kubernetes(Local):
     Attributes:
         image: Container image with drakegrasp, as pipelines/recipes/Dockerfile makes it.
         claim: Name of the PersistentVolumeClaim in which OUT lies; pods see it at OUT's folder.
+            Without one files travel over the network.
         name: Of the cluster.
         namespace: Of the cluster.
     """
@@ -59,11 +60,12 @@ class Kubernetes(Local):
         super().__post_init__()
         if self.workers is None:
             raise ConfigError(f"--workers must be given with --cluster {self.kind}")
-        for key in ("image", "claim"):
-            if not getattr(self, key):
-                raise ConfigError(f"--with {key}=NAME must be given with --cluster {self.kind}")
+        if not self.image:
+            raise ConfigError(f"--with image=NAME must be given with --cluster {self.kind}")
         for key, most in (("name", _LONGEST), ("namespace", 63), ("claim", 63)):
             text = getattr(self, key)
+            if text is None:
+                continue
             if not _NAME.fullmatch(text) or len(text) > most:
                 raise ConfigError(
                     f"{key} must be at most {most} of a-z, 0-9 and -, got {text[:80]!r}"
@@ -87,7 +89,8 @@ class Kubernetes(Local):
 
     def line(self) -> str:
         """Return what the manifest asks for, in words."""
-        return f"{self.workers} worker pods of {self.image}, OUT in the claim {self.claim}"
+        where = f"OUT in the claim {self.claim}" if self.claim else "which do not see OUT"
+        return f"{self.workers} worker pods of {self.image}, {where}"
 
     def is_open(self) -> bool:
         """Return whether others reach the scheduler: all pods of the cluster do."""
@@ -113,9 +116,9 @@ class Kubernetes(Local):
             out: Directory of the dataset, absolute; its folder is where pods see the volume.
 
         Raises:
-            ConfigError: If `out` is in no folder.
+            ConfigError: If there is a claim, and `out` is in no folder.
         """
-        if out.parent == Path(out.anchor):
+        if self.claim and out.parent == Path(out.anchor):
             raise ConfigError(f"--out must be in a folder of the claim, e.g. /data/OUT, got {out}")
         python = ["python", "-m"]
         tls = [w for k, file in FILES.items() for w in (f"--tls-{k}", f"{KEYS}/{file}")]
@@ -163,10 +166,10 @@ class Kubernetes(Local):
         """Return the specification of a pod with one container."""
         # What it asks for, and the folders that it sees.
         asked = {"cpu": "1", **({} if memory is None else {"memory": str(memory)})}
-        mounts = [{"name": "data", "mountPath": str(out.parent)}]
-        volumes: list[dict[str, Any]] = [
-            {"name": "data", "persistentVolumeClaim": {"claimName": self.claim}}
-        ]
+        mounts, volumes = list[dict[str, str]](), list[dict[str, Any]]()
+        if self.claim:
+            mounts.append({"name": "data", "mountPath": str(out.parent)})
+            volumes.append({"name": "data", "persistentVolumeClaim": {"claimName": self.claim}})
         if self.tls:
             mounts.append({"name": "tls", "mountPath": KEYS})
             volumes.append({"name": "tls", "secret": {"secretName": self.secret}})

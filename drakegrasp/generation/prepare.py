@@ -43,7 +43,7 @@ class PrepareTask:
     Attributes:
         source: The mesh.
         mesh_sha256: Its digest, `source_sha256`.
-        out: Directory of the dataset, visible to every worker.
+        out: Directory of the dataset, as the process that does the task sees it.
         config: All the rules.
         postures: What is tried of it instead of palm poses of samplers; None: these.
         restartable: Whether the process that runs it is started again when it dies. If so, a

@@ -89,7 +89,7 @@ class WorkUnit:
     """What one task does: plain data.
 
     Attributes:
-        out: Directory of the dataset, visible to every worker.
+        out: Directory of the dataset, as the process that does the task sees it.
         header: Object and range of candidates.
         config: All the rules.
         refined: Whether palm poses about those of samples are tried, if the configuration has any.

@@ -16,6 +16,7 @@ import loader_speed
 import prepare_memory
 import scene_speed
 import verify_speed
+import wire_bytes
 import worker_memory
 
 COMMANDS = {
@@ -25,6 +26,7 @@ COMMANDS = {
     "prepare": prepare_memory,
     "scenes": scene_speed,
     "verdicts": verify_speed,
+    "wire": wire_bytes,
     "worker": worker_memory,
 }
 

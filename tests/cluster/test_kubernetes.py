@@ -109,6 +109,14 @@ def test_what_kubernetes_would_refuse_is_one_line(changes: dict[str, Any], words
         cluster_of("kubernetes", **{"workers": 2, **WITH, **changes})
 
 
+def test_without_a_claim_pods_have_no_volume_for_the_dataset() -> None:
+    document = manifest(claim=None)
+    pod = document["spec"]["worker"]["spec"]
+    assert [volume["name"] for volume in pod["volumes"]] == ["tls"]
+    assert [mount["name"] for mount in pod["containers"][0]["volumeMounts"]] == ["tls"]
+    assert list(faults({"spec": document["spec"]}, SCHEMA)) == []
+
+
 def test_volume_is_not_put_over_the_root() -> None:
     cluster = cluster_of("kubernetes", workers=2, **WITH)
     with pytest.raises(ConfigError, match="--out must be in a folder of the claim"):
