@@ -145,7 +145,7 @@ class Grouping:
         return found
 
     def means(self, values: npt.ArrayLike) -> Array:
-        """Return (..., objects) means over the rows of each object of values (..., rows)."""
+        """Return means (..., objects) of values (..., rows) over the rows of each object."""
         member = np.eye(len(self.names))[self.objects]
         return np.asarray(np.asarray(values, dtype=float) @ member / member.sum(axis=0))
 

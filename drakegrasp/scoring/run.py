@@ -183,7 +183,7 @@ def _refuse_other_train(data: GraspDataset, train: GraspDataset) -> None:
 def _chosen_rows(
     data: GraspDataset, predictions: Sequence[Attempts], per_object: int | None
 ) -> list[int]:
-    """Return the rows to score, in order: those of the predictions, some of each object."""
+    """Return the rows to score, in order: rows of the predictions, at most some per object."""
     if per_object is not None and per_object < 1:
         raise GraspError(f"per_object must be 1 or more, got {per_object}")
 

@@ -239,7 +239,7 @@ def verification_figure(verified: Verification) -> Figure:
     """
     model, views = verified.placed.model, list(_views(verified))
 
-    # The page [inch].
+    # The size of the page [inch].
     gap, margin, head, foot = 0.08, 0.12, 1.25, 0.4
     width = len(views) * (EDGE + gap) - gap + 2.0 * margin
     figure = Figure(figsize=(width, EDGE + head + foot), facecolor="white")

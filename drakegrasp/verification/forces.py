@@ -570,7 +570,7 @@ class ForceVerdict:
                 f"more than {np.rad2deg(MAX_ANGLE):.0f}°"
             )
 
-        # Or the surface there cannot support the load.
+        # The surface there may be unable to support the load.
         if not np.isfinite(self.planned_share):
             return f"no forces within the surface's friction cones carry it{self._other()}"
         if self.planned_share > 1.0:

@@ -291,7 +291,7 @@ def choose_rows(
     chosen = chosen.astype(np.int64)
     chosen = np.full(count, chosen) if chosen.ndim == 0 else chosen.ravel()
 
-    # One row per grasp.
+    # Check that there is one row per grasp.
     if len(chosen) != count:
         raise GraspError(f"rows must be one per grasp ({count}), got {len(chosen)}")
     if rows is None and count != len(dataset):
@@ -300,7 +300,7 @@ def choose_rows(
             f"{dataset.split} in {dataset.path.name}, got {count} grasps ({said})"
         )
 
-    # Rows that exist.
+    # Check that the rows exist.
     wrong = chosen[(chosen < 0) | (chosen >= len(dataset))]
     if len(wrong):
         raise GraspError(

@@ -130,7 +130,7 @@ def _directions(grip: Grip, centre: Array, approach: Array | None) -> list[tuple
 
 
 def _origin(grip: Grip, direction: Array, parts: list[Array]) -> tuple[Array, bool] | None:
-    """Return the origin (3,) of G on the palm below the pinch, and whether the palm is beside."""
+    """Return the origin (3,) of G below the pinch, and whether the palm is beside the ray."""
     # Find where the ray to the pinch leaves the palm, or else the palm's foremost point.
     spans = [ray_span(corners, grip.middle, direction) for corners in parts]
     leaves = [span[1] for span in spans if span is not None]
