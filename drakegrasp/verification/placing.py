@@ -279,7 +279,7 @@ def choose_rows(
 ) -> npt.NDArray[np.int64]:
     """Return the row (n,) of the dataset's split for each of `count` grasps; one may be for all.
 
-    `said` is what an error says of how to give rows.
+    `said` is the part of the error message that explains how to give rows.
 
     Raises:
         GraspError: If there is not exactly one row per grasp, or a row does not exist.

@@ -179,9 +179,9 @@ def _principal_axis(centred: Array) -> Array:
     """Return the unit direction (2,) of largest variance of points (n, 2) about their mean.
 
     It is computed in closed form, because LAPACK's last bits depend on the CPU. With the points'
-    scatter matrix C = [[a, b], [b, d]] and h = (a − d)/2, the eigenvalues are (a + d)/2 ± √(h² +
-    b²). The first eigenvector is parallel to (h + √(h² + b²), b), or to (b, √(h² + b²) − h). It is
-    +u if the variance is the same in all directions.
+    scatter matrix C = [[a, b], [b, d]] and h = (a − d)/2, the eigenvalues are
+    (a + d)/2 ± √(h² + b²). The first eigenvector is parallel to (h + √(h² + b²), b), or to
+    (b, √(h² + b²) − h). It is +u if the variance is the same in all directions.
     """
     (uu, vv), uv = (centred**2).sum(axis=0), (centred[:, 0] * centred[:, 1]).sum()
     half = (uu - vv) / 2.0
