@@ -256,6 +256,8 @@ def _of_split(raw: dict[str, Any], data: GraspDataset) -> dict[str, Any]:
         if raw["trial"] is None:
             return raw
         told, column = raw["trial"].tolist(), "trial_id"
+
+    # Repeat each posture for each of its rows.
     rows_of = dict[Any, list[int]]()
     for row, one in enumerate(data.column(column).tolist()):
         rows_of.setdefault(one, []).append(row)
