@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import norm
+from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.dataset.opening import differences, opened, read_codes, refuse_first
 from drakegrasp.dataset.reader import PredictedRows, read_predicted_rows
 from drakegrasp.dataset.schema import (
@@ -292,7 +292,12 @@ class Predictions(Gallery):
         ]
 
         # The hand in the stages that the trial reached, and the hand of the dataset's grasp.
-        states = hand_states(verdict, X_TO, hand, "force")
+        # One that ended before closing is shown as it began.
+        states, X_OG = hand_states(verdict, X_TO, hand, "force"), verdict.get("X_OG")
+        if not states and X_OG is not None and np.isfinite(X_OG).all():
+            X_TG = multiply(X_TO, unpack_pose(X_OG))
+            links = hand.poses(X_TG, None, float(np.nan_to_num(verdict["spread"])))
+            states["start"] = {"links": links, "contacts": []}
         states["dataset's grasp"] = hand_states(row, X_TO, hand, "force")["closed"]
         for state in states.values():
             state["contacts"] = [*marks, *state["contacts"]]

@@ -89,6 +89,28 @@ def test_page_of_a_prediction_has_both_hands_and_all_contacts(client: TestClient
     z_T = np.array([0.5, -np.sqrt(0.75), 0.0])
     np.testing.assert_allclose(apart, [0.007 * z_T, [0, 0, 0], [0, 0, 0]], atol=1e-9)
     assert set(_scene(client.get("/prediction/2").text)["states"]) == {"dataset's grasp"}
+
+
+def test_a_palm_that_never_closed_is_shown_open(out: Path, results: Path) -> None:
+    """A palm pose alone has no contacts to show; the open hand shows where it was tried."""
+    with h5py.File(results, "a") as file:
+        palms = file["grasps/X_OG"]
+        palms[2] = palms[3]
+        for name in ("p_OQ", "nhat_Q_O"):
+            file["grasps"][name][2] = np.nan
+        file["grasps/confidence"][:] = [0.3, 0.9, 0.5, 0.1]
+    app = make_app(Inspection(out, results))
+    with TestClient(app, base_url="http://127.0.0.1:8321") as client:
+        assert shown(client, "sort=confidence") == ["1", "2", "0", "3"]
+        states = _scene(client.get("/prediction/2").text)["states"]
+        closed = _scene(client.get("/prediction/3").text)["states"]["closed"]
+    assert set(states) == {"start", "dataset's grasp"}
+    # The first link is the palm's.
+    assert states["start"]["links"][0] == closed["links"][0]
+    assert states["start"]["links"] != closed["links"]
+
+
+def test_other_numbers_have_no_page(client: TestClient) -> None:
     for label in ("4", "x", "-1"):
         assert client.get(f"/prediction/{label}").status_code == 404
 
