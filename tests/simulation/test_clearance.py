@@ -16,6 +16,7 @@ from helpers.objects import from_above, standing
 from drakegrasp.frames import X_WT
 from drakegrasp.hand.settings import override_config
 from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.contacts import Way
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.simulation.trial import has_only_scraped, lift_on, run_attempt
 
@@ -65,13 +66,22 @@ def test_clearance_is_the_least_of_all_steps(scene, cube, config, standoff) -> N
     assert quick.closed.clearance == pytest.approx(min(closing), abs=1e-4)
 
 
-def test_lift_begins_where_closing_ended(scene, cube, config) -> None:
+def test_lift_begins_where_closing_ended(scene, cube, config, monkeypatch) -> None:
+    looks = list[float]()
+
+    class Noted(Way):
+        def look(self, scene: Scene) -> None:
+            looks.append(scene.time)
+            super().look(scene)
+
+    monkeypatch.setattr("drakegrasp.simulation.lift.Way", Noted)
     rules = override_config(config, ["lift.drive=torque"])
     noted = record_heights(scene)
     try:
         record = run_attempt(scene, standing(cube), from_above(cube, PASSES), rules)
     finally:
         scene.simulator.clear_monitor()
+    assert looks[0] == pytest.approx(record.closed.duration)
     lifting = [height for time, height in noted if time >= record.closed.duration - 1e-9]
     assert record.lift.clearance == pytest.approx(min(lifting), abs=1e-4)
     assert record.lift.clearance > record.closed.clearance + 1e-3

@@ -94,6 +94,11 @@ def test_patch_mostly_beside_the_pad_is_split(closed, scale):
     # It carries what the pressure on its faces says, and pushes along its own normal.
     share = np.linalg.norm(part.f_Q_O[0]) / np.linalg.norm(whole.f_Q_O[0])
     assert 0.05 < share < 0.5
+    # Its friction is a part of the whole patch's.
+    along = np.eye(3) - np.outer(whole.nhat_Q_O[0], whole.nhat_Q_O[0])
+    friction, of_whole = along @ part.f_Q_O[0], along @ whole.f_Q_O[0]
+    assert np.linalg.norm(of_whole) > 0.01
+    np.testing.assert_allclose(friction, share * of_whole, atol=1e-4)
     cosine = -(part.f_Q_O[0] * part.nhat_Q_O[0]).sum() / np.linalg.norm(part.f_Q_O[0])
     assert cosine > np.cos(np.arctan(0.71)) - 1e-3
 

@@ -167,6 +167,23 @@ def test_worm_yields_beyond_its_strength_and_holds_again(
 
 
 @pytest.mark.sim
+@pytest.mark.parametrize(("rate", "stands"), [(-1.5e-4, False), (-0.9e-4, True), (1.0, True)])
+def test_worm_yields_until_its_finger_opens_no_more(
+    scene: Scene, cube: ObjectModel, monkeypatch: pytest.MonkeyPatch, rate: float, stands: bool
+) -> None:
+    """A tenth of a milliradian per second is rest."""
+    _closed_on(scene, cube)
+    engage(scene, "worm")
+    for motor, own in zip(scene.motors, scene.effort_limits, strict=True):
+        motor.set_effort_limit(2.0 * own)
+    monkeypatch.setattr(drive_module, "closing_rates", lambda _: np.full(len(scene.motors), rate))
+    scene.simulator.get_monitor()(scene.simulator.get_context())
+    held = [motor.effort_limit() for motor in scene.motors] == [*scene.effort_limits]
+    disengage(scene)
+    assert held is stands
+
+
+@pytest.mark.sim
 def test_worm_holds_what_is_within_its_strength(scene: Scene, cube: ObjectModel) -> None:
     """The loads that it carries are those of the contacts: force times lever, motor included."""
     _closed_on(scene, cube)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -335,6 +336,21 @@ def test_two_contacts_leave_poses_that_collide_out(held, monkeypatch):
 
     assert run([HITS] * 9 + [LOST, HITS, HELD, LOST]) == (LOST, HELD)
     assert run([HITS] * 3) == (HITS,)
+
+
+@pytest.mark.parametrize(("fingers", "passed"), [(2, True), (3, False), (4, False)])
+def test_poses_that_collide_are_left_out_of_two_fingers_alone(held, monkeypatch, fingers, passed):
+    said = []
+
+    def tries(base, fits, *, pass_collisions):
+        said.append(pass_collisions)
+        return base.tries
+
+    monkeypatch.setattr(verifying, "load_hand", lambda _: SimpleNamespace(num_fingers=fingers))
+    monkeypatch.setattr(verifying, "_fits", lambda *_: [])
+    monkeypatch.setattr(verifying, "_try_poses", tries)
+    assert verifying._lift_by_hand(held).outcome is held.outcome
+    assert said == [passed]
 
 
 def test_number_of_threads_changes_no_bit(cube, grasp):
