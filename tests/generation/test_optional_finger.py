@@ -30,7 +30,10 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> BuildReport:
     pole.export(folder / "meshes" / "11_box_slim.obj")
     config = load_config(
         hand=str(write_with_optional_fingers(folder, 0, 1)),
-        overrides=[*SMALL, "candidates.max=30", "candidates.standoffs=[0.06]", "camera.size=32"],
+        overrides=[
+            *(*SMALL, "lift.max_speed=0.5", "lift.max_acceleration=1", "candidates.max=17"),
+            *("candidates.standoffs=[0.06]", "camera.size=32"),
+        ],
     )
     return build(find_meshes(folder / "meshes"), folder / "out", config, run_here, show=False)
 

@@ -290,7 +290,7 @@ def test_a_dataset_of_postures_of_preshapes_is_sound_and_replayed(of_preshapes):
 
 def test_scenes_have_the_hand_from_which_a_posture_of_a_preshape_closed(of_preshapes, tmp_path):
     out = Path(shutil.copytree(of_preshapes[0], tmp_path / "out"))
-    make_scenes(out)
+    make_scenes(out, overrides=["scenes.views=1", "scenes.width=64", "scenes.height=48"])
     with h5py.File(out / "scenes.hdf5") as file:
         by_trial = np.argsort(file["grasps/trial_id"][:])
         q_open = file["grasps/q_open"][:][by_trial]
