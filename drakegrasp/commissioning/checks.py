@@ -360,7 +360,8 @@ def _turned_round(hand: Hand, i: int) -> str:
     lower, upper = hand.joint_limits[hand.joint_names.index(finger.closing_joint)]
     mend = f"; reverse its axis, and keep limits {lower:g}..{upper:g}"
 
-    # Next to the others at 0 the hand is closed there, so its new zero is where it is open now.
+    # A pad close to the others at 0 means that the hand is closed at 0, so that the new zero
+    # must be where the hand is open now.
     away, travel = moved[i] - start[i], pad_points_at(hand, closed_positions(hand))[i] - start[i]
     gap = float((start[i] - others) @ away / np.linalg.norm(away))
     if gap < 0.5 * np.linalg.norm(travel):
@@ -405,7 +406,7 @@ def _normals(triangles: Array) -> Array:
 
 
 def _face_at(triangles: Array, point: Array) -> Array:
-    """Return those of the triangles (n, 3, 3) that are closest to a point (3,) [m]."""
+    """Return the triangles among (n, 3, 3) that are closest to a point (3,) [m]."""
     near = trimesh.triangles.closest_point(triangles, np.tile(point, (len(triangles), 1)))
     distance = np.linalg.norm(near - point, axis=1)
     return np.asarray(triangles[distance <= distance.min() + SAME_PLACE])
@@ -418,7 +419,7 @@ def _facing(hand: Hand) -> Array:
     motion = pad_points_at(hand, half + step) - pad_points_at(hand, half)
 
     # Mean normal of each pad's surface, out of the fingertip. Without a region the pad is the whole
-    # closed surface, which faces no way as a whole; its face is at the pad point.
+    # closed surface, whose mean normal is zero, so that only the triangles at the pad point count.
     X_GF, shapes = fingertip_poses(hand, spread=0.0, closing=half), link_shapes(hand.model)
     cosines = np.zeros(hand.num_fingers)
     for i, pad in enumerate(pad_surfaces(hand.model, hand.fingers)):

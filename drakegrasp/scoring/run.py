@@ -108,7 +108,7 @@ def score(
             for a row.
         again: The command that creates the card again.
         protocol: Name, source, numbers and versions of a protocol that replaces the lift.
-        folder: Folder that stores verdicts, so that the same call can continue; None for none.
+        folder: Folder that stores verdicts, so that the same call can continue; None stores none.
 
     Raises:
         GraspError: If there is nothing to score, the predictions are for different rows, the
@@ -183,7 +183,7 @@ def _refuse_other_train(data: GraspDataset, train: GraspDataset) -> None:
 def _chosen_rows(
     data: GraspDataset, predictions: Sequence[Attempts], per_object: int | None
 ) -> list[int]:
-    """Return the rows to score, in order: rows of the predictions, at most some per object."""
+    """Return the rows to score, in order: rows of the predictions, at most `per_object` each."""
     if per_object is not None and per_object < 1:
         raise GraspError(f"per_object must be 1 or more, got {per_object}")
 
