@@ -51,8 +51,8 @@ CONVENTIONS = {
     "contacts": "pressure-weighted centre and mean normal of the hydroelastic patches between the "
     "pad of a fingertip and the object; a patch mostly beside the pad is split there, and its rest "
     "counts as another link",
-    "held": "of the end of the lift, seen on the object in its resting pose: what moved with the "
-    "object is moved back with it",
+    "held": "at the end of the lift, relative to the object in its resting pose: everything that "
+    "moved with the object is moved back with it",
     "oto": "one-to-one: the camera is rolled with the palm",
     "otm": "one-to-many: image up is world up",
 }
@@ -294,7 +294,7 @@ _CONTACTS: tuple[Field, ...] = (
     Field("f_Q_O", "k 3", "float64", "N", "O", "forces of the fingertips on the object"),
     Field("area", "k", "float64", "m^2", "-", "areas of the contact patches"),
     Field("penetration", "k", "float64", "m", "-",
-          "largest depths of the object's surface in the fingertips", limits=FROM_0),
+          "largest penetration depths of the object's surface into the fingertips", limits=FROM_0),
     Field("other_links", "", "uint8", "-", "-",
           "number of other links of the hand that touch the object"),
     Field("hand_on_table", "", "bool", "-", "-", "whether the hand touches the table"),
@@ -316,30 +316,31 @@ _LIFTED = _contacts("lifted", "trial.lift", "after the lift")
 _LINEAGE = (
     Field("resting", "", "uint8", "-", "-", "index of the object's resting pose"),
     Field("source", "", "uint8", "-", "-",
-          "sampler of the palm pose: 0 rotations, 1 normals, 2 refine, 3 own; 4 a posture that "
-          "was given"),
+          "sampler of the palm pose: 0 rotations, 1 normals, 2 refine, 3 other; 4 for a posture "
+          "from a file"),
     Field("generation", "", "uint8", "-", "-",
           "0: first round; else the number of refined palm poses up to this one"),
     Field("child", "", "int32", "-", "-",
-          "number in the family of a first-round attempt, which is 0; children of n have the "
-          "numbers n c + 1 to n c + c, with c = refine.children"),
+          "number in the family of a first-round attempt, whose number is 0; children of n have "
+          "the numbers n c + 1 to n c + c, with c = refine.children"),
     Field("parent", "", "int32", "-", "-",
-          "number of the parent in the family, of the same candidate and stand-off"),
+          "number of the parent in the family, which has the same candidate and stand-off"),
     Field("log_density", "", "float64", "-", "-",
-          "logarithm of the density of the palm pose's draw: among the different rotations; per "
-          "m^2 of surface and rad of roll; per m^3 rad^3 about the parent's; of a posture what its "
-          "file says, NaN if nothing", some=True),
+          "logarithm of the density of the palm pose's draw: among the distinct rotations; per "
+          "m^2 of surface and rad of roll; per m^3 rad^3 about the parent's palm pose; for a "
+          "posture the value of its file, or NaN", some=True),
 )
 #: `preshape` of a posture without one, with which all fingers of a hand with preshapes close.
 NO_PRESHAPE = 255
 # Fields of several tables.
 _PRESHAPE = (
     Field("preshape", "", "uint8", "-", "-",
-          "index of the hand file's preshape, 255 of a posture of none; 0 if the file has none",
+          "index of the hand file's preshape; 255 for a posture without preshape; 0 if the hand "
+          "file has no preshapes",
           optional=True),
     Field("unused", "", "uint32", "-", "-",
-          "fingers that the preshape leaves out, as bits: 1 for the first finger. They have no "
-          "contact", optional=True),
+          "fingers that the preshape leaves out, as bits: 1 for the first finger. These fingers "
+          "have no contact", optional=True),
 )
 _SPREAD = Field("spread", "", "float64", "rad", "-", "angle of the spread joints",
                 shown=Shown("spread", "°"))
@@ -349,13 +350,13 @@ _TIME_CLOSE = Field("time_close", "", "float64", "s", "-",
                     shown=Shown("time of closing", "s", 2))
 _TIME_LIFT = Field(
     "time_lift", "", "float64", "s", "-",
-    "simulated time of the lift with its hold; shorter where it ended early",
+    "simulated time of the lift with its hold; shorter if the lift ended early",
     of="trial.lift.duration", shown=Shown("time of the lift", "s", 2))
 #: Missing in files of datasets that do not measure it, see `close.scrape_depth`.
 _CLEARANCE = {
     when: Field(f"clearance_{when}", "", "float64", "m", "T",
-                f"least height of the hand above the table's top {during}, negative below it; NaN "
-                "in datasets that do not measure it", some=True, optional=True,
+                f"smallest height of the hand above the table's top {during}, negative below "
+                "the top; NaN in datasets that do not measure it", some=True, optional=True,
                 of=f"trial.{of}.clearance", shown=Shown(f"least height {during}", "mm"))
     for when, of, during in (("close", "closed", "from the start of closing to its end"),
                              ("lift", "lift", "during the lift"))
@@ -370,7 +371,8 @@ _SLIP = _measured(
           shown=Shown("turn", "°")),
 )
 _SLIP_USE = Field("slip_use", "k", "float64", "-", "-",
-                  "share of the friction cone in use after the lift, 1 at its border",
+                  "fraction of the friction cone in use after the lift; 1 at the border of the "
+                  "cone",
                   stage=Stage.LIFTED, per_finger=True, some=True, optional=True,
                   derive=_friction_use, shown=Shown("friction in use", digits=2),
                   needs=("lifted_touching", "lifted_f_Q_O", "lifted_nhat_Q_O", "friction_hand"))
@@ -385,9 +387,10 @@ _RELEASED = _measured(
 )
 _WORDS = (
     Field("precision", "", "bool", "-", "-",
-          "whether it is a success that the fingertips alone hold after the lift"),
+          "whether the attempt is a success in which only fingertips hold the object after the "
+          "lift"),
     Field("stable", "", "bool", "-", "-",
-          "whether it is a precision grasp with slip below 5 mm and turn below 5 deg"),
+          "whether the attempt is a precision grasp with slip below 5 mm and turn below 5 deg"),
 )
 
 #: The conditions of an attempt, drawn or not: everything that `simulation.conditions` may change.
@@ -400,7 +403,7 @@ CONDITION_FIELDS: tuple[Field, ...] = (
         Field("friction_table", "", "float64", "-", "-",
               "effective coefficient of friction between table and object",
               shown=Shown("friction of the object with the table", digits=3)),
-        Field("mass", "", "float64", "kg", "-", "mass of the object; its inertia is in proportion",
+        Field("mass", "", "float64", "kg", "-", "mass of the object; the inertia is scaled with it",
               shown=Shown("mass", "kg", 3)),
     ),
     *_measured(
@@ -414,7 +417,7 @@ CONDITION_FIELDS: tuple[Field, ...] = (
     Field("X_C0C", "12", "float64", "m, -", "C0",
           "pose of the oto camera in its usual pose behind the palm", of="conditions.X_C0C"),
     Field("depth_noise", "", "float64", "1/m", "-",
-          "standard deviation of the depths over their square; 0 for images without noise",
+          "standard deviation of a depth divided by the depth squared; 0 for images without noise",
           of="conditions.sensor.noise"),
     Field("depth_seed", "", "uint64", "-", "-",
           "seed of the noise of the depth images; 0 for images without noise",
@@ -427,17 +430,18 @@ HOLD_FIELDS: tuple[Field, ...] = tuple(
     replace(field, stage=Stage.LIFTED, some=True, optional=True)
     for field in (
         Field("p_hold_samples", "", "int32", "-", "-",
-              "k: disturbed repeats (section `certify`) that would be samples by the default "
-              "filters, but for those of pictures and outliers"),
-        Field("p_hold_held", "", "int32", "-", "-", "disturbed repeats that hold"),
+              "k: number of disturbed repeats (section `certify`) that would be samples by the "
+              "default filters, except those of images and outliers"),
+        Field("p_hold_held", "", "int32", "-", "-", "number of disturbed repeats that hold"),
         Field("p_hold_repeats", "", "int32", "-", "-",
-              "n: disturbed repeats with a verdict; 0 for an attempt that was not drawn"),
+              "n: number of disturbed repeats with a verdict; 0 for an attempt that was not "
+              "selected"),
         Field("p_hold_half_step", "", "float64", "-", "-",
-              "whether it would be a sample, undisturbed, at half the time step: 1 or 0; NaN if "
-              "that was not tried or has no verdict"),
+              "whether the undisturbed attempt would be a sample at half the time step: 1 or 0; "
+              "NaN if this was not tried or has no verdict"),
         Field("p_hold_probability", "", "float64", "-", "-",
-              "probability with which an attempt of its kind was drawn for repeats; NaN if it was "
-              "not drawn", limits=(POSITIVE, 1.0)),
+              "probability with which an attempt of this kind was selected for repeats; NaN if the "
+              "attempt was not selected", limits=(POSITIVE, 1.0)),
     )
 )
 
@@ -446,11 +450,12 @@ DATA_FIELDS: tuple[Field, ...] = (
     Field("images", "4 S S", "float32", "-, -, -, m", "C",
           "R, G, B in 0..1 and depth; object and table only, never the hand", sample=True),
     Field("masks", "S S", "uint8", "-", "C",
-          "1 where the object is seen, 0 everywhere else", sample=True, limits=(0, 1)),
+          "1 where the object is visible, 0 elsewhere", sample=True, limits=(0, 1)),
     Field("grasps", "6k", "float32", "m, -", "C",
-          "contact points, then outward unit normals, after closing, in this file's camera"),
+          "contact points, then outward unit normals, after closing, in the frame of this file's "
+          "camera"),
     Field("grasps_held", "6k", "float32", "m, -", "C",
-          "the same where the fingertips hold the object after the lift, on the resting object"),
+          "contact points and normals after the lift, relative to the resting object"),
     Field("trial_id", "", "int64", "-", "-", "row of trials.hdf5"),
     *_copied("grasp_props", *_WORDS, *_LINEAGE, *_PRESHAPE),
     Field("grasp_props/weight", "", "float32", "-", "-",
@@ -461,7 +466,7 @@ DATA_FIELDS: tuple[Field, ...] = (
           "number of other links of the hand that touch the object after the lift",
           of="lifted_other_links"),
     Field("grasp_props/X_CG", "12", "float32", "m, -", "C",
-          "pose of the palm at the start and while closing, in this file's camera"),
+          "pose of the palm at the start and while closing, in the frame of this file's camera"),
     Field("grasp_props/X_CG_held", "12", "float32", "m, -", "C",
           "pose of the palm after the lift, relative to the resting object"),
     Field("grasp_props/q", "j", "float32", "rad or m", "-",
@@ -471,8 +476,8 @@ DATA_FIELDS: tuple[Field, ...] = (
     Field("grasp_props/f_Q_C", "k 3", "float32", "N", "C",
           "forces of the fingertips on the object after closing"),
     Field("grasp_props/f_Q_C_held", "k 3", "float32", "N", "C",
-          "forces of the fingertips on the object after the lift, turned with it to its resting "
-          "pose"),
+          "forces of the fingertips on the object after the lift, rotated with the object to its "
+          "resting pose"),
     Field("grasp_props/area", "k", "float32", "m^2", "-",
           "areas of the contact patches after closing", of="closed_area"),
     Field("grasp_props/area_held", "k", "float32", "m^2", "-",
@@ -500,37 +505,39 @@ DATA_FIELDS: tuple[Field, ...] = (
 
 #: A row per attempt, whatever its outcome, in `/trials` of trials.hdf5 and of every shard.
 TRIAL_FIELDS: tuple[Field, ...] = (
-    Field("trial_id", "", "int64", "-", "-", "the row's own number"),
+    Field("trial_id", "", "int64", "-", "-", "number of the row"),
     Field("object", "", "int32", "-", "-", "row of /objects"),
     *_measured(
         "attempt",
         Field("candidate", "", "int32", "-", "-",
-              "index of the palm pose among its object's candidates; of a family's first attempt"),
+              "index of the palm pose among its object's candidates; in a family, that of the "
+              "first attempt"),
         Field("standoff_index", "", "uint8", "-", "-",
               "index into the configuration's candidates.standoffs"),
         *_LINEAGE,
         Field("posture_row", "", "float64", "-", "-",
-              "row of the posture in its file; NaN for a palm pose of a sampler", some=True,
+              "row of the posture in its file; NaN for a sampled palm pose", some=True,
               optional=True),
         Field("own_motors", "", "bool", "-", "-",
-              "whether each joint had a motor of its own, because the posture does not follow the "
+              "whether each joint had its own motor, because the posture does not follow the "
               "couplings of the hand file", optional=True),
         *_PRESHAPE,
         _SPREAD,
         Field("seed", "", "uint64", "-", "-",
-              "state of the candidate's random stream, from which the spread was drawn, or of the "
-              "refined palm pose's"),
+              "state of the random stream of the candidate or of the refined palm pose, from which "
+              "the spread was drawn"),
     ),
     _verdict("trial.outcome", [outcome for outcome in Outcome if not outcome.verification_only]),
     *_measured(
         "trial",
         _X_TO,
         Field("X_OG", "12", "float64", "m, -", "O",
-              "pose of the palm at the start; the candidate's where the palm ray misses"),
+              "pose of the palm at the start; the candidate's pose if the palm ray misses"),
     ),
     *CONDITION_FIELDS,
     Field("audited", "", "bool", "-", "-",
-          "whether a closed hand that may lift is lifted in any case, as one in ten is",
+          "whether a closed hand that may lift is lifted in any case; this is drawn for one "
+          "attempt in ten",
           of="attempt.audited"),
     *_since(
         Stage.CLOSED,
@@ -538,8 +545,8 @@ TRIAL_FIELDS: tuple[Field, ...] = (
         _CLEARANCE["close"],
         *_CLOSED,
         Field("chance", "", "float64", "-", "-",
-              "chance of a sample, of a closed hand that may lift; NaN for hands without "
-              "weights of it", some=True, of="trial.chance"),
+              "predicted probability that a closed hand that may lift yields a sample; NaN for "
+              "hands without a model of this probability", some=True, of="trial.chance"),
     ),
     *_since(
         Stage.LIFTED,
@@ -547,8 +554,9 @@ TRIAL_FIELDS: tuple[Field, ...] = (
               "distance of the contact points after closing from the full mesh's surface",
               per_finger=True, of="fit.distance", shown=Shown("off surface", "mm", 2)),
         Field("normal_angle", "k", "float64", "rad", "-",
-              "angle of the normals after closing from the full mesh's nearest face, or from that "
-              "ahead if it agrees better", per_finger=True, of="fit.normal_angle",
+              "angle between the normals after closing and the normal of the full mesh's nearest "
+              "face, or of the face nearest to a point ahead if it agrees better",
+              per_finger=True, of="fit.normal_angle",
               shown=Shown("normal angle", "°")),
         _TIME_LIFT,
         _CLEARANCE["lift"],
@@ -568,11 +576,11 @@ TRIAL_FIELDS: tuple[Field, ...] = (
 #: How robust a success is; see `drakegrasp.simulation.robustness`.
 CERTIFICATE_FIELDS: tuple[Field, ...] = (
     Field("certified_share", "", "float64", "-", "-",
-          "share of `certify.repeats` repeats with noise that hold; NaN if not certified",
+          "fraction of the `certify.repeats` disturbed repeats that hold; NaN if not certified",
           limits=SHARE),
     Field("certified_friction", "", "float64", "-", "-",
-          "least friction of hand and object at which it holds, inf if not even at the configured "
-          "one; NaN if not certified", limits=FROM_0),
+          "smallest friction between hand and object at which the grasp holds; inf if it does not "
+          "hold at the configured friction; NaN if not certified", limits=FROM_0),
 )
 
 
@@ -581,7 +589,7 @@ def _image_fields(camera: str) -> tuple[Field, ...]:
     return (
         Field(f"image_{camera}", "4 S S", "float32", "-, -, -, m", frame,
               "R, G, B in 0..1 and depth", sample=True),
-        Field(f"mask_{camera}", "S S", "uint8", "-", frame, "1 where the object is seen",
+        Field(f"mask_{camera}", "S S", "uint8", "-", frame, "1 where the object is visible",
               sample=True),
         Field(f"X_TC_{camera}", "12", "float64", "m, -", "T", "pose of the camera"),
     )
@@ -600,29 +608,30 @@ LOOK_FIELDS: tuple[Field, ...] = (
 SUCCESS_FIELDS: tuple[Field, ...] = (
     Field("trial_id", "", "int64", "-", "-", "row of /trials"),
     Field("removal", "", "uint8", "-", "-",
-          f"why it is no sample: {_labels(list(Removal))}", limits=(0, max(Removal))),
+          f"why the success is not a sample: {_labels(list(Removal))}", limits=(0, max(Removal))),
     *CERTIFICATE_FIELDS,
 )
 
 #: A row per object, in `/objects` of trials.hdf5.
 OBJECT_FIELDS: tuple[Field, ...] = (
     Field("name", "", "str", "-", "-", "name of the object"),
-    Field("class_name", "", "str", "-", "-", "name of its class"),
+    Field("class_name", "", "str", "-", "-", "name of the object's class"),
     Field("mesh_sha256", "", "str", "-", "-",
-          "hash of the mesh file and of what objects.yaml says of it"),
+          "hash of the mesh file and of its entries in objects.yaml"),
     Field("scale", "", "float64", "m", "-", "metres per unit of length of the mesh file"),
     Field("up", "", "str", "-", "-", "axis of the mesh file that is +z of the object"),
     Field("mass", "", "float64", "kg", "-", "mass"),
-    Field("density", "", "float64", "kg/m^3", "-", "mass over volume"),
+    Field("density", "", "float64", "kg/m^3", "-", "mass divided by volume"),
     Field("friction", "", "float64", "-", "-",
-          "its own coefficient with hand and table; NaN: those of the configuration"),
+          "the object's own coefficient with hand and table; NaN if those of the configuration "
+          "apply"),
     Field("collision_error", "", "float64", "m", "-",
           "largest distance between mesh and collision surface"),
-    Field("combinations", "", "int64", "-", "-", "combinations of rotations that were considered"),
+    Field("combinations", "", "int64", "-", "-", "number of combinations of rotations"),
     Field("valid", "", "int64", "-", "-",
-          "those above the table whose palm ray meets the bounding box"),
-    Field("distinct", "", "int64", "-", "-", "different palm poses among the valid ones"),
-    Field("candidates", "", "int64", "-", "-", "palm poses drawn from the different ones"),
+          "number of combinations above the table whose palm ray meets the bounding box"),
+    Field("distinct", "", "int64", "-", "-", "number of distinct palm poses among them"),
+    Field("candidates", "", "int64", "-", "-", "number of palm poses drawn from the distinct ones"),
 )
 
 #: A row per predicted grasp, in the order of the input, in `/grasps` of the results of
@@ -630,41 +639,43 @@ OBJECT_FIELDS: tuple[Field, ...] = (
 #: are NaN, 0, false or empty. Palm, joints, contacts and lift are those of the first wrist pose.
 VERIFICATION_FIELDS: tuple[Field, ...] = (
     Field("object", "", "str", "-", "-", "name of the object", of="placed.model.name"),
-    Field("method", "", "str", "-", "-", "how it was verified: hand, forces alone, or posture",
+    Field("method", "", "str", "-", "-", "method of verification: hand, forces, or posture",
           of="method"),
     _verdict("outcome", [outcome for outcome in Outcome if not outcome.dataset_only]),
     Field("success", "", "bool", "-", "-",
           "whether the first wrist pose holds, with each contact within verify.max_contact_error "
-          "of the one asked for", of="success"),
-    Field("held", "", "bool", "-", "-", "whether the first wrist pose holds, wherever", of="held"),
+          "of the requested contact", of="success"),
+    Field("held", "", "bool", "-", "-",
+          "whether the first wrist pose holds, wherever the contacts are", of="held"),
     *(replace(field, of=field.name) for field in _WORDS),
     Field("sample", "", "bool", "-", "-",
-          "whether it passes the filters of a dataset, but for those that need images or other "
-          "grasps", of="sample"),
+          "whether the grasp passes the filters of a dataset, except filters that need images or "
+          "other grasps", of="sample"),
     Field("removal", "", "uint8", "-", "-",
-          f"first filter that removes a grasp that is held: {_labels(list(Removal))}",
+          f"first filter that removes a held grasp: {_labels(list(Removal))}",
           stage=Stage.LIFTED, of="removal"),
     Field("held_any", "", "bool", "-", "-",
-          "whether any of the wrist poses that were tried holds: an oracle's choice",
+          "whether any of the tried wrist poses holds: the choice of an oracle",
           of="held_any"),
     Field("confidence", "", "float64", "-", "-",
-          "what the file of the grasps states; NaN: nothing", of="confidence",
+          "confidence that the file of the grasps states; NaN if it states none", of="confidence",
           shown=Shown("confidence", digits=3)),
     Field("rank", "", "int64", "-", "-",
-          "rank by confidence among those for the same row, or of the same object without rows, 0 "
-          "for the best; -1 where none is stated", of="rank"),
-    Field("reason", "", "str", "-", "-", "why, in words", of="reason"),
+          "rank by confidence among the grasps for the same row, or without rows for the same "
+          "object; 0 for the best, -1 if the file states no confidence", of="rank"),
+    Field("reason", "", "str", "-", "-", "reason of the outcome, in words", of="reason"),
     Field("hints", "", "str", "-", "-",
-          "what would make a grasp that fails fit much better, in words", of="hint_text"),
+          "changes with which a failed grasp would fit much better, in words", of="hint_text"),
     *_measured(
         "placed",
         _X_TO,
         Field("X_TO_simulated", "12", "float64", "m, -", "T",
-              "pose at which it is simulated: moved on the table and turned about its normal"),
+              "pose of the object in the simulation: moved on the table and rotated about its "
+              "normal"),
     ),
     Field("p_OQ", "k 3", "float64", "m", "O",
-          "contact points that were tried; NaN in an invalid row", of="p_OQ"),
-    Field("nhat_Q_O", "k 3", "float64", "-", "O", "their unit normals out of the object",
+          "contact points of the tried grasp; NaN in an invalid row", of="p_OQ"),
+    Field("nhat_Q_O", "k 3", "float64", "-", "O", "outward unit normals of the tried grasp",
           of="nhat_Q_O"),
     Field("normalised", "", "bool", "-", "-",
           "whether a predicted normal was not of unit length", of="normalised"),
@@ -678,25 +689,27 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
           of="epsilon",
           shown=Shown("epsilon of the asked contacts", digits=3)),
     Field("smallest_friction", "", "float64", "-", "-",
-          "least friction coefficient at which forces within the hand's limit at the predicted "
-          "contacts hold the object; inf if none does", of="smallest_friction",
+          "smallest friction coefficient at which forces within the hand's limits at the "
+          "predicted contacts hold the object; inf if there is none", of="smallest_friction",
           shown=Shown("least friction at the asked contacts", digits=2)),
     *_measured(
         "pregrasp",
-        Field("X_OG", "12", "float64", "m, -", "O", "pose of the palm that was found, or given"),
+        Field("X_OG", "12", "float64", "m, -", "O", "fitted or given pose of the palm"),
         _SPREAD,
     ),
     Field("closing", "k", "float64", "rad or m", "-",
           "closing positions at which the fingertips meet the predicted points",
           of="fit.closing"),
     Field("fit_residual", "k", "float64", "m", "-",
-          "distance of the predicted points from the fingertips then", of="fit.residual",
+          "distance of the predicted points from the fingertips at these positions",
+          of="fit.residual",
           shown=Shown("asked to fingertip of the fit", "mm")),
     Field("fit_normal_error", "k", "float64", "rad", "-",
-          "angle between the fingertips' and the predicted normals then", of="fit.normal_error",
+          "angle between the fingertips' and the predicted normals at these positions",
+          of="fit.normal_error",
           shown=Shown("asked normal to pad of the fit", "°")),
     Field("solver_status", "", "int16", "-", "-",
-          "exit mode of SLSQP, 0 for success; -1 where it was not asked", of="solver_status"),
+          "exit mode of SLSQP, 0 for success; -1 if SLSQP was not used", of="solver_status"),
     Field("solver_iterations", "", "uint16", "-", "-", "iterations of SLSQP", of="fit.iterations"),
     Field("tries", "", "uint16", "-", "-", "number of wrist poses that were tried",
           of="num_tries",
@@ -708,11 +721,11 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
         _TIME_CLOSE,
         *_CLOSED,
         Field("contact_error", "k", "float64", "m", "-",
-              "distance of the contact points after closing from those asked for; NaN for a "
+              "distance of the contact points after closing from the requested ones; NaN for a "
               "fingertip that does not touch", per_finger=True, of="contact_error",
               shown=Shown("asked to reached", "mm")),
         Field("normal_error", "k", "float64", "rad", "-",
-              "angle of the normals after closing from those asked for", per_finger=True,
+              "angle between the normals after closing and the requested ones", per_finger=True,
               of="normal_error",
               shown=Shown("asked to reached normal", "°")),
     ),
@@ -721,33 +734,35 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
         _TIME_LIFT,
         *_LIFTED,
         Field("X_TO_lifted", "12", "float64", "m, -", "T",
-              "pose of the object after the lift, which began at X_TO_simulated",
+              "pose of the object after the lift, which starts at X_TO_simulated",
               of="trial.lift.X_TO"),
         *_SLIP,
     ),
     *_measured(
         "forces",
         Field("planned_force", "", "float64", "N", "-",
-              "method forces: normal force of the finger that is loaded hardest for its strength; "
-              "inf if no forces carry the object"),
+              "method forces: normal force of the finger with the largest load relative to its "
+              "strength; inf if no forces can lift the object"),
         Field("planned_share", "", "float64", "-", "-",
-              "method forces: share of that finger's strength, as small as the lift allows; above "
-              "1 it fails"),
+              "method forces: smallest possible load of that finger, as a fraction of its "
+              "strength; above 1 the grasp fails"),
     ),
     Field("points_share", "", "float64", "-", "-",
-          "method forces: that share where each contact is a point", of="forces.points.share"),
+          "method forces: this fraction if each contact is a point", of="forces.points.share"),
     Field("patches_share", "", "float64", "-", "-",
-          "method forces: that share where each contact is a patch", of="forces.patches.share"),
+          "method forces: this fraction if each contact is a patch", of="forces.patches.share"),
     Field("selected_p_OQ", "k 3", "float64", "m", "O",
           "method forces: points of the surface that the predicted contacts select",
           of="forces.contacts.p_OQ"),
     Field("selected_nhat_Q_O", "k 3", "float64", "-", "O",
-          "method forces: the surface's own normals there", of="forces.contacts.nhat_Q_O"),
+          "method forces: normals of the surface at the selected points",
+          of="forces.contacts.nhat_Q_O"),
     Field("selected_distance", "k", "float64", "m", "-",
-          "method forces: distance of the predicted points from them",
+          "method forces: distance of the predicted points from the selected ones",
           of="forces.contacts.distance"),
     Field("selected_angle", "k", "float64", "rad", "-",
-          "method forces: angle of the predicted normals from them", of="forces.contacts.angle"),
+          "method forces: angle between predicted and selected normals",
+          of="forces.contacts.angle"),
 )
 
 #: Kinds of views in `/views` of scenes.hdf5.
@@ -765,14 +780,15 @@ SCENE_FIELDS: tuple[Field, ...] = (
           "`split.by` is", limits=(0, len(SPLITS) - 1)),
     Field("object", "o", "int32", "-", "-", "rows of /objects"),
     Field("resting", "o", "uint8", "-", "-", "indices of the objects' resting poses"),
-    Field("probability", "o", "float64", "-", "-", "shares of the drops that ended in them"),
+    Field("probability", "o", "float64", "-", "-", "fractions of the drops that ended in them"),
     Field("X_TO", "o 12", "float64", "m, -", "T",
-          "poses of the objects: resting poses, turned about Tz and moved on the table"),
-    Field("mass", "o", "float64", "kg", "-", "masses; what was drawn for an attempt may differ"),
+          "poses of the objects: resting poses, rotated about Tz and moved on the table"),
+    Field("mass", "o", "float64", "kg", "-",
+          "masses of the objects; the mass drawn for an attempt may differ"),
     Field("friction_hand", "o", "float64", "-", "-",
-          "effective coefficients of friction between hand and objects, likewise"),
+          "effective coefficients of friction between hand and objects; may differ in attempts"),
     Field("friction_table", "o", "float64", "-", "-",
-          "effective coefficients of friction between table and objects, likewise"),
+          "effective coefficients of friction between table and objects; may differ in attempts"),
 )
 
 #: A row per camera and scene, in `/views` of scenes.hdf5.
@@ -782,9 +798,9 @@ VIEW_FIELDS: tuple[Field, ...] = (
           f"the camera: {', '.join(f'{i} {name}' for i, name in enumerate(VIEW_KINDS))}"),
     Field("rgb", "h w 3", "uint8", "-", "C", "colours", sample=True),
     Field("depth", "h w", "uint16", "0.1 mm", "C",
-          "clean depth; 0 where there is nothing between `near` and `far`", sample=True),
+          "depth without noise; 0 where nothing is between `near` and `far`", sample=True),
     Field("mask", "h w", "uint8", "-", "C",
-          "1 + index in the scene of the object that is seen, 0 everywhere else", sample=True),
+          "1 + index of the visible object in the scene, 0 elsewhere", sample=True),
     Field("K", "9", "float64", "px", "-", "camera matrix, 3x3 row-major"),
     Field("X_TC", "12", "float64", "m, -", "T", "pose of the camera"),
     *(replace(field, optional=False) for field in CONDITION_FIELDS
@@ -795,21 +811,22 @@ VIEW_FIELDS: tuple[Field, ...] = (
 #: A row per closed hand, in `/grasps` of scenes.hdf5; the grasps of a scene are consecutive.
 SCENE_GRASP_FIELDS: tuple[Field, ...] = (
     Field("scene", "", "int32", "-", "-", "row of /scenes"),
-    Field("object", "", "uint8", "-", "-", "index in the scene of the object that is grasped"),
+    Field("object", "", "uint8", "-", "-", "index of the grasped object in the scene"),
     Field("trial_id", "", "int64", "-", "-", "row of trials.hdf5"),
     Field("outcome", "", "uint8", "-", "-", "verdict, see /trials"),
     Field("tested", "", "bool", "-", "-",
-          "whether the hand was lifted to a verdict; else whether it would hold is unknown"),
-    Field("held", "", "bool", "-", "-", "whether it holds"),
+          "whether the hand was lifted to a verdict; if not, it is unknown whether it would hold"),
+    Field("held", "", "bool", "-", "-", "whether the grasp holds"),
     *_WORDS,
-    Field("sample", "", "bool", "-", "-", "whether it is a sample of the dataset"),
+    Field("sample", "", "bool", "-", "-", "whether the grasp is a sample of the dataset"),
     Field("audited", "", "bool", "-", "-",
-          "whether it was lifted whatever its chance: such hands are a fair sample of those "
-          "that may lift", of="audited"),
+          "whether the hand was lifted whatever its predicted probability: such hands are an "
+          "unbiased sample of the hands that may lift", of="audited"),
     Field("source", "", "uint8", "-", "-", "sampler of the palm pose, see /trials", of="source"),
     Field("family", "", "int32", "-", "-",
-          "number of the first-round attempt that it was refined from or is, within the scene"),
-    Field("weight", "", "float32", "-", "-", "weight of a sample, see /train; 0 of others"),
+          "number, within the scene, of the first-round attempt from which the grasp was refined, "
+          "or of the grasp itself"),
+    Field("weight", "", "float32", "-", "-", "weight of a sample, see /train; 0 for other grasps"),
     *(replace(field, of=field.name) for field in HOLD_FIELDS),
     *_PRESHAPE,
     Field("X_TG", "12", "float32", "m, -", "T", "pose of the palm at the start and while closing"),
@@ -838,8 +855,8 @@ VISIBLE_FIELDS: tuple[Field, ...] = (
     Field("view", "", "int32", "-", "-", "row of /views"),
     Field("grasp", "", "int32", "-", "-", "row of /grasps"),
     Field("visible", "k", "bool", "-", "-",
-          "whether the camera sees the contact after closing: neither object nor table is before "
-          "it, and it is in the image"),
+          "whether the camera sees the contact after closing: the contact is in the image, and "
+          "neither object nor table hides it"),
 )
 
 #: A row per object, in `/objects` of scenes.hdf5.
@@ -853,7 +870,7 @@ SCENE_OBJECT_FIELDS: tuple[Field, ...] = (
 
 #: A row per predicted grasp, in `/rows` of the results for rows of a dataset.
 PREDICTED_ROW_FIELDS: tuple[Field, ...] = (
-    Field("row", "", "int64", "-", "-", "row of the dataset's split that the grasp is for"),
+    Field("row", "", "int64", "-", "-", "row of the dataset's split to which the grasp belongs"),
     Field("trial_id", "", "int64", "-", "-", "row of trials.hdf5 of the same sample"),
 )
 # fmt: on

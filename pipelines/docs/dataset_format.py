@@ -207,9 +207,10 @@ in `_deg` are in degrees; all other values are as in the table, in its units.
 """
 
 _SHARDS = """
-`/trials` as above without `trial_id` and `object`, and `/looks` with one row per success:
+## Shards
 
-`/trials` as above without `trial_id` and `object`, and `/looks` with a row per success:
+A shard has `/trials` as above without `trial_id` and `object`, and `/looks` with one row per
+success:
 """
 
 
