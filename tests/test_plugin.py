@@ -122,11 +122,15 @@ def test_hand_is_used_by_its_name() -> None:
     assert load_config("paper", ["hand=jaw"]).candidates.standoffs == (0.01, 0.02)
 
 
+def test_cluster_is_found_and_says_what_it_does_not_take() -> None:
+    with pytest.raises(ConfigError, match="--workers must not be given with --cluster half"):
+        cluster_of("half", workers=3)
+
+
+@pytest.mark.nightly
 @pytest.mark.cluster
 def test_cluster_starts_its_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.cpu_count", lambda: 2)
-    with pytest.raises(ConfigError, match="--workers must not be given with --cluster half"):
-        cluster_of("half", workers=3)
     with cluster_of("half").connected(tmp_path) as client:
         client.wait_for_workers(1)
         assert len(client.nthreads()) == 1

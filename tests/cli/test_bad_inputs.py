@@ -231,7 +231,7 @@ def test_files(base: Path, tmp_path: Path, file: str, command: str) -> None:
     kinds, commands = FILES[file]
     k = commands.index(command)
     # The whole dataset is checked for each.
-    share = 80 if command == "check" else 40 if k else 10
+    share = 160 if command == "check" else 80 if k else 10
     walk(base, tmp_path, file, kinds[k % share :: share], command)
 
 
@@ -347,9 +347,10 @@ def test_predictions(base: Path, tmp_path: Path, suffix: str) -> None:
     walk_file(base, tmp_path, sound, suffix, kinds, command, "rows", "contact points")
 
 
-def test_cameras(base: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("share", [4, in_second_tier(1)])
+def test_cameras(base: Path, tmp_path: Path, share: int) -> None:
     np.save(tmp_path / "grasp.npy", array_kinds.GRASP)
-    sound, kinds = _npy(tmp_path, np.eye(4)), array_kinds.CAMERA_NPY
+    sound, kinds = _npy(tmp_path, np.eye(4)), array_kinds.CAMERA_NPY[::share]
     command = "verify {tmp}/grasp.npy --object {mesh} --frame camera --camera {file}"
     command += " --out {to}/verdicts --workers 1 --quiet"
     walk_file(base, tmp_path, sound, ".npy", kinds, command, "X_TC", "contact points")

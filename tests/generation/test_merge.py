@@ -201,21 +201,16 @@ def test_of_an_object_that_was_tried_for_longer_all_is_taken(
     assert_same_arrays(tmp_path / "into" / TRIALS, sound / TRIALS)
 
 
-def test_rejections_stay(sound: Path, other: Path, tmp_path: Path) -> None:
-    second = Path(shutil.copytree(other, tmp_path / "second"))
-    assemble(second, rejected=[AttemptKey(NAMES[0], 0, 0)])
-    merge(tmp_path / "into", [sound, second])
-    assert read_manifest(tmp_path / "into").rejected == (AttemptKey(f"{NAMES[0]}-seed-1", 0, 0),)
-    assert check_dataset(tmp_path / "into") == []
-
-
-def test_images_of_each_seed_are_inspected(sound: Path, other: Path, tmp_path: Path) -> None:
+def test_rejections_stay_and_are_inspected(sound: Path, other: Path, tmp_path: Path) -> None:
     """Of a removed success, the image is in the shard, which has the hash of its own seed."""
     second = Path(shutil.copytree(other, tmp_path / "second"))
     assemble(second, rejected=[AttemptKey(NAMES[0], 0, 0)])
     merge(tmp_path / "into", [sound, second])
+    key = AttemptKey(f"{NAMES[0]}-seed-1", 0, 0)
+    assert read_manifest(tmp_path / "into").rejected == (key,)
+    assert check_dataset(tmp_path / "into") == []
     state = Catalog(tmp_path / "into").current()
-    place = state.find_key(AttemptKey(f"{NAMES[0]}-seed-1", 0, 0))
+    place = state.find_key(key)
     assert place is not None
     assert state.table.held[place]
     assert read_look(state, place, "oto") is not None
