@@ -16,6 +16,7 @@ from helpers.datasets import OTO
 
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.remote import CACHE_VARIABLE, local_file
+from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.errors import DataError, MachineError
 
 ADDRESS = f"memory://bucket/data/{OTO}"
@@ -86,6 +87,7 @@ def test_a_download_that_breaks_off_leaves_nothing(
     assert downloads(cache) == []
 
 
+@pytest.mark.parametrize("read", [GraspDataset, SceneDataset])
 @pytest.mark.parametrize(
     ("address", "message"),
     [
@@ -94,9 +96,14 @@ def test_a_download_that_breaks_off_leaves_nothing(
         ("nothing://bucket/a.hdf5", "Protocol not known"),
     ],
 )
-def test_what_is_no_file_is_refused(store: MemoryFileSystem, address: str, message: str) -> None:
+def test_what_is_no_file_is_refused(
+    store: MemoryFileSystem,
+    address: str,
+    message: str,
+    read: type[GraspDataset] | type[SceneDataset],
+) -> None:
     with pytest.raises(DataError, match=message):
-        GraspDataset(address)
+        read(address)
 
 
 def test_a_missing_package_is_named_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -59,6 +59,16 @@ def test_a_file_of_its_datasets_is_read_in_its_gripper_frame(tmp_path: Path) -> 
     np.testing.assert_allclose(table.X_FG, X_MA, atol=1e-12)
 
 
+def test_in_the_frame_of_the_object_a_scale_of_one_is_any(tmp_path: Path) -> None:
+    """Exported meshes are in metres, and so are poses on them, whatever unit the sources had."""
+    for scale, known in ((1, np.nan), (0.5, 0.5)):
+        thing = {"file": "mug.obj", "scale": scale}
+        path = write_json(tmp_path / "a.json", object=thing)
+        table = read_attempts(path, FRANKA, read_as={"frame": "object"})
+        np.testing.assert_array_equal(table.scale, [known] * 2)
+        np.testing.assert_array_equal(read_attempts(path, FRANKA).scale, [scale] * 2)
+
+
 def test_its_predictions_of_many_objects_are_read(tmp_path: Path) -> None:
     path = write_hdf5(tmp_path / "a.h5")
     assert holds_postures(path) and not has_rows(path)
