@@ -113,7 +113,7 @@ def test_examples_in_help_texts_are_taken(sound: Path, tmp_path: Path) -> None:
     for name, words in (
         ("assemble", [out]),
         ("merge", [tmp_path / "into", sound]),
-        ("scenes", [out]),
+        ("scenes", [out, "--set", "scenes.width=64", "--set", "scenes.height=48"]),
     ):
         result = run(name, *words, "--set", found[name])
         assert result.exit_code == 0, result.output

@@ -32,6 +32,7 @@ from drakegrasp.dataset.statistics import (
     why_no_sample,
 )
 from drakegrasp.dataset.trials import NONE
+from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
@@ -90,8 +91,16 @@ def test_attempts_of_the_first_round_are_counted_by_preshape(out: Path, tmp_path
     assert refined == PreshapeCount("pair", 2, 1, 1, 1, 2)
 
 
-def test_samples_are_as_many_wherever_they_are_counted(out: Path, tmp_path: Path) -> None:
+def test_samples_are_as_many_wherever_they_are_counted(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Two of the first object's and one of the third's are refined."""
+
+    def leave_out(*_: object) -> None:
+        raise DataError("it counts no samples")
+
+    for name in ("_phases", "_approaches", "_classes", "_distributions"):
+        monkeypatch.setattr(f"drakegrasp.pictures.figures.{name}", leave_out)
     with h5py.File(out / TRIALS) as file:
         rows, objects = file["successes/trial_id"][:], file["trials/object"][:]
     for row in (*rows[objects[rows] == 0][:2], rows[objects[rows] == 2][0]):
