@@ -67,13 +67,12 @@ def find(kind: Kind, name: str) -> Any:
     """
     entry = _entry(kind, name)
     package = "drakegrasp" if entry.dist is None else entry.dist.name
-    whose = "" if entry.dist is None else f" of the package {package}"
+    whose = "" if package == "drakegrasp" else f" of the package {package}"
     try:
         return entry.load()
     except ModuleNotFoundError as error:
         extra = "".join(f": pip install '{package}[{extra}]'" for extra in entry.extras)
-        needs = whose and f" for {name}{whose}"
-        raise MachineError(f"{error.name} must be installed{needs}{extra}") from None
+        raise MachineError(f"{error.name} must be installed for {name}{whose}{extra}") from None
     except (Exception, SystemExit) as error:
         got = f"{type(error).__name__} ({one_line(error)})"
         raise ConfigError(
@@ -81,12 +80,12 @@ def find(kind: Kind, name: str) -> Any:
         ) from error
 
 
-def summary(kind: Kind, name: str) -> str:
-    """Return the constant `HELP` of the module of a name, without loading the module."""
+def summary(kind: Kind, name: str, constant: str = "HELP") -> str:
+    """Return a text of the module of a name, without loading the module; empty if it has none."""
     spec = util.find_spec(_entry(kind, name).module)
     text = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
     for node in ast.parse(text).body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "HELP":
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == constant:
             return str(ast.literal_eval(node.value))
     return ""
 

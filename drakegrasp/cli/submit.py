@@ -27,12 +27,14 @@ _ALONE = ("--dry-run", "--tls")
 
 @click.command(cls=OneCommand, context_settings={"help_option_names": ["-h", "--help"]})
 @described
+@click.option("--address", hidden=True, help="An older name of --scheduler.")
 @click.argument("where", nargs=-1, metavar="[HOST...|ADDRESS|PATH]")
 def submit(
     where: tuple[str, ...],
     times: Path | None,
+    address: str | None,
     kind: Annotated[str, Named("clusters")] = "local",
-    address: str | None = None,
+    scheduler: str | None = None,
     workers: int | None = None,
     cores: int | None = None,
     memory: str | None = None,
@@ -48,9 +50,9 @@ def submit(
 
     \b
         drakegrasp submit --cluster local OPTIONS
-        drakegrasp submit --cluster ssh node1 node2 --cores 16 OPTIONS
-        drakegrasp submit --cluster slurm --workers 200 OPTIONS
-        drakegrasp submit --address tls://10.0.0.1:8786 OPTIONS
+        drakegrasp submit --cluster ssh a b --cores 16 --interface eth0 OPTIONS
+        drakegrasp submit --cluster slurm --workers 200 --interface ib0 OPTIONS
+        drakegrasp submit --scheduler tls://10.0.0.1:8786 OPTIONS
 
     The command first prints what will run and the expected duration; with --dry-run it stops then.
     The same command continues an interrupted build, on any cluster. See docs/how-to/clusters.md for
@@ -60,7 +62,7 @@ def submit(
         --cluster KIND (kind): Where the work runs: local, ssh, slurm, pbs, lsf, sge, htcondor, oar,
             kubernetes, scheduler, scheduler-file, or a kind of another package. Hosts follow ssh,
             an address follows scheduler, and a path follows scheduler-file.
-        --address ADDRESS: Use the running Dask scheduler at this address, instead.
+        --scheduler ADDRESS: Use the running Dask scheduler at this address, instead.
         BUILD
         --workers N: Total number of processes. [default with local: one per core]
         --cores N: Number of cores of each SSH host or job, with a worker on each core.
@@ -75,19 +77,25 @@ def submit(
         --script FILE: Only write the script of a job, or the manifest of kubernetes.
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.api.building import build_on, find_sources
-    from drakegrasp.cluster.kinds import cluster_of, describe, present
+    from drakegrasp.cluster.kinds import AddressMissingError, cluster_of, describe, present
     from drakegrasp.exchange.attempts import read_attempts
     from drakegrasp.hand.description import load_hand
 
-    if address is not None:
+    if (running_at := scheduler or address) is not None:
         if kind != "local" or where:
-            raise click.UsageError("--address must be used without --cluster")
-        kind, where = "scheduler", (address,)
+            raise click.UsageError("--scheduler must be used without --cluster")
+        kind, where = "scheduler", (running_at,)
     given = dict(workers=workers, cores=cores, memory=memory, walltime=walltime)
     given |= dict(interface=interface, host=host)
     tls = chosen_tls(options)
     request = parse_request(options)
-    cluster = cluster_of(kind, own, where=where, **given, **tls)
+    try:
+        cluster = cluster_of(kind, own, where=where, **given, **tls)
+    except AddressMissingError as error:
+        if not dry_run:
+            raise
+        cluster = cluster_of(kind, own, where=where, **given | {"interface": "NAME"}, **tls)
+        say(f"note: {error}")
 
     # Print what will run before anything starts.
     say("\n".join(describe(cluster)))

@@ -328,7 +328,9 @@ def verdict_table(results: Sequence[Verification]) -> Table:
     ended += [row(o.label, counts[o], not o.inconclusive) for o in others]
     more = [row(words, sum(getattr(r, n) for r in results)) for n, words in _VERDICTS.items()]
     total = ["all", _count(len(results)), ""]
-    return make_table("Verdicts", ("outcome", "grasps", "share"), ended, [total], more)
+    table = make_table("Verdicts", ("outcome", "grasps", "share"), ended, [total], more)
+    table.columns[0].max_width = None  # our own labels, which are whole
+    return table
 
 
 #: Labels in a table for the attributes of a verdict.
@@ -385,7 +387,9 @@ def score_table(card: Mapping[str, Any], seconds: Mapping[str, float]) -> Table:
     names = [name for name in card["measures"] if name != "headline"]
     protocol = card["settings"].get("protocol")
     counts = "Sample" if protocol is None else f"By {protocol['protocol']}"
-    title = f"{counts}, success@1, first wrist pose, mean over {card['objects']} objects [%]"
+    objects = counted(card["objects"], "object")
+    title = f"{counts}, success@1, first wrist pose, mean over {objects} [%]"
+    drawn = card["intervals"]["drawn"]
     timed = ["s per\nverdict"] * (protocol is None)
 
     def row(name: str, values: Mapping[str, Mapping[str, float]]) -> list[str]:
@@ -396,7 +400,7 @@ def score_table(card: Mapping[str, Any], seconds: Mapping[str, float]) -> Table:
 
     heads = ("set", "headline", "95 %\ninterval", *names, *timed)
     rows = (row(name, each["measures"]) for name, each in card["sets"].items())
-    return make_table(title, heads, rows)
+    return make_table(title, heads, rows, caption=f"intervals: bootstrap over {drawn}")
 
 
 def make_console(*, stderr: bool = False) -> Console:

@@ -170,8 +170,9 @@ def export(
     if directory is None:
         directory = out / f"export_{form}"
         refuse_link(directory)
-    with progress_bar("export", "sample", show=not quiet) as progress:
+    counts = registry.summary("exporters", form, "COUNTS") or "sample"
+    with progress_bar("export", f"{counts}s", show=not quiet) as progress:
         count = export_dataset(out, directory, form, publication=publication, progress=progress)
-    say(f"{counted(count, 'sample')} in {directory}")
+    say(f"{counted(count, counts)} in {directory}")
     if publishes and (missing := not_said(publication)):
         say(f"before it is published, --about should say: {', '.join(missing)}")

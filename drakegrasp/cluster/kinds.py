@@ -43,6 +43,10 @@ REMOTE = ("workers", "cores", "memory", "host", "interface")
 MOST_MEMORY = 10**15
 
 
+class AddressMissingError(ConfigError):
+    """Nothing says where a scheduler of workers on other machines listens."""
+
+
 @dataclass(kw_only=True)
 class Local:
     """Workers on this machine, as on the command line; the base of all kinds.
@@ -179,7 +183,7 @@ class Remote(Local):
         """Return the options that say where a scheduler listens; none if the user's settings do.
 
         Raises:
-            ConfigError: If it is not said where to listen.
+            AddressMissingError: If it is not said where to listen.
         """
         for name in ("host", "interface"):
             if (value := getattr(self, name)) is not None:
@@ -188,7 +192,7 @@ class Remote(Local):
             return {"host": LOOPBACK}
         if self.listens():
             return {}
-        raise ConfigError(
+        raise AddressMissingError(
             "--interface NAME or --host ADDRESS must be given for workers on other machines: "
             "without, the scheduler listens to this machine only"
         )

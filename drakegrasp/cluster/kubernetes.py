@@ -103,7 +103,7 @@ class Kubernetes(Local):
     def client_options(self) -> list[str]:
         """Return the options of a client in a pod that has the secret where the workers have it."""
         tls = [word for k, file in FILES.items() for word in (f"--tls-{k}", f"{KEYS}/{file}")]
-        return ["--address", self.address, *(tls if self.tls else ())]
+        return ["--scheduler", self.address, *(tls if self.tls else ())]
 
     def submission(self) -> str:
         """Return the command that takes the manifest."""
@@ -196,4 +196,4 @@ class Kubernetes(Local):
         Raises:
             MachineError: Always.
         """
-        raise MachineError(f"kubectl must start the workers; then give --address {self.address}")
+        raise MachineError(f"kubectl must start the workers; then give --scheduler {self.address}")

@@ -128,7 +128,7 @@ def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> 
         if drive != "torque":
             return judge(name, [], text)
         free = run_attempt(scene, X_TO, pregrasp, config)
-        text += f", {_slip(free)} with its own, which are pushed open"
+        text += f", and {_slip(free)} with fingers that motors of its own strength keep closed"
         ok = _stays(free, config) or not LINES[line]
         return judge(name, [] if ok else [f"{text}: {_SOFT}"], text)
 

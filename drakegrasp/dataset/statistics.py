@@ -303,12 +303,12 @@ def held_note(funnel: Funnel) -> str:
     if left:
         lifts, held, stable, samples = funnel.audited.sum(axis=0).tolist()
         # Before the files are assembled, it is unknown which successes are samples.
-        found = [f"{held:,} are held", f"{stable:,} stable"]
+        found = [f"{held:,} held", f"{stable:,} stable"]
         found += [counted(samples, "sample")] if funnel.removals.any() else []
         reasons.append(
             f"closed hands that were not lifted, as their chance of a sample is small or their "
             f"image too flat: {left:,}; "
-            f"of {lifts:,} that were lifted in any case {', '.join(found)}"
+            f"lifted in any case: {lifts:,}, of them {', '.join(found)}"
         )
     return f"the number of held grasps is a lower bound: {'; '.join(reasons)}" if reasons else ""
 
@@ -434,9 +434,9 @@ def why_no_sample(outcomes: AnyArray, removals: AnyArray, config: Config) -> Sho
     if most.inconclusive:
         return Shortfall(reason, "another machine or a simpler mesh: this says nothing of grasps")
     if by_stage[Stage.LIFTED] and most.stage is not Stage.LIFTED:
-        reason += f"; {by_stage[Stage.LIFTED]:,} were lifted, none held"
+        reason += f"; lifted: {by_stage[Stage.LIFTED]:,}, none held"
     elif by_stage[Stage.CLOSED] and most.stage is Stage.PLACED:
-        reason += f"; {by_stage[Stage.CLOSED]:,} closed, none lifted"
+        reason += f"; closed: {by_stage[Stage.CLOSED]:,}, none lifted"
     elif not by_stage[Stage.CLOSED] and not by_stage[Stage.LIFTED]:
         reason += "; the hand never closed on it"
     return Shortfall(reason, ways_to_grasps(config))

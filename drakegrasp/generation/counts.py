@@ -58,11 +58,12 @@ class Counts:
             units = {of[0].object_name: of for of in headers_by_object(manifest) if of}
             self.target = Target(manifest.config, units)
 
-        # Progress: attempts of the first round, all by outcome, and those that were there before.
+        # Progress: attempts, those of the first round, and those that were there before. Before the
+        # build only the number of the first round is known; refined ones come with the samples.
         self._pool, self._report = pool, report
         standoffs = len(manifest.config.candidates.standoffs)
         self._total = standoffs * sum(entry.candidates for entry in manifest.objects)
-        self._standoffs, self._done = standoffs, 0
+        self._standoffs, self._done, self._first = standoffs, 0, 0
         self._outcomes: Counter[Outcome] = Counter()
         self._reused_attempts = 0
 
@@ -95,9 +96,9 @@ class Counts:
         self._outcomes.update(outcomes)
         self._attempts[header.object_name] += sum(outcomes.values())
         self._ended[header.object_name] += sum(outcomes.get(outcome, 0) for outcome in ENDED)
-        first_round = self._standoffs * (header.stop - header.start)
-        self._done += first_round
-        self._reused_attempts += reused * first_round
+        self._first += self._standoffs * (header.stop - header.start)
+        self._done += sum(outcomes.values())
+        self._reused_attempts += reused * sum(outcomes.values())
         if self._max_grasps is not None:
             self._close_gap(header, grasps)
         self.show()
@@ -139,7 +140,9 @@ class Counts:
             enough = sum(min(found, self._each) for found in self._found.values())
             ends.append((enough, self._each * len(self._found)))
         made = [self._done * max(wanted / found, 1.0) for found, wanted in ends if found]
-        return min(self._total, *map(ceil, made)) if made else self._total
+        # What is left of the first round has as many refined attempts as what is done.
+        whole = -(-self._total * self._done // self._first) if self._first else self._total
+        return min([whole, *map(ceil, made)])
 
     def needs(self, header: ShardHeader) -> bool:
         """Return whether a unit's object has too few grasps in the units before the first gap."""

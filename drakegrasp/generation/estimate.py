@@ -41,6 +41,7 @@ class Plan:
     Attributes:
         objects: Number of objects.
         attempts: Number of attempts.
+        refined: Number of those that are refined, and so not known before.
         units: Number of work units.
         workers: Number of workers.
         stages: Wall clock of each stage: start, prepare, simulate, assemble [s].
@@ -51,6 +52,7 @@ class Plan:
 
     objects: int
     attempts: int
+    refined: int
     units: int
     workers: int
     stages: dict[str, float]
@@ -97,14 +99,15 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
     ranges = tuple(config.unit_ranges(config.candidates.max))
     units = objects * len(ranges)
     standoffs = len(config.candidates.standoffs)
-    attempts = objects * config.candidates.max * standoffs
+    first = objects * config.candidates.max * standoffs
+    attempts = first + (refined := round(first * _refined(config, times)))
     successes = attempts * times.successes
     samples = successes * times.samples
 
     # The mean attempt, and the scenes: all workers that share an object's units build its scene.
     attempt = times.attempt + times.successes * (times.look + _certify_seconds(config))
     scenes = objects * min(workers, len(ranges))
-    longest = standoffs * max(map(len, ranges)) * attempt
+    longest = standoffs * max(map(len, ranges)) * attempts / first * attempt
 
     # Assembling: a task for each object, then one for some rows each. Meanwhile one process puts
     # what is packed into the files.
@@ -114,6 +117,7 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
     return Plan(
         objects=objects,
         attempts=attempts,
+        refined=refined,
         units=units,
         workers=workers,
         stages={
@@ -143,7 +147,7 @@ def plan_request(
     Args:
         request: What is to be built.
         workers: Number of workers; one per core of this machine if None.
-        times: Of the stages; `MEASURED` if None.
+        times: Of the stages; those that were measured with a like configuration if None.
 
     Raises:
         MeshError: If there is no mesh, or `only` names no object.
@@ -157,15 +161,16 @@ def plan_request(
     refuse_unknown(request.only, names)
     objects = len(set(request.only or names))
     count = available_cores() if workers is None else workers
-    return plan_build(objects, request.config, count, times or MEASURED)
+    return plan_build(objects, request.config, count, times or measured_times(request.config))
 
 
 def plan_lines(plan: Plan) -> list[str]:
     """Return a plan as the lines that are printed."""
     stages = ", ".join(f"{name} {_duration(seconds)}" for name, seconds in plan.stages.items())
+    refined = f", of them about {plan.refined:,} refined" if plan.refined else ""
     return [
         f"from the beginning: {counted(plan.objects, 'object')}, "
-        f"{counted(plan.attempts, 'attempt')} in {counted(plan.units, 'work unit')}",
+        f"{counted(plan.attempts, 'attempt')} in {counted(plan.units, 'work unit')}{refined}",
         f"expected {_duration(plan.seconds)} on {counted(plan.workers, 'worker')} ({stages})",
         f"expected {plan.core_hours:,.2f} core-hours",
         f"expected {counted(plan.samples, 'sample')}, {_size(plan.bytes)} on disk",
@@ -176,6 +181,15 @@ def plan_lines(plan: Plan) -> list[str]:
 def _shared(tasks: int, workers: int, seconds: float) -> float:
     """Return how long workers take for tasks of equal length [s]; Dask limits their number."""
     return max(math.ceil(tasks / workers) * seconds, tasks * TASK_SECONDS)
+
+
+def _refined(config: Config, times: StageTimes) -> float:
+    """Return how many refined attempts an attempt of the first round leads to on average."""
+    total, born = 0.0, config.refine.children * times.parents
+    for _ in range(config.refine.generations):
+        total += born
+        born *= config.refine.children * times.refined_parents
+    return total
 
 
 def _certify_seconds(config: Config) -> float:
@@ -219,6 +233,9 @@ class StageTimes:
         sample_bytes: Of a row, in grasping_oto.hdf5 and grasping_otm.hdf5 together [B].
         object_bytes: Of an object's own files [B].
         source: Where the figures are from, for the reader.
+        parents: Share of the attempts of the first round that a configuration with refinement
+            refines.
+        refined_parents: The same of refined attempts.
     """
 
     prepare: NonNegative
@@ -236,6 +253,8 @@ class StageTimes:
     sample_bytes: NonNegative
     object_bytes: NonNegative
     source: str
+    parents: NonNegative = 0.005
+    refined_parents: NonNegative = 0.4
 
 
 #: By the log and the files of thirty G3DB meshes with 400 palm poses each (34,800 attempts, preset
@@ -259,6 +278,25 @@ MEASURED = StageTimes(
     object_bytes=215e3,
     source="measured on 30 G3DB meshes, preset paper; --times for those of your own",
 )
+
+
+#: By four built-in objects with 24 palm poses each (288 attempts, and 232 refined ones, preset
+#: `fast`, 2026-11-27); the time of an attempt by the builds of docs/results/yield.md. What is not
+#: named is as in `MEASURED`.
+FAST = replace(
+    MEASURED,
+    attempt=0.1,
+    successes=0.17,
+    samples=0.9,
+    parents=0.035,
+    refined_parents=0.24,
+    source="measured on 4 built-in objects, preset fast; --times for those of your own",
+)
+
+
+def measured_times(config: Config) -> StageTimes:
+    """Return the times that were measured with a preset like a configuration."""
+    return FAST if "above" in config.candidates.method else MEASURED
 
 
 def read_times(path: Path) -> StageTimes:
@@ -296,8 +334,8 @@ def _unit_of(event: dict[str, Any]) -> _Unit | None:
 def logged_times(out: Path, config: Config) -> StageTimes | None:
     """Return the mean times of a build's units so far, by its log, or None if none is done.
 
-    What a log does not say, e.g. the sizes of files, is as in `MEASURED`. The log has wall-clock
-    times: other work of the machines is in them.
+    What a log does not say, e.g. the sizes of files, is as in `measured_times`. The log has
+    wall-clock times: other work of the machines is in them.
 
     Args:
         out: Directory of the dataset.
@@ -306,7 +344,7 @@ def logged_times(out: Path, config: Config) -> StageTimes | None:
     # Add up the units of builds with this configuration.
     seconds: Counter[str] = Counter()
     outcomes: Counter[str] = Counter()
-    objects = set()
+    objects, base = set(), measured_times(config)
     ours = False
     for event in read_log(out):
         if event["event"] == "started":
@@ -321,9 +359,9 @@ def logged_times(out: Path, config: Config) -> StageTimes | None:
     if not attempts:
         return None
     return replace(
-        MEASURED,
+        base,
         attempt=(seconds["try"] + seconds["measure"] + seconds["write"]) / attempts,
-        look=seconds["look"] / successes if successes else MEASURED.look,
+        look=seconds["look"] / successes if successes else base.look,
         successes=successes / attempts,
         source=f"{counted(attempts, 'attempt')} of {counted(len(objects), 'object')} in "
         f"{out / LOG_FILE}",

@@ -21,7 +21,7 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import differences, read_manifest, same_results
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import DataError, MeshError
+from drakegrasp.errors import DataError, MeshError, listed
 from drakegrasp.foreign_files import read_json
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MANIFEST_NAME
@@ -90,7 +90,9 @@ def write_objects(
     items = {item.name: item for item in draw_builtin(config.builtin)}
     unknown = sorted(set(only) - items.keys())
     if unknown:
-        raise MeshError(f"only must be names of objects of {NAME}, got {unknown[0]!r}")
+        raise MeshError(
+            f"only must be names of objects of {NAME} ({listed(list(items))}), got {unknown[0]!r}"
+        )
     chosen = [item for name, item in items.items() if not only or name in only]
 
     # Write their meshes, and compare them with the published ones.

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from drakegrasp.errors import NAMED
+from drakegrasp.errors import NAMED, counted
 from drakegrasp.frames import Array
 from drakegrasp.scoring.measures import (
     COVER,
@@ -174,8 +174,8 @@ def _warnings(
     found = []
     if len(grouping.names) < FEW_OBJECTS:
         found.append(
-            f"only {len(grouping.names)} test objects: intervals of fewer than {FEW_OBJECTS} are "
-            "too narrow, and an order of methods may not last"
+            f"only {counted(len(grouping.names), 'test object')}: intervals of fewer than "
+            f"{FEW_OBJECTS} are too narrow, and an order of methods may not last"
         )
     if len(grouping.rows) < total:
         found.append(f"{len(grouping.rows)} of the {total} rows of the split were scored")
@@ -201,7 +201,8 @@ def card_text(card: Mapping[str, Any]) -> str:
     lines = ["# Score of predicted grasps", ""]
     for name, value in card["headline"].items():
         lines += [f"**{name}: {_interval(value)}** {counts}, success@1, first wrist pose, mean "
-                  f"over {card['objects']} objects ({card['rows']} rows).", ""]  # fmt: skip
+                  f"over {counted(card['objects'], 'object')} "
+                  f"({counted(card['rows'], 'row')}).", ""]  # fmt: skip
     lines += [f"> Warning: {warning}." for warning in card["warnings"]]
     lines += [""] if card["warnings"] else []
 

@@ -140,5 +140,5 @@ def test_command_writes_the_manifest_and_says_what_follows(
     *_, apply, client = result.stdout.splitlines()
     assert apply == f"kubectl apply -f {file}"
     address = "tls://drakegrasp-scheduler.default.svc.cluster.local:8786"
-    assert client.startswith(f"client: drakegrasp submit --address {address} --tls-ca-file ")
+    assert client.startswith(f"client: drakegrasp submit --scheduler {address} --tls-ca-file ")
     assert client.endswith("--out /data/out --objects builtin --seed=3")

@@ -84,6 +84,16 @@ def test_dry_run_says_what_would_run_and_makes_nothing(
     assert not out.exists()
 
 
+def test_a_dry_run_needs_no_address_of_the_scheduler(tmp_path: Path) -> None:
+    """It says that one is missing; without --dry-run that is an error."""
+    words = ["--cluster", "ssh", "a", "--cores", "2"]
+    said, refused = "--interface NAME or --host ADDRESS must be given", tmp_path / "out"
+    result = plan_only(refused, *words)
+    assert (result.exit_code, f"note: {said}" in result.stdout) == (0, True)
+    result = run("--objects", "builtin", "--out", refused, *words)
+    assert (result.exit_code, f"error: {said}" in result.stderr) == (2, True)
+
+
 def test_open_port_is_warned_of(tmp_path: Path) -> None:
     ssh = ["--cluster", "ssh", "a", "--cores", "1", "--host", "10.0.0.1"]
     said = plan_only(tmp_path / "out", *ssh, "--no-tls").stdout
@@ -134,11 +144,11 @@ def test_workers_elsewhere_need_a_certificate_unless_told_otherwise(
             "--workers must be --cores times the number of hosts, 8, or not be given, got 9",
         ),
         (["--cluster", "moab"], "error: Invalid value for '--cluster': 'moab' is not one of"),
-        (["--address", "tls://a:1", "--cluster", "ssh", "a"], "--address must be used without"),
+        (["--scheduler", "tls://a:1", "--cluster", "ssh", "a"], "--scheduler must be used without"),
+        (["--address", "tls://a:1", "--cluster", "ssh", "a"], "--scheduler must be used without"),
         (["--with", "image=x"], "--with must be left out for --cluster local, got 'image=x'"),
         (["--cluster", "kubernetes", "--with", "size=1"], "KEY one of image, claim, name, namesp"),
         (["--cluster", "kubernetes", "--workers", "2"], "--with image=NAME must be given"),
-        (["--cluster", "ssh", "a", "--cores", "2"], "--interface NAME or --host ADDRESS must be"),
         (["--cluster", "ssh", "me@a", "--cores", "2", "--host", "x"], "go into ~/.ssh/config"),
         (["--cluster", "scheduler"], "must be followed by its address"),
         (["--cluster", "scheduler", "tcp://a:1", "--workers", "2"], "--workers must not be given"),

@@ -63,7 +63,7 @@ def test_slip_of_fingers_that_are_pushed_open_is_told() -> None:
     locked, own = finding.text.split(" with fingers that are locked, ")
     assert "slips by 0.1" in locked
     assert own.startswith("slips by 6.")
-    assert own.endswith("with its own, which are pushed open")
+    assert own.endswith("with fingers that motors of its own strength keep closed")
 
 
 def test_trial_grasps_are_lifted_to_their_end(monkeypatch) -> None:

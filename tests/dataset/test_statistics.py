@@ -184,8 +184,8 @@ def test_objects_of_one_class_are_one_class(tmp_path: Path) -> None:
             "842 of 1,200 attempts (70%) end in start_collision, "
             f"{Outcome.START_COLLISION.text}; the hand never closed on it",
         ),
-        ({Outcome.SCREENED: 9, Outcome.HAND_CONTACT: 1}, {}, "; 1 closed, none lifted"),
-        ({Outcome.START_COLLISION: 9, Outcome.MOVED: 3}, {}, "; 3 were lifted, none held"),
+        ({Outcome.SCREENED: 9, Outcome.HAND_CONTACT: 1}, {}, "; closed: 1, none lifted"),
+        ({Outcome.START_COLLISION: 9, Outcome.MOVED: 3}, {}, "; lifted: 3, none held"),
         (
             {Outcome.DROPPED: 9, Outcome.SCREENED: 3},
             {},

@@ -22,6 +22,7 @@ from drakegrasp.generation.estimate import (
     MEASURED,
     START_SECONDS,
     logged_times,
+    measured_times,
     plan_build,
     plan_lines,
     read_times,
@@ -71,6 +72,20 @@ def test_certificates_cost_their_trials() -> None:
     certified = override_config(SMALL, ["certify.repeats=2"])
     seconds = [plan_build(1, c, 1, times).stages["simulate"] for c in (SMALL, certified)]
     assert seconds[1] - seconds[0] == pytest.approx(2 * (2 + 5) * CERTIFY_SECONDS)
+
+
+def test_refined_attempts_are_in_the_plan_of_a_preset_that_refines() -> None:
+    """Of a hundred attempts ten have four children, of which two have four, and so on."""
+    times = replace(EVEN, parents=0.1, refined_parents=0.05)
+    refining = override_config(SMALL, ["refine.children=4", "refine.generations=2"])
+    plan = plan_build(1, refining, 1, times)
+    assert (plan.attempts, plan.refined) == (300 + 120 + 24, 120 + 24)
+    assert plan.stages["simulate"] == pytest.approx(0.1 * plan.attempts)
+    assert ", of them about 144 refined" in plan_lines(plan)[0]
+
+    # A preset has the times that were measured with it.
+    assert "preset fast" in measured_times(load_config("fast")).source
+    assert "preset paper" in measured_times(load_config("paper")).source
 
 
 def test_a_plan_is_of_the_objects_that_are_named(tmp_path: Path) -> None:
