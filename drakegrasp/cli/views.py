@@ -138,6 +138,8 @@ def export(
     form: Annotated[str, Named("exporters")],
     licence: str | None = None,
     about: Path | None = None,
+    attempts: Annotated[str | None, click.Choice(["samples", "failed", "all"])] = None,
+    fps: Annotated[int | None, click.IntRange(1, 120)] = None,
 ) -> None:
     """Write the samples of a dataset in another format.
 
@@ -147,32 +149,40 @@ def export(
         --to (form): The format.
         --licence --license ID: Licence that the card of format hf names, e.g. cc-by-4.0.
         --about YAML: For format hf: name, version, url, creators, published, licence, citation.
+        --attempts WHICH: Of format lerobot: samples, failed (closed, and not held) or all of which
+            it is known whether they hold.  [default: samples]
+        --fps N: Frames per second of format lerobot.  [default: 10]
         --quiet
     """
     from drakegrasp.exchange.export import (
         Publication,
         export_dataset,
-        names_publishers,
         not_said,
+        options_of,
         read_publication,
     )
     from drakegrasp.foreign_files import refuse_link
 
-    # Data about the publishers; the option overrides the file.
-    publishes = names_publishers(form)
-    for option, value in (("--about", about), ("--licence", licence)):
-        if value and not publishes:
+    # What only some formats take; the option on publishers overrides the file.
+    known = options_of(form)
+    for option, value, name in (
+        *(("--about", about, "publication"), ("--licence", licence, "publication")),
+        *(("--attempts", attempts, "attempts"), ("--fps", fps, "fps")),
+    ):
+        if value and name not in known:
             raise click.UsageError(f"{option} must be left out with --to {form}, got {value}")
     publication = Publication() if about is None else read_publication(about)
     if licence:
         publication = publication.model_copy(update={"licence": licence})
+    given = {"publication": publication, "attempts": attempts, "fps": fps}
+    options = {name: given[name] for name in known if given.get(name)}
 
     if directory is None:
         directory = out / f"export_{form}"
         refuse_link(directory)
     counts = registry.summary("exporters", form, "COUNTS") or "sample"
     with progress_bar("export", f"{counts}s", show=not quiet) as progress:
-        count = export_dataset(out, directory, form, publication=publication, progress=progress)
+        count = export_dataset(out, directory, form, progress=progress, **options)
     say(f"{counted(count, counts)} in {directory}")
-    if publishes and (missing := not_said(publication)):
+    if "publication" in known and (missing := not_said(publication)):
         say(f"before it is published, --about should say: {', '.join(missing)}")

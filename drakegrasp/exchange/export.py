@@ -11,6 +11,7 @@ import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -90,8 +91,8 @@ def export_dataset(
     directory: str | Path,
     form: str,
     *,
-    publication: Publication | None = None,
     progress: Report = silent,
+    **options: Any,
 ) -> int:
     """Write the samples of a dataset in another format and return their number.
 
@@ -99,12 +100,13 @@ def export_dataset(
         out: Directory of the dataset.
         directory: Where to write; it must be new or empty, and appears when it is complete.
         form: The name of an exporter, see `drakegrasp.registry`.
-        publication: What the card and the metadata of format `hf` say of the publishers.
         progress: Called with the number of samples done and of all.
+        options: Of the format, see `options_of`, e.g. `publication` (a `Publication`) of format
+            `hf`: what its card and its metadata say of the publishers.
 
     Raises:
-        DataError: If there is no dataset, it is of another schema or has no samples, or the
-            directory holds something.
+        DataError: If there is no dataset, it is of another schema or has no samples, the directory
+            holds something, or an option is not one of the format.
         MachineError: If a package is missing that the format needs.
         OSError: If the disk is full; nothing is left behind.
     """
@@ -113,24 +115,25 @@ def export_dataset(
     if not registry.is_known("exporters", form):
         known = ", ".join(registry.names("exporters"))
         raise DataError(f"format must be one of {known}, got {form!r}")
+    for name, value in options.items():
+        if name not in options_of(form):
+            raise DataError(f"{name} must be left out with format {form}, got {value!r}")
     for path in DATA_FILES.values():
-        if not any(
-            len(GraspDataset(out / path, split=split, fewer_fingers=True)) for split in SPLITS
-        ):
+        found = [GraspDataset(out / path, split=split, fewer_fingers=True) for split in SPLITS]
+        if options.get("attempts", "samples") == "samples" and not any(map(len, found)):
             raise DataError(f"{out / path}: must have samples to export, got none")
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise DataError(f"{directory}: must be a new or empty directory, got one that holds files")
 
     write = registry.find("exporters", form)
-    told = {"publication": publication or Publication()} if names_publishers(form) else {}
     with atomic_folder(directory) as folder:
-        count: int = write(out, folder, progress, **told)
+        count: int = write(out, folder, progress, **options)
     return count
 
 
-def names_publishers(form: str) -> bool:
-    """Return whether an exporter takes a `Publication`."""
-    return "publication" in inspect.signature(registry.find("exporters", form)).parameters
+def options_of(form: str) -> tuple[str, ...]:
+    """Return the names of the options of an exporter: what it takes besides the first three."""
+    return tuple(inspect.signature(registry.find("exporters", form)).parameters)[3:]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -410,8 +410,16 @@ COLUMNS: Columns = IMAGES | {
 }
 
 
-def write_hub(out: Path, folder: Path, progress: Report, *, publication: Publication) -> int:
+def write_hub(
+    out: Path, folder: Path, progress: Report, *, publication: Publication | None = None
+) -> int:
     """Write the folder and return the number of samples; see `export.export_dataset`.
+
+    Args:
+        out: See `export.export_dataset`.
+        folder: See `export.export_dataset`.
+        progress: See `export.export_dataset`.
+        publication: What the card and the metadata say of the publishers.
 
     Raises:
         MachineError: If pyarrow is not installed.
@@ -424,6 +432,7 @@ def write_hub(out: Path, folder: Path, progress: Report, *, publication: Publica
         ) from None
 
     # The Parquet files of each camera and split, and those of scenes.
+    publication = publication or Publication()
     tables = [_sample_table(out, camera, split) for camera in CAMERAS for split in SPLITS]
     samples, done = sum(table.count for table in tables) // len(CAMERAS), 0
     tables += scene_tables(out)

@@ -45,7 +45,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, RigidBody
+from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
@@ -53,12 +53,11 @@ from drakegrasp.errors import MachineError
 from drakegrasp.frames import X_WT, Array, make_pose, transform_points
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import joint_positions
-from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.environment import require_render_memory
 from drakegrasp.vision.camera import Picture, object_colour
-from drakegrasp.vision.rendering import BLANK, add_drawn_object
+from drakegrasp.vision.rendering import BLANK, GREY, add_drawn_object, add_posed_hand
 
 #: Vertical field of view [deg]: narrow, so that perspective distorts little.
 FOV_Y_DEG = 26.0
@@ -72,8 +71,6 @@ OVERSAMPLING = 2
 MARGIN = 0.035
 BACKGROUND = np.array([0.95, 0.96, 0.97])
 TABLE_COLOUR = np.array([0.74, 0.70, 0.64, 1.0])
-#: Colour of links whose model specifies none; Drake's own default is the colour of an object.
-GREY = np.array([0.70, 0.71, 0.73, 1.0])
 TABLE_SIZE, TABLE_THICKNESS = 1.6, 0.1
 #: Edge of the shadow map [px].
 SHADOW_MAP = 4096
@@ -168,19 +165,8 @@ class StillScene:
             slab = Box(table_size, table_size, TABLE_THICKNESS)
             plant.RegisterVisualGeometry(plant.world_body(), X_WB, slab, "table", TABLE_COLOUR)
 
-        # The hand's palm is welded to a frame whose pose is a parameter of the context, so the palm
-        # can be placed anywhere without a joint. The hand's model may contain links of any name, so
-        # our names must differ from these.
-        instance = add_model(plant, hand.model)
-        base = plant.GetBodyByName(hand.palm_link, instance)
-        X_BG = RigidTransform(hand.X_BG)
-        palm = plant.AddFrame(
-            FixedOffsetFrame("drakegrasp_palm", base.body_frame(), X_BG, instance)
-        )
-        self._wrist = plant.AddFrame(
-            FixedOffsetFrame("wrist", plant.world_frame(), RigidTransform())
-        )
-        plant.WeldFrames(self._wrist, palm)
+        # The hand, whose palm can be placed anywhere.
+        instance, self._wrist = add_posed_hand(plant, hand)
         if add is not None:
             add(plant, instance)
         plant.Finalize()

@@ -92,7 +92,7 @@ def read_contacts(scene: Scene) -> Contacts:
 
 def table_force(scene: ObjectScene) -> Array:
     """Return the present force (3,) of the table on the object, in {W} [N]."""
-    return _forces_on_object(scene).get(scene.table.index(), np.zeros(3))
+    return forces_on_object(scene).get(scene.table.index(), np.zeros(3))
 
 
 def bodies_on_object(scene: ObjectScene) -> set[BodyIndex]:
@@ -101,11 +101,11 @@ def bodies_on_object(scene: ObjectScene) -> set[BodyIndex]:
     These are the bodies of the contacts of `read_contacts`, without points, normals and areas.
     """
     limit = scene.physics.contact_force
-    forces = _forces_on_object(scene)
+    forces = forces_on_object(scene)
     return {body for body, force in forces.items() if float(norm(force)) > limit}
 
 
-def _forces_on_object(scene: ObjectScene) -> dict[BodyIndex, Array]:
+def forces_on_object(scene: ObjectScene) -> dict[BodyIndex, Array]:
     """Return the force (3,) of each body on the object, in {W} [N]: the sum of its patches."""
     results = scene.plant.get_contact_results_output_port().Eval(scene.context)
     grasped, forces = scene.object.index(), dict[BodyIndex, Array]()

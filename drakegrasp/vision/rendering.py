@@ -1,7 +1,8 @@
 """Rendering: RGB, depth and mask of the resting object from a camera pose.
 
-In: an object, its resting pose and a camera pose. Out: images of object and table. The hand is
-never drawn: the renderer has its own diagram, without physics and without a hand.
+In: an object, its resting pose and a camera pose. Out: images of object and table. The renderer has
+its own diagram, without physics. The images of a dataset show no hand; those of a trial over time
+do (`build_renderer` with a hand, `pose_hand`).
 
 A renderer must be built and used in one thread. Drake's first rendering thread owns the OpenGL
 context, and any other thread silently gets a blank image. A blank image is an error here.
@@ -34,7 +35,12 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import RigidBody, SpatialInertia
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    ModelInstanceIndex,
+    RigidBody,
+    SpatialInertia,
+)
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
@@ -42,8 +48,9 @@ from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import CameraConfig
 from drakegrasp.errors import BlankImageError
 from drakegrasp.frames import X_WT, invert_pose, transform_points
+from drakegrasp.hand.description import Hand
 from drakegrasp.hand.files import MODELS
-from drakegrasp.hand.parsing import make_parser
+from drakegrasp.hand.parsing import add_model, make_parser
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.environment import require_render_memory
@@ -51,6 +58,8 @@ from drakegrasp.vision.camera import Appearance, Lens, object_colour, unproject,
 
 #: Colour of pixels beyond the table.
 BACKGROUND = np.array([0.86, 0.90, 0.94])
+#: Colour of links whose model specifies none; Drake's own default is the colour of an object.
+GREY = np.array([0.70, 0.71, 0.73, 1.0])
 #: Intensity of the light at the camera, which never changes.
 CAMERA_LIGHT = 0.6
 #: Message of the error about a blank image.
@@ -100,6 +109,7 @@ class Renderer:
         half_extents: Half extents of the object's box, (3,) [m].
         config: The camera.
         appearance: Colours of object and table, and the light; `paint` changes it.
+        hand: The plant's model of the hand, and the frame that carries its palm, if there is one.
     """
 
     diagram: Diagram
@@ -111,10 +121,11 @@ class Renderer:
     half_extents: Array
     config: CameraConfig
     appearance: Appearance
+    hand: tuple[ModelInstanceIndex, FixedOffsetFrame] | None = None
 
 
-def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
-    """Return a renderer of an object's full mesh on the table."""
+def build_renderer(model: ObjectModel, config: CameraConfig, hand: Hand | None = None) -> Renderer:
+    """Return a renderer of an object's full mesh on the table, and of a hand if there is one."""
     # Software OpenGL would start its own threads beside the one process per core.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     require_render_memory()
@@ -127,6 +138,7 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
     (instance,) = make_parser(plant).AddModels(MODELS / "table.sdf")
     table = plant.GetBodyByName("table", instance)
     plant.WeldFrames(plant.world_frame(), table.body_frame(), RigidTransform(X_WT))
+    drawn = None if hand is None else add_posed_hand(plant, hand)
     plant.Finalize()
     diagram = builder.Build()
     return Renderer(
@@ -139,7 +151,40 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
         half_extents=model.half_extents,
         config=config,
         appearance=appearance,
+        hand=drawn,
     )
+
+
+def add_posed_hand(
+    plant: MultibodyPlant, hand: Hand
+) -> tuple[ModelInstanceIndex, FixedOffsetFrame]:
+    """Add a hand whose palm can be placed anywhere without a joint.
+
+    The palm is welded to a frame whose pose is a parameter of the context.
+
+    Args:
+        plant: Not finalized; its shapes are drawn.
+        hand: The hand. Its model may contain links of any name: our names must differ from them.
+
+    Returns:
+        The plant's model of the hand, and that frame in the world.
+    """
+    instance = add_model(plant, hand.model)
+    base = plant.GetBodyByName(hand.palm_link, instance)
+    X_BG = RigidTransform(hand.X_BG)
+    palm = plant.AddFrame(FixedOffsetFrame("drakegrasp_palm", base.body_frame(), X_BG, instance))
+    wrist = plant.AddFrame(FixedOffsetFrame("wrist", plant.world_frame(), RigidTransform()))
+    plant.WeldFrames(wrist, palm)
+    return instance, wrist
+
+
+def pose_hand(renderer: Renderer, X_TG: npt.ArrayLike, q: npt.ArrayLike) -> None:
+    """Move the hand of a renderer: its palm to X_TG (4, 4), its joints to q (j,) [rad or m]."""
+    assert renderer.hand is not None
+    instance, wrist = renderer.hand
+    context = renderer.plant.GetMyMutableContextFromRoot(renderer.context)
+    wrist.SetPoseInParentFrame(context, RigidTransform(multiply(X_WT, X_TG)))
+    renderer.plant.SetPositions(context, instance, np.asarray(q, dtype=float))
 
 
 def paint(renderer: Renderer, appearance: Appearance) -> None:
@@ -173,7 +218,9 @@ def _engine_parameters(appearance: Appearance) -> RenderEngineVtkParams:
         direction=appearance.light_direction,
         intensity=appearance.light_strength,
     )
-    return RenderEngineVtkParams(default_clear_color=BACKGROUND, lights=[at_camera, above])
+    return RenderEngineVtkParams(
+        default_clear_color=BACKGROUND, default_diffuse=GREY, lights=[at_camera, above]
+    )
 
 
 def _set_colour(renderer: Renderer, body: RigidBody, colour: Array) -> None:

@@ -10,7 +10,13 @@ from pathlib import Path
 import pytest
 from helpers.datasets import make_dataset
 
-from drakegrasp.exchange.export import ClosedGrasp, Publication, export_dataset, read_closed_grasps
+from drakegrasp.exchange.export import (
+    ClosedGrasp,
+    Publication,
+    export_dataset,
+    options_of,
+    read_closed_grasps,
+)
 
 #: What the publishers of the exported dataset say.
 PUBLICATION = Publication(
@@ -43,7 +49,8 @@ def exported(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Callabl
     @cache
     def export(form: str) -> Path:
         to = tmp_path_factory.mktemp(form) / "to"
-        export_dataset(dataset, to, form, publication=PUBLICATION)
+        said = {"publication": PUBLICATION} if "publication" in options_of(form) else {}
+        export_dataset(dataset, to, form, **said)
         return to
 
     return export

@@ -57,9 +57,9 @@ SAMPLES = (
     *("lift.least_chance=0", "lift.least_depth_variance=0"),
 )
 
-#: Formats of an export that only go out: contacts, meshes, pictures, or scenes, from which no
-#: posture of the hand is read.
-ONLY_OUT = {"hf", "original", "meshes", "glb", "mjcf"}
+#: Formats of an export that only go out: contacts, meshes, pictures, scenes, or episodes, from
+#: which no posture of the hand is read.
+ONLY_OUT = {"hf", "original", "meshes", "glb", "mjcf", "lerobot"}
 #: Layouts of postures that users write.
 OWN = ("npz", "hdf5", "csv", "parquet")
 
