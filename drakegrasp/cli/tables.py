@@ -169,7 +169,7 @@ def hold_table(funnel: Funnel) -> Table:
         head, (whole, part) = "in the audit:\nstable of held", funnel.audited.T[1:3]
         notes.append(
             "in the audit: a part of the hands was lifted whatever the chance of a sample; their "
-            "counts alone say which share of the held grasps is stable"
+            "counts alone show which fraction of the held grasps is stable"
         )
     if note := held_note(funnel):
         notes.append(note)
@@ -335,7 +335,7 @@ def verdict_table(results: Sequence[Verification]) -> Table:
 
 #: Labels in a table for the attributes of a verdict.
 _VERDICTS = {
-    "success": "success: as asked for",
+    "success": "success: contacts as requested",
     "precision": "precision",
     "stable": "stable",
     "sample": "sample, but for images",
