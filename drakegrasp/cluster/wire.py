@@ -8,7 +8,8 @@ need it are on the way. A worker gets it from there when it lacks it, and keeps 
 last tasks in its own directory. The task runs in a process beside the worker, in a folder with
 copies of the files: whatever kills that process leaves the worker alone, which starts another one.
 Its journal lies in that folder, so a step that kills its process is found as where workers see the
-dataset. What is lost with a worker is done again by another one, from the beginning.
+dataset. What is lost with a worker is done again by another one, from the beginning. A client that
+is killed leaves the files of the tasks on their way at the scheduler, until that ends.
 
 Functions whose items are no such tasks read what only this machine has: they run here.
 """
@@ -33,7 +34,14 @@ from distributed.utils import sync
 
 from drakegrasp.cluster.apart import ApartError, ProcessApart
 from drakegrasp.errors import MachineError
-from drakegrasp.runtime.executor import Executor, FileTask, processes, task_of
+from drakegrasp.runtime.executor import (
+    Executor,
+    FileTask,
+    processes,
+    refuse_to_start_workers,
+    run_here,
+    task_of,
+)
 from drakegrasp.runtime.files import write_atomic
 
 T = TypeVar("T")
@@ -117,7 +125,7 @@ class _Wire:
         items = iter(items)
         first = list(islice(items, 1))
         if not (first and isinstance(task_of(first[0]), FileTask)):
-            with processes() as here:
+            with _processes_here() as here:
                 yield from here(function, chain(first, items))
             return
 
@@ -181,6 +189,18 @@ class _Wire:
                 write_atomic(self._out / place, files[place])
             else:
                 (self._out / place).unlink(missing_ok=True)
+
+
+@contextmanager
+def _processes_here() -> Iterator[Executor]:
+    """Yield what uses the cores of this machine; one of them where no process can start."""
+    try:
+        refuse_to_start_workers()
+    except MachineError:
+        yield run_here
+        return
+    with processes() as here:
+        yield here
 
 
 def _name(build: str, digest: str) -> str:
