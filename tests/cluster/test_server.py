@@ -7,6 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -157,11 +158,13 @@ def test_slurm_workers_have_their_settings_and_are_replaced(
     for name in ("SLURM_CONF", "SBATCH_EXPORT"):
         monkeypatch.setenv(name, slurm[name])
     monkeypatch.setattr(jobs, "REFILL_SECONDS", 2.0)
-    cluster = cluster_of("slurm", workers=3, cores=1, walltime="00:20:00", tls=False)
     # Over the defaults of dask-jobqueue, which another test's import may have read already.
     yaml = dask.config.collect(paths=[slurm["DASK_CONFIG"]], env={})
     settings_of_site = dask.config.merge(dask.config.config, yaml)
-    with dask.config.set(settings_of_site), cluster.connected(tmp_path) as client:
+    with ExitStack() as stack:
+        stack.enter_context(dask.config.set(settings_of_site))
+        cluster = cluster_of("slurm", workers=3, cores=1, walltime="00:20:00", tls=False)
+        client = stack.enter_context(cluster.connected(tmp_path))
         client.wait_for_workers(3, timeout=PATIENCE)
         check_settings(client, 3, "tcp")
         for worker in settings(client).values():

@@ -30,6 +30,7 @@ from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.cluster.wire import by_wire
 from drakegrasp.config import Config
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import MachineError
 from drakegrasp.generation.pipeline import BuildReport, build
 from drakegrasp.hand.settings import load_config
@@ -232,6 +233,14 @@ def test_client_that_stopped_goes_on_and_a_killed_worker_changes_nothing(
             report = build_by_workers()
         assert (report.reused, report.simulated) == (done, 6 - done)
         assert pids[0] not in client.run(os.getpid).values()
+
+        # Verdicts need the dataset's hand there.
+        hand = read_manifest(out).config
+        with (
+            pytest.raises(MachineError, match=r"must have hand \w+ like the client, got none"),
+            admitted_workers(client, hand),
+        ):
+            raise AssertionError
     assert_same_files(here, out)
     line = f"2 of 2 workers do not see {out} and the meshes: files travel over the network"
     assert capfd.readouterr().err.splitlines() == [line, line]
