@@ -81,8 +81,8 @@ class Outcome(IntEnum):
     OFF_SURFACE = 14, "", "a contact, or its normal, is off the surface"  # by forces only
     # For this outcome and the next, it is unknown whether the hand would have held the object.
     MOVED = 15, "moved", "the object moved more in the hand than a sample may"
-    NOT_LIFTED = 16, "left", "closed with a small chance or a flat image"
-    INVALID = 17, "", "the row of numbers is no grasp"  # it counts as a failure
+    NOT_LIFTED = 16, "left", "the closed hand has a small chance of a sample, or a flat image"
+    INVALID = 17, "", "the row of numbers is not a valid grasp"  # it counts as a failure
     PARTLY_HELD = (
         18,
         "lost",
