@@ -108,6 +108,8 @@ def test_episodes_are_the_trials(folder: Path, rows: dict[str, dict[str, Any]]) 
         assert state[phase == 1][:, :3] == pytest.approx(
             np.tile(X_TG[:3, 3], (sum(phase == 1), 1)), abs=1e-4
         )
+        lasted = row["time_lift"] if number == 0 else 0.0
+        assert 0.0 <= sum(phase == 2) - FPS * lasted < 2.0
         stage = "lifted" if number == 0 else "closed"
         assert state[-1, 7:] == pytest.approx(row[f"{stage}_q"], abs=1e-6)
         if number == 0:
