@@ -298,7 +298,7 @@ def test_palms_on_exported_meshes_are_the_same_trials(
 
     # On the rows of the dataset, and on the mesh that was exported, of whose unit nothing is said.
     rules = [word for rule in (*RULES, *OBJECTS) for word in ("--set", rule)]
-    onto = ("--object", folder / f"{NAME}.obj", "--config", "fast", *rules)
+    onto = ("--object", folder / f"{NAME}.obj", "--frame", "mesh", "--config", "fast", *rules)
     for where in (("--dataset", out / OTO, "--split", "train"), onto):
         found = verified(tmp_path / "palms.csv", *where, "--link", hand.palm_link)
         assert [v["outcome"] for v in found] == ["success"] * len(chosen)
