@@ -1,9 +1,10 @@
-"""One way from files of others to attempts: postures of our own layouts and of other tools.
+"""Reads files of postures, in our own layouts and those of other tools, as attempts.
 
-In: a file, or a folder of files, the hand that they are for, and what they are of. Out: one table,
-`Attempts`, or an error in one line that names the file and what is wrong. Each format is an
-importer of the registry, found by the suffix of the file. Our own layouts are here; those of other
-tools are in the modules that write them. docs/how-to/postures.md lists the layouts.
+In: a file or a folder of files, their hand, and the object or dataset rows that they are for. Out:
+one table, `Attempts`, or an error in one line that names the file and the mistake. Each format is
+an importer in the registry, found by the suffix of the file. This module reads our own layouts; the
+layouts of other tools are read by the modules named after them. docs/how-to/postures.md lists all
+layouts.
 """
 
 from __future__ import annotations
@@ -53,11 +54,12 @@ from drakegrasp.simulation.attempts import (
 from drakegrasp.verification.placing import choose_rows, read_several
 from drakegrasp.verification.prediction import read_grasps
 
-#: What a file says of all its rows together.
+#: Values that a file states once for all its rows.
 _OF_FILE = ("frame", "link", "joints", "hand", "of_objects")
-#: Suffixes of the layouts.
+#: Suffixes of files of arrays, tables and YAML files.
 ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml", ".yml")
-#: Arrays are smaller, all together [bytes]: two million postures of a hand with 16 joints.
+#: Maximum total size of the arrays of a file [bytes]: two million postures of a hand with 16
+#: joints.
 MOST_BYTES = 1_000_000_000
 #: The arrays of our own layout that are neither poses nor joints.
 _TEXTS = ("object", "joints", "source", "frame", "link", "preshape")
@@ -80,31 +82,33 @@ def read_attempts(
     several: bool = False,
     read_as: Mapping[str, str] | None = None,
 ) -> Attempts:
-    """Return the postures of a file, or of all files of a folder, or contacts, as one table.
+    """Return the postures or contacts of a file, or the postures of a folder of files, as a table.
 
-    A bad row stays in the table, with the reason; so does a bad file of a folder.
+    An invalid row stays in the table, with the reason. An invalid file of a folder is one such row.
 
     Args:
         path: The file or the folder.
         hand: The hand.
-        of: Name of the object of rows that name none; None: each must. Or the split of a dataset
-            whose rows they are for: then `row` says which, or they are one for each row, or
-            exported samples, of which those of the split count, or files that name objects alone,
-            in which each grasp is for every row of its object. Objects and the poses of the frame
-            "camera" are those of the rows; `Attempts.of_row` has the rows. Contacts name no object,
-            so they must be of something.
-        split: Group of an HDF5 file of contacts; that of the dataset if it is for one.
+        of: Name of the object of rows that do not name one, or the split of a dataset whose rows
+            the grasps are for; None: each row must name its object. For a split, the file may have
+            a column `row`, or one grasp per row of the split, or exported samples, of which those
+            of the split are used, or grasps that only name their object, each of which is used for
+            every row of this object. Objects, and the camera for grasps in the frame "camera", are
+            those of the rows, and `Attempts.of_row` has the row numbers. Contacts do not name an
+            object, so `of` must be given for them.
+        split: Name of the group to read in an HDF5 file of contacts; if `of` is a split of a
+            dataset, the group of this split is read.
         several: Whether the contacts are for rows of a dataset, of which each may have several
-            (n, m, 6k), with a confidence.
-        read_as: What the caller says of all postures: `frame` and `link`, which are stronger than
-            what the file says, and the `preshape` of rows that name none.
+            grasps (n, m, 6k), with a confidence.
+        read_as: Values for all postures. `frame` and `link` replace those of the file; `preshape`
+            is used for rows that do not name one.
 
     Raises:
-        GraspError: If it is no file of postures of this hand, or names no object.
+        GraspError: If the file has no postures of this hand, or does not name an object.
         DataError: If the dataset cannot be used.
         MachineError: If a package is missing that the format needs.
     """
-    # Contacts, which name nothing that they are of.
+    # Contacts, which do not name their objects.
     if of is not None and not holds_postures(path):
         data = of if isinstance(of, GraspDataset) else None
         said = read_contacts(path, split=data.split if data else split, axes=3 if several else 2)
@@ -136,19 +140,20 @@ def read_attempts(
 def _raw(
     path: Path, hand: Hand, read_as: Mapping[str, str], *, nameless: bool = False
 ) -> dict[str, Any]:
-    """Return what file and caller say of postures, as arguments of `make_attempts`.
+    """Return the postures of a file, with the caller's values, as arguments of `make_attempts`.
 
-    Beside these, `hand` is the name of the hand, `trial` (n,) the trials that samples were, and
-    `of_objects` says that the rows are for objects, wherever these are.
+    There are three additional keys: `hand` is the name of the hand, `trial` (n,) has the trials
+    from which the samples were exported, and `of_objects` states whether each grasp is for its
+    object in any pose.
 
     Raises:
-        GraspError: If it is no file of postures.
+        GraspError: If the file is not a file of postures.
         MachineError: If a package is missing that the format needs.
     """
     if not path.is_file():
         raise GraspError(f"postures must be a file or a folder of files, got {str(path)!r}")
 
-    # Formats of other packages know their files, and leave the others to ours.
+    # Importers of other packages are asked first; they return None for a file that is not theirs.
     for name in reversed(registry.names("importers")):
         if Path(name).suffix == path.suffix.lower():
             read = registry.find("importers", name)
@@ -166,11 +171,11 @@ def _raw(
 
 
 def _as_asked(raw: dict[str, Any], read_as: Mapping[str, str]) -> dict[str, Any]:
-    """Return what a file says with what the caller says, see `read_attempts`."""
+    """Return the content of a file, with the values of the caller, see `read_attempts`."""
     if "frame" in read_as:
         raw["frame"] = read_as["frame"]
     if read_as.get("frame") == "object" and raw.get("scale") is not None:
-        # Meshes in {O} are exported in metres, whatever the unit of their sources.
+        # Meshes in {O} are exported in metres, so a scale of 1 does not refer to the source mesh.
         raw["scale"] = np.where(np.asarray(raw["scale"]) == 1.0, np.nan, raw["scale"])
     if "link" in read_as:
         raw["link"] = _link([read_as["link"]])
@@ -186,23 +191,23 @@ def suffixes() -> tuple[str, ...]:
 
 
 def read_arrays(path: Path, hand: Hand, nameless: bool = False) -> dict[str, Any]:
-    """Return the postures of arrays in our own layout, which may name no object if `nameless`."""
+    """Return the postures of arrays in our own layout; if `nameless`, objects need no names."""
     return _of_arrays(_read_arrays(path), nameless)
 
 
 def read_palms(path: Path, hand: Hand, nameless: bool = False) -> dict[str, Any] | None:
-    """Return the palm poses of a .npy file of (n, 4, 4) numbers; None for another."""
+    """Return the palm poses of a .npy file of (n, 4, 4) numbers; None for any other .npy file."""
     poses = _poses_alone(path)
     return None if poses is None else _of_arrays({"X_FG": poses}, nameless)
 
 
 def read_columns(path: Path, hand: Hand, nameless: bool = False) -> dict[str, Any]:
-    """Return the postures of a table, which may name no object if `nameless`."""
+    """Return the postures of a table; if `nameless`, objects need no names."""
     return _of_columns(*_read_columns(path), nameless)
 
 
 def _named(raw: dict[str, Any], of: str | None) -> dict[str, Any]:
-    """Return rows whose objects have names; `of` is that of those without."""
+    """Return the rows with a name for each object; `of` names the object of rows without a name."""
     objects = [name or of or "" for name in raw["objects"]]
     if raw.get("of_row") is not None and not any(objects):
         raise GraspError("postures must name an object in each row, got rows of a dataset alone")
@@ -210,7 +215,7 @@ def _named(raw: dict[str, Any], of: str | None) -> dict[str, Any]:
 
 
 def _made(hand: Hand, raw: dict[str, Any]) -> Attempts:
-    """Return the table of what a file says."""
+    """Return the table of the content of a file."""
     told = raw.get("hand")
     if told not in (None, hand.name):
         raise GraspError(f"hand must be {told}, as the file says, got {hand.name} (--hand)")
@@ -229,7 +234,8 @@ def _for_rows(path: Path, hand: Hand, data: GraspDataset, read_as: Mapping[str, 
         with named(each):
             raw = _of_split(_raw(each, hand, read_as, nameless=True), data)
             if len(raw["objects"]):
-                # Between files confidence is not compared, unless they are of different objects.
+                # The confidences of different files cannot be compared, unless each file is for
+                # objects of its own.
                 kept = len(files) == 1 or raw.get("of_objects")
                 known = raw if kept else {**raw, "confidence": None}
                 tables.append(_on_rows(known, data, hand))
@@ -241,10 +247,11 @@ def _for_rows(path: Path, hand: Hand, data: GraspDataset, read_as: Mapping[str, 
 
 
 def _of_split(raw: dict[str, Any], data: GraspDataset) -> dict[str, Any]:
-    """Return postures that are of the split, with their rows; where nobody knows, as they are.
+    """Return the postures that are for rows of the split, with these rows.
 
-    The trial of an exported sample says which row it is. What is for an object is for each of its
-    rows; so are postures that all name an object, unless there is one for each row of the split.
+    The row of an exported sample is found by its trial. A grasp for an object is repeated for each
+    row of this object. Postures that all name an object are also for objects, unless there is one
+    for each row of the split. Other postures are returned unchanged.
     """
     told, column = raw["objects"], "object_props/object_name"
     of_objects = raw.get("of_objects") or (
@@ -272,13 +279,13 @@ def _of_split(raw: dict[str, Any], data: GraspDataset) -> dict[str, Any]:
 
 
 def _on_rows(raw: dict[str, Any], data: GraspDataset, hand: Hand) -> Attempts:
-    """Return the postures of a file on their rows."""
+    """Return the postures of a file with the objects and cameras of their rows."""
     if raw.get("X_TC") is not None:
         raise GraspError("X_TC must be left out: the camera is that of the row; got it")
     said = "`row` in the file says for which row each is, or `object` for which object"
     rows = choose_rows(data, raw.get("of_row"), len(raw["objects"]), said=said)
 
-    # What the rows say of object and camera.
+    # Object and camera of each row.
     objects = data.column("object_props/object_name")[rows].tolist()
     X_TC = unpack_pose(data.column(f"object_props/frame_work2cam_{data.camera}")[rows])
     other = [
@@ -292,7 +299,7 @@ def _on_rows(raw: dict[str, Any], data: GraspDataset, hand: Hand) -> Attempts:
 
 @contextmanager
 def named(path: Path) -> Iterator[None]:
-    """Put the name of a file before errors about its postures, unless it is there."""
+    """Put the name of a file before errors about its postures, unless they begin with it."""
     try:
         yield
     except GraspError as error:
@@ -301,12 +308,12 @@ def named(path: Path) -> Iterator[None]:
 
 
 def holds_postures(path: Path) -> bool:
-    """Return whether a file that holds postures or predictions of contacts holds postures.
+    """Return whether a file holds postures; otherwise it holds predictions of contacts.
 
-    A folder always does, because predictions of contacts are single files.
+    A folder always holds postures, because predictions of contacts are single files.
 
     Raises:
-        GraspError: If it cannot be read.
+        GraspError: If the file cannot be read.
     """
     if path.is_dir():
         return True
@@ -328,15 +335,15 @@ def holds_postures(path: Path) -> bool:
 
 
 def is_graspgen(file: h5py.File) -> bool:
-    """Return whether an HDF5 file has the predictions of GraspGen."""
+    """Return whether an HDF5 file holds predictions of GraspGen."""
     return {"misc", "objects"} <= set(file)
 
 
 def has_rows(path: Path) -> bool:
-    """Return whether a file of postures says for which rows of a dataset they are.
+    """Return whether a file of postures states the dataset row of each posture.
 
     Raises:
-        GraspError: If it cannot be read.
+        GraspError: If the file cannot be read.
     """
     if path.is_dir():
         return False
@@ -350,10 +357,10 @@ def has_rows(path: Path) -> bool:
 
 
 def files_in(folder: Path) -> list[Path]:
-    """Return the files of one foreign layout in a folder and those below.
+    """Return the files of the first layout that a folder and its subfolders have.
 
     Raises:
-        GraspError: If there is none.
+        GraspError: If there are no such files.
     """
     known = (".npy", *YAMLS, *ARRAYS, *TABLES)
     others = [(suffix,) for suffix in suffixes() if suffix not in known]
@@ -394,7 +401,7 @@ def _read_arrays(path: Path) -> dict[str, Any]:
 
 
 def _poses_alone(path: Path) -> Array | None:
-    """Return the poses (n, 4, 4) of a .npy file of such; None if it holds anything else."""
+    """Return the poses (n, 4, 4) of a .npy file; None if it holds anything else."""
     try:
         refuse_irregular(path, MOST_BYTES)
         with path.open("rb") as file:
@@ -408,7 +415,7 @@ def _poses_alone(path: Path) -> Array | None:
 
 
 def refuse_large(size: int) -> None:
-    """Refuse arrays that are larger than any postures: a small file can unpack to terabytes."""
+    """Reject arrays larger than any file of postures; a small file can unpack to terabytes."""
     if size > MOST_BYTES:
         raise GraspError(f"arrays must be at most {MOST_BYTES:.0e} bytes, got {size:.1e}")
 
@@ -420,7 +427,7 @@ def _dataset(item: h5py.Dataset | h5py.Group) -> Any:
 
 
 def _of_arrays(arrays: Mapping[str, Any], nameless: bool) -> dict[str, Any]:
-    """Return the rows of our own layout, which may name no object if they are `nameless`."""
+    """Return the rows of our own layout; if `nameless`, objects need no names."""
     if unknown := [name for name in arrays if name not in _KNOWN]:
         raise GraspError(
             f"arrays must be some of {', '.join(_KNOWN)}, got {', '.join(map(repr, unknown))}"
@@ -433,7 +440,7 @@ def _of_arrays(arrays: Mapping[str, Any], nameless: bool) -> dict[str, Any]:
         raise GraspError(f"{', '.join(missing)} must be there, got only {listed(sorted(arrays))}")
     texts = {name: _texts(arrays[name], name) for name in _TEXTS if name in arrays}
 
-    # The palm's poses, in either form.
+    # The palm poses, in either form.
     invalid = xyzw = None
     if "X_FG" in arrays:
         X_FG = _stacked(arrays["X_FG"], "X_FG")
@@ -465,7 +472,7 @@ def _of_arrays(arrays: Mapping[str, Any], nameless: bool) -> dict[str, Any]:
 
 
 def _leading_on(arrays: Mapping[str, Any], unknown: Sequence[str]) -> str:
-    """Return what to do with arrays that are not postures; empty if nobody knows."""
+    """Return advice for arrays that are not postures; empty if there is none."""
     for name in unknown:
         shape = np.shape(arrays[name])
         if name == "grasps" or (len(shape) == 2 and shape[1] % 6 == 0):
@@ -479,7 +486,7 @@ def _leading_on(arrays: Mapping[str, Any], unknown: Sequence[str]) -> str:
 
 
 def _conditions(columns: Mapping[str, Any], count: int) -> dict[str, Any]:
-    """Return the conditions (n, 3) of rows that tell some."""
+    """Return the conditions (n, 3) of the rows as a keyword; empty if there are no such columns."""
     if not set(CONDITIONS) & set(columns):
         return {}
     unknown = np.full(count, np.nan)
@@ -501,7 +508,7 @@ def _texts(value: Any, name: str) -> list[str]:
 
 
 def _only(values: Sequence[str | None] | None, name: str) -> str | None:
-    """Return the one text of a column, or None if there is none."""
+    """Return the text that all rows of a column share, or None if the column has no rows."""
     different = {value or "" for value in values or ()}
     if len(different) > 1:
         raise GraspError(f"{name} must be the same in all rows, got {', '.join(sorted(different))}")
@@ -509,13 +516,13 @@ def _only(values: Sequence[str | None] | None, name: str) -> str | None:
 
 
 def _link(values: Sequence[str | None] | None) -> str | None:
-    """Return the link of a column; None for the palm frame, whose name is "palm" in our files."""
+    """Return the link that a column names; None for the palm frame ("palm" in our files)."""
     name = _only(values, "link")
     return None if name in (None, "", "palm") else name
 
 
 def _stacked(value: Any, name: str) -> Array:
-    """Return poses (n, 4, 4) of numbers (n, 4, 4), (n, 3, 4) or (n, 12)."""
+    """Return poses (n, 4, 4) from numbers (n, 4, 4), (n, 3, 4) or (n, 12)."""
     try:
         X = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
@@ -533,7 +540,7 @@ def _stacked(value: Any, name: str) -> Array:
 
 
 def _column_names(path: Path) -> list[str]:
-    """Return the names of a table's columns; the first line of a CSV file, whatever it is."""
+    """Return the names of a table's columns; for a CSV file, the cells of its first line."""
     if path.suffix.lower() == ".parquet":
         return list(_parquet().read_schema(path).names)
     with path.open(encoding="utf-8-sig", newline="") as file:
@@ -543,7 +550,7 @@ def _column_names(path: Path) -> list[str]:
 def _cells(file: TextIO) -> Iterator[list[str]]:
     """Yield the cells of each line of a CSV file, without the blanks around them.
 
-    Cells are separated as in the first line: by commas, or by semicolons if it has none.
+    Cells are separated by semicolons if the first line has semicolons and no comma, else by commas.
     """
     first = file.readline()
     comma = "," if "," in first or ";" not in first else ";"
@@ -560,7 +567,7 @@ def _parquet() -> Any:
 
 
 def _read_columns(path: Path) -> tuple[dict[str, list[Any]], list[str]]:
-    """Return the columns of a table, and for each row why it is bad, or an empty text."""
+    """Return the columns of a table, and for each row why it is invalid, or an empty text."""
     if path.suffix.lower() == ".parquet":
         parquet = _parquet()
         try:
@@ -571,7 +578,7 @@ def _read_columns(path: Path) -> tuple[dict[str, list[Any]], list[str]]:
         except Exception as error:
             raise GraspError(f"must be a Parquet file, got: {one_line(error)}") from None
 
-    # CSV, whose names stand in the first line.
+    # A CSV file, which has the names in its first line.
     try:
         refuse_irregular(path, LARGEST_TEXT)
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -592,7 +599,7 @@ def _read_columns(path: Path) -> tuple[dict[str, list[Any]], list[str]]:
 def _of_columns(
     columns: Mapping[str, list[Any]], invalid: list[str], nameless: bool
 ) -> dict[str, Any]:
-    """Return the rows of a plain table, with a column for each number; see `_of_arrays`."""
+    """Return the rows of a table that has one column per number; see `_of_arrays`."""
     place = [*("x", "y", "z"), *("qw", "qx", "qy", "qz")]
     needed = place if nameless or "row" in columns else ["object", *place]
     missing = [name for name in needed if name not in columns]
@@ -602,7 +609,8 @@ def _of_columns(
     def numbers(*names: str) -> Array:
         return np.column_stack([_floats(columns, name, invalid) for name in names])
 
-    # As arrays: the joints of each stage in the order of the grasp, the place, numbers and texts.
+    # Convert to arrays: the joints of each stage in the order of the grasp, the pose, numbers and
+    # texts.
     arrays: dict[str, Any] = {}
     alone = np.ones(len(invalid), dtype=bool)
     for stage in ("grasp", "pregrasp", "squeeze"):
@@ -620,18 +628,18 @@ def _of_columns(
     if "row" in arrays and np.array_equal(arrays["row"], np.floor(arrays["row"])):
         arrays["row"] = arrays["row"].astype(np.int64)
     for name in filter(columns.__contains__, ("object", "source", "preshape", *_OF_FILE[:2])):
-        # A bad row tells nothing of all rows.
+        # A value for all rows is not taken from an invalid row.
         texts = zip(columns[name], invalid, strict=True)
         told = [str(text or "") for text, bad in texts if name not in _OF_FILE or not bad]
         arrays[name] = np.array(told, dtype=object)
     raw = _of_arrays(arrays, nameless)
     reasons = [one or other for one, other in zip(invalid, raw["invalid"], strict=True)]
-    # The names of columns leave no doubt about quaternions.
+    # The columns name the parts of quaternions, so their order is certain.
     return {**raw, "alone": alone, "invalid": reasons, "X_FG_xyzw": None}
 
 
 def _empty(columns: Mapping[str, list[Any]], names: Sequence[str]) -> npt.NDArray[np.bool_]:
-    """Return (n,) whether all cells of a row are empty in some columns."""
+    """Return (n,), whether all cells of each row are empty in the named columns."""
     rows = zip(*(columns[name] for name in names), strict=True)
     return np.array([all(cell in (None, "") for cell in row) for row in rows], dtype=bool)
 
@@ -639,7 +647,10 @@ def _empty(columns: Mapping[str, list[Any]], names: Sequence[str]) -> npt.NDArra
 def _floats(
     columns: Mapping[str, list[Any]], name: str, invalid: list[str]
 ) -> npt.NDArray[np.float64]:
-    """Return a column as numbers; an empty cell is NaN; `invalid` says which are not numbers."""
+    """Return a column as numbers; an empty cell becomes NaN.
+
+    For a cell that is not a number, the reason is added to `invalid`, unless the row has one.
+    """
     values = np.full(len(columns[name]), np.nan)
     for i, cell in enumerate(columns[name]):
         try:

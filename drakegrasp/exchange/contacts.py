@@ -1,7 +1,7 @@
-"""Files of contacts: k points and k outward normals for each grasp, and what stands beside them.
+"""Files of contacts: k points and k outward normals for each grasp, and optional columns.
 
-In: a .npy, CSV, HDF5 or Parquet file. Out: its numbers, of any shape, with the rows of a dataset
-and the confidence that it states, or an error in one line that names the file.
+In: a .npy, CSV, HDF5 or Parquet file. Out: the numbers of the file, of any shape, with the dataset
+rows and the confidence that the file states, or an error in one line that names the file.
 """
 
 from __future__ import annotations
@@ -17,33 +17,35 @@ from drakegrasp.errors import GraspError, MachineError, first_line
 from drakegrasp.foreign_files import read_text, refuse_irregular
 from drakegrasp.frames import Array, as_numbers
 
-#: Suffixes of files with grasps.
+#: Suffixes of files that can hold grasps.
 HDF5_SUFFIXES = (".h5", ".hdf5")
 SUFFIXES = (".npy", ".csv", *HDF5_SUFFIXES, ".parquet")
-#: What to do with poses in place of contacts.
+#: Advice for a file that holds poses instead of contacts.
 _POSES = ": poses of the palm go with joints into a file of postures, as X_FG, object and q_grasp"
 #: Names of the arrays in an HDF5 file, and of the columns in a Parquet file.
 GRASPS, ROWS, CONFIDENCE = "grasps", "rows", "confidence"
 
 
 def read_contacts(path: Path, *, split: str | None = None, axes: int = 2) -> dict[str, Any]:
-    """Return the `grasps` of a file, an array with a row per grasp, its `rows` and `confidence`.
+    """Return the `grasps`, `rows` and `confidence` of a file.
 
-    The grasps are (n, m), or (n, j, m) for j per row, with n at least 1. The rows (n,) are those of
-    a dataset's split, the confidence is as stated; None if the file has none.
+    The grasps are (n, m), or (n, j, m) for j grasps per row, with n at least 1. The rows (n,) are
+    row numbers in a dataset's split. The confidence is returned as stored. Rows or confidence that
+    the file does not have are None.
 
     Args:
         path: A `.npy` file, (n, m) or (m,); a `.csv` file with a line per grasp and optionally a
             header; an HDF5 file (`.h5`, `.hdf5`) with an array `grasps`, and optionally `rows` and
             `confidence` beside it, at the root or in a group; or a Parquet file with a line per
             entry and these as columns, `grasps` of lists.
-        split: Name of the group of an HDF5 file. If it is None or there is no such group, the
-            root is read; if it is None and the root has no grasps, the only group that has.
-        axes: Most axes of the array of grasps: 3 for several per row.
+        split: Name of the group to read in an HDF5 file. If it is None or there is no such group,
+            the root is read. If it is None and the root has no grasps, the only group with grasps
+            is read.
+        axes: Maximum number of axes of the array of grasps; 3 allows several grasps per row.
 
     Raises:
         GraspError: If the file cannot be read as one of these; the message names the file.
-        MachineError: If a Parquet file is given and pyarrow is not installed.
+        MachineError: If the file is a Parquet file and pyarrow is not installed.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -77,16 +79,16 @@ def read_numbers(path: Path) -> Array:
     """Return the real numbers of a `.npy` file, of any shape. Pickled objects are not loaded.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
 
     Raises:
-        GraspError: If the file cannot be read, or holds anything else.
+        GraspError: If the file cannot be read, or does not hold real numbers.
     """
     try:
         refuse_irregular(path)
         with path.open("rb") as file:
             array = np.lib.format.read_array(file, allow_pickle=False)
-    # A damaged header may claim any size, hence the MemoryError.
+    # A damaged header may state any size, and then NumPy raises a MemoryError.
     except (OSError, EOFError, ValueError, TypeError, ArithmeticError, MemoryError) as error:
         raise GraspError(
             f"{path}: must be a .npy file of numbers, got none ({first_line(error)})"
@@ -95,8 +97,8 @@ def read_numbers(path: Path) -> Array:
 
 
 def _read_csv(path: Path) -> Array:
-    """Return the numbers of a text file, a row per line, without a header."""
-    # The cells of all lines that are not empty.
+    """Return the numbers of a text file, one row per line, without the header."""
+    # Read the cells of all lines that are not empty.
     try:
         lines = read_text(path, "utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -105,12 +107,12 @@ def _read_csv(path: Path) -> Array:
         ) from None
     rows = [(n, line.split(",")) for n, line in enumerate(lines, start=1) if line.strip()]
 
-    # The first line is a header only if it has several cells and none of them is a number: a
-    # mistyped grasp, or one that is not separated by commas, must not pass for a header.
+    # The first line is a header only if it has several cells and none of them is a number. A
+    # mistyped grasp, or a grasp without commas, must not be taken for a header.
     if rows and len(rows[0][1]) > 1 and not any(_is_number(cell) for cell in rows[0][1]):
         del rows[0]
 
-    # The other lines hold numbers, all equally many.
+    # All other lines hold the same number of numbers.
     for number, cells in rows:
         for column, cell in enumerate(cells, start=1):
             if not _is_number(cell):
@@ -127,7 +129,7 @@ def _read_csv(path: Path) -> Array:
 
 
 def _read_hdf5(path: Path, split: str | None) -> tuple[dict[str, Any], str]:
-    """Return the arrays of an HDF5 file that it has, and where they are."""
+    """Return those of the known arrays that an HDF5 file has, and their location."""
     try:
         with open_hdf5(path) as file:
             group = _choose_group(path, file, split)
@@ -142,7 +144,7 @@ def _read_hdf5(path: Path, split: str | None) -> tuple[dict[str, Any], str]:
 
 
 def _read_parquet(path: Path) -> dict[str, Any]:
-    """Return the columns of a Parquet file that it has."""
+    """Return those of the known columns that a Parquet file has."""
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -164,8 +166,8 @@ def _read_parquet(path: Path) -> dict[str, Any]:
 
 
 def _choose_group(path: Path, file: h5py.File, split: str | None) -> h5py.Group:
-    """Return the group of an HDF5 file whose grasps to read; see `read_contacts`."""
-    # All groups with grasps; the name of the root is empty.
+    """Return the group of an HDF5 file from which to read the grasps; see `read_contacts`."""
+    # Find all groups with grasps; the root has an empty name here.
     groups = {"": file} | {k: v for k, v in file.items() if isinstance(v, h5py.Group)}
     groups = {k: v for k, v in groups.items() if isinstance(v.get(GRASPS), h5py.Dataset)}
     if split in groups:
@@ -175,7 +177,7 @@ def _choose_group(path: Path, file: h5py.File, split: str | None) -> h5py.Group:
     if split is None and len(groups) == 1:
         return next(iter(groups.values()))
 
-    # There are none, or it is not clear which to read.
+    # No group has grasps, or several have them and none was chosen.
     must = f"in /{split} or at the root" if split else "at the root or in one group"
     got = ", ".join(f"/{name}" for name in groups)
     choose = "; choose with --split" if groups else ""
@@ -186,7 +188,7 @@ def _choose_group(path: Path, file: h5py.File, split: str | None) -> h5py.Group:
 
 
 def _grasps(array: Array, where: str, axes: int) -> Array:
-    """Return an array with a row per grasp, from such an array or from a single grasp."""
+    """Return an array with one row per grasp; a single grasp (m,) becomes one row."""
     if array.size == 0:
         raise GraspError(f"{where}: must hold at least one grasp, got none")
     if not 1 <= array.ndim <= axes:
@@ -207,5 +209,5 @@ def _is_number(text: str) -> bool:
 
 
 def _listed(names: tuple[str, ...]) -> str:
-    """Return names as in "a, b or c"."""
+    """Return names in the form "a, b or c"."""
     return f"{', '.join(names[:-1])} or {names[-1]}"

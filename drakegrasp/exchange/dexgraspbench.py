@@ -1,23 +1,26 @@
-"""The files of DexGraspBench (github JYChen18/DexGraspBench), which BODex and Dexonomy write, too.
+"""The files of DexGraspBench (github JYChen18/DexGraspBench), also written by BODex and Dexonomy.
 
-Samples of a dataset go out so that its code evaluates them, our own predictions so that a protocol
-of MuJoCo tries them, and its grasps come in as attempts. Out: a folder whose content is copied into
-that repository: hand (MJCF and YAML), objects (convex parts, and the volume from which the
-benchmark has the density) and a .npy file per grasp, each a dictionary with the object's pose and
-three postures of the hand. A posture is the palm link's position [m] and quaternion (w, x, y, z),
-then the joints in the order of `joint_names` and the units of `joint_units`, rad or m:
+This module writes samples of a dataset for evaluation by the benchmark's code, writes our own
+predictions for the MuJoCo protocols, and reads grasps of the benchmark as attempts.
 
-* `grasp_qpos`: after closing, as it is stored;
-* `pregrasp_qpos`: closing and coupled joints opened by `APART`, or as far as they were open;
-* `squeeze_qpos`: the same joints closed further by `APART`: the command of a position controller
-  that presses. The benchmark's own grasps go on from pregrasp and grasp by equal steps, too.
+Out: a folder whose content is copied into the benchmark's repository. It has the hand (MJCF and
+YAML), the objects (convex parts, and their volume, from which the benchmark computes the density)
+and a .npy file per grasp. This file is a dictionary with the object's pose and three postures of
+the hand. A posture is the palm link's position [m] and quaternion (w, x, y, z), followed by the
+joint positions in the order of `joint_names` and the units of `joint_units`, rad or m:
 
-Keys that the benchmark does not read say under what the sample held: `hand`, `preshape`,
-`trial_id`, `start_qpos` (the joints of the open hand) and `conditions` (friction of hand and table,
-mass). All poses are over the table, in {T}. The hand is `mjcf.links`: gains, torques and
-damping are those of the benchmark's Shadow Hand. Of predictions, objects stand as
-`PlacedObject.X_TO_simulated` says; contacts become the posture of the first wrist pose that fits
-them, and a grasp that lacks pregrasp or squeeze gets those of the export.
+* `grasp_qpos`: after closing, as stored in the dataset;
+* `pregrasp_qpos`: closing and coupled joints opened by `APART`, but not beyond the open hand;
+* `squeeze_qpos`: the same joints closed further by `APART`. A position controller with this command
+  presses on the object. In the benchmark's own grasps, the step from grasp to squeeze also equals
+  the step from pregrasp to grasp.
+
+Keys that the benchmark does not read state the conditions under which the sample held: `hand`,
+`preshape`, `trial_id`, `start_qpos` (the joints of the open hand) and `conditions` (friction of
+hand and table, mass). All poses are in {T}, with the object on the table. `mjcf.links` builds the
+hand; its gains, torques and damping are those of the benchmark's Shadow Hand. The object of a
+prediction is at `PlacedObject.X_TO_simulated`. Contacts become the posture of the first wrist pose
+that fits them. A grasp without pregrasp or squeeze gets the postures described above.
 """
 
 from __future__ import annotations
@@ -56,16 +59,16 @@ from drakegrasp.simulation.posture import Posture, joint_order
 from drakegrasp.verification.placing import PlacedGrasp
 from drakegrasp.verification.verify import first_fit
 
-#: What `drakegrasp export --help` says of the format.
+#: Description of the format in `drakegrasp export --help`.
 HELP = (
     "hand, objects and grasps as that benchmark's code evaluates them; needs pip install "
     "'drakegrasp[peer]'"
 )
 
-#: By how much pregrasp and squeeze are apart from the grasp [rad], of joints that slide by
-#: `description.SLIDE`.
+#: Distance of pregrasp and squeeze from the grasp [rad]. For sliding joints it is multiplied by
+#: `description.SLIDE` [m/rad].
 APART = 0.2
-#: Where hand and objects are in the benchmark's repository, and the name of the experiment.
+#: Folder of hand and objects in the benchmark's repository, and the name of the experiment.
 ASSETS, EXPERIMENT = Path("assets/drakegrasp"), "export"
 OBJECTS = ASSETS / "objects"
 
@@ -75,7 +78,7 @@ def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
     require_mujoco("mujoco", "coacd")
     from drakegrasp.mjcf.scene import convex_parts
 
-    # The hand, by a name that the benchmark does not have.
+    # Write the hand under a name that the benchmark does not use.
     hand = load_hand(read_manifest(out).config.hand_source)
     files = BenchFiles(hand, folder)
     name = f"drakegrasp_{hand.name}"
@@ -83,7 +86,7 @@ def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
     settings = yaml.safe_dump(hand_settings(hand), sort_keys=False)
     (folder / "config" / "hand" / f"{name}.yaml").write_text(settings, encoding="utf-8")
 
-    # Object by object.
+    # Write object by object.
     grasps = list(read_closed_grasps(out))
     progress(0, len(grasps))
     done, data = 0, folder / "output" / f"{EXPERIMENT}_{name}" / "graspdata"
@@ -98,10 +101,10 @@ def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
 
 
 class BenchFiles:
-    """Writes a hand and grasps as the benchmark reads them.
+    """Writes a hand and grasps in the layout that the benchmark reads.
 
     Attributes:
-        hand_path: MJCF of the hand.
+        hand_path: Path of the hand's MJCF file.
     """
 
     def __init__(self, hand: Hand, folder: Path) -> None:
@@ -109,7 +112,7 @@ class BenchFiles:
 
         Args:
             hand: The hand.
-            folder: To which the paths of objects in the files are relative.
+            folder: Folder to which object paths in the files are relative.
         """
         from drakegrasp.mjcf.links import make_hand_model, write_hand_model
 
@@ -123,10 +126,10 @@ class BenchFiles:
         """Write a grasp.
 
         Args:
-            path: Of its file.
+            path: Path of the grasp file.
             grasp: The grasp.
-            known: (j,), joints of "pregrasp" and "squeeze" in the plant's order, where they are
-                not to be derived from the grasp.
+            known: (j,), joint positions of "pregrasp" and "squeeze" in the plant's order. Those
+                that are missing or None are derived from the grasp.
         """
         content: Any = grasp_dictionary(self.posed.hand, self.posed, self._joints, grasp)
         places = [self.posed.joints.index(name) for name in self._joints]
@@ -138,7 +141,7 @@ class BenchFiles:
 
 
 def hand_settings(hand: Hand) -> dict[str, Any]:
-    """Return what the benchmark's YAML says of a hand; fingertips have the names of their links."""
+    """Return the content of the benchmark's YAML file of a hand; fingertips have link names."""
     tips = list(hand.fingertip_links)
     return {
         "xml_path": str(ASSETS / "hand" / "hand.xml"),
@@ -152,10 +155,10 @@ def hand_settings(hand: Hand) -> dict[str, Any]:
 
 
 def write_object(folder: Path, parts: Sequence[Array]) -> None:
-    """Write an object's convex parts, and their volume as its mass at a density of one.
+    """Write the convex parts of an object, and their total volume as the mass at a density of one.
 
     Args:
-        folder: Of the object.
+        folder: Folder of the object.
         parts: The corners (n, 3) of each part in {O} [m].
     """
     (folder / "urdf" / "meshes").mkdir(parents=True)
@@ -171,16 +174,16 @@ def write_object(folder: Path, parts: Sequence[Array]) -> None:
 def grasp_dictionary(
     hand: Hand, posed: StillScene, joints: Sequence[str], grasp: ClosedGrasp
 ) -> dict[str, Any]:
-    """Return what the file of a grasp holds, see the module.
+    """Return the content of a grasp file, as the module docstring describes it.
 
     Args:
         hand: The hand.
-        posed: The same hand, which knows the order of the stored joints.
+        posed: The same hand as a still scene, which has the order of the stored joints.
         joints: Names of the joints in the order of the file.
         grasp: The sample.
     """
-    # The palm link's pose, and how far each joint moves: in proportion to its finger's closing,
-    # if the grasp uses it.
+    # The palm link's pose, and the step of each joint. The step is proportional to the closing of
+    # the joint's finger, and zero if the grasp does not use the finger.
     X_TB = pose_vector(multiply(grasp.X_TG, invert_pose(hand.X_BG)))
     step = dict.fromkeys(hand.joint_names, 0.0)
     closing = APART * hand.closing_unit
@@ -193,7 +196,7 @@ def grasp_dictionary(
     def posture(share: float) -> Array:
         q = [closed[name] + share * step[name] for name in joints]
         if share < 0.0:
-            # No finger opens farther than it can.
+            # No joint opens beyond its position in the open hand.
             q = [
                 _between(at, open_at[name], closed[name])
                 for name, at in zip(joints, q, strict=True)
@@ -221,7 +224,7 @@ def grasp_dictionary(
 
 
 def _between(at: float, one: float, other: float) -> float:
-    """Return the position nearest to one given between two others."""
+    """Return a position, clamped to the range between two others."""
     return min(max(at, min(one, other)), max(one, other))
 
 
@@ -235,17 +238,18 @@ def pose_vector(X_AB: npt.ArrayLike) -> Array:
 def read_dexgraspbench(path: Path, hand: Hand) -> dict[str, Any]:
     """Return the grasps of a .npy file as arguments of `make_attempts`, see `attempts`.
 
-    The object's frame is that of its mesh file; in what drakegrasp itself exports it is {O}.
+    The object's frame is the frame of its mesh file; in a file that drakegrasp exported, this is
+    {O}.
 
     Raises:
-        GraspError: If it is none.
+        GraspError: If the file is not a grasp file of DexGraspBench.
     """
     try:
         stored = read_grasp_file(path)
     except DataError as error:
         raise GraspError(f"{path}: {error}") from None
 
-    # The root of the hand in the object's frame, in metres.
+    # The pose of the hand's root in the object's frame [m].
     grasp, pose = stored.postures["grasp"], stored.object_pose
     X_WM, no_object = quaternion_poses(pose[:, :3], pose[:, 3:])
     X_WL, no_hand = quaternion_poses(grasp[:, :3], grasp[:, 3:7])
@@ -276,7 +280,7 @@ def read_dexgraspbench(path: Path, hand: Hand) -> dict[str, Any]:
     }
 
 
-#: An object on the table, and a posture in {O}; or the reason, for a bad row.
+#: An object on the table, and a posture in {O}, or the reason why the row is invalid.
 PlacedPosture: TypeAlias = tuple[PlacedObject, Posture | str]
 
 
@@ -289,24 +293,29 @@ def write_grasps(
     keep: Path | None = None,
     report: Report = silent,
 ) -> tuple[Path, list[Path | str]]:
-    """Write grasps, and return the MJCF of the hand, and the file of each or why there is none.
+    """Write grasps in the layout of the benchmark.
 
     Args:
-        grasps: In the caller's order.
-        hand: Their hand.
-        folder: To which the paths of objects in the files are relative.
-        execute: Cuts and writes the objects.
-        keep: Folder that keeps the convex parts of objects for the next call; None keeps none.
-        report: Is told how many objects are written.
+        grasps: The grasps, each with its object.
+        hand: The hand of all grasps.
+        folder: Folder to which object paths in the files are relative.
+        execute: Runs the decomposition and writing of the objects.
+        keep: Folder in which the convex parts of objects are cached for the next call; None:
+            they are not cached.
+        report: Called with the number of objects written and of all objects.
+
+    Returns:
+        The path of the hand's MJCF file, and for each grasp, in the given order, the path of its
+        file or the reason why there is none.
 
     Raises:
         OSError: If a folder cannot be written.
     """
-    # The hand, and where its spread is among the joints.
+    # Write the hand; find the index of its spread joint.
     files = BenchFiles(hand, folder)
     spread = joint_order(hand).index(hand.spread.joints[0]) if hand.spread.joints else None
 
-    # Each object once.
+    # Write each object once.
     things = (placed.model for placed, posture in grasps if isinstance(posture, Posture))
     models = {model.name: model for model in things}
     report(0, len(models))
@@ -314,7 +323,7 @@ def write_grasps(
     for done, _ in enumerate(execute(_write_parts, tasks), start=1):
         report(done, len(models))
 
-    # Each grasp.
+    # Write each grasp.
     found = list[Path | str]()
     for number, (placed, posture) in enumerate(grasps):
         if isinstance(posture, str):
@@ -337,7 +346,7 @@ def write_grasps(
 
 
 def _write_parts(task: tuple[ObjectModel, Path, Path | None]) -> None:
-    """Cut an object into convex parts and write them."""
+    """Decompose an object into convex parts and write them."""
     from drakegrasp.mjcf.scene import convex_parts, kept_convex_parts
 
     model, folder, keep = task
@@ -347,7 +356,10 @@ def _write_parts(task: tuple[ObjectModel, Path, Path | None]) -> None:
 def fitted_postures(
     grasps: Sequence[PlacedGrasp], execute: Executor = run_here
 ) -> list[PlacedPosture]:
-    """Return the posture of each grasp, in the given order; of contacts the first wrist pose."""
+    """Return the posture of each grasp, in the given order.
+
+    For contacts it is the posture of the first wrist pose that fits them.
+    """
     contacts = [(i, g) for i, g in enumerate(grasps) if not g.invalid and g.method != "posture"]
     fitted = dict(execute(_fit, contacts))
 
@@ -356,7 +368,7 @@ def fitted_postures(
             return grasp.invalid or fitted[i]
         if np.isnan(grasp.attempt.q_grasp).all():
             return "joints must be given with a protocol, got a palm pose alone"
-        # Nobody named its resting pose.
+        # The prediction does not name the resting pose.
         if (count := len(grasp.stands)) > 1:
             return f"resting must be 0 to {count - 1} with a protocol, got none"
         return grasp.posture(grasp.placed)
@@ -365,7 +377,7 @@ def fitted_postures(
 
 
 def _fit(task: tuple[int, PlacedGrasp]) -> tuple[int, Posture]:
-    """Return the number of a grasp of contacts, and the posture of its first wrist pose."""
+    """Return the number of a grasp given as contacts, and the posture of its first wrist pose."""
     number, grasp = task
     fit, hand = first_fit(grasp), load_hand(grasp.config.hand_source)
     named = joint_positions(hand, fit.spread, fit.closing)

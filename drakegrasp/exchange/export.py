@@ -1,7 +1,7 @@
-"""Export: the samples of a dataset in the format of another tool.
+"""Exports the samples of a dataset in the format of another tool.
 
-In: the directory of a dataset and a format. Out: a new directory, complete or absent. Each format
-is a module with one function that writes a directory; the registry names them.
+In: the directory of a dataset and a format. Out: a new directory, which is either complete or
+absent. Each format is a module with one function that writes a directory; the registry lists them.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from drakegrasp.yaml_text import parse_yaml
 
 
 class Publication(BaseModel):
-    """Attributes are the keys of the file, all optional.
+    """What the publishers of a dataset state; the attributes are the keys of a file, all optional.
 
     Attributes:
-        name: Of the dataset, e.g. "Mugs and bowls, Allegro Hand".
+        name: Name of the dataset, e.g. "Mugs and bowls, Allegro Hand".
         version: Semantic version of the dataset, e.g. 1.0.0.
-        url: Address of its page.
+        url: Address of the dataset's page.
         creators: Names of people or groups.
-        published: Day on which it was published.
-        licence: Identifier, e.g. cc-by-4.0.
-        citation: How to cite it, as BibTeX.
+        published: Day of publication.
+        licence: Identifier of the licence, e.g. cc-by-4.0.
+        citation: Citation of the dataset, as BibTeX.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -59,15 +59,15 @@ class Publication(BaseModel):
     citation: str | None = Key(default=None, min_length=1)
 
 
-#: What Croissant 1.1 demands and no program knows.
+#: Keys that Croissant 1.1 requires and that only the publishers can state.
 REQUIRED = ("name", "url", "creators", "published", "licence")
 
 
 def read_publication(path: Path) -> Publication:
-    """Return the content of a file.
+    """Return the publication that a YAML file states.
 
     Raises:
-        DataError: If it is not readable YAML, has an unknown key, or a value of another form.
+        DataError: If the file is not readable YAML, or has an unknown key or an invalid value.
     """
     try:
         content = parse_yaml(read_text(path))
@@ -82,7 +82,7 @@ def read_publication(path: Path) -> Publication:
 
 
 def not_said(publication: Publication) -> list[str]:
-    """Return the keys that a published dataset must have and this one lacks."""
+    """Return the keys that a published dataset must have and this publication lacks."""
     return [key for key in REQUIRED if not getattr(publication, key)]
 
 
@@ -98,19 +98,19 @@ def export_dataset(
 
     Args:
         out: Directory of the dataset.
-        directory: Where to write; it must be new or empty, and appears when it is complete.
-        form: The name of an exporter, see `drakegrasp.registry`.
-        progress: Called with the number of samples done and of all.
-        options: Of the format, see `options_of`, e.g. `publication` (a `Publication`) of format
-            `hf`: what its card and its metadata say of the publishers.
+        directory: Directory to write, new or empty; it appears when it is complete.
+        form: Name of an exporter, see `drakegrasp.registry`.
+        progress: Called with the number of samples written and of all samples.
+        options: Options of the format, see `options_of`. For example, `publication` (a
+            `Publication`) of format `hf` is what the publishers state, for the card and metadata.
 
     Raises:
-        DataError: If there is no dataset, it is of another schema or has no samples, the directory
-            holds something, or an option is not one of the format.
-        MachineError: If a package is missing that the format needs.
-        OSError: If the disk is full; nothing is left behind.
+        DataError: If there is no dataset, the dataset has another schema or no samples, the
+            directory is not empty, or the format does not have an option.
+        MachineError: If a package that the format needs is missing.
+        OSError: If the disk is full; no files are left behind.
     """
-    # A dataset that cannot be read is refused before anything is written.
+    # A dataset that cannot be read is rejected before anything is written.
     out, directory = Path(out), Path(directory)
     if not registry.is_known("exporters", form):
         known = ", ".join(registry.names("exporters"))
@@ -138,18 +138,18 @@ def options_of(form: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ClosedGrasp:
-    """A sample when its fingers have closed on the resting object.
+    """A sample after the fingers have closed on the resting object.
 
     Attributes:
-        trial_id: Row of /trials.
+        trial_id: Row of the sample in /trials.
         split: `train`, `valid` or `test`.
         object_name: Name of the object.
-        X_TO, X_TG: Poses (4, 4) of the object and of the palm over the table.
+        X_TO, X_TG: Poses (4, 4) of the object and of the palm in {T}.
         q: (n,), positions of the hand's joints [rad or m], in the plant's order.
         spread: Angle of the spread joints [rad].
-        unused: Fingers that its preshape leaves out, as bits: 1 for the first finger.
-        preshape: Index of the hand's preshape; None: it is of none.
-        conditions: (3,), friction of hand and table and mass [kg] of the trial; None: not known.
+        unused: Fingers that the preshape does not use, as bits: 1 for the first finger.
+        preshape: Index of the hand's preshape; None if the sample has no preshape.
+        conditions: (3,), friction of hand and table and mass [kg] of the trial; None if not known.
     """
 
     trial_id: int
@@ -164,25 +164,25 @@ class ClosedGrasp:
     conditions: Array | None = None
 
     def preshape_name(self, hand: Hand) -> str:
-        """Return the name of its preshape of a hand; empty if it is of none."""
+        """Return the name of the sample's preshape of a hand; empty if it has no preshape."""
         none = self.preshape is None or not hand.preshapes
         return "" if none else hand.preshape_names[self.preshape or 0]
 
 
 def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
-    """Yield the samples of a dataset in the order of its trials: each object's are together.
+    """Yield the samples of a dataset in the order of its trials, so object by object.
 
     Raises:
-        DataError: If a file of the dataset is missing or not of the dataset.
+        DataError: If a file of the dataset is missing or belongs to another dataset.
     """
-    # Which trials are samples, and of which split.
+    # Find the trials that are samples, and their splits.
     trials = Trials(out)
     ids = sample_ids(out)
     split_of = {row: split for split, rows in ids.items() for row in rows.tolist()}
     rows = np.array(sorted(split_of), dtype=np.int64)
     refuse_other_codes(out / DATA_FILES["oto"], "trial_id", rows, len(trials))
 
-    # Their postures.
+    # Read their postures.
     names = ("object_name", "X_TO", "X_OG", "closed_q", "spread", "unused", "preshape")
     samples = trials[rows].columns((*names, *CONDITIONS))
     conditions = np.column_stack([samples[name] for name in CONDITIONS])

@@ -1,9 +1,9 @@
-"""Posed scenes: a GLB file per grasp, with the object and the hand's shapes as the fingers closed.
+"""Posed scenes: one GLB file per grasp, with the object and the hand's shapes after closing.
 
-In: a dataset. Out: `<object>/<trial_id>.glb`, which any viewer opens without a simulator. glTF has
-+Y up, so our table frame {T} is turned by -90 degrees about X. Links are drawn as their collision
-shapes, which are convex. Nodes are called `object/NAME` and `hand/LINK`: an object may be named as
-a link is.
+In: a dataset. Out: `<object>/<trial_id>.glb`, which any viewer opens without a simulator. In glTF
++Y points up, so our table frame {T} is rotated by -90 degrees about X. Each link is drawn as its
+collision shapes, which are convex. Nodes are named `object/NAME` and `hand/LINK`, because an object
+may have the same name as a link.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from drakegrasp.pictures.still_scene import Poses, StillScene
 from drakegrasp.runtime.progress import Report
 from drakegrasp.vision.camera import object_colour
 
-#: What `drakegrasp export --help` says of the format.
+#: Description of the format in `drakegrasp export --help`.
 HELP = "a 3D scene per grasp: the object in the closed hand"
 
-#: Pose of {T} in the frame U of the file, whose +Y is up.
+#: Pose of {T} in the frame {U} of the file, in which +Y points up.
 X_UT = make_pose(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))
-#: Colours of fingertips and of other links, RGBA.
+#: RGBA colours of fingertips and of other links.
 TIP_COLOUR, LINK_COLOUR = (0.93, 0.55, 0.20, 1.0), (0.45, 0.48, 0.52, 1.0)
 
 
 def write_glb(out: Path, folder: Path, progress: Report) -> int:
-    """Write a scene per sample and return their number; see `export.export_dataset`."""
+    """Write one scene per sample and return the number of scenes; see `export.export_dataset`."""
     hand = load_hand(read_manifest(out).config.hand_source)
     posed, links = StillScene(hand), link_meshes(hand)
     grasps = list(read_closed_grasps(out))
@@ -56,12 +56,12 @@ def write_glb(out: Path, folder: Path, progress: Report) -> int:
 def posed_scene(
     model: ObjectModel, posed: StillScene, links: dict[str, trimesh.Trimesh], grasp: ClosedGrasp
 ) -> trimesh.Scene:
-    """Return object and hand as they are when the fingers have closed.
+    """Return the scene of object and hand after the fingers have closed.
 
     Args:
         model: The object.
         posed: The hand.
-        links: The links' meshes by name, each in its link's frame.
+        links: Meshes of the links by link name, each in the frame of its link.
         grasp: The sample.
     """
     scene = trimesh.Scene(base_frame="scene")
@@ -79,7 +79,7 @@ def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, X_TB: Array) ->
 
 
 def link_meshes(hand: Hand) -> dict[str, trimesh.Trimesh]:
-    """Return the links that have shapes, each as one mesh in its link's frame."""
+    """Return one mesh for each link that has shapes, in the frame of the link."""
     meshes = {}
     for link, shapes in link_shapes(hand.model).items():
         parts = [trimesh.Trimesh(**_indexed(hull_triangles(corners))) for corners in shapes]

@@ -1,9 +1,11 @@
-"""The files of GraspGen (github NVlabs/GraspGen) beside isaac_grasp, which its demo writes.
+"""The file formats of GraspGen (github NVlabs/GraspGen) other than isaac_grasp.
 
-In: a JSON file of its datasets, with the grasps of one object and whether each held it, or the HDF5
-file that `scripts/inference_graspgen.py` writes, with the predicted grasps of many objects and
-their confidence. Out: palm poses alone, of its gripper frame (`graspgen` in a hand file), in the
-axes of the mesh file and in metres.
+In: a JSON file of GraspGen's datasets, with the grasps of one object and whether each grasp held
+the object, or the HDF5 file that `scripts/inference_graspgen.py` writes, with the predicted grasps
+of many objects and their confidence. Out: palm poses without joints. They are poses of GraspGen's
+gripper frame (`graspgen` in a hand file) in the axes of the mesh file, in metres.
+
+GraspGen's demo writes isaac_grasp, which `drakegrasp.exchange.isaac_grasp` reads.
 """
 
 from __future__ import annotations
@@ -20,17 +22,17 @@ from drakegrasp.exchange.attempts import is_graspgen, refuse_large
 from drakegrasp.foreign_files import read_json
 from drakegrasp.hand.description import Hand
 
-#: Name of its gripper frame in hand files.
+#: Name of GraspGen's gripper frame in hand files.
 LINK = "graspgen"
 
 
 def read_graspgen_json(path: Path, hand: Hand) -> dict[str, Any]:
-    """Return the grasps of a file of its datasets as arguments of `make_attempts`.
+    """Return the grasps of a file of GraspGen's datasets as arguments of `make_attempts`.
 
-    Those that held their object are ranked first.
+    Grasps that held their object are ranked first.
 
     Raises:
-        GraspError: If it is none.
+        GraspError: If the file is not a file of GraspGen's datasets.
     """
     try:
         tree: Any = read_json(path)
@@ -52,10 +54,13 @@ def read_graspgen_json(path: Path, hand: Hand) -> dict[str, Any]:
 
 
 def read_graspgen_hdf5(path: Path, hand: Hand) -> dict[str, Any] | None:
-    """Return the predictions of a file as arguments of `make_attempts`; None for another file.
+    """Return the predictions of a file as arguments of `make_attempts`.
+
+    Returns:
+        The arguments; None if the file does not hold predictions of GraspGen.
 
     Raises:
-        GraspError: If it is damaged.
+        GraspError: If the file holds such predictions but is damaged.
     """
     with open_hdf5(path) as file:
         if not is_graspgen(file):
@@ -83,7 +88,7 @@ def _names(item: object) -> list[str]:
 
 
 def _predicted(group: h5py.Group) -> tuple[list[str], Any, Any, Any]:
-    """Return the name of the object, pose, scale and confidence of each grasp of an object."""
+    """Return object name, pose, scale and confidence of each grasp of one object."""
     X_MA = _poses(group["pred_grasps"][()])
     name = Path(group["asset_path"].asstr()[()]).stem
     scale, confidence = float(group["asset_scale"][()]), group["confidence"][()].astype(float)
@@ -91,10 +96,10 @@ def _predicted(group: h5py.Group) -> tuple[list[str], Any, Any, Any]:
 
 
 def _poses(numbers: Any) -> Any:
-    """Return poses (n, 4, 4).
+    """Return numbers as poses (n, 4, 4).
 
     Raises:
-        ValueError: If they are none.
+        ValueError: If they do not have this shape.
     """
     X = np.asarray(numbers, dtype=float)
     if X.ndim != 3 or X.shape[1:] != (4, 4):

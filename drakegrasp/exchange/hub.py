@@ -3,14 +3,14 @@
 In: a dataset. Out: `<camera>/<split>-00000-of-00001.parquet` for both cameras and all splits that
 have samples, `README.md` (whose head in YAML the Hub and `datasets` read) and `croissant.json`
 (mlcommons.org/croissant, version 1.1, with the fields of its RAI vocabulary 1.0).
-`datasets.load_dataset(folder, "oto")` reads it. With a scenes.hdf5 there is a configuration of
-views, and one of the grasps in them. Their columns are those of the schema, with what /scenes and
-/objects say of a row's scene in place of the numbers of their rows; a scene has the same number in
-both.
+`datasets.load_dataset(folder, "oto")` reads it. If the dataset has a scenes.hdf5, there is also a
+configuration of views and a configuration of the grasps in the scenes. Their columns are those of
+the schema, but the columns that refer to rows of /scenes and /objects are replaced by the content
+of these rows. A scene has the same number in both configurations.
 
-Colour is an 8-bit PNG, depth a 16-bit PNG in units of `DEPTH_UNIT`, the mask an 8-bit PNG of 0 and
-255; images of scenes have the values that their file holds. All other columns are those of the data
-file, by their last names. Needs the extra `[hub]`.
+Colour is an 8-bit PNG, depth a 16-bit PNG in units of `DEPTH_UNIT`, the mask an 8-bit PNG with the
+values 0 and 255. Images of scenes have the values stored in scenes.hdf5. All other columns are
+fields of the data file; a column has the last part of the field's name. Needs the extra `[hub]`.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ from drakegrasp.runtime.progress import Report
 if TYPE_CHECKING:
     import pyarrow as pa
 
-#: Types of Croissant by NumPy's letter of a kind.
+#: Croissant's data types by the kind letter of NumPy's types.
 _CROISSANT_TYPES = {"f": "sc:Float", "i": "sc:Integer", "u": "sc:Integer", "b": "sc:Boolean"}
-#: Terms of Croissant that mean what its vocabulary says.
+#: Terms that are defined in Croissant's own vocabulary.
 _TERMS = (
     *("arrayShape", "citeAs", "column", "containedIn", "equivalentProperty", "extract", "field"),
     *("fileProperty", "fileObject", "fileSet", "format", "includes", "isArray", "isLiveDataset"),
@@ -88,12 +88,12 @@ def croissant(
     """Return the content of `croissant.json`.
 
     Args:
-        folder: With the files.
+        folder: Folder of the files.
         files: Table and path of each file that was written.
         card: Content of the data card (`card_content`).
-        publication: What the publishers say; keys that they do not say are left out.
+        publication: What the publishers state; keys that they do not state are left out.
     """
-    # Each file with its hash, so that a damaged download shows.
+    # Each file with its hash, so that a damaged download is detected.
     distribution = [
         {
             "@type": "cr:FileObject",
@@ -133,14 +133,14 @@ def croissant(
 
 def _responsibility(card: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of Croissant's RAI vocabulary, all from the data card."""
-    # How many, of what, by which programs.
+    # Counts, classes and versions for the texts below.
     counts = card["counts"]
     everything, removals = counts["all"], counts["removed"]
     samples = [row["samples"] for row in counts["classes"].values()]
     versions = ", ".join(f"{name} {card['versions'][name]}" for name in ("drakegrasp", "drake"))
     reasons = ", ".join(f"{count} {reason}" for reason, count in removals.items()) or "none"
 
-    # Only what is known of every dataset that drakegrasp makes.
+    # Only statements that are true of every dataset that drakegrasp builds.
     return {
         "rai:dataCollection": (
             f"Simulated with {versions}, hand {card['hand']}: {everything['attempts']} attempts to "
@@ -197,10 +197,10 @@ def _croissant_type(field: Field) -> str:
     return "sc:Text" if field.dtype == "str" else _CROISSANT_TYPES[np.dtype(field.dtype).kind]
 
 
-#: Fields by the names of columns; those that are images (`sample`) are PNG files.
+#: Fields by the names of columns; columns that are images (`sample`) hold PNG files.
 Columns = Mapping[str, Field]
-#: Size of a file [byte] after which the next one begins, as the Hub recommends it, and rows in a
-#: group, which is read as a whole.
+#: Size of a file [byte] at which the next file begins, as the Hub recommends it, and the number of
+#: rows in a row group, which is read as a whole.
 FILE_BYTES, GROUP_ROWS = 500_000_000, 100
 
 
@@ -209,12 +209,12 @@ class HubTable:
     """The rows of a configuration in a split.
 
     Attributes:
-        config, split: Names.
-        what: What the rows are, in a sentence.
+        config, split: Names of the configuration and the split.
+        what: Description of the rows in a sentence.
         count: Number of rows.
-        columns: What they have.
-        read: Returns the columns of the rows from one to before another, as lists of JSON types;
-            an image is a cell of `png_cell`.
+        columns: Fields of the columns.
+        read: Function that takes a start and an end (excluded) and returns the columns of these
+            rows as lists of JSON types; an image is a cell of `png_cell`.
     """
 
     config: str
@@ -225,10 +225,10 @@ class HubTable:
     read: Callable[[int, int], Mapping[str, Sequence[Any]]]
 
     def write(self, folder: Path, wrote: Callable[[int], None]) -> Iterator[tuple[HubTable, str]]:
-        """Write the files of the table below a folder, and yield it with the path of each.
+        """Write the files of the table; yield, for each file, the table and the file's path.
 
         Args:
-            folder: Of all configurations.
+            folder: Folder of all configurations; the paths are relative to it.
             wrote: Called with the number of rows of each group that is written.
         """
         import pyarrow as pa
@@ -248,7 +248,7 @@ class HubTable:
                     if file.tell() >= FILE_BYTES:
                         break
 
-        # Their names say how many they are.
+        # The names of the files contain the number of files, which is known only now.
         for number, part in enumerate(parts):
             path = f"{self.config}/{self.split}-{number:05d}-of-{len(parts):05d}.parquet"
             part.rename(folder / path)
@@ -256,7 +256,7 @@ class HubTable:
 
 
 def png_cell(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> dict[str, Any]:
-    """Return the cell of an image, as `datasets` reads it."""
+    """Return an image as a cell, in the form that `datasets` reads."""
     from PIL import Image
 
     file = io.BytesIO()
@@ -265,7 +265,7 @@ def png_cell(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> dict[str
 
 
 def _schema(columns: Columns) -> pa.Schema:
-    """Return the schema of the files, with the types that `datasets` reads them as."""
+    """Return the schema of the files, with the types that `datasets` gives the columns."""
     import pyarrow as pa
 
     features: dict[str, Any] = {}
@@ -287,19 +287,19 @@ def _schema(columns: Columns) -> pa.Schema:
     return pa.schema(fields, metadata=dict(metadata))
 
 
-#: Configurations, and what their rows are.
+#: Configurations of scenes, and descriptions of their rows.
 SCENE_CONFIGS = {
     "views": "images of scenes, by cameras that know no grasp",
     "scene_grasps": "the hands that closed in these scenes; the column scene joins both",
 }
-#: Columns that have another name than their field: as those of samples.
+#: Columns whose name differs from that of their field, to be the same as in samples.
 _NAMES = {"rgb": "image"}
-#: What is said of columns whose fields refer to files that are not in the folder.
+#: Meanings of columns whose fields refer to files that are not in the folder.
 _MEANINGS = {
     "scene": "number of the scene",
     **{field.name: field.meaning for field in TRIAL_FIELDS if field.name in ("outcome", "source")},
 }
-#: What is said of the objects of a scene in place of their rows.
+#: Columns that replace the rows of a scene's objects in /objects.
 _OBJECTS = tuple(
     Field(name, "o", "str", "-", "-", f"{what} of the objects")
     for name, what in (("object_name", "names"), ("class_name", "classes"))
@@ -317,10 +317,10 @@ VIEW_COLUMNS, GRASP_COLUMNS = (
 
 
 def scene_tables(out: Path) -> list[HubTable]:
-    """Return the tables of a dataset's scenes; none without a scenes.hdf5.
+    """Return the tables of a dataset's scenes; an empty list without a scenes.hdf5.
 
     Raises:
-        DataError: If the file is damaged, or of another state of the dataset.
+        DataError: If the file is damaged, or was built from another state of the dataset.
     """
     path = out / SCENES_FILE
     if not os.path.lexists(path):
@@ -334,7 +334,7 @@ def scene_tables(out: Path) -> list[HubTable]:
 
 
 def _table(data: SceneDataset, config: str, group: str, columns: Columns, split: str) -> HubTable:
-    """Return the rows of a group that are of a split."""
+    """Return the table of those rows of a group that belong to a split."""
     of_rows = data.tables["scenes"]["split"][data.tables[group]["scene"]]
     rows = np.flatnonzero(of_rows == SPLITS.index(split))
 
@@ -373,13 +373,13 @@ def _read(
     return found
 
 
-#: What `drakegrasp export --help` says of the format.
+#: Description of the format in `drakegrasp export --help`.
 HELP = (
     "Parquet, a dataset card and Croissant metadata, as the Hugging Face Hub has them; needs "
     "pip install 'drakegrasp[hub]'"
 )
 
-#: Columns of samples that are images, made of the fields `images` and `masks`.
+#: Image columns of samples, computed from the fields `images` and `masks`.
 IMAGES = {
     name: Field(name, "", "uint8", "-", "C", meaning, sample=True)
     for name, meaning in (
@@ -388,19 +388,19 @@ IMAGES = {
         ("mask", "8-bit PNG, 255 where the object is seen, else 0"),
     )
 }
-#: The files of a folder, in words.
+#: Descriptions of the files of a folder.
 FILES = {
     "oto/, otm/": "the samples, as each camera sees them, in Parquet files",
     "croissant.json": "the same for programs, with a hash of each file",
 }
-#: What is not as in the files of a dataset.
+#: Conventions that differ from those of the files of a dataset.
 CONVENTIONS = {
     "depth": "z of the camera frame in units of 0.1 mm; see Camera for pixels that show nothing",
     "images": "PNG files; row 0 is the top",
 }
-#: What a data file says of its camera: intrinsics [px] and the range of depths [m].
+#: Attributes of the camera in a data file: intrinsics [px] and the range of depths [m].
 _CAMERA = ("K", "near", "far")
-#: What fields are called here, where it is not their last name.
+#: Column names of fields for which the column does not have the last part of the field's name.
 NAMES = {"grasps": "grasp", "grasps_held": "grasp_held"}
 #: Columns of samples.
 COLUMNS: Columns = IMAGES | {
@@ -431,7 +431,7 @@ def write_hub(
             "format hf needs pyarrow, got none: pip install 'drakegrasp[hub]'"
         ) from None
 
-    # The Parquet files of each camera and split, and those of scenes.
+    # Write the Parquet files of each camera and split, and those of scenes.
     publication = publication or Publication()
     tables = [_sample_table(out, camera, split) for camera in CAMERAS for split in SPLITS]
     samples, done = sum(table.count for table in tables) // len(CAMERAS), 0
@@ -445,7 +445,7 @@ def write_hub(
 
     written = [file for table in tables for file in table.write(folder, wrote)]
 
-    # What they are, for people and for programs.
+    # Describe them for people and for programs.
     content = card_content(out)
     text = _card(out, tables, content, publication)
     (folder / "README.md").write_text(text, encoding="utf-8")
@@ -457,7 +457,7 @@ def write_hub(
 def _card(
     out: Path, tables: Sequence[HubTable], card: Mapping[str, Any], publication: Publication
 ) -> str:
-    """Return the text of the dataset card: that of the dataset, its files and its columns."""
+    """Return the text of the dataset card: the dataset's own card, the files and the columns."""
     configs = {table.config: table.columns for table in tables}
     scenes = [name for name in configs if name not in CAMERAS]
     content = {**card, "files": FILES | {f"{name}/": SCENE_CONFIGS[name] for name in scenes}}
@@ -471,7 +471,7 @@ def _card(
     content["columns"] = _described(COLUMNS)
     content["columns_of"] = {name: _described(configs[name]) for name in scenes}
 
-    # The head names the files of each configuration and split.
+    # The head lists the files of each configuration and split.
     files = [
         {
             "config_name": config,
@@ -494,7 +494,7 @@ def _card(
 
 
 def _described(columns: Columns) -> dict[str, tuple[str, str, str, str]]:
-    """Return shape, unit, frame and meaning of columns, by their names."""
+    """Return shape, unit, frame and meaning of each column by its name."""
     return {
         name: (" x ".join(map(str, field.axes)), field.unit, field.frame, field.meaning)
         for name, field in columns.items()
@@ -502,7 +502,7 @@ def _described(columns: Columns) -> dict[str, tuple[str, str, str, str]]:
 
 
 def _sample_table(out: Path, camera: str, split: str) -> HubTable:
-    """Return the samples of a split as a camera sees them."""
+    """Return the table of a split's samples with the images of a camera."""
     data = GraspDataset(out / DATA_FILES[camera], split=split, fewer_fingers=True)
 
     def read(start: int, stop: int) -> dict[str, list[Any]]:
@@ -525,7 +525,7 @@ def _sample_table(out: Path, camera: str, split: str) -> HubTable:
 
 
 def encode_images(image: npt.ArrayLike, mask: npt.ArrayLike) -> dict[str, dict[str, Any]]:
-    """Return the cells of an image (4, S, S) with depth [m] and its mask (S, S)."""
+    """Return the cells of an image (4, S, S), with depth [m] as last channel, and a mask (S, S)."""
     channels = np.asarray(image)
     colour = np.rint(np.moveaxis(channels[:3], 0, -1) * 255.0).astype(np.uint8)
     depth = np.clip(np.rint(channels[3] / DEPTH_UNIT), 0, np.iinfo(np.uint16).max)

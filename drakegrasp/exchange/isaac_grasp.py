@@ -1,9 +1,9 @@
-"""The format isaac_grasp 1.0 (nvidia-isaac-ros.github.io, "Isaac Grasp File"): a YAML per object.
+"""The format isaac_grasp 1.0 (nvidia-isaac-ros.github.io, "Isaac Grasp File").
 
-In: a dataset. Out: `<object>.yaml`, with the pose of the palm link in {O} of each sample, the
-joints after closing and those of the open hand, and `meshes/<object>.obj`, the object in {O} [m].
-The format allows more keys: those of ours say under what the sample held, so that the file read
-back gives the same trial.
+In: a dataset. Out: a file `<object>.yaml` per object, and `meshes/<object>.obj`, the object in {O}
+[m]. For each sample the YAML file has the pose of the palm link in {O}, the joint positions after
+closing and those of the open hand. The format allows additional keys. Ours state the conditions
+under which the sample held, so that the file can be read back as the same trial.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from drakegrasp.simulation.attempts import CONDITIONS, quaternion_poses
 from drakegrasp.simulation.posture import joint_order
 from drakegrasp.yaml_text import parse_yaml
 
-#: What a file of ours says of its origin.
+#: Value with which our files state their origin.
 CREATED_WITH = "drakegrasp"
-#: Keys of the joints of a grasp, and of those before it.
+#: Keys of the joint positions of the grasp and of the pregrasp.
 _STAGES = ("cspace_position", "pregrasp_cspace_position")
-#: What `drakegrasp export --help` says of the format.
+#: Description of the format in `drakegrasp export --help`.
 HELP = "a YAML file per object: poses of the palm link, joints by name"
 
 
@@ -70,13 +70,13 @@ def write_isaac_grasp(out: Path, folder: Path, progress: Report) -> int:
 
 
 def grasp_entry(hand: Hand, grasp: ClosedGrasp) -> dict[str, Any]:
-    """Return what the file says of a sample, which held."""
+    """Return the entry of a sample in the file."""
     order = joint_order(hand)
     X_OB = multiply(multiply(invert_pose(grasp.X_TO), grasp.X_TG), invert_pose(hand.X_BG))
     x, y, z, w, *xyz = pose_vector(X_OB).tolist()
     closed = dict(zip(order, grasp.q.tolist(), strict=True))
 
-    # Fingers that the grasp uses are open before it; the other joints stay where they are.
+    # Before the grasp, the fingers that it uses are open; the other joints do not move.
     used = ~unused_fingers(grasp.unused, hand.num_fingers)
     moved = np.asarray(hand.joint_gain[:, 1:][:, used].any(axis=1))
     moves = dict(zip(hand.joint_names, moved.tolist(), strict=True))
@@ -90,7 +90,7 @@ def grasp_entry(hand: Hand, grasp: ClosedGrasp) -> dict[str, Any]:
         "trial_id": grasp.trial_id,
     }
 
-    # How the object lay, and what else the trial had.
+    # The resting pose of the object, and the other conditions of the trial.
     x, y, z, w, *xyz = pose_vector(grasp.X_TO).tolist()
     entry["resting_pose"] = {"position": [x, y, z], "orientation": {"w": w, "xyz": xyz}}
     if name := grasp.preshape_name(hand):
@@ -101,13 +101,14 @@ def grasp_entry(hand: Hand, grasp: ClosedGrasp) -> dict[str, Any]:
 
 
 def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
-    """Return the grasps of a file as arguments of `make_attempts`; its name is that of the object.
+    """Return the grasps of a file as arguments of `make_attempts`.
 
-    The object's frame is that of its mesh file; in what drakegrasp itself exports it is {O}. A
-    grasp without `cspace_position` is a palm pose alone, as GraspGen writes them.
+    The object has the name of the file. Its frame is the frame of its mesh file; in a file that
+    drakegrasp exported, this is {O}. A grasp without `cspace_position` is a palm pose without
+    joints, as GraspGen writes it.
 
     Raises:
-        GraspError: If it is none.
+        GraspError: If the file is not an isaac_grasp file.
     """
     try:
         tree: Any = parse_yaml(read_text(path))
@@ -121,7 +122,8 @@ def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
     if not isinstance(grasps, dict) or not grasps:
         raise GraspError(f"{path}: grasps must be there, got none")
 
-    # Each grasp with the joints of the first that names some; without any it is a palm pose alone.
+    # Read from each grasp the joints that the first grasp with joints names. A grasp without
+    # joints is a palm pose without joints.
     told = [each for each in grasps.values() if isinstance(each, dict)]
     stages = [each[key] for each in told for key in _STAGES if key in each]
     named = next((stage for stage in stages if isinstance(stage, dict) and stage), None)
@@ -177,7 +179,7 @@ def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
 
 
 def _of_export(grasp: Any) -> list[float]:
-    """Return the object's pose (7,), the trial, and the conditions of a grasp; NaN if not told."""
+    """Return the object's pose (7,), the trial and the conditions of a grasp; NaN if not stated."""
     found, lies = [np.nan] * 7, grasp.get("resting_pose")
     if lies is not None:
         found = [*lies["position"], lies["orientation"]["w"], *lies["orientation"]["xyz"]]
@@ -187,13 +189,13 @@ def _of_export(grasp: Any) -> list[float]:
 
 
 def _confidence(grasp: Any) -> float:
-    """Return what a grasp says of its confidence; NaN if that is no number."""
+    """Return the confidence that a grasp states; NaN if it is not a number."""
     stated = grasp.get("confidence")
     return float(stated) if isinstance(stated, int | float) else np.nan
 
 
 def _isaac_numbers(grasp: Any, joints: list[str]) -> list[float]:
-    """Return position, quaternion, grasp and pregrasp of a grasp; NaN for what is missing."""
+    """Return position, quaternion, joints at grasp and pregrasp; NaN for missing numbers."""
     turn, nothing = grasp["orientation"], dict.fromkeys(joints, np.nan)
     closed, before = _STAGES
     q = [grasp.get(closed, nothing), grasp.get(before) or nothing]

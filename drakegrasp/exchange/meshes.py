@@ -1,10 +1,11 @@
-"""Meshes for a network of others: the objects of a dataset in {O} [m], and tables of its rows.
+"""Meshes for another group's network: the objects of a dataset in {O} [m], and tables of its rows.
 
-In: a dataset. Out: `<object>.obj` for each object, `objects.yaml` with what the triangles do not
-say, so that `build --objects` makes the same objects of the folder, and `rows_<split>.csv` with a
-line per sample. A pose that a network gives in the frame of such a file is in {O}: `score` reads it
-with `--frame object`, `verify --object` with any frame. The columns of the tables have the names
-that files of postures have, so that a table with the columns of a pose is one.
+In: a dataset. Out: `<object>.obj` for each object, `objects.yaml` with their properties, and
+`rows_<split>.csv` with one line per sample. From this folder `build --objects` builds the same
+objects. The frame of such a mesh file is {O}, so a pose that a network predicts in it is in {O}:
+`score` reads it with `--frame object`, and `verify --object` with any frame. The columns of the
+tables have the names of files of postures, so a table becomes a file of postures when the columns
+of a palm pose are added.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ from drakegrasp.objects.sources import MANIFEST_NAME
 from drakegrasp.runtime.progress import Report
 from drakegrasp.simulation.attempts import CONDITIONS
 
-#: What `drakegrasp export --help` says of the format.
+#: Description of the format in `drakegrasp export --help`.
 HELP = "the objects [m] and tables of the rows, for a network of others"
-#: Columns of the object's pose on the table, X_TO: position [m] and quaternion.
+#: Columns of the object's pose X_TO on the table: position [m] and quaternion.
 PLACE = tuple(f"object_{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
 
 
@@ -56,7 +57,7 @@ def write_meshes(out: Path, folder: Path, progress: Report) -> int:
     text = yaml.safe_dump({"units": "m", "objects": said}, sort_keys=False)
     (folder / MANIFEST_NAME).write_text(text, encoding="utf-8")
 
-    # A table of each split that has rows.
+    # Write one table for each split that has rows.
     scale_of = {entry.name: entry.scale for entry in manifest.objects}
     trials, count = Trials(out), 0
     for split in SPLITS:
@@ -68,7 +69,7 @@ def write_meshes(out: Path, folder: Path, progress: Report) -> int:
 
 
 def _write_rows(path: Path, samples: Trials, scale_of: Mapping[str, float]) -> None:
-    """Write the table of the rows of a split, whose attempts are given in their order."""
+    """Write the table of a split, given the trials of its rows in the order of the rows."""
     names = samples["object_name"].tolist()
     places = np.array([pose_vector(X_TO) for X_TO in unpack_pose(samples["X_TO"])])
     columns: dict[str, Sequence[Any]] = {

@@ -1,9 +1,10 @@
-"""Posed scenes for MuJoCo: an MJCF per grasp, with object, table and the hand at the grasp.
+"""Posed scenes for MuJoCo: one MJCF file per grasp, with the object, the table and the hand.
 
 In: a dataset. Out: `<object>/<trial_id>.xml`, which `mujoco.MjModel.from_xml_path` loads, and
-`meshes/`. Everything is in {T}. The keyframe `grasp` has the joints as the fingers closed, the
-object where it rests, and the motors' commands at these joints. The object's mass is its own;
-friction is that of the configuration. The palm is fixed to the world.
+`meshes/`. All poses are in {T}. The keyframe `grasp` has the joint positions after closing, the
+object in its resting pose, and the same joint positions as commands of the motors. The mass is that
+of the object, without randomisation; the friction is that of the configuration or of the object.
+The palm is fixed to the world.
 """
 
 from __future__ import annotations
@@ -30,17 +31,17 @@ from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.runtime.progress import Report
 from drakegrasp.vision.camera import object_colour
 
-#: What `drakegrasp export --help` says of the format.
+#: Description of the format in `drakegrasp export --help`.
 HELP = "the same for MuJoCo, with the table; needs drakegrasp[peer]"
 
-#: Half extents of the table [m], whose top is at z = 0.
+#: Half extents of the table [m]; its top is at z = 0.
 TABLE = (0.8, 0.8, 0.05)
-#: Folder of all meshes, and the one of the hand's in it.
+#: Folder of all meshes, and the folder of the hand's meshes in it.
 MESHES, HAND = "meshes", "hand"
 
 
 def write_mjcf(out: Path, folder: Path, progress: Report) -> int:
-    """Write a scene per sample and return their number; see `export.export_dataset`."""
+    """Write one scene per sample and return the number of scenes; see `export.export_dataset`."""
     config = read_manifest(out).config
     hand = load_plain_hand(config.hand_source, "scenes of MuJoCo")
     posed, grasps = StillScene(hand), list(read_closed_grasps(out))
@@ -59,7 +60,7 @@ def write_mjcf(out: Path, folder: Path, progress: Report) -> int:
 
 
 class ObjectScenes:
-    """The scenes of an object, one grasp after the other."""
+    """Builds the scenes of one object, one grasp after the other."""
 
     def __init__(self, hand: Hand, thing: ObjectModel, config: Config, folder: Path) -> None:
         """Write the meshes, and build the scene.
@@ -67,8 +68,8 @@ class ObjectScenes:
         Args:
             hand: The hand.
             thing: The object.
-            config: Friction of hand and table.
-            folder: To which `meshes/` is written.
+            config: Configuration, from which the friction of hand and table is used.
+            folder: Folder in which `meshes/` is created.
         """
         # The table.
         physics = thing.own_physics(config.physics)
@@ -88,7 +89,7 @@ class ObjectScenes:
             priority=1,
         )
 
-        # The hand, whose palm each grasp moves, and the object.
+        # The hand, whose palm `posed` moves for each grasp, and the object.
         model = make_hand_model(hand, physics.friction_hand)
         self._joints = [joint.name for joint in model.joints]
         self._frame = self._attach(model)
@@ -100,7 +101,7 @@ class ObjectScenes:
 
         Args:
             grasp: The sample.
-            joints: Names of its joints, in the order in which they are stored.
+            joints: Names of the joints, in the order of `grasp.q`.
         """
         palm = pose_vector(multiply(grasp.X_TG, invert_pose(self._hand.X_BG)))
         self._frame.pos, self._frame.quat = palm[:3], palm[3:]
@@ -108,16 +109,16 @@ class ObjectScenes:
         self._key.qpos = [*(q[name] for name in self._joints), *pose_vector(grasp.X_TO)]
         self._key.ctrl = [q[joint] for joint in self._motor_joints()]
 
-        # Meshes have absolute paths while it is compiled, and go with the folder afterwards.
+        # The compiler needs absolute paths of meshes; the file needs paths relative to its folder.
         self._spec.compile()
         return self._spec.to_xml().replace(escape(str(self._meshes)), f"../{MESHES}")
 
     def _motor_joints(self) -> list[str]:
-        """Return the joints of the motors."""
+        """Return the names of the joints that the motors drive."""
         return [motor.target.removeprefix(f"{HAND}/") for motor in self._spec.actuators]
 
     def _attach(self, model: mujoco.MjSpec) -> mujoco.MjsFrame:
-        """Add the hand; return the frame that carries its palm."""
+        """Add the hand; return the frame to which its palm is attached."""
         for mesh in model.meshes:
             mesh.file = self._write(HAND, mesh.file, model.assets[mesh.file].decode())
         frame = self._spec.worldbody.add_frame()
@@ -142,7 +143,7 @@ class ObjectScenes:
             )
 
     def _write(self, folder: str, name: str, text: str) -> str:
-        """Write a mesh and return its path."""
+        """Write the text of a mesh file and return the path of the file."""
         path = self._meshes / folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")

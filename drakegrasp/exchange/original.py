@@ -1,14 +1,15 @@
 """The layout of the released code of Veres, Moussa and Taylor (github mveres01/grasping).
 
-In: a dataset. Out: `grasping_oto.hdf5` and `grasping_otm.hdf5` as its loaders expect them: depth is
-the first channel of an image, a grasp is 9k numbers (27 for three fingers: points, normals and
-forces), and cameras have the axes of V-REP's sensors: +X left, +Y up, +Z forward.
+In: a dataset. Out: `grasping_oto.hdf5` and `grasping_otm.hdf5` in the form that the loaders of the
+released code expect. Depth is the first channel of an image. A grasp is 9k numbers (27 for three
+fingers: points, normals and forces). Cameras have the axes of V-REP's sensors: +X left, +Y up,
++Z forward.
 
-What it has no place for is left out: masks, joints, palm, the grasp at the end of the lift, and the
-conditions of an attempt, but for the mass, which is in `work2mass`. What it has and we do not:
-`unproj_z` and `unproj_y` of `object_props`, which only helped to find the image frame that is
-stored. Forces are those of the fingertips on the object; which of the two bodies V-REP's forces act
-on, the released code does not say.
+Data for which the layout has no place are left out: masks, joints, palm, the grasp at the end of
+the lift, and the conditions of an attempt except the mass, which is stored in `work2mass`. The
+released files also have `unproj_z` and `unproj_y` in `object_props`, which only helped to find the
+image frame; we do not write them. Our forces act from the fingertips on the object. The released
+code does not state on which of the two bodies V-REP's forces act.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ from drakegrasp.frames import Array, invert_pose, make_pose, pack_pose, unpack_p
 from drakegrasp.runtime.files import atomic_hdf5
 from drakegrasp.runtime.progress import Report
 
-#: What `drakegrasp export --help` says of the format.
+#: Description of the format in `drakegrasp export --help`.
 HELP = "HDF5 as of the paper's released code: depth first, 27 numbers a grasp, axes of its cameras"
 
-#: Pose of V-REP's camera axes V in ours: a turn by 180 degrees about the line of sight.
+#: Pose of V-REP's camera axes V in our camera frame: a rotation by 180 degrees about +Z.
 X_CV = make_pose(np.diag([-1.0, -1.0, 1.0]), [0.0, 0.0, 0.0])
-#: Rows that are read at once: images of 64 samples take 17 MB.
+#: Number of rows that are read at once; the images of 64 samples take 17 MB.
 BATCH = 64
-#: The fields of `object_props` that the released code has.
+#: Fields of `object_props` that the released files also have.
 PROPS = tuple(
     field.name
     for field in DATA_FIELDS
@@ -58,7 +59,10 @@ def write_original(out: Path, folder: Path, progress: Report) -> int:
 
 
 def original_pose(name: str, packed: npt.ArrayLike) -> Array:
-    """Return poses (n, 12) of a field of `object_props` with V-REP's axes of the camera."""
+    """Return the packed poses (n, 12) of a field of `object_props` with V-REP's camera axes.
+
+    Poses that do not refer to a camera are returned unchanged.
+    """
     X = unpack_pose(packed)
     if name.startswith("frame_cam2"):
         X = invert_pose(X_CV) @ X
@@ -68,7 +72,12 @@ def original_pose(name: str, packed: npt.ArrayLike) -> Array:
 
 
 def original_grasps(grasps: npt.ArrayLike, f_Q_C: npt.ArrayLike) -> Array:
-    """Return grasps (n, 9k) in V-REP's axes of (n, 6k) in ours and forces (n, k, 3) [N]."""
+    """Return grasps (n, 9k) in V-REP's camera axes.
+
+    Args:
+        grasps: Points [m] and normals (n, 6k) in our camera axes.
+        f_Q_C: Contact forces (n, k, 3) [N] in our camera axes.
+    """
     forces = np.asarray(f_Q_C, dtype=float)
     n, k, _ = forces.shape
     vectors = np.asarray(grasps, dtype=float).reshape(n, 2 * k, 3)
@@ -81,8 +90,8 @@ def _split(out: Path, camera: str, split: str) -> GraspDataset:
 
 
 def _write_split(group: h5py.Group, data: GraspDataset, done: int) -> int:
-    """Write the samples of a split; return how many are done after it."""
-    # All but the images are a few hundred bytes a row.
+    """Write the samples of a split; return `done` plus their number."""
+    # Without the images, a row takes a few hundred bytes.
     columns: Mapping[str, Any] = {name: data.column(name) for name in PROPS}
     grasps = original_grasps(data.column("grasps"), data.column("grasp_props/f_Q_C"))
     group.create_dataset("grasps", data=grasps.astype(np.float32))
@@ -95,7 +104,7 @@ def _write_split(group: h5py.Group, data: GraspDataset, done: int) -> int:
         else:
             group.create_dataset(name, data=values)
 
-    # Images by batches, with depth first.
+    # Images are written in batches, with depth as the first channel.
     size = data.image_size
     images = group.create_dataset(
         "images",

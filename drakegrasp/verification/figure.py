@@ -212,7 +212,7 @@ def _towards(marks: Marks, X_WO: Array, p_WC: Array) -> Array:
 
 
 def is_seen(model: ObjectModel, X_WO: Array, marks: Marks, p_WC: Array) -> npt.NDArray[np.bool_]:
-    """Return (n,), whether the object does not hide each contact from a camera at p_WC (3,)."""
+    """Return (n,), whether a camera at p_WC (3,) sees each contact, unhidden by the object."""
     start = marks.p_OQ + HIDDEN * marks.nhat_Q_O
     hits = first_hits(np.asarray(model.visual.triangles), start, _towards(marks, X_WO, p_WC))
     return ~np.isfinite(hits)

@@ -51,7 +51,13 @@ def trim(root: Element) -> None:
 
 
 def _name(parent: Element, name: str, count: list[int]) -> None:
-    """Name the bodies and joints below an element that belongs to a body of this name."""
+    """Give names to the unnamed bodies and joints below an element.
+
+    Args:
+        parent: The element, which is the body `name` or a frame in this body.
+        name: Name of the body.
+        count: Number of bodies visited so far, in a list of one; it is increased.
+    """
     for child in parent:
         if child.tag == "frame":
             _name(child, name, count)
