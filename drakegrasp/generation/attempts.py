@@ -1,9 +1,9 @@
-"""One object's trial setup in this process, the steps of a trial on it, and the rows of a shard.
+"""The trial setup of an object in this process, the steps of a trial, and the rows of a shard.
 
-In: a prepared object of a dataset, and attempts. Out: what geometry predicts of them, the records
-of their trials, and the columns of a shard by the names of `drakegrasp.dataset.schema`: `/trials`,
-a row per attempt, and `/looks`, what the cameras see of each success. Nothing is written here. A
-verdict asks the filters of a dataset about the columns that a trial alone has.
+In: a prepared object of a dataset, and attempts. Out: the predictions from geometry, the records of
+the trials, and the columns of a shard by the names of `drakegrasp.dataset.schema`: `/trials`, with
+a row per attempt, and `/looks`, with the images of each success. Nothing is written here. For a
+verdict, the filters of a dataset are applied to the columns of a single trial.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, image_fra
 from drakegrasp.vision.depth_sensor import spoil_depth
 from drakegrasp.vision.rendering import Renderer, paint, render
 
-#: Prepared objects that a process keeps: the next unit is mostly of the same object.
+#: Number of prepared objects that a process caches; the next unit mostly has the same object.
 KEPT_OBJECTS = 2
-#: Where the cameras of a name are, given the pose of the palm.
+#: Functions that return the pose of the camera of each name, given the pose of the palm.
 _CAMERA_POSES = {"oto": camera_pose_oto, "otm": camera_pose_otm}
 
 
 @dataclass(eq=False)
 class TrialSetup:
-    """What every trial of an object needs.
+    """The objects that every trial of an object needs.
 
     Attributes:
         prepared: The object, its resting poses and its palm poses.
-        config: All the rules.
-        scene: Physics of object, table and hand. A scene in which Drake failed is replaced.
+        config: Configuration of the dataset.
+        scene: Simulation of object, table and hand. A scene in which Drake failed is replaced.
     """
 
     prepared: PreparedObject
@@ -64,14 +64,14 @@ class TrialSetup:
     scene: Scene
 
     def scene_of(self, attempt: Attempt) -> Scene:
-        """Return the scene of an attempt: the hand may be in a preshape."""
+        """Return the scene of an attempt, with the hand in the attempt's preshape if it has one."""
         if attempt.preshape is None:
             return self.scene
         model, config = self.prepared.model, self.config
         return cached_scene(model, config.physics, config.hand_source, attempt.preshape)
 
     def renew_scene(self) -> None:
-        """Build the scene again if Drake failed in the one that was kept."""
+        """Replace the scene, after Drake failed in it and the cache was emptied."""
         config = self.config
         self.scene = cached_scene(self.prepared.model, config.physics, config.hand_source)
 
@@ -82,7 +82,7 @@ class TrialSetup:
 
     @cached_property
     def sizes(self) -> dict[str, int]:
-        """The array lengths that the schema leaves open: fingers, joints and pixels."""
+        """The array lengths that the schema does not fix: fingers, joints and pixels."""
         return sizes(
             fingers=self.scene.hand.num_fingers,
             joints=len(hand_joint_names(self.scene)),
@@ -91,10 +91,10 @@ class TrialSetup:
 
 
 def trial_setup(out: Path, header: ShardHeader, config: Config) -> TrialSetup:
-    """Return the setup of a unit's object; what it holds is kept from an earlier unit.
+    """Return the setup of a unit's object, whose object and scene are cached between units.
 
     Raises:
-        DataError: If the object's files are damaged, or of another configuration or mesh.
+        DataError: If the object's files are damaged, or belong to another configuration or mesh.
     """
     prepared = _load(out, header.object_name, header.mesh_sha256, config)
     scene = cached_scene(prepared.model, config.physics, config.hand_source)
@@ -110,7 +110,7 @@ def _load(out: Path, name: str, mesh_sha256: str, config: Config) -> PreparedObj
             f"{out}: the prepared {name} must be of the work unit's mesh {mesh_sha256[:12]}, "
             f"got {prepared.model.mesh_sha256[:12]}"
         )
-    release_memory()  # what other objects left, also in preparing them
+    release_memory()  # from earlier objects and their preparation
     return prepared
 
 
@@ -131,7 +131,7 @@ def list_attempts(prepared: PreparedObject, indices: range, config: Config) -> l
 
 
 def list_children(prepared: PreparedObject, parent: Attempt, config: Config) -> list[Attempt]:
-    """Return the attempts about that of a grasp that holds, with their conditions."""
+    """Return the attempts near a parent attempt that held, with their conditions."""
     made = children(parent, config.refine, name=prepared.model.name, seed=config.seed)
     return _completed(prepared.model, made, config)
 
@@ -142,7 +142,7 @@ def find_attempt(
     """Return an attempt by its identity in a dataset, with its conditions.
 
     Raises:
-        DataError: If there is no such number in a family.
+        DataError: If a family has no child of this number.
     """
     siblings, generations = config.refine.children, config.refine.generations
     most = sum(siblings**k for k in range(1, generations + 1))
@@ -157,7 +157,7 @@ def find_attempt(
 
 
 def _completed(model: ObjectModel, attempts: Sequence[Attempt], config: Config) -> list[Attempt]:
-    """Return attempts whose palms are centred, see `centred`, with their conditions."""
+    """Return attempts with centred palms, see `centred`, and with their conditions."""
     return [
         replace(
             each,
@@ -170,11 +170,11 @@ def _completed(model: ObjectModel, attempts: Sequence[Attempt], config: Config) 
 
 
 def predict_attempts(setup: TrialSetup, attempts: Sequence[Attempt]) -> list[Prediction | None]:
-    """Return what geometry says of each attempt; one call for all of them is much faster."""
+    """Return the prediction from geometry for each attempt; one call for all is much faster."""
     config, prepared = setup.config, setup.prepared
     hand = load_hand(config.hand_source)
 
-    # A call is about one resting pose and preshape.
+    # `predict` takes attempts of one resting pose and one preshape.
     groups: dict[tuple[int, int | None], list[int]] = {}
     for row, attempt in enumerate(attempts):
         groups.setdefault((attempt.resting, attempt.preshape), []).append(row)
@@ -200,14 +200,17 @@ def try_attempt(
 
 
 def lift_scraped(setup: TrialSetup, attempt: Attempt, record: TrialRecord) -> TrialRecord:
-    """Lift the hand of `try_attempt`, which only scraped the table; see `lift_on`."""
+    """Lift the hand of a trial that `try_attempt` ended because it scraped the table.
+
+    See `lift_on`.
+    """
     is_visible = partial(_is_visible, setup, attempt, record.X_TO)
     lifted = lift_on(setup.scene_of(attempt), record, attempt, setup.config, is_visible=is_visible)
     return _without_failed(setup, lifted)
 
 
 def _without_failed(setup: TrialSetup, record: TrialRecord) -> TrialRecord:
-    """Return a record; a scene in which Drake failed is not used again."""
+    """Return the record; if Drake failed, replace the scenes."""
     if record.outcome is Outcome.SOLVER_ERROR:
         forget_scenes()
         setup.renew_scene()
@@ -215,10 +218,10 @@ def _without_failed(setup: TrialSetup, record: TrialRecord) -> TrialRecord:
 
 
 def _is_visible(setup: TrialSetup, attempt: Attempt, X_TO: Array) -> bool:
-    """Return whether the otm depth image of an attempt is not too flat for a lift.
+    """Return whether the otm depth image of an attempt has enough variance for a lift.
 
     Raises:
-        MachineError: If the renderer fails: that is no failure of the grasp.
+        MachineError: If the renderer fails, which is not a failure of the grasp.
     """
     least = setup.config.lift.least_depth_variance
     if least == 0.0:
@@ -236,13 +239,13 @@ def _is_visible(setup: TrialSetup, attempt: Attempt, X_TO: Array) -> bool:
 
 
 class TrialRow(NamedTuple):
-    """What a row of `/trials` is made of; `Field.of` in the schema says of which part.
+    """The sources of a row of `/trials`; `Field.of` in the schema names the source of a column.
 
     Attributes:
-        attempt: What was tried.
-        conditions: Its friction, mass, looks and cameras.
-        trial: What happened.
-        fit: How the contacts after closing lie on the surface, if the hand lifted something.
+        attempt: The attempt.
+        conditions: Friction, mass, appearance and cameras of the attempt.
+        trial: The record of the trial.
+        fit: Fit of the contacts after closing to the surface; None if the hand was not lifted.
     """
 
     attempt: Attempt
@@ -254,7 +257,7 @@ class TrialRow(NamedTuple):
 def trial_rows(
     setup: TrialSetup, attempts: Sequence[Attempt], records: Sequence[TrialRecord]
 ) -> dict[str, AnyArray]:
-    """Return the columns of `/trials` that attempts and the records of their trials give."""
+    """Return the columns of `/trials` for attempts and the records of their trials."""
     return _trial_rows(setup.prepared.model, setup.config, setup.sizes, attempts, records)
 
 
@@ -267,19 +270,19 @@ def _trial_rows(
 ) -> dict[str, AnyArray]:
     fields = [field for field in trial_columns() if field.of]
     columns = {field.name: field.empty(len(records), sizes) for field in fields}
-    # The index of a preshape, of which a posture has none.
+    # A posture has no index of a preshape.
     columns["preshape"][:] = NO_PRESHAPE if load_hand(config.hand_source).preshapes else 0
     usual = usual_conditions(model, config.physics)
     for i, (attempt, record) in enumerate(zip(attempts, records, strict=True)):
         row = TrialRow(attempt, attempt.conditions or usual, record, _fit(model, record))
         used = ~unused_fingers(attempt.unused, sizes["k"])
         for field in fields:
-            # What a stage did not reach keeps the column's fill value.
+            # A value that the trial did not reach keeps the fill value of the column.
             value = field.value_of(row)
             if value is None:
                 continue
             if field.shape.startswith("k"):
-                # A finger that a preshape does not use has no contact, and no force.
+                # A finger that the preshape does not use has no contact and no force.
                 columns[field.name][i] = np.nan if field.per_finger else 0
                 columns[field.name][i][used] = value
             else:
@@ -288,7 +291,7 @@ def _trial_rows(
 
 
 def _fit(model: ObjectModel, record: TrialRecord) -> ContactFit | None:
-    """Return how the contacts after closing lie on the mesh; None if the hand lifted nothing."""
+    """Return the fit of the contacts after closing to the mesh; None if the hand was not lifted."""
     if record.closed is None or record.lift is None:
         return None
     closed = record.closed.contacts
@@ -298,7 +301,8 @@ def _fit(model: ObjectModel, record: TrialRecord) -> ContactFit | None:
 def look_at(setup: TrialSetup, attempt: Attempt, X_TO: Array) -> dict[str, AnyArray]:
     """Return the row of `/looks` of a success on an object that rests at X_TO (4, 4).
 
-    Where the object is out of sight the image frame is missing, and a filter removes the sample.
+    If the camera does not see the object, the image frame is missing and a filter removes the
+    sample.
 
     Raises:
         BlankImageError: If an image is blank, because OpenGL failed.
@@ -307,15 +311,15 @@ def look_at(setup: TrialSetup, attempt: Attempt, X_TO: Array) -> dict[str, AnyAr
 
 
 def _seen(setup: TrialSetup, attempt: Attempt, X_TO: Array, name: str) -> dict[str, AnyArray]:
-    """Return what the camera of a name sees of the object at rest, before the attempt."""
-    # The camera, and how the scene looks.
+    """Return the image and mask that a camera takes of the object at rest, before the attempt."""
+    # The camera, and the appearance of the scene.
     camera, model = setup.config.camera, setup.prepared.model
     conditions = attempt.conditions or usual_conditions(model, setup.config.physics)
     X_TC = _CAMERA_POSES[name](multiply(X_TO, attempt.X_OG), camera, conditions.X_C0C)
     paint(setup.renderer, conditions.appearance)
     seen = render(setup.renderer, X_TO, X_TC)
 
-    # The object's frame comes from the clean image; the sensor's errors come last.
+    # Compute the image frame from the clean image, before the errors of the sensor are added.
     K, image = intrinsics(camera), seen.image
     found: dict[str, AnyArray] = {"mask": seen.mask, "X_TC": pack_pose(X_TC)}
     if name == "otm" and seen.mask.any():
@@ -331,31 +335,31 @@ def _seen(setup: TrialSetup, attempt: Attempt, X_TO: Array, name: str) -> dict[s
 def judge_sample(
     model: ObjectModel, trial: TrialRecord, config: Config, *, views: bool = True
 ) -> Removal | None:
-    """Return the first filter that removes a held grasp, `KEPT` if none does.
+    """Return the first filter that removes a held grasp, or `KEPT` if none does.
 
-    The cameras are where a build puts them without randomisation.
+    The cameras have the poses of a build without randomisation.
 
     Args:
         model: The object.
-        trial: Of the grasp.
-        config: With the filters and the camera.
-        views: Whether the filters of the view of a camera count: where it is, and whether it sees
-            the contacts. They do not where the palm is off, as the picture was taken before.
+        trial: Trial of the grasp.
+        config: Configuration, from which the filters and the camera are used.
+        views: Whether to apply the filters of camera poses and of the contacts that a camera sees.
+            They do not apply to a palm with an error, because the image was taken before it.
 
     Returns:
-        The filter; None for a trial that is no success.
+        The filter; None for a trial that is not a success.
     """
     if trial.outcome is not Outcome.SUCCESS:
         return None
 
-    # Its row of /trials, as a build would write it.
+    # Create its row of /trials, as a build would write it.
     assert trial.closed is not None
     fingers, joints = len(trial.closed.contacts.touching), len(trial.closed.q)
     lengths = sizes(fingers=fingers, joints=joints, image=0)
     attempt = Attempt(X_OG=trial.X_OG, spread=0.0)
     columns = _trial_rows(model, config, lengths, [attempt], [trial])
 
-    # And where the cameras would be.
+    # Add the poses of the cameras.
     if views:
         X_TG = multiply(trial.X_TO, trial.X_OG)
         for name, pose in _CAMERA_POSES.items():
@@ -364,12 +368,12 @@ def judge_sample(
     return Removal(int(first_removal(successes, config.filters)[0]))
 
 
-#: Of the filters' columns, those that only pictures of a success show.
+#: Columns of the filters that need the images of a success.
 _OF_PICTURES = {"seen", "depth_variance"}
 
 
 def unjudged(rules: FilterConfig) -> tuple[Removal, ...]:
-    """Return the filters, of those that are on, about which a verdict knows nothing."""
+    """Return the enabled filters that a verdict cannot apply."""
     of_pictures = (rule for rule in RULES if rule.is_on(rules) and {*rule.needs} & _OF_PICTURES)
     others = {Removal.OUTLIER: rules.outlier_sigma > 0.0, Removal.OWN: bool(rules.own)}
     return (

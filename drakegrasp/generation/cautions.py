@@ -1,4 +1,4 @@
-"""What a user should know of a dataset before it is simulated; empty if there is nothing."""
+"""Warnings about a dataset before it is simulated; a warning that does not apply is empty."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drakegrasp.objects.sources import MeshSource
 def nothing_trains(sources: Sequence[MeshSource], split: SplitConfig) -> str:
     """Return why no sample of these meshes can be in the split `train`; empty if one can.
 
-    Nothing is said of a configuration that names no class to train on, as a benchmark's does.
+    There is no warning if the configuration has no classes for training, as in a benchmark.
     """
     if split.train_classes == ():
         return ""

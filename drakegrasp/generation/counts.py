@@ -1,7 +1,7 @@
-"""What a build has done so far, in numbers.
+"""Counts the progress of a build.
 
-In: the header and the outcomes of each work unit that is done, in any order. Out: counts, the
-figures of the progress bar, and whether an object needs more grasps.
+In: the header and the outcomes of each completed work unit, in any order. Out: counts, the figures
+of the progress bar, and whether an object needs more grasps.
 """
 
 from __future__ import annotations
@@ -21,33 +21,35 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import WorkerPool
 from drakegrasp.runtime.progress import Report
 
-#: Outcomes of attempts that the machine, or an error of the simulator, ended.
+#: Outcomes of attempts that ended because of the machine or an error of the simulator.
 ENDED = (Outcome.CRASHED, Outcome.TIMEOUT)
-#: Share of an object's attempts that may end so, and a number that always may. Of the millions of
-#: attempts behind the benchmarks none did.
+#: Fraction of an object's attempts from which on these outcomes cause a warning, and a number
+#: below which they do not, unless all attempts end so. None of the millions of attempts behind the
+#: benchmarks had such an outcome.
 ENDED_SHARE, FEW_ENDED = 0.02, 10
 
 
 class Counts:
-    """Numbers of what is done; their memory does not grow with the number of work units.
+    """Counts of completed work, whose memory does not grow with the number of work units.
 
-    For `max_grasps` it keeps, by object, up to which candidate all units are done, the grasps of
-    these units, and those of the units beyond the first gap, which are few: units in flight.
+    For `max_grasps` it stores, for each object, the candidate up to which all units are done and
+    the grasps of these units. It also stores the grasps of the units beyond this first gap; they
+    are few, because other units are only ahead of those that are still running.
 
     Attributes:
         simulated: Work units that were run now.
         reused: Work units that were done before.
         damaged: Damaged shards.
         errors: Number of solver errors by message.
-        target: What a number of samples to find needs; None without one.
+        target: Units for a requested number of samples; None if no number is requested.
     """
 
     def __init__(self, manifest: Manifest, pool: WorkerPool | None, report: Report) -> None:
         """Begin to count.
 
         Args:
-            manifest: Says how much there is to do.
-            pool: Its size is shown, if there is one.
+            manifest: Manifest of the dataset, which states the amount of work.
+            pool: Workers, whose number is shown; None: it is not shown.
             report: Called with the figures.
         """
         self.simulated = self.reused = 0
@@ -67,24 +69,25 @@ class Counts:
         self._outcomes: Counter[Outcome] = Counter()
         self._reused_attempts = 0
 
-        # What ends a build before all attempts are made: samples in all, and by object samples, or
-        # grasps.
+        # Limits that end a build before all attempts are made: the total number of samples, and
+        # for each object the number of samples or of grasps.
         config = manifest.config
         self._wanted, self._each = config.samples, config.samples_per_object or config.max_grasps
         self._found = Counter(dict.fromkeys((entry.name for entry in manifest.objects), 0))
 
-        # By object: all attempts, and those that the machine ended and not the physics.
+        # For each object: all attempts, and those that ended because of the machine.
         self._attempts: Counter[str] = Counter()
         self._ended: Counter[str] = Counter()
 
-        # For `max_grasps`, by object: grasps before the first gap, where it is, and those beyond.
+        # For `max_grasps`, for each object: the grasps before the first gap, its place, and the
+        # grasps of units beyond it.
         self._max_grasps = manifest.config.max_grasps
         self._grasps: Counter[str] = Counter()
         self._gap: Counter[str] = Counter()
         self._beyond: dict[str, dict[int, tuple[int, int]]] = {}
 
     def add(self, summary: UnitSummary, *, reused: bool = False) -> None:
-        """Count a unit that is done, now or before (`reused`)."""
+        """Count a completed unit; if `reused`, an earlier build completed it."""
         header, outcomes, samples = summary.header, summary.outcomes, summary.samples
         self.reused += reused
         self.simulated += not reused
@@ -117,7 +120,7 @@ class Counts:
         return lines
 
     def show(self) -> None:
-        """Report what is done, and by how many workers."""
+        """Report the completed attempts and the number of workers."""
         figures = {"grasps": self._outcomes[Outcome.SUCCESS]}
         for outcome in ENDED:
             if self._outcomes[outcome]:
@@ -129,9 +132,9 @@ class Counts:
         self._report(self._done, self._expected(), found=self._reused_attempts, **figures)
 
     def _expected(self) -> int:
-        """Return how many attempts the build will make, if it continues to find as much as it did.
+        """Return the expected number of attempts of the build, at the success rate so far.
 
-        It makes all of them, or ends when it has found what is wanted.
+        The build makes all attempts, unless it finds the requested samples or grasps before.
         """
         ends = []
         if self._wanted is not None:
@@ -158,28 +161,29 @@ class Counts:
 
 
 class Target:
-    """The units of a target, and what is known of them.
+    """The work units for a requested number of samples, and the samples found so far.
 
     Attributes:
-        units: Work units of each object, by its name, in their order.
-        found: Number of samples of each unit that is done.
+        units: Work units of each object in their order, by the name of the object.
+        found: Number of samples of each completed unit.
     """
 
     def __init__(self, config: Config, units: Mapping[str, Sequence[ShardHeader]]) -> None:
-        """Take the units of a target.
+        """Begin without any samples.
 
         Args:
-            config: Its `samples`, `samples_per_object` and `samples_patience` state the target.
+            config: Configuration, whose `samples`, `samples_per_object` and `samples_patience`
+                define the target.
             units: See the attributes.
         """
         self._config, self.units, self.found = config, units, dict[ShardHeader, int]()
 
     def plan(self) -> tuple[dict[str, int], dict[str, int], list[ShardHeader]]:
-        """Return how far the rounds are known.
+        """Return the result of the complete rounds and the missing units of the next round.
 
         Returns:
             The number of units and of samples of each object in the complete rounds, and the units
-            that the next round lacks; if there is none, the target is met.
+            of the next round that are not done; if there are none, no further round is needed.
         """
         taken, counts = dict.fromkeys(self.units, 0), dict.fromkeys(self.units, 0)
         while True:
@@ -192,14 +196,15 @@ class Target:
                 counts[header.object_name] += self.found[header]
 
     def next_units(self) -> Iterator[ShardHeader]:
-        """Yield the units that the next round lacks, and while some of them run, the ones after.
+        """Yield the missing units of the next round, and then, while some of them run, later units.
 
-        A unit that the target turns out not to need costs its time and changes nothing else.
+        A unit that the target turns out not to need costs time, but does not change the result.
         """
         taken, _, missing = self.plan()
         yield from missing
 
-        # The next unit of each object that is done with this round and is still below the level.
+        # Yield the next unit of each object whose unit of this round is done and that still takes
+        # part.
         ahead = set[ShardHeader]()
         while True:
             counts, places = dict.fromkeys(self.units, 0), dict(taken)
@@ -220,7 +225,7 @@ class Target:
             yield free[0]
 
     def shortfall(self) -> list[str]:
-        """Return what a target that has been run could not give, in words; empty if it is met."""
+        """Return lines that state which part of the target was not reached; empty if none."""
         taken, counts, _ = self.plan()
         total, lines = sum(counts.values()), list[str]()
         wanted, per_object = self._config.samples, self._config.samples_per_object
@@ -230,7 +235,7 @@ class Target:
         if wanted is not None and per_object is None:
             lines.append(f"{total:,} of {wanted:,} samples were found")
 
-        # Each object ended at its last palm pose, or after many in vain.
+        # Each object ended at its last palm pose, or after many palm poses without a sample.
         short = [n for n in self.units if per_object is None or counts[n] < per_object]
         vain = [n for n in short if self._in_vain(self.units[n][: taken[n]]) >= patience]
         spent = [n for n in short if n not in vain and taken[n] == len(self.units[n])]
@@ -244,7 +249,12 @@ class Target:
         return lines
 
     def _active(self, taken: Mapping[str, int], counts: Mapping[str, int]) -> list[str]:
-        """Return the objects that take part in the next round, given their units and samples."""
+        """Return the objects that take part in the next round.
+
+        Args:
+            taken: Number of units of each object in the rounds so far.
+            counts: Number of samples of each object in these units.
+        """
         left = [
             name
             for name, units in self.units.items()
@@ -255,7 +265,7 @@ class Target:
         return [name for name in left if level is None or counts[name] < level]
 
     def _in_vain(self, units: Sequence[ShardHeader]) -> int:
-        """Return how many palm poses were tried since the last sample of some units."""
+        """Return the number of palm poses tried after the last unit with a sample."""
         last = takewhile(lambda unit: not self.found.get(unit, 0), reversed(units))
         return sum(unit.stop - unit.start for unit in last)
 
@@ -266,7 +276,7 @@ class Target:
             return level
         if total >= wanted:
             return 0
-        # Fill up the objects with the fewest first.
+        # Fill up the objects with the fewest samples first.
         rest, ordered = wanted - total, sorted(counts)
         for k, count in enumerate(ordered, start=1):
             above = ordered[k] if k < len(ordered) else None
@@ -279,7 +289,7 @@ class Target:
 
 
 def refuse_two_ends(config: Config) -> None:
-    """Refuse a number of grasps together with a number of samples after which to stop.
+    """Reject a configuration that limits both the number of grasps and the number of samples.
 
     Raises:
         ConfigError: If both are stated.

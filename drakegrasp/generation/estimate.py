@@ -1,7 +1,7 @@
-"""What a build will take: hours, core-hours and bytes, before it is started.
+"""Estimates the hours, core-hours and bytes of a build before it is started.
 
-In: the number of objects, the configuration, the number of workers, and how long each stage
-takes on average. Out: stage by stage, the tasks of the busiest worker times the mean of a task.
+In: the number of objects, the configuration, the number of workers, and the mean time of each
+stage. Out: for each stage, the number of tasks of the busiest worker times the mean time of a task.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import available_cores
 from drakegrasp.shapes.catalog import draw_builtin
 
-#: Time that the scheduler and the client spend on a task, one after the other [s]; measured
+#: Time of the scheduler and the client for one task [s], which limits the rate of tasks; measured
 #: with distributed 2026.8 on two cores.
 TASK_SECONDS = 0.003
 #: One simulation of `certify` [s]: twice the mean of 48 successes on ten G3DB meshes.
@@ -36,18 +36,18 @@ START_SECONDS = 5.0
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What a build is expected to take.
+    """The expected size and duration of a build.
 
     Attributes:
         objects: Number of objects.
         attempts: Number of attempts.
-        refined: Number of those that are refined, and so not known before.
+        refined: Number of refined attempts among them, which is only an expectation.
         units: Number of work units.
         workers: Number of workers.
-        stages: Wall clock of each stage: start, prepare, simulate, assemble [s].
-        samples: Expected rows of the data files.
+        stages: Wall-clock time of each stage: start, prepare, simulate, assemble [s].
+        samples: Expected number of rows of the data files.
         bytes: Expected size of the directory [B].
-        source: Where the times are from.
+        source: Source of the times.
     """
 
     objects: int
@@ -62,7 +62,7 @@ class Plan:
 
     @property
     def seconds(self) -> float:
-        """Wall clock from start to end [s]."""
+        """Wall-clock time from start to end [s]."""
         return sum(self.stages.values())
 
     @property
@@ -72,16 +72,16 @@ class Plan:
 
     @property
     def core_hours(self) -> float:
-        """Hours of all workers together, waiting included: what a cluster is asked for."""
+        """Hours of all workers together, including waiting, as requested from a cluster."""
         return self.workers * self.hours
 
 
-#: More workers, or objects, than any build has.
+#: Maximum number of workers and of objects, larger than in any build.
 MOST_WORKERS = 1_000_000
 
 
 def plan_build(objects: int, config: Config, workers: int, times: StageTimes) -> Plan:
-    """Return what building some objects from nothing is expected to take.
+    """Return the expected size and duration of building objects from the beginning.
 
     Every object is taken to have as many candidates as it may have, and none to be cut short by
     `max_grasps`: this is never less than what will be done.
@@ -95,7 +95,7 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
         if count > MOST_WORKERS:
             raise ConfigError(f"{name} must be at most {MOST_WORKERS:,}, got {count}")
 
-    # How much there is to do.
+    # The amount of work.
     ranges = tuple(config.unit_ranges(config.candidates.max))
     units = objects * len(ranges)
     standoffs = len(config.candidates.standoffs)
@@ -109,8 +109,8 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
     scenes = objects * min(workers, len(ranges))
     longest = standoffs * max(map(len, ranges)) * attempts / first * attempt
 
-    # Assembling: a task for each object, then one for some rows each. Meanwhile one process puts
-    # what is packed into the files.
+    # Assembling has one task per object, and then one task per block of rows. Meanwhile one process
+    # writes the packed rows to the files.
     survey = _shared(objects, workers, attempts / objects * times.survey)
     pack = _shared(math.ceil(attempts / TASK_ROWS), workers, TASK_ROWS * times.pack)
 
@@ -142,16 +142,16 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
 def plan_request(
     request: BuildRequest, workers: int | None = None, times: StageTimes | None = None
 ) -> Plan:
-    """Return what a requested build is expected to take.
+    """Return the expected size and duration of a requested build.
 
     Args:
-        request: What is to be built.
+        request: The requested build.
         workers: Number of workers; one per core of this machine if None.
-        times: Of the stages; those that were measured with a like configuration if None.
+        times: Times of the stages; if None, those measured with a similar configuration.
 
     Raises:
-        MeshError: If there is no mesh, or `only` names no object.
-        ConfigError: If there is no worker.
+        MeshError: If there is no mesh, or `only` has a name that no object has.
+        ConfigError: If the number of workers is less than 1.
     """
     if request.objects == BUILTIN:
         names = [each.name for each in draw_builtin(request.config.builtin)]
@@ -165,7 +165,7 @@ def plan_request(
 
 
 def plan_lines(plan: Plan) -> list[str]:
-    """Return a plan as the lines that are printed."""
+    """Return the lines that are printed for a plan."""
     stages = ", ".join(f"{name} {_duration(seconds)}" for name, seconds in plan.stages.items())
     refined = f", of them about {plan.refined:,} refined" if plan.refined else ""
     return [
@@ -179,7 +179,7 @@ def plan_lines(plan: Plan) -> list[str]:
 
 
 def _shared(tasks: int, workers: int, seconds: float) -> float:
-    """Return how long workers take for tasks of equal length [s]; Dask limits their number."""
+    """Return the time of workers for tasks of equal length [s]; Dask limits the rate of tasks."""
     return max(math.ceil(tasks / workers) * seconds, tasks * TASK_SECONDS)
 
 
@@ -193,7 +193,7 @@ def _refined(config: Config, times: StageTimes) -> float:
 
 
 def _certify_seconds(config: Config) -> float:
-    """Return how long certifying takes for each success [s]; other lifts are not counted."""
+    """Return the mean time of certifying per success [s]; other lifts are not counted."""
     rules = config.certify
     simulations = rules.repeats + rules.friction_steps + 1 if config.certified else 0
     return CERTIFY_SECONDS * (rules.share or 0.0) * simulations
@@ -215,27 +215,28 @@ def _size(size: float) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class StageTimes:
-    """How long the stages take on one core on average, and what they leave on the disk.
+    """Mean times of the stages on one core, and sizes of their files.
 
     Attributes:
-        prepare: Repairing, settling and sampling an object [s].
-        scene: Building an object's scene and distance field, on each worker that needs it [s].
-        attempt: An attempt, over all outcomes [s].
-        look: Both images of a success [s].
-        survey: Reading shards before the files are assembled, per attempt [s].
-        pack: Packing rows and samples, per attempt [s].
-        put: What one process does of assembling, however many workers there are, per attempt [s].
-        successes: Share of the attempts that succeed.
-        samples: Share of the successes that the filters keep.
-        unit_bytes: Of a shard without rows [B].
-        attempt_bytes: Of a row of a failed attempt, in its shard and in trials.hdf5 [B].
-        success_bytes: What a success adds to its shard [B].
-        sample_bytes: Of a row, in grasping_oto.hdf5 and grasping_otm.hdf5 together [B].
-        object_bytes: Of an object's own files [B].
-        source: Where the figures are from, for the reader.
-        parents: Share of the attempts of the first round that a configuration with refinement
+        prepare: Time for repairing, settling and sampling an object [s].
+        scene: Time for building an object's scene and distance field, on each worker that needs
+            them [s].
+        attempt: Mean time of an attempt over all outcomes [s].
+        look: Time for both images of a success [s].
+        survey: Time for reading shards before the files are assembled, per attempt [s].
+        pack: Time for packing rows and samples, per attempt [s].
+        put: Time for the part of assembling that always runs in one process, per attempt [s].
+        successes: Fraction of the attempts that succeed.
+        samples: Fraction of the successes that the filters keep.
+        unit_bytes: Size of a shard without rows [B].
+        attempt_bytes: Size of a failed attempt's row, in its shard and in trials.hdf5 [B].
+        success_bytes: Size that a success adds to its shard [B].
+        sample_bytes: Size of a row in grasping_oto.hdf5 and grasping_otm.hdf5 together [B].
+        object_bytes: Size of the files of an object [B].
+        source: Source of the figures, for the reader.
+        parents: Fraction of the attempts of the first round that a configuration with refinement
             refines.
-        refined_parents: The same of refined attempts.
+        refined_parents: Fraction of the refined attempts that are refined again.
     """
 
     prepare: NonNegative
@@ -257,10 +258,11 @@ class StageTimes:
     refined_parents: NonNegative = 0.4
 
 
-#: By the log and the files of thirty G3DB meshes with 400 palm poses each (34,800 attempts, preset
-#: `paper`, Drake 1.51.1, 2026-11-22) on two workers; files by `measure_storage` of
-#: `pipelines/measurements/measure_stages.py`. Assembling, and the bytes of a unit, by 1.5 million
-#: attempts of `pipelines/measurements/synthetic_dataset.py`.
+#: Measured with the log and the files of thirty G3DB meshes with 400 palm poses each (34,800
+#: attempts, preset `paper`, Drake 1.51.1, 2026-11-22) on two workers. The sizes of files were
+#: measured by `measure_storage` of `pipelines/measurements/measure_stages.py`. Assembling and the
+#: bytes of a unit were measured with 1.5 million attempts of
+#: `pipelines/measurements/synthetic_dataset.py`.
 MEASURED = StageTimes(
     prepare=3.2,
     scene=0.4,
@@ -303,7 +305,7 @@ def read_times(path: Path) -> StageTimes:
     """Return the stage times that `pipelines/measurements/measure_stages.py` printed to a file.
 
     Raises:
-        DataError: If it holds anything else.
+        DataError: If the file holds anything else.
     """
     try:
         return TypeAdapter(StageTimes).validate_python(read_json(path), strict=False)
@@ -315,7 +317,7 @@ def read_times(path: Path) -> StageTimes:
 
 
 class _Unit(BaseModel):
-    """What the log says of a unit that was simulated."""
+    """The log's entry of a simulated unit."""
 
     model_config = ConfigDict(strict=True)
     object: str
@@ -324,7 +326,7 @@ class _Unit(BaseModel):
 
 
 def _unit_of(event: dict[str, Any]) -> _Unit | None:
-    """Return a unit of the log; None for one that was done before, and what no build writes."""
+    """Return a simulated unit of the log; None for a reused unit and for an invalid entry."""
     try:
         return _Unit.model_validate(event)
     except ValidationError:
@@ -332,10 +334,10 @@ def _unit_of(event: dict[str, Any]) -> _Unit | None:
 
 
 def logged_times(out: Path, config: Config) -> StageTimes | None:
-    """Return the mean times of a build's units so far, by its log, or None if none is done.
+    """Return the mean times of the units in a build's log, or None if the log has no attempts.
 
-    What a log does not say, e.g. the sizes of files, is as in `measured_times`. The log has
-    wall-clock times: other work of the machines is in them.
+    Values that a log does not state, e.g. the sizes of files, are those of `measured_times`. The
+    log has wall-clock times, so other load of the machines increases them.
 
     Args:
         out: Directory of the dataset.
@@ -354,7 +356,7 @@ def logged_times(out: Path, config: Config) -> StageTimes | None:
             outcomes.update(unit.outcomes)
             objects.add(unit.object)
 
-    # Their means; the log may have none.
+    # Compute their means; the log may have no attempts.
     attempts, successes = outcomes.total(), outcomes[Outcome.SUCCESS.label]
     if not attempts:
         return None

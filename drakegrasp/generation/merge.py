@@ -1,8 +1,8 @@
-"""Datasets that were built apart, as one: by objects, by seeds, or by work units.
+"""Merges datasets that were built separately, by objects, by seeds or by work units.
 
-In: directories of datasets of one configuration, whose seeds may differ. Out: a directory with the
-files of their objects and shards, under names that distinguish seeds, and what assembling makes of
-them. A mesh under several seeds is one object of the split.
+In: directories of datasets with the same configuration, except for the seed. Out: a directory with
+the files of their objects and shards, under names that distinguish seeds, and the assembled files.
+A mesh that was built with several seeds counts as one object in the split.
 """
 
 from __future__ import annotations
@@ -37,12 +37,13 @@ from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
 from drakegrasp.runtime.progress import Report, silent
 
-#: Keys in which datasets may differ; the merged one has the first's seed and no target.
+#: Keys in which datasets may differ. The merged dataset has the seed of the first dataset and no
+#: requested number of samples.
 _FREE = ("seed", "samples", "samples_per_object", "samples_patience")
 
 
-#: An object of one of the datasets: the directory, the object there, its work units, and what it is
-#: in the merged dataset.
+#: An object of one of the datasets: the directory, the object's entry there, its work units, and
+#: its entry in the merged dataset.
 _Part: TypeAlias = tuple[Path, ObjectEntry, Sequence[ShardHeader], ObjectEntry]
 
 
@@ -54,26 +55,27 @@ def merge(
     execute: Executor = run_here,
     progress: Report = silent,
 ) -> Assembly:
-    """Make one dataset of several, which stay as they are; it appears when it is complete.
+    """Merge several datasets into a new one, which appears when it is complete.
 
-    An object that several have with the same seed is taken once. Files are hard links where the
-    file system allows.
+    The given datasets are not changed. An object that several datasets have with the same seed is
+    used once. Files are hard links if the file system allows them.
 
     Args:
         into: Directory of the merged dataset, new or empty.
-        outs: Directories of the datasets, whose objects come in this order.
-        overrides: As for `assemble`, for all of them: they may differ in what these set.
-        execute: Does the work of assembling.
-        progress: Called with the number of its tasks that are done and to do.
+        outs: Directories of the datasets; the objects are merged in this order.
+        overrides: Overrides as for `assemble`, applied to all datasets, which may differ in the
+            keys that these set.
+        execute: Runs the tasks of assembling.
+        progress: Called with the number of completed tasks and of all tasks.
 
     Raises:
-        ConfigError: If an override or a filter of the user's own cannot be used.
-        DataError: If the directory is in use, a dataset is not complete, or two of them are not of
-            one configuration, one hand and one version, or differ in what both have.
+        ConfigError: If an override or a user-defined filter cannot be used.
+        DataError: If the directory is in use, a dataset is not complete, or two datasets differ in
+            configuration, hand or version, or in an object that both have.
         HandError: If the files of the hand in a dataset have changed.
-        DiskFullError: If there is no room.
+        DiskFullError: If the disk is full.
     """
-    # Refuse what cannot be done before anything is written.
+    # Reject invalid input before anything is written.
     if into.exists() and (not into.is_dir() or any(into.iterdir())):
         raise DataError(f"{into}: must be a new or empty directory, got one that is in use")
     manifests = {out: with_postprocessing(_read_complete(out, execute), overrides) for out in outs}
@@ -93,7 +95,7 @@ def merge(
 
 
 def _read_complete(out: Path, execute: Executor) -> Manifest:
-    """Return the manifest of a dataset that is complete, or of a part of one."""
+    """Return the manifest of a complete dataset, or of a part of a dataset."""
     manifest = read_manifest(out)
     if not _is_part(out) and not is_assembled(out, verify_shards=True, execute=execute):
         raise DataError(
@@ -104,18 +106,18 @@ def _read_complete(out: Path, execute: Executor) -> Manifest:
 
 
 def _is_part(out: Path) -> bool:
-    """Return whether a directory has shards and none of the files that are of all of them."""
+    """Return whether a directory has no assembled files, so holds a part of a dataset."""
     return not any((out / name).exists() for name in ASSEMBLED_FILES)
 
 
 def _refuse_missing(manifest: Manifest, folder: Path, parts: Sequence[Path]) -> None:
-    """Refuse parts that together lack a work unit.
+    """Check that parts together have all work units.
 
     Raises:
-        DataError: If they do.
+        DataError: If a work unit is missing.
     """
     missing = [header for header in manifest.headers() if not header.path(folder).exists()]
-    # With `max_grasps` those behind the last wanted grasp need not be there.
+    # With `max_grasps`, units after the last requested grasp may be missing.
     if parts and missing and manifest.config.max_grasps is None:
         first = missing[0]
         raise DataError(
@@ -125,10 +127,10 @@ def _refuse_missing(manifest: Manifest, folder: Path, parts: Sequence[Path]) -> 
 
 
 def _refuse_differences(manifests: Mapping[Path, Manifest]) -> None:
-    """Refuse datasets whose labels cannot be compared.
+    """Check that the labels of the datasets can be compared.
 
     Raises:
-        DataError: If there are any.
+        DataError: If datasets differ in configuration or versions.
     """
     (first, known), *others = manifests.items()
     for out, manifest in others:
@@ -146,17 +148,20 @@ def _refuse_differences(manifests: Mapping[Path, Manifest]) -> None:
 
 
 def _with_hand_of(known: Config, config: Config) -> Config:
-    """Return a configuration with the same hand elsewhere: its files count, by their digest."""
+    """Return a configuration with the hand's path of another, if both paths have the same name.
+
+    Hands are compared by the digest of their files, so their paths may differ.
+    """
     if PurePath(known.hand).stem != PurePath(config.hand).stem:
         return config
     return config.with_hand(known.hand)
 
 
 def _parts(manifests: Mapping[Path, Manifest]) -> list[_Part]:
-    """Return the objects of all datasets, with their names and seeds in the merged one.
+    """Return the objects of all datasets, with their names and seeds in the merged dataset.
 
     Raises:
-        DataError: If one has a name for which another has another mesh.
+        DataError: If objects of the same name have different meshes, classes or groups.
     """
     seed = next(iter(manifests.values())).config.seed
     entries = [
@@ -165,7 +170,7 @@ def _parts(manifests: Mapping[Path, Manifest]) -> list[_Part]:
         for entry, headers in zip(manifest.objects, headers_by_object(manifest), strict=True)
     ]
 
-    # The seeds of each mesh.
+    # Collect the seeds of each mesh.
     meshes, seeds = dict[str, tuple[Path, ObjectEntry]](), dict[str, set[int]]()
     for out, entry, _, own in entries:
         seeds.setdefault(entry.mesh_name, set()).add(own)
@@ -177,7 +182,7 @@ def _parts(manifests: Mapping[Path, Manifest]) -> list[_Part]:
                     f"{getattr(known, key)}, got {getattr(entry, key)}"
                 )
 
-    # A mesh keeps its name under the first seed, and where it has one seed only.
+    # A mesh keeps its name with the first seed, or if it has only one seed.
     parts = list[_Part]()
     for out, entry, headers, own in entries:
         mesh, alone = entry.mesh_name, own == seed or len(seeds[entry.mesh_name]) == 1
@@ -195,9 +200,9 @@ def _merged_manifest(manifests: Mapping[Path, Manifest], parts: Iterable[_Part])
     """Return the manifest of the merged dataset.
 
     Raises:
-        DataError: If two parts are one object and differ, or have one name and differ in seed.
+        DataError: If two parts have the same name and differ.
     """
-    # Each object once; of two that are equal, the one that was tried for longer.
+    # Use each object once; of two equal objects, use the one with more tried candidates.
     objects, names = dict[str, ObjectEntry](), dict[tuple[Path, str], str]()
     for out, entry, _, merged in parts:
         names[out, entry.name] = merged.name
@@ -232,7 +237,7 @@ def _merged_manifest(manifests: Mapping[Path, Manifest], parts: Iterable[_Part])
 
 
 def _with_hand(manifest: Manifest, parts: Iterable[Manifest], folder: Path) -> Manifest:
-    """Return a merged manifest with the hand in its folder, if a dataset carries it."""
+    """Return a merged manifest with the hand copied to its folder, if a dataset contains it."""
     for part in parts:
         if isinstance(part.config.hand_source, CarriedHand):
             config = manifest.config.with_hand(part.config.hand, part.config.hand_source)
@@ -241,15 +246,15 @@ def _with_hand(manifest: Manifest, parts: Iterable[Manifest], folder: Path) -> M
 
 
 def _take_files(part: _Part, folder: Path) -> None:
-    """Put the files of an object into a folder.
+    """Link or copy the files of an object into a folder.
 
     Raises:
-        DataError: If another part has put others there.
+        DataError: If another part has put different files there.
     """
     out, entry, headers, merged = part
     pairs = [(path(out, entry.name), path(folder, merged.name)) for path in (model_path, plan_path)]
     for header in headers:
-        # Behind the last wanted grasp there need be none.
+        # Units after the last requested grasp may have no shard.
         if header.path(out).exists():
             pairs.append((header.path(out), shards_folder(folder, merged.name) / header.file_name))
     for source, target in pairs:
@@ -263,7 +268,7 @@ def _take_files(part: _Part, folder: Path) -> None:
 
 
 def _link(source: Path, target: Path) -> None:
-    """Give a file a second name, or copy it where that cannot be."""
+    """Create a hard link to a file, or copy the file if links are not supported."""
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(source, target)

@@ -1,4 +1,4 @@
-"""Runs a trial of a dataset again: says which stored values differ, or keeps it over time."""
+"""Runs a trial of a dataset again, and reports the values that differ or records its motion."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ class Replay:
     """A trial that was run again.
 
     Attributes:
-        trial_id: Its row.
-        object_name: Its object.
-        recorded: The outcome in the file.
-        found: The outcome now.
+        trial_id: Row of the trial in /trials.
+        object_name: Name of the object.
+        recorded: Outcome in the file.
+        found: Outcome of the replay.
         differences: Largest absolute difference of each field whose values differ.
-        versions: Packages whose versions differ, as "then -> now".
-        meetings: Of a start collision the links of the hand that meet the object or the table
-            where it starts, by "object" and "table".
+        versions: Packages whose versions differ, with values "then -> now".
+        meetings: For a start collision, the links of the hand that touch the object or the table
+            at the start, by the keys "object" and "table".
     """
 
     trial_id: int
@@ -60,7 +60,7 @@ class Replay:
 
     @property
     def same(self) -> bool:
-        """Whether every stored value came out the same, bit for bit."""
+        """Whether the replay reproduced every stored value bit for bit."""
         return not self.differences
 
 
@@ -68,23 +68,23 @@ class Replay:
 def replay_trial(out: str | Path, trial_id: int) -> Replay:
     """Run one trial of a dataset again, from its prepared object and its candidate.
 
-    The same machine and versions give the same bits. `versions` says which packages have other
-    versions now.
+    With the same machine and versions, the values are equal bit for bit. `versions` lists the
+    packages that have other versions now.
 
     Raises:
         DataError: If the dataset or the trial is not there.
     """
     stored, prepared, attempt, config = _stored_trial(Path(out), trial_id)
 
-    # Run the attempt as a work unit would, up to the row that it would store.
+    # Run the attempt as a work unit does, and create the row that the unit would store.
     scene = build_scene(prepared.model, config.physics, load_hand(config.hand_source))
     setup = TrialSetup(prepared=prepared, config=config, scene=scene)
     record = try_attempt(setup, attempt)
     row = trial_rows(setup, [attempt], [record])
     if stored["outcome"] == Outcome.SLIPPED and record.outcome is Outcome.PARTLY_HELD:
-        row["outcome"][0] = Outcome.SLIPPED  # as an older version called it
+        row["outcome"][0] = Outcome.SLIPPED  # the name in older versions
 
-    # What a hand met that could not start.
+    # Find what the hand touches in a start collision.
     meetings = {}
     if record.outcome is Outcome.START_COLLISION:
         meetings = start_meetings(setup.scene_of(attempt), record.X_TO, attempt)
@@ -115,7 +115,7 @@ def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
     """Run one trial of a dataset again and write an HTML file that plays it back.
 
     Returns:
-        The outcome now.
+        The outcome of the replay.
 
     Raises:
         DataError: If the dataset or the trial is not there.
@@ -123,7 +123,7 @@ def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
     """
     stored, prepared, attempt, config = _stored_trial(Path(out), trial_id)
     X_TO = prepared.resting_poses[attempt.resting]
-    # A hand that was not lifted for its image is not lifted here, and nothing is rendered.
+    # If the hand was not lifted because of its image, it is not lifted here; nothing is rendered.
     lifted = stored["outcome"] != Outcome.NOT_LIFTED
     found = record_attempt(prepared.model, X_TO, attempt, config, Path(path), is_visible=lifted)
     return found.outcome
@@ -201,7 +201,7 @@ def trace_trial(out: str | Path, trial_id: int) -> TracedTrial | None:
 def _stored_trial(
     out: Path, trial_id: int
 ) -> tuple[dict[str, Any], PreparedObject, Attempt, Config]:
-    """Return a row of trials.hdf5, and what to run it again with."""
+    """Return a row of trials.hdf5, with the object, attempt and configuration to run it again."""
     manifest, row = read_manifest(out), Trials(out).trial(trial_id)
     config = manifest.config_of(row["object_name"])
     prepared = load_prepared(out, row["object_name"], config)

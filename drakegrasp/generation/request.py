@@ -1,4 +1,4 @@
-"""What a caller asks to be built, and which part of it."""
+"""The request for a build, and the part of its work units that a job builds."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ if TYPE_CHECKING:
     from drakegrasp.config import Config
 
 
-#: Stands for the built-in objects in place of a directory.
+#: Name that requests the built-in objects instead of a directory of meshes.
 BUILTIN = "builtin"
 
 
 @dataclass(frozen=True, kw_only=True)
 class BuildRequest:
-    """What to build; who does the work is said elsewhere.
+    """What to build; the workers are specified elsewhere.
 
     Attributes:
         objects: Directory of meshes, or "builtin".
         out: Directory of the dataset.
-        config: All the rules.
+        config: Configuration of the dataset.
         units: Unit of length of the meshes.
         manifest: YAML file with units and classes by mesh.
         only: Names of the objects to build; all if empty.
         postures: File of postures that are tried instead of drawn palm poses.
         show: Whether to show progress on standard error.
-        read_as: What is said of all postures, see `exchange.attempts.read_attempts`.
+        read_as: Values for all postures, see `exchange.attempts.read_attempts`.
     """
 
     objects: str
@@ -47,10 +47,10 @@ class BuildRequest:
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the work units of a build, for jobs that do not know of each other.
+    """A part of the work units of a build, for jobs that do not communicate.
 
     Attributes:
-        number: Which part, from 1 on.
+        number: Number of the part, from 1.
         of: Number of parts.
     """
 
@@ -66,7 +66,7 @@ def read_part(text: str) -> Part:
     """Return the part that a text such as 3/16 names.
 
     Raises:
-        ConfigError: If it names none.
+        ConfigError: If the text does not name a part.
     """
     match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text.strip())
     part = Part(*map(int, match.groups())) if match else Part(0, 0)
@@ -76,10 +76,10 @@ def read_part(text: str) -> Part:
 
 
 def refuse_unknown(only: Sequence[str], names: Sequence[str]) -> None:
-    """Refuse names that no object has.
+    """Check that each name is the name of an object.
 
     Raises:
-        MeshError: If there is one.
+        MeshError: If no object has one of the names.
     """
     unknown = [name for name in only if name not in names]
     if unknown:
