@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 from helpers.commands import run
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.config import ScenesConfig
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.exchange.export import export_dataset
-from drakegrasp.frames import multiply, unpack_pose
+from drakegrasp.frames import unpack_pose
+from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.vision.camera import Lens
 
@@ -172,6 +174,45 @@ def test_images_are_seen_where_the_cameras_stand(folder: Path) -> None:
         if "close" not in camera:
             assert changed[: len(changed) // 2].any()
     assert np.ravel(stats["observation.images.front"]["max"]).max() <= 1.0
+
+
+def test_long_exports_have_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each with times from 0, in folders of a few files."""
+    monkeypatch.setattr(lerobot, "LENS", Lens.of(ScenesConfig(width=48, height=32)))
+    monkeypatch.setattr(lerobot, "PART_SECONDS", 1)
+    monkeypatch.setattr(lerobot, "CHUNK", 2)
+    hand, lengths = load_hand("franka"), (3, 2, 6, 5, 4)
+    writer = lerobot._Writer(tmp_path, FPS, hand)
+    known = lerobot.features(hand)
+    for length in lengths:
+        columns = {
+            name: np.zeros((length, *each["shape"][: each["names"] is not None]))
+            for name, each in known.items()
+            if each["dtype"] != "video"
+        }
+        image = {
+            name: np.zeros(known[name]["shape"], np.uint16 if "depth" in name else np.uint8)
+            for name in CAMERAS
+        }
+        writer.add("lift it", {"split": "train"}, columns, [image] * length)
+    writer.finish()
+
+    parts = [(0, 0), (0, 1), (1, 0), (1, 1)]
+    episodes = {"chunk_index": [], "file_index": [], "from_timestamp": [], "index": []}
+    for chunk, file in parts:
+        name = f"chunk-{chunk:03d}/file-{file:03d}"
+        rows = pq.read_table(tmp_path / f"meta/episodes/{name}.parquet").to_pydict()
+        data = pq.read_table(tmp_path / f"data/{name}.parquet").to_pydict()
+        episodes["index"] += data["index"]
+        for key in ("chunk_index", "file_index", "from_timestamp"):
+            episodes[key] += rows[f"videos/{CAMERAS[1]}/{key}"]
+        with av.open(str(tmp_path / f"videos/{CAMERAS[1]}/{name}.mp4")) as video:
+            assert len(list(video.decode(video=0))) == len(data["index"])
+    assert [*zip(episodes["chunk_index"], episodes["file_index"], strict=True)] == [
+        parts[k] for k in (0, 0, 1, 2, 3)
+    ]
+    assert episodes["from_timestamp"] == [0.0, 3 / FPS, 0.0, 0.0, 0.0]
+    assert episodes["index"] == [*range(sum(lengths))]
 
 
 @pytest.mark.nightly
