@@ -65,7 +65,8 @@ class Parcel:
         number: Of the task.
         build: Names what is sent by one client.
         call: Pickled function and item.
-        files: SHA-256 of the files that it reads, by their places.
+        files: Names at the scheduler of the files that it reads, which end with the SHA-256, by
+            their places.
         writes: Places of the files that it writes or removes.
     """
 
@@ -116,9 +117,11 @@ class _Wire:
 
     def __init__(self, execute: Executor, client: Client, out: Path, build: str) -> None:
         self._execute, self._client, self._out, self._build = execute, client, out, build
-        # Digests by what says that a file changed; how many tasks on their way need each content.
+        # Digests by what says that a file changed; names of contents that the scheduler has, by
+        # digest; how many tasks on their way need each.
         self._digests: dict[tuple[Any, ...], str] = {}
-        self._uses = Counter[str]()
+        self._names: dict[str, str] = {}
+        self._uses, self._serial = Counter[str](), count()
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
         """Yield function(item) of every item; the files of a result are there before it."""
@@ -159,28 +162,29 @@ class _Wire:
         )
 
     def _offer(self, path: Path) -> str:
-        """Have the scheduler keep a file for one task more; return its SHA-256."""
+        """Have the scheduler keep a file for one task more; return its name there."""
         status = path.stat()
         key = path, status.st_ino, status.st_size, status.st_mtime_ns
-        digest = self._digests.get(key)
-        if digest is None or not self._uses[digest]:
+        digest = self._digests.get(key, "")
+        if digest not in self._names:
             content = path.read_bytes()
             digest = self._digests[key] = hashlib.sha256(content).hexdigest()
-            if not self._uses[digest]:
-                self._variable(digest).set(content)
-        self._uses[digest] += 1
-        return digest
+            if digest not in self._names:
+                # Dask forgets a variable a moment after it is told to: no name is used again.
+                name = f"drakegrasp-{self._build}-{next(self._serial)}-{digest}"
+                self._names[digest] = name
+                Variable(name, client=self._client).set(content)
+        self._uses[self._names[digest]] += 1
+        return self._names[digest]
 
     def _release(self, parcel: Parcel) -> None:
         """Have the scheduler forget the files that no other task on its way needs."""
-        for digest in parcel.files.values():
-            self._uses[digest] -= 1
-            if not self._uses[digest]:
+        for name in parcel.files.values():
+            self._uses[name] -= 1
+            if not self._uses[name]:
+                del self._uses[name], self._names[_digest_in(name)]
                 with suppress(OSError):  # the scheduler may be gone, and the files with it
-                    self._variable(digest).delete()
-
-    def _variable(self, digest: str) -> Variable:
-        return Variable(_name(self._build, digest), client=self._client)
+                    Variable(name, client=self._client).delete()
 
     def _write(self, places: Iterable[str], files: Mapping[str, bytes]) -> None:
         """Write the files at some places, and remove those that are not there."""
@@ -203,8 +207,9 @@ def _processes_here() -> Iterator[Executor]:
         yield here
 
 
-def _name(build: str, digest: str) -> str:
-    return f"drakegrasp-{build}-{digest}"
+def _digest_in(name: str) -> str:
+    """Return the SHA-256 in the name of a file at the scheduler."""
+    return name.rpartition("-")[2]
 
 
 # At a worker
@@ -242,10 +247,10 @@ class _Copies:
         for place in self._digests.keys() - set().union(*self._recent):
             (self._folder / place).unlink(missing_ok=True)
             del self._digests[place]
-        for place, digest in files.items():
-            if self._digests.get(place) != digest:
-                write_atomic(self._folder / place, _fetched(self.build, digest, worker))
-                self._digests[place] = digest
+        for place, name in files.items():
+            if self._digests.get(place) != _digest_in(name):
+                write_atomic(self._folder / place, _fetched(name, worker))
+                self._digests[place] = _digest_in(name)
 
     def _taken(self, places: Iterable[str]) -> dict[str, bytes]:
         """Return the files at some places, and remove them."""
@@ -293,13 +298,12 @@ def leave(build: str | None = None) -> None:
         _copies = None
 
 
-def _fetched(build: str, digest: str, worker: Worker) -> bytes:
-    """Return a file by its SHA-256 from the scheduler."""
-    name = _name(build, digest)
+def _fetched(name: str, worker: Worker) -> bytes:
+    """Return a file by its name at the scheduler."""
     found = sync(worker.loop, worker.scheduler.variable_get, name=name, timeout=FETCH_SECONDS)
     content: bytes = found["value"]
-    if hashlib.sha256(content).hexdigest() != digest:
-        raise MachineError(f"a file came from the scheduler with other bytes ({digest[:16]})")
+    if hashlib.sha256(content).hexdigest() != _digest_in(name):
+        raise MachineError(f"a file must come from the scheduler unchanged, got another ({name})")
     return content
 
 

@@ -70,8 +70,8 @@ def weigh_files(dask_worker: Worker) -> None:
     fetch = wire._fetched
     dask_worker.fetched = 0
 
-    def weighing(build: str, digest: str, worker: Worker) -> bytes:
-        content = fetch(build, digest, worker)
+    def weighing(name: str, worker: Worker) -> bytes:
+        content = fetch(name, worker)
         worker.fetched += len(content)
         return content
 
