@@ -1,7 +1,7 @@
-"""The whole path from meshes to files; an `Executor` does the work.
+"""Builds a dataset from meshes; an `Executor` does the work.
 
-`build` plans and records. The executor runs two kinds of tasks: preparing an object and running a
-work unit. Results may come back in any order; the files are the same.
+`build` plans the work and records the results. The executor runs two kinds of tasks: preparing an
+object and running a work unit. The order in which results arrive does not change the files.
 """
 
 from __future__ import annotations
@@ -67,26 +67,26 @@ from drakegrasp.simulation.attempts import Attempts, misfits
 from drakegrasp.simulation.candidates import found_sampler
 from drakegrasp.simulation.drive import drive_of
 
-#: By how much a rank may be off the border of a split that depends on which objects have samples.
+#: Margin of ranks at the border of a split, which depends on which objects have samples.
 NEAR_BORDER = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
 class BuildReport:
-    """What a build did.
+    """The result of a build.
 
     Attributes:
         out: Directory of the dataset.
-        simulated: Number of work units that were run now.
-        reused: Number of work units that were done before.
+        simulated: Number of work units that this build ran.
+        reused: Number of work units that an earlier build completed.
         objects: Number of objects.
-        refused: Name and reason of each mesh that was refused.
-        errors: Number of solver errors by message, of the units that were run now.
-        notices: What the user should know: damage that was repaired, leftovers that were removed.
-        unexplained: A line for each object so many of whose attempts crashed or timed out that the
-            machine must be at fault; the dataset is complete, but its labels are wrong there.
-        assembled: Whether the files were written now, or were those of all shards already.
-        assembly: What the files hold; None after a part of a build that others go on with.
+        refused: Name of each rejected mesh, and the reason.
+        errors: Number of solver errors by message, in the units that this build ran.
+        notices: Information for the user, such as repaired damage and removed leftover files.
+        unexplained: A line for each object with so many crashes or timeouts that the machine must
+            be the cause; the dataset is complete, but the labels of such an object are wrong.
+        assembled: Whether this build wrote the assembled files; otherwise they were up to date.
+        assembly: Content of the assembled files; None after a part of a build that is not the last.
     """
 
     out: Path
@@ -114,27 +114,27 @@ def build(
 ) -> BuildReport:
     """Build or complete the dataset of some meshes in a directory.
 
-    What is complete already, and of the same configuration and mesh, is not done again. Refused
-    meshes are reported; the others are built.
+    Complete results of the same configuration and mesh are reused. Rejected meshes are reported;
+    the others are built.
 
     Args:
         sources: The meshes.
-        out: Directory; new, empty, or of this configuration.
-        config: All the rules.
-        execute: Does the work.
+        out: Directory of the dataset; new, empty, or with a dataset of this configuration.
+        config: Configuration of the dataset.
+        execute: Runs the tasks.
         postures: See `build_locked`.
         part: See `build_locked`.
-        pool: The executor's processes, if they are started again when they die: then a crash or
-            a hang costs one attempt. Without, crashes propagate to the caller.
+        pool: The executor's processes, if they are restarted when they die. A crash or a hang then
+            ends only one attempt. Without a pool, crashes propagate to the caller.
         show: Whether to show progress on standard error.
 
     Raises:
-        ConfigError: As `refuse_unusable`, and `refuse_part`.
+        ConfigError: As for `refuse_unusable` and `refuse_part`.
         DataError: If the directory cannot be used, another process builds there, or no mesh
             can be simulated.
-        GraspError: If no row of the postures is one of these objects.
+        GraspError: If no row of the postures is for one of these objects.
         HandError: If the hand cannot be used.
-        DiskFullError: If there is no room; the same call continues when there is.
+        DiskFullError: If the disk is full; the same call continues when there is space.
         MachineError: If the workers cannot do the work.
     """
     refuse_unusable(config)
@@ -158,7 +158,7 @@ def posture_config(config: Config, postures: Attempts | None) -> Config:
     """Return the configuration of a build that tries postures instead of palm poses of samplers.
 
     Raises:
-        ConfigError: If it names other postures than are given.
+        ConfigError: If the configuration names other postures than the given ones.
     """
     digest, named = None if postures is None else postures.digest(), config.candidates.postures
     if named not in (None, digest):
@@ -166,18 +166,18 @@ def posture_config(config: Config, postures: Attempts | None) -> Config:
         raise ConfigError(f"candidates.postures must be {must}, got {named!r}")
     if digest is None:
         return config
-    # A posture has no stand-off: there is one attempt of each.
+    # A posture has no stand-off, so there is one attempt per posture.
     rules = config.candidates
     changed = {"postures": digest, "standoffs": rules.standoffs[:1]}
     return config.model_copy(update={"candidates": rules.model_copy(update=changed)})
 
 
 def refuse_unusable(config: Config) -> None:
-    """Refuse at once what would stop a build later.
+    """Reject a configuration that would stop a build later.
 
     Raises:
-        ConfigError: If it states both a number of grasps and of samples to stop at, or a class of
-            the user's own cannot be used.
+        ConfigError: If it limits both the number of grasps and the number of samples, or a
+            user-defined class cannot be used.
     """
     refuse_two_ends(config)
     for name in config.candidates.methods:
@@ -186,10 +186,10 @@ def refuse_unusable(config: Config) -> None:
 
 
 def refuse_part(part: Part | None, config: Config) -> None:
-    """Refuse a part of a build that ends when there are enough samples.
+    """Reject a part of a build that ends when there are enough samples.
 
     Raises:
-        ConfigError: If it is one: which units it needs depends on all of them.
+        ConfigError: If it is such a part. The units that it needs depend on the results of all.
     """
     if part is not None and config.has_target:
         raise ConfigError(
@@ -213,14 +213,14 @@ def build_locked(
 
     Args:
         sources: The meshes.
-        out: Directory; new, empty, or of this configuration.
-        config: All the rules.
-        execute: Does the work.
-        dead: Who held the lock before and died, as `build_lock` yields it.
-        postures: What is tried instead of palm poses of samplers; the configuration knows it by
-            its digest, see `posture_config`. Bad rows are reported and left out.
-        part: Which work units are done, all if None. The files are written when all units are
-            there.
+        out: Directory of the dataset; new, empty, or with a dataset of this configuration.
+        config: Configuration of the dataset.
+        execute: Runs the tasks.
+        dead: Process that held the lock before and died, as `build_lock` yields it.
+        postures: Postures to try instead of palm poses of samplers. The configuration states their
+            digest, see `posture_config`. Invalid rows are reported and not tried.
+        part: Part of the work units to run; all if None. The assembled files are written when all
+            units are complete.
         pool: The executor's processes, as for `build`.
         show: Whether to show progress on standard error.
 
@@ -229,7 +229,7 @@ def build_locked(
     """
     job = _Build(out, execute, pool, postures, part, show=show)
     with disk_full_named(out):
-        # The directory must be ours, and the dataset in it must be of these meshes.
+        # The directory must have this configuration, and a dataset in it must have these meshes.
         known = claim_directory(out, config)
         if known is not None:
             refuse_missing(known, [source.name for source in sources], out)
@@ -243,7 +243,7 @@ def build_locked(
         try:
             return job.run(sources, config, known, notices)
         except BaseException as error:
-            # The log says why a build stopped; a second error would hide the first.
+            # Log why the build stopped; an error of the log must not hide this error.
             with suppress(OSError, DataError):
                 if (out / "manifest.json").exists():
                     job.log("stopped", reason=f"{type(error).__name__}: {error}")
@@ -253,7 +253,7 @@ def build_locked(
 
 
 class _Build:
-    """The steps of a build, and what they share; `log` writes its events, see `BuildLog`."""
+    """The steps of a build and their common data; `log` writes events, see `BuildLog`."""
 
     def __init__(
         self,
@@ -279,7 +279,7 @@ class _Build:
         """Prepare, simulate, assemble."""
         out, start = self._out, time.monotonic()
 
-        # The manifest comes first: without one a directory holds no dataset.
+        # Write the manifest first, because a directory without a manifest holds no dataset.
         hand, versions = load_hand(config.hand_source), installed_versions(config)
         new = Manifest(config=config, versions=versions, fingers=finger_names(config))
         joints = position_order(hand.model, hand.palm_link)
@@ -289,7 +289,7 @@ class _Build:
         self._begin(manifest, notices)
         self._warn(nothing_trains(sources, config.split))
 
-        # Prepare each object, or refuse its mesh.
+        # Prepare each object, or reject its mesh.
         with self._progress("prepare", "objects") as report:
             manifest = self._prepare_all(sources, manifest, report)
         if not manifest.objects:
@@ -305,7 +305,7 @@ class _Build:
                 self._warn(told)
                 notices.append(told)
 
-        # Simulate the work units that are not done; killed workers leave temporary files.
+        # Simulate the missing work units; remove the temporary files of killed workers.
         with self._progress("simulate", "attempts") as report:
             counts, manifest = self._run_all(manifest, report)
         write_manifest(manifest, out)
@@ -313,7 +313,7 @@ class _Build:
         if self._pool is not None:
             sweep_temporary(out)
 
-        # The files are of all work units: a part leaves them to whoever has the others.
+        # The assembled files need all work units, so only the part that completes them writes them.
         stale = False if self._left else self._assemble(manifest)
         if self._left:
             others = counted(self._left, "work unit")
@@ -340,10 +340,10 @@ class _Build:
         )
 
     def _assemble(self, manifest: Manifest) -> bool:
-        """Assemble the shards, unless the files are of these very shards already.
+        """Assemble the shards, unless the assembled files already have exactly these shards.
 
         Returns:
-            Whether the files were written now.
+            Whether the files were written.
         """
         out, execute = self._out, self._execute
         stale = not is_assembled(out, verify_shards=True, execute=execute)
@@ -351,7 +351,7 @@ class _Build:
             with self._progress("assemble", "tasks") as report:
                 assemble_locked(out, manifest, execute=execute, progress=report)
         else:
-            write_card(out)  # the licence of a mesh may be stated otherwise now
+            write_card(out)  # the licence of a mesh may have changed
         scenes = manifest.config.scenes.when == "assembled"
         if scenes and (stale or not (out / SCENES_FILE).is_file()):
             with self._progress("scenes", "objects") as report:
@@ -362,7 +362,7 @@ class _Build:
         return progress_bar(stage, unit, show=self._show)
 
     def _warn(self, text: str) -> None:
-        """Log what the user should know before the end, if there is anything, and say it."""
+        """Log and print a warning for the user, unless it is empty."""
         if text:
             self.log("notice", text=text)
             self._say(text)
@@ -376,7 +376,7 @@ class _Build:
         self._say("there is no worker: waiting for one")
 
     def _begin(self, manifest: Manifest, notices: Sequence[str]) -> None:
-        """Log who builds what, and listen to the workers."""
+        """Log the start of the build, and observe the workers."""
         self.log(
             "started",
             command=sys.argv,
@@ -400,11 +400,11 @@ class _Build:
     def _prepare_all(
         self, sources: Sequence[MeshSource], manifest: Manifest, report: Report
     ) -> Manifest:
-        """Return the manifest with every object prepared or refused, in the sources' order."""
+        """Return the manifest with every object prepared or rejected, in the sources' order."""
         entries: dict[str, ObjectEntry | RefusedMesh] = {}
         tasks = []
 
-        # What the manifest says of an unchanged mesh still holds.
+        # Reuse the manifest's entries of unchanged meshes.
         for source in sources:
             digest = source_sha256(source)
             entry = _known_entry(source, digest, self._out, manifest)
@@ -434,11 +434,11 @@ class _Build:
                 self.log("mesh prepared", name=name, **facts)
             report(len(entries), len(sources), found=known)
 
-        # Licence and group do not affect results; take them from the sources.
+        # Take licence and group from the sources, because they do not affect results.
         said = {source.name: source for source in sources}
         ordered = [entries[source.name] for source in sources]
 
-        # A rejected grasp of another mesh was another grasp.
+        # If a mesh has changed, its rejected grasps no longer exist.
         before = {entry.name: entry.mesh_sha256 for entry in manifest.objects}
         same = {entry.name for entry in ordered if before.get(entry.name) == entry.mesh_sha256}
         objects = (entry for entry in ordered if isinstance(entry, ObjectEntry))
@@ -453,10 +453,11 @@ class _Build:
         )
 
     def _run_all(self, manifest: Manifest, report: Report) -> tuple[Counts, Manifest]:
-        """Run the work units that are not done.
+        """Run the missing work units.
 
         Returns:
-            The counts of all, and the manifest with how many palm poses a target of samples took.
+            The counts of all units, and the manifest. With a target of samples, the manifest has
+            the number of palm poses that were tried for each object.
         """
         every = replace(manifest, objects=tuple(replace(e, tried=None) for e in manifest.objects))
         counts = Counts(every, self._pool, report)
@@ -470,7 +471,7 @@ class _Build:
 
             self._pool.on_change = change
 
-        # What an earlier build has done is not done again.
+        # Count the units of earlier builds, which are reused.
         done = set[ShardHeader]()
         find = partial(find_units, every.config)
         for units, damaged in self._execute(find, find_tasks(self._out, every)):
@@ -483,7 +484,7 @@ class _Build:
 
         target = counts.target
         if target is None:
-            # An object may have enough grasps by the time that there is room for its next unit.
+            # An object may have enough grasps before a worker is free for its next unit.
             def due(*, mine: bool) -> Iterator[ShardHeader]:
                 for unit, header in enumerate(every.headers()):
                     is_mine = self._part is None or self._part.has(unit)
@@ -494,7 +495,7 @@ class _Build:
             self._left = sum(1 for _ in due(mine=False))
             return counts, every
 
-        # Round after round until the target is met.
+        # Run round after round until the target is met.
         while (plan := target.plan())[2]:
             self._run_units(target.next_units(), every, counts)
         tried = {
@@ -507,7 +508,7 @@ class _Build:
     def _run_units(
         self, headers: Iterable[ShardHeader], manifest: Manifest, counts: Counts
     ) -> None:
-        """Run work units, and count what they found."""
+        """Run work units, and count their results."""
         spared, tested = _spared(manifest), _likely_tested(manifest)
         units = (
             WorkUnit(
@@ -521,7 +522,7 @@ class _Build:
             for header in headers
         )
 
-        # Count and log each when it is done.
+        # Count and log each unit when it is done.
         for summary in self._execute(run_unit, units):
             counts.add(summary)
             self.log(
@@ -536,10 +537,10 @@ class _Build:
 
 
 def _refused(postures: Attempts, manifest: Manifest) -> str:
-    """Return which rows of the postures are not tried, and why; empty if all are.
+    """Return which rows of the postures are not tried, and why; empty if all are tried.
 
     Raises:
-        GraspError: If none is left.
+        GraspError: If no row can be tried.
     """
     for entry in manifest.objects:
         poses = unpack_pose([pose.X_TO for pose in entry.resting])
@@ -551,15 +552,15 @@ def _refused(postures: Attempts, manifest: Manifest) -> str:
 
 
 def refuse_missing(known: Manifest, names: Collection[str], out: Path) -> None:
-    """Refuse to continue a dataset without a mesh that it was built from.
+    """Check that all meshes from which a dataset was built are given to continue it.
 
     Args:
         known: The manifest of the dataset.
-        names: Of the meshes that are given.
+        names: Names of the given meshes.
         out: Directory of the dataset.
 
     Raises:
-        DataError: If one is missing.
+        DataError: If a mesh is missing.
     """
     built = [entry.name for entry in known.objects] + [mesh.name for mesh in known.refused]
     missing = [name for name in built if name not in names]
@@ -573,7 +574,7 @@ def refuse_missing(known: Manifest, names: Collection[str], out: Path) -> None:
 def _known_entry(
     source: MeshSource, digest: str, out: Path, manifest: Manifest
 ) -> ObjectEntry | RefusedMesh | None:
-    """Return a mesh's entry in the manifest if it still holds, else None."""
+    """Return the manifest's entry of a mesh if it is still valid, else None."""
     for refusal in manifest.refused:
         if (refusal.name, refusal.mesh_sha256) == (source.name, digest) and not refusal.again:
             return refusal
@@ -590,17 +591,18 @@ def _known_entry(
 
 def _spared(manifest: Manifest) -> set[str]:
     """Return the names of the objects whose palm poses are not refined."""
-    # By the name, which a shard is of; a group can be said anew, and is for morphs alone another.
+    # The choice depends on the object's name, as the shard does. A group would not do, because it
+    # can be changed later.
     share, seed = manifest.config.refine.spared, manifest.config.seed
     names = (entry.name for entry in manifest.objects)
     return {name for name in names if rank_in_split(name, seed) < share}
 
 
 def _likely_tested(manifest: Manifest) -> set[str]:
-    """Return the names of the objects that a split by object may test or validate with.
+    """Return the names of the objects that a split by object may use for test or validation.
 
-    Which it does depends on which objects have samples. The shares are a little larger here, so
-    that hardly any is left out.
+    The split depends on which objects have samples. The fractions are slightly larger here, so that
+    hardly any object is missed.
     """
     rules, config = manifest.config.split, manifest.config
     ranks = {
@@ -612,5 +614,5 @@ def _likely_tested(manifest: Manifest) -> set[str]:
 
 
 def _count(names: Sequence[str], what: str) -> str:
-    """Return e.g. `3 shards (a, b, c)`; of many only the first are named."""
+    """Return e.g. `3 shards (a, b, c)`; a long list of names is cut."""
     return f"{len(names)} {what}{'s' * (len(names) != 1)} ({listed(names)})"

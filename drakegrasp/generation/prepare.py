@@ -1,7 +1,7 @@
-"""Preparing one mesh as a task, and what a crash or a hang of its process means for the mesh.
+"""Prepares one mesh as a task, and rejects a mesh whose preparation crashes or hangs.
 
-In: a mesh and the configuration, as plain data. Out: the object's files, and its entry in the
-manifest: what it is, or why it was refused.
+In: a mesh and the configuration, as plain data. Out: the object's files, and the entry in the
+manifest, which describes the object or states why the mesh was rejected.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from drakegrasp.simulation.attempts import Attempts, given_candidates
 from drakegrasp.simulation.candidates import sample_candidates
 from drakegrasp.simulation.settle import find_resting_poses
 
-#: Computing time after which preparing a mesh hangs [s].
+#: Computing time after which the preparation of a mesh is considered to hang [s].
 PREPARE_SECONDS = 1800.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class PrepareTask:
-    """What one task does: plain data.
+    """The input of a task that prepares a mesh, as plain data.
 
     Attributes:
         source: The mesh.
-        mesh_sha256: Its digest, `source_sha256`.
-        out: Directory of the dataset, as the process that does the task sees it.
-        config: All the rules.
-        postures: What is tried of it instead of palm poses of samplers; None: these.
-        restartable: Whether the process that runs it is started again when it dies. If so, a
-            crash or a hang costs only the mesh; if not, it propagates to the caller.
+        mesh_sha256: Digest of the mesh, see `source_sha256`.
+        out: Directory of the dataset, as a path of the process that runs the task.
+        config: Configuration of the dataset.
+        postures: Postures to try instead of palm poses of samplers; None: use the samplers.
+        restartable: Whether the process that runs the task is restarted when it dies. If so, only
+            the mesh is lost by a crash or a hang; if not, it propagates to the caller.
     """
 
     source: MeshSource
@@ -58,12 +58,12 @@ class PrepareTask:
     restartable: bool
 
     def reads(self) -> dict[str, Path]:
-        """Return the mesh, the hand, and what an earlier run has left, see `FileTask`."""
+        """Return the files of the mesh, the hand and an earlier run, see `FileTask`."""
         own = places(self.out, *object_files(self.out, self.source.name), self.journal)
         return {self._mesh_place: self.source.path, **hand_places(self.config), **own}
 
     def writes(self) -> tuple[str, ...]:
-        """Return the places of the object's files and of the journal."""
+        """Return the paths of the object's files and the journal, relative to the dataset."""
         files = *object_files(self.out, self.source.name), self.journal
         return tuple(path.relative_to(self.out).as_posix() for path in files)
 
@@ -79,30 +79,31 @@ class PrepareTask:
 
     @property
     def _mesh_place(self) -> str:
-        # Messages name the file.
+        # Messages name the file, so the copy keeps its name.
         return f"meshes/{self.mesh_sha256[:16]}/{self.source.path.name}"
 
 
 @one_thread
 def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
-    """Prepare one mesh; return its name and its entry in the manifest, which may be a refusal.
+    """Prepare one mesh, and return its name and its entry in the manifest.
 
-    An object whose files are complete is not prepared again.
+    The entry of a rejected mesh is a `RefusedMesh`. An object whose files are complete is not
+    prepared again.
 
     Raises:
-        DiskFullError: If there is no room for the object's files.
-        MachineError: If something other than the mesh kills the process again and again.
+        DiskFullError: If there is no space for the object's files.
+        MachineError: If something other than the mesh kills the process repeatedly.
     """
     out, name, config = task.out, task.source.name, task.config
     with disk_full_named(out):
-        # The worker or the client may have died before the manifest named the object.
+        # The worker or the client may have died before the object was in the manifest.
         entry = _entry_there(task)
         if entry is not None:
             return name, entry
         if not task.restartable:
             return name, _prepared_entry(task)
 
-        # With a journal, a mesh that kills its process is found and refused.
+        # The journal identifies a mesh that kills its process, which is then rejected.
         release_memory()
         identity = {
             "name": name,
@@ -140,10 +141,10 @@ def _prepared_entry(task: PrepareTask) -> ObjectEntry | RefusedMesh:
     try:
         prepared = prepare(task.source, task.config, task.postures)
     except MeshError as error:
-        # The entry has the name already.
+        # The entry already has the name.
         return _refused(task, str(error).removeprefix(f"{task.source.path.name}: "))
 
-    # The digest was taken from another read of the file.
+    # The digest was computed when the file was read before.
     if prepared.model.mesh_sha256 != task.mesh_sha256:
         return _refused(task, "the mesh file changed during the build")
     save_prepared(prepared, task.out, task.config)
@@ -160,8 +161,8 @@ def prepare(source: MeshSource, config: Config, postures: Attempts | None = None
 
     Args:
         source: The mesh.
-        config: All the rules.
-        postures: What is tried of it instead of palm poses of samplers.
+        config: Configuration of the dataset.
+        postures: Postures to try instead of palm poses of samplers.
 
     Raises:
         MeshError: If the mesh cannot be repaired, its size is implausible, or the object does
@@ -170,8 +171,8 @@ def prepare(source: MeshSource, config: Config, postures: Attempts | None = None
     model = prepare_object(source, config.objects)
     resting = find_resting_poses(model, config)
 
-    # What else a mesh alone decides: one whose distances hang or take too much memory costs the
-    # mesh here, and would stop the build later.
+    # Compute the distance field here as well. If it hangs or needs too much memory, only the mesh
+    # is rejected; later it would stop the build.
     if config.screen.mode == "on":
         inject_fault(source.name, "distances")
         _ = model.field

@@ -1,8 +1,8 @@
-"""Makes scenes.hdf5 of an assembled dataset: a task per object, put together in their order.
+"""Creates scenes.hdf5 of an assembled dataset, with one task per object.
 
 In: the directory of a dataset, each prepared object and the rows of its closed hands in
-trials.hdf5. Out: the file, with places, pictures, closed hands and what cameras see of them; it
-appears when it is complete, and nothing else changes. Its bytes do not depend on the workers.
+trials.hdf5. Out: the file, with object poses, images, closed hands and the contacts that the
+cameras see. It appears when it is complete, and its bytes do not depend on the workers.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from drakegrasp.simulation.scene_cache import cached_renderer
 from drakegrasp.vision.camera import RING, Lens, draw_viewpoint, fixed_viewpoints, visible_contacts
 from drakegrasp.vision.rendering import Renderer, paint, render
 
-#: Columns that count rows of other groups, which a task counts from its object's first.
+#: Columns with row numbers of other groups; a task counts these rows from its object's first row.
 _ROWS_OF = {
     ("scenes", "object"): "objects",
     ("views", "scene"): "scenes",
@@ -77,24 +77,24 @@ def make_scenes(
     execute: Executor = run_here,
     progress: Report = silent,
 ) -> dict[str, dict[str, int]]:
-    """Write scenes.hdf5 of a dataset, and its card, which counts them; what is there is replaced.
+    """Write scenes.hdf5 of a dataset, and the card with its counts; existing files are replaced.
 
     Args:
         out: Directory of an assembled dataset.
-        overrides: `scenes.key=value` texts, for this file alone.
-        execute: Does the work.
-        progress: Called with the number of objects that are done and to do.
+        overrides: `scenes.key=value` texts, which apply to this file only.
+        execute: Runs the tasks.
+        progress: Called with the number of completed objects and of all objects.
 
     Raises:
         ConfigError: If an override cannot be used.
-        DataError: If there is no dataset, or it is damaged, or another process builds in it.
+        DataError: If there is no dataset, the dataset is damaged, or another process builds in it.
         BlankImageError: If OpenGL failed.
-        DiskFullError: If there is no room.
+        DiskFullError: If the disk is full.
 
     Returns:
-        How many scenes, objects, views and grasps there are, by split, see `count_scenes`.
+        The numbers of scenes, objects, views and grasps by split, see `count_scenes`.
     """
-    read_manifest(out)  # the lock would make a missing directory
+    read_manifest(out)  # fails for a missing directory, which the lock would create
     with build_lock(out):
         return make_scenes_locked(out, overrides=overrides, execute=execute, progress=progress)
 
@@ -117,7 +117,7 @@ def make_scenes_locked(
 
     rows, tables = Counter[str](), dict[str, list[Columns]]()
     with disk_full_named(out), atomic_hdf5(out / SCENES_FILE) as file:
-        # Those of trials.hdf5 that say of what it was made.
+        # Copy the attributes of trials.hdf5 that state the origin of the data.
         origin = config, manifest.versions, manifest.fingers, manifest.joints
         file.attrs.update(origin_attributes(*origin))
         file.attrs.update({"near": config.scenes.near, "far": config.scenes.far})
@@ -137,10 +137,10 @@ def make_scenes_locked(
 
 
 def _with_scenes(config: Config, overrides: Sequence[str]) -> Config:
-    """Return a configuration with other scenes.
+    """Return a configuration with overrides of keys of `scenes`.
 
     Raises:
-        ConfigError: If an override is of anything else.
+        ConfigError: If an override is for another key.
     """
     for text in overrides:
         if not text.strip().startswith("scenes."):
@@ -149,7 +149,7 @@ def _with_scenes(config: Config, overrides: Sequence[str]) -> Config:
 
 
 def _tasks(out: Path, manifest: Manifest, trials: Trials) -> Iterator[SceneTask]:
-    """Yield a task per object, in the order of the dataset."""
+    """Yield one task per object, in the order of the dataset."""
     columns = trials.columns(("object", "outcome", "time_close"))
     weights = np.full(len(trials), np.nan)
     sample_split = np.full(len(trials), len(SPLITS))
@@ -159,7 +159,7 @@ def _tasks(out: Path, manifest: Manifest, trials: Trials) -> Iterator[SceneTask]
             weights[ids] = file[split]["grasp_props/weight"][:]
             sample_split[ids] = number
 
-    # Hands that closed, whatever became of them; a simulator that failed says nothing.
+    # Use all hands that closed, with any outcome, except those for which the simulator failed.
     failed = [outcome for outcome in Outcome if outcome.inconclusive]
     closed = np.isfinite(columns["time_close"]) & ~np.isin(columns["outcome"], failed)
     present = [
@@ -181,16 +181,17 @@ def _tasks(out: Path, manifest: Manifest, trials: Trials) -> Iterator[SceneTask]
 
 
 def split_objects(manifest: Manifest, present: Sequence[set[int]]) -> list[int]:
-    """Return the split of each object as an index into SPLITS: no object is in two.
+    """Return the split of each object as an index into SPLITS; no object is in two splits.
 
-    Objects of a group go together. A group whose samples are tested is tested. By object, a group
-    validates if its samples do. By class every object has samples that validate, so of the groups
-    that are not tested a share as large validates: those of the highest rank. A group without
-    samples goes where its rank, or its class, would take it.
+    All objects of a group are in the same split. A group with samples in `test` is in `test`. In a
+    split by object, a group with samples in `valid` is in `valid`. In a split by class, samples of
+    every object are in `valid`; so of the groups that are not in `test`, the fraction
+    `valid_fraction` with the highest ranks is in `valid`. A group without samples is in the split
+    that follows from its rank or its class.
 
     Args:
-        manifest: Of the dataset.
-        present: Of each object the splits that have samples of it.
+        manifest: Manifest of the dataset.
+        present: For each object, the splits that have samples of it.
     """
     config, seed = manifest.config.split, manifest.config.seed
     train, valid, test = range(len(SPLITS))
@@ -222,7 +223,7 @@ def split_objects(manifest: Manifest, present: Sequence[set[int]]) -> list[int]:
 def _write_images(
     file: h5py.File, images: Mapping[str, Sequence[bytes]], start: int, config: Config
 ) -> None:
-    """Add the packed images of an object's views, which begin with a row."""
+    """Add the packed images of an object's views, of which the first has row `start`."""
     group, sizes = (
         file.require_group("views"),
         {"h": config.scenes.height, "w": config.scenes.width},
@@ -238,7 +239,7 @@ def _write_images(
 
 
 def _numbered(group: str, columns: Columns, rows: Mapping[str, int]) -> Columns:
-    """Return columns whose numbers count the rows of the file."""
+    """Return columns whose row numbers count from the first row of the file."""
     added = {name: rows[of] for (own, name), of in _ROWS_OF.items() if own == group}
     return {name: v + added[name] if name in added else v for name, v in columns.items()}
 
@@ -255,25 +256,25 @@ def _write_table(file: h5py.File, name: str, parts: Sequence[Columns]) -> None:
 
 # The scenes of one object
 
-#: Last number of the place of a scene's streams; streams of other things have other ones.
+#: Last number of the place of a scene's streams, which other streams do not have.
 _PLACE = 4
-#: The number before it: of where the object lies, how the scene looks, and of the first camera.
+#: Number before it: for the object's place, for the scene's appearance, and for the first camera.
 _WHERE, _LOOK, _CAMERA = 0, 1, 2
 Columns = dict[str, AnyArray]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneTask:
-    """The scenes of an object to make.
+    """The input of a task that creates the scenes of an object.
 
     Attributes:
         out: Directory of the dataset.
-        name: Of the object.
-        split: Of its scenes, an index into SPLITS.
-        config: Of the object.
+        name: Name of the object.
+        split: Split of the scenes, as an index into SPLITS.
+        config: Configuration of the object.
         joints: Names of the hand's joints, in the order of the files.
-        trials: Columns GRASPS_FOLLOW_FROM of trials.hdf5 (n rows), of its closed hands.
-        weights: (n,), of those that are samples, NaN of others.
+        trials: Columns GRASPS_FOLLOW_FROM of trials.hdf5 (n rows) of the object's closed hands.
+        weights: (n,), weights of the rows that are samples; NaN for other rows.
     """
 
     out: Path
@@ -285,14 +286,14 @@ class SceneTask:
     weights: Array
 
     def reads(self) -> dict[str, Path]:
-        """Return the prepared object and the hand, see `FileTask`."""
+        """Return the files of the prepared object and the hand, see `FileTask`."""
         return {
             **hand_places(self.config),
             **places(self.out, *object_files(self.out, self.name)),
         }
 
     def writes(self) -> tuple[str, ...]:
-        """Return nothing: the scenes are the result."""
+        """Return no paths, because the scenes are the result of the task."""
         return ()
 
     def moved(self, folder: Path) -> SceneTask:
@@ -302,11 +303,11 @@ class SceneTask:
 
 @one_thread
 def make_scenes_of(task: SceneTask) -> tuple[dict[str, Columns], dict[str, list[bytes]]]:
-    """Return the scenes of an object, whose rows are counted from its first on.
+    """Return the scenes of an object, with rows counted from the object's first row.
 
     Returns:
-        Columns by group without images; packed chunks of the rows of /views by the names of their
-        fields.
+        The columns of each group without images, and the packed images of the rows of /views by the
+        names of their fields.
 
     Raises:
         DataError: If a file of the dataset is missing or damaged.
@@ -331,7 +332,7 @@ def _stream(config: Config, name: str, resting: int, number: int) -> Stream:
 
 
 def _place(prepared: PreparedObject, resting: int, config: Config) -> Array:
-    """Return X_TO (4, 4) of a resting pose, turned about Tz and moved to a drawn place."""
+    """Return X_TO (4, 4) of a resting pose, rotated about Tz and moved to a random place."""
     u = _stream(config, prepared.model.name, resting, _WHERE).uniform(3)
     turn = make_pose(rotation_about([0.0, 0.0, 1.0], 2.0 * np.pi * u[0]), np.zeros(3))
     X_TO = multiply(turn, prepared.resting_poses[resting])
@@ -352,7 +353,7 @@ def _object(prepared: PreparedObject) -> Columns:
 
 
 def _scenes(task: SceneTask, prepared: PreparedObject, X_TO: Array) -> Columns:
-    """Return the rows of /scenes, a scene per resting pose; there is one object in each."""
+    """Return the rows of /scenes, with one scene per resting pose and one object per scene."""
     count = len(X_TO)
     materials = usual_materials(prepared.model, task.config.physics)
     return {
@@ -391,7 +392,7 @@ def _views(
                 **_conditions(look, _stream(config, name, k, _CAMERA + number)),
             }
 
-            # What it sees of the contacts.
+            # Find the contacts that the camera sees.
             p_TQ, nhat_Q_T = (grasps[key][own] for key in ("p_TQ", "nhat_Q_T"))
             sees = visible_contacts(p_TQ, nhat_Q_T, X_TC, lens.K, depth * DEPTH_UNIT, mask)
             visible["visible"].append(sees)
@@ -429,7 +430,7 @@ def _picture(
 
 
 def _conditions(look: Conditions, camera: Stream) -> dict[str, Any]:
-    """Return the looks of a scene and the noise of a camera, by their names in the schema."""
+    """Return the appearance of a scene and the noise of a camera, by their names in the schema."""
     values = {key: value for key, value in look.values().items() if key in _VIEW_CONDITIONS}
     return values | {"depth_seed": camera.key if look.sensor.noise else 0}
 
@@ -441,7 +442,7 @@ _VIEW_CONDITIONS = {f.name for f in VIEW_FIELDS if f.of}
 
 
 def _grasps(task: SceneTask, prepared: PreparedObject, X_TO: Array) -> Columns:
-    """Return the rows of /grasps, scene by scene in the order of the attempts."""
+    """Return the rows of /grasps, ordered by scene and then by attempt."""
     order = np.argsort(task.trials["resting"], kind="stable")
     trials = {name: values[order] for name, values in task.trials.items()}
     scene = trials["resting"]
@@ -479,14 +480,14 @@ def _open_hands(task: SceneTask, prepared: PreparedObject, trials: Columns) -> A
     return rows
 
 
-#: What names an attempt of an object.
+#: Columns that identify an attempt of an object.
 _IDENTITY = ("candidate", "standoff_index", "child")
 
 
 def _given_start(
     task: SceneTask, prepared: PreparedObject, hand: Hand, identity: Mapping[str, int]
 ) -> Array:
-    """Return the positions (j,) of the joints from which a posture closes."""
+    """Return the positions (j,) of the joints from which the hand of a posture closes."""
     attempt = find_attempt(prepared, **identity, config=task.config)
     if attempt.path is not None:
         return attempt.path[0]

@@ -1,11 +1,10 @@
-"""Work units: one object's attempts at a range of its candidates, from trials to a shard.
+"""Work units: the attempts of one object at a range of its candidates, from trials to a shard.
 
-Palm poses about those of grasps that hold are tried in the unit of these grasps: no unit waits for
-another.
+Refined palm poses are tried in the same unit as their parents, so no unit waits for another.
 
-A work unit is plain data, so it can be sent to another process. Its header and the configuration
-alone decide what its shard holds: not who runs it, nor what ran before, nor how often its process
-died (see `drakegrasp.runtime.journal`).
+A work unit is plain data, so it can be sent to another process. The content of its shard depends
+only on its header and the configuration. It does not depend on the process that runs the unit, on
+earlier units, or on how often the process died (see `drakegrasp.runtime.journal`).
 """
 
 from __future__ import annotations
@@ -65,16 +64,17 @@ from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord, has_only_scraped
 from drakegrasp.table import AnyArray, Table, join
 
-#: An attempt that takes this many times its limit of computing time hangs: it never looks at it.
+#: An attempt hangs if it takes this many times its limit of computing time. An attempt that does not
+#: hang checks the limit itself.
 HANG_FACTOR = 1.5
-#: Computing time after which any other step of a unit hangs [s].
+#: Computing time after which any other step of a unit is considered to hang [s].
 STAGE_SECONDS = 600.0
-#: A certificate hangs when it takes this many times the limit of all its simulations.
+#: A certificate hangs if it takes this many times the limit of all its simulations.
 CERTIFY_FACTOR = 2.0
-#: What a parent of refined palm poses and a sample that is repeated pass: all default filters but
-#: that of outliers, which looks at all grasps of an object.
+#: Filters for parents of refined palm poses and for samples that are certified: all default filters
+#: except that of outliers, which needs all grasps of an object.
 PARENT_FILTERS = FilterConfig(outlier_sigma=0.0)
-#: What each step of a unit that is no attempt does, for error messages.
+#: Descriptions of the steps that are not attempts, for error messages.
 _STEPS = {
     "build": "building its scene",
     "predict": "predicting its attempts",
@@ -86,16 +86,17 @@ _STEPS = {
 
 @dataclass(frozen=True, kw_only=True)
 class WorkUnit:
-    """What one task does: plain data.
+    """The input of a task that runs attempts, as plain data.
 
     Attributes:
-        out: Directory of the dataset, as the process that does the task sees it.
+        out: Directory of the dataset, as a path of the process that runs the task.
         header: Object and range of candidates.
-        config: All the rules.
-        refined: Whether palm poses about those of samples are tried, if the configuration has any.
-        likely_tested: Whether its samples may test or validate, see `certify.share_tested`.
-        restartable: Whether the process that runs it is started again when it dies. If so, a
-            crash or a hang costs only the attempt; if not, it propagates to the caller.
+        config: Configuration of the dataset.
+        refined: Whether refined palm poses are tried, if the configuration has any.
+        likely_tested: Whether samples may be used for test or validation, see
+            `certify.share_tested`.
+        restartable: Whether the process that runs the unit is restarted when it dies. If so, a
+            crash or a hang ends only the attempt; if not, it propagates to the caller.
     """
 
     out: Path
@@ -106,12 +107,12 @@ class WorkUnit:
     restartable: bool = False
 
     def reads(self) -> dict[str, Path]:
-        """Return the prepared object, the hand, and the journal if there is one, see `FileTask`."""
+        """Return the files of the object and the hand, and the journal if any, see `FileTask`."""
         files = *object_files(self.out, self.header.object_name), self.header.journal_path(self.out)
         return {**hand_places(self.config), **places(self.out, *files)}
 
     def writes(self) -> tuple[str, ...]:
-        """Return the places of the shard and of the journal."""
+        """Return the paths of the shard and the journal, relative to the dataset."""
         files = self.header.path(self.out), self.header.journal_path(self.out)
         return tuple(path.relative_to(self.out).as_posix() for path in files)
 
@@ -122,15 +123,15 @@ class WorkUnit:
 
 @dataclass(frozen=True, kw_only=True)
 class UnitSummary:
-    """What is known of a unit that is done; its data are in its shard.
+    """Summary of a completed unit, whose data are in its shard.
 
     Attributes:
-        header: Of the unit.
+        header: Header of the unit.
         outcomes: Number of attempts by outcome.
-        seconds: Wall clock by stage (`build`, `try`, `measure`, `look`, `certify` if there are
-            repeats, `write`) [s]; for logs only. Empty if the shard was there already.
-        errors: Number of solver errors by their message.
-        samples: Number of samples, see `count_samples`; None if there is no target of them.
+        seconds: Wall-clock time by stage (`build`, `try`, `measure`, `look`, `certify` if there are
+            repeats, `write`) [s]; for logs only. Empty if the shard existed already.
+        errors: Number of solver errors by message.
+        samples: Number of samples, see `count_samples`; None if there is no target of samples.
     """
 
     header: ShardHeader
@@ -140,7 +141,7 @@ class UnitSummary:
     samples: int | None = None
 
 
-#: Two threads in one scene would mix up their results: only one unit runs at a time.
+#: Only one unit runs at a time, because two threads in one scene would mix up their results.
 _one_unit = threading.Lock()
 
 
@@ -153,13 +154,13 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
     Raises:
         DataError: If the object's files are damaged, or Drake cannot build its scene.
         BlankImageError: If OpenGL renders blank images.
-        DiskFullError: If there is no room for the shard.
-        MachineError: If something other than an attempt kills the process again and again.
+        DiskFullError: If there is no space for the shard.
+        MachineError: If a step other than an attempt kills the process repeatedly.
     """
     out, header = unit.out, unit.header
     with _one_unit, disk_full_named(out):
         try:
-            # A process may have died after it wrote the shard and before it answered.
+            # A process may have died after writing the shard and before returning.
             summary = _find_unit(out, header)
         except DataError:
             summary = None
@@ -176,14 +177,14 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
 class _Experiment:
     """The attempts of a unit, round after round, with the journal and the times of its steps.
 
-    Rows count through all rounds of the unit.
+    Rows are numbered through all rounds of the unit.
     """
 
     def __init__(self, unit: WorkUnit, journal: Journal) -> None:
-        """Build the object's scene, or take the one of the unit before, and list the attempts.
+        """Build the object's scene, or use that of the previous unit, and list the attempts.
 
         Raises:
-            MachineError: If the process died in this unit again and again.
+            MachineError: If the process died repeatedly in this unit.
         """
         self._unit, self._config, self._journal = unit, unit.config, journal
         self._seconds: dict[str, float] = {}
@@ -201,8 +202,8 @@ class _Experiment:
             self._attempts = list_attempts(self._setup.prepared, indices, self._config)
 
     def run(self) -> UnitSummary:
-        """Run round after round, and write the shard: all of it or nothing."""
-        # Run the attempts, then those about the samples among them, and so on.
+        """Run round after round, and write the shard, either completely or not at all."""
+        # Run the attempts, then the attempts near the samples among them, and so on.
         header, rules = self._unit.header, self._config.refine
         attempts, trials, looks = self._attempts, list[Table](), list[Table]()
         refines = self._unit.refined and rules.children > 0
@@ -220,7 +221,7 @@ class _Experiment:
                     rows |= self._certify(attempts, rows, looks[-1], samples, first)
             trials.append(Table(rows))
 
-            # Most palm poses about a hand that only scraped the table do not scrape it.
+            # Most palm poses near that of a hand that only scraped the table do not scrape it.
             parents = sorted({*samples, *scraping}) if has_children else []
             with timed(self._seconds, "try"):
                 attempts = [
@@ -242,10 +243,10 @@ class _Experiment:
 
     @contextmanager
     def _step(self, step: str) -> Iterator[None]:
-        """Run a step that is not an attempt: if its process dies there, no grasp is to blame.
+        """Run a step that is not an attempt, so that a crash in it is not the fault of a grasp.
 
         Raises:
-            MachineError: If it did.
+            MachineError: If an earlier process died in this step.
         """
         name, verdict = self._unit.header.object_name, self._journal.verdict(step)
         if verdict is not None:
@@ -275,14 +276,15 @@ class _Experiment:
     def _try_all(
         self, attempts: Sequence[Attempt], first: int, *, lift_scraping: bool
     ) -> tuple[list[TrialRecord], list[int]]:
-        """Return the records of attempts, and which would be samples but for scraping the table.
+        """Return the records of attempts, and which would be samples if scraping were allowed.
 
-        What geometry already decides is not simulated. The first attempt is in row `first`.
-        Attempts in which an earlier process died, and that are not yet judged, run first: then a
-        failing one is found at once. Hands that scrape are lifted while they are still closed.
+        Attempts that geometry decides are not simulated. The first attempt is in row `first`.
+        Attempts in which an earlier process died, and that have no verdict yet, run first, so that
+        an attempt that crashes is found at once. Hands that only scrape are lifted while they are
+        still closed.
         """
         with timed(self._seconds, "try"):
-            # The first time it measures the object's distances.
+            # The first call computes the object's distance field.
             with self._step("predict"):
                 inject_fault(self._unit.header.object_name, "predict")
                 predictions = predict_attempts(self._setup, attempts)
@@ -310,10 +312,10 @@ class _Experiment:
             return try_attempt(self._setup, attempt, prediction)
 
     def _only_scrapes(self, attempt: Attempt, record: TrialRecord, row: int) -> bool:
-        """Return whether a trial shows no sample only because the hand scraped the table.
+        """Return whether a trial is not a sample only because the hand scraped the table.
 
-        Whether it would be one is seen by lifting it. If that ended its process, it costs the
-        children.
+        The hand is lifted to find this out. If an earlier process died in the lift, the answer is
+        no, and the attempt gets no children.
         """
         step = f"lift {row}"
         if not has_only_scraped(record) or self._journal.verdict(step) is not None:
@@ -323,14 +325,14 @@ class _Experiment:
         return self._is_sample(lifted)
 
     def _is_sample(self, trial: TrialRecord, *, views: bool = True) -> bool:
-        """Return whether a trial shows a sample by the default filters, see `judge_sample`."""
+        """Return whether a trial is a sample by the default filters, see `judge_sample`."""
         rules = self._config.model_copy(update={"filters": PARENT_FILTERS})
         return judge_sample(self._setup.prepared.model, trial, rules, views=views) is Removal.KEPT
 
     def _looks(
         self, attempts: Sequence[Attempt], records: Sequence[TrialRecord], first: int
     ) -> Table:
-        """Return the rows of `/looks`: what both cameras see of every success."""
+        """Return the rows of `/looks`, with the images of both cameras of every success."""
         rows = [i for i, record in enumerate(records) if record.outcome is Outcome.SUCCESS]
         looks = {f.name: f.empty(len(rows), self._setup.sizes) for f in LOOK_FIELDS}
         with timed(self._seconds, "look"):
@@ -343,7 +345,7 @@ class _Experiment:
         return Table(looks)
 
     def _samples(self, trials: dict[str, AnyArray], looks: Table) -> list[int]:
-        """Return which attempts of a round are samples by the default filters."""
+        """Return the indices of the attempts of a round that are samples by the default filters."""
         rows = np.flatnonzero(trials["outcome"] == Outcome.SUCCESS)
         found = Table({name: values[rows] for name, values in trials.items()})
         found = found.with_columns(looks, depth_otm=looks["image_otm"][:, 3])
@@ -358,9 +360,9 @@ class _Experiment:
         samples: Sequence[int],
         first: int,
     ) -> dict[str, AnyArray]:
-        """Return the columns of what the lifts of a round that are drawn for it tolerate.
+        """Certify the lifts of a round that are drawn for it, and return the columns of results.
 
-        The least friction of a success goes into its row of `/looks`.
+        The least friction of a success is written to its row of `/looks`.
         """
         rules, known = self._config.certify, set(samples)
         tested = rules.share_tested if self._unit.likely_tested else 0.0
@@ -378,12 +380,12 @@ class _Experiment:
                 holds[name][row] = found[name]
             if held and found:
                 looks["certified_friction"][look_of[row]] = found["certified_friction"]
-        # A scene in which Drake failed was forgotten.
+        # A scene in which Drake failed is no longer cached, so build it again.
         self._setup.renew_scene()
         return holds
 
     def _certificate(self, attempt: Attempt, row: int, *, held: bool) -> dict[str, float]:
-        """Return how much an attempt tolerates, see `certify`; empty if its process died there."""
+        """Return the results of `certify` for an attempt; empty if a process died in this step."""
         step, config, prepared = f"certify {row}", self._config, self._setup.prepared
         if self._journal.verdict(step) is not None:
             return {}
@@ -409,10 +411,10 @@ def count_outcomes(outcomes: AnyArray) -> dict[Outcome, int]:
 
 
 def _find_unit(out: Path, header: ShardHeader) -> UnitSummary | None:
-    """Return what is known of a unit that is done but for its samples, or None if it is not.
+    """Return the summary of a completed unit without its samples, or None if it has no shard.
 
     Raises:
-        DataError: If its shard is damaged or of something else.
+        DataError: If the shard is damaged or belongs to another unit.
     """
     path = header.path(out)
     if not path.exists():
@@ -422,14 +424,14 @@ def _find_unit(out: Path, header: ShardHeader) -> UnitSummary | None:
 
 
 def _with_samples(out: Path, summary: UnitSummary, config: Config) -> UnitSummary:
-    """Return a summary with its number of samples, if there is a target of them."""
+    """Return a summary with its number of samples, if there is a target of samples."""
     if not config.has_target:
         return summary
     return replace(summary, samples=count_samples(out, summary.header, config))
 
 
 def find_tasks(out: Path, manifest: Manifest) -> Iterator[SurveyTask]:
-    """Yield the task of each object of which there may be a shard, for `find_units`."""
+    """Yield the task of each object that may have a shard, for `find_units`."""
     try:
         folders = set(os.listdir(out / "shards"))
     except FileNotFoundError:
@@ -440,24 +442,24 @@ def find_tasks(out: Path, manifest: Manifest) -> Iterator[SurveyTask]:
 
 
 def find_units(config: Config, task: SurveyTask) -> tuple[list[UnitSummary], list[tuple[str, str]]]:
-    """Look at the shards of an object of a dataset, up to its last wanted grasp.
+    """Find the completed units of an object of a dataset, up to its last requested grasp.
 
-    The folder is listed once and the seals of its shards are verified, so a build that continues
-    looks at them with all its workers.
+    The folder is listed once, and the seals of its shards are verified. A build that continues runs
+    this in all its workers.
 
     Returns:
-        The work units whose shard is whole; path within the dataset of each other shard, and what
-        is wrong with it.
+        The summaries of the work units with a valid shard, and for each damaged shard its path
+        within the dataset and what is wrong with it.
     """
     out, done, damaged = Path(task.out), list[UnitSummary](), list[tuple[str, str]]()
     names = set(os.listdir(shards_folder(out, task.headers[0].object_name)))
     grasps, unbroken = 0, True
     for header in task.headers:
-        # Enough grasps in the units before the first gap: no other unit is needed.
+        # No other unit is needed if the units before the first gap have enough grasps.
         if task.wanted is not None and grasps >= task.wanted:
             break
 
-        # A file that is not listed is not opened.
+        # Open only files that are listed.
         try:
             found = _find_unit(out, header) if header.file_name in names else None
         except DataError as error:
@@ -467,7 +469,7 @@ def find_units(config: Config, task: SurveyTask) -> tuple[list[UnitSummary], lis
             unbroken = False
             continue
 
-        # A process may have died after it wrote the shard and before it removed the journal.
+        # A process may have died after writing the shard and before removing the journal.
         if header.journal_path(out).name in names:
             header.journal_path(out).unlink(missing_ok=True)
         done.append(_with_samples(out, found, config))
