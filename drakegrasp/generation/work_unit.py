@@ -64,8 +64,8 @@ from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord, has_only_scraped
 from drakegrasp.table import AnyArray, Table, join
 
-#: An attempt hangs if it takes this many times its limit of computing time. An attempt that does not
-#: hang checks the limit itself.
+#: An attempt hangs if it takes this many times its limit of computing time; an attempt that does
+#: not hang checks the limit itself.
 HANG_FACTOR = 1.5
 #: Computing time after which any other step of a unit is considered to hang [s].
 STAGE_SECONDS = 600.0
