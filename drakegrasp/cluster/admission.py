@@ -1,10 +1,11 @@
-"""Which workers may do the work: checked at the start of a build, and when a worker joins later.
+"""Checks the workers at the start of a build, and each worker that joins later.
 
-In: a Dask client. Out: workers that give the results of this machine, and whether they see the
-files of the dataset. A worker that cannot render a test image is closed. One with several threads,
-or with another version of Drake, drakegrasp or the hand, is refused: at the start with an error,
-later by closing it before its first task. Where one of them does not see the files, or none is
-there yet, the files of all travel over the network, see `drakegrasp.cluster.wire`.
+In: a Dask client. Out: workers that produce the same results as this machine, and whether they see
+the files of the dataset. A worker that cannot render a test image is closed. A worker with several
+threads, or with another version of Drake, drakegrasp or the hand, is rejected. At the start this is
+an error; a worker that joins later is closed before its first task. If a worker does not see the
+files, or no worker has joined yet, the files are sent to all workers over the network, see
+`drakegrasp.cluster.wire`.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ _TOPIC = "drakegrasp-admission"
 
 @dataclass(frozen=True, kw_only=True)
 class Shared:
-    """What a worker must see to work in a dataset's directory itself.
+    """Files that a worker must see to work directly in a dataset's directory.
 
     Attributes:
         probe: File that the client wrote there.
-        text: What is in it.
-        files: Others that must be there, as a mesh.
+        text: Content of the probe.
+        files: Other files that must exist, such as meshes.
     """
 
     probe: Path
@@ -57,26 +58,26 @@ class Shared:
 
 
 class Admission(WorkerPlugin):  # type: ignore[misc]
-    """Sets up a worker, or closes it before its first task if it is not fit for the work."""
+    """Sets up a worker, or closes it before its first task if it is not suitable."""
 
     name = "drakegrasp-admission"
 
     def __init__(
         self, config: Config, hosts: frozenset[str], shared: Shared | None, *, travels: bool
     ) -> None:
-        """Know what is fit.
+        """Store the requirements.
 
         Args:
-            config: Of the build.
+            config: Configuration of the build.
             hosts: Names of the machines that are known to render.
-            shared: What it must see, if anything.
-            travels: Whether it gets the hand's files from the client.
+            shared: Files that a worker must see; None if it need not see any.
+            travels: Whether the worker gets the hand's files from the client.
         """
         self._config, self._hosts, self._shared = config, hosts, shared
         self._travels, self._versions = travels, installed_versions(config)
 
     def setup(self, worker: Worker) -> None:
-        """Check and set up the worker; Dask calls this before it gives it any task."""
+        """Check and set up the worker; Dask calls this before the worker's first task."""
         os.environ.update(WORKER_ENVIRONMENT)  # for a worker that was started by hand
         fault = None
         if self._shared is not None and not self._shared.is_seen():
@@ -88,7 +89,7 @@ class Admission(WorkerPlugin):  # type: ignore[misc]
             fault = _image_fault()
         if fault is not None:
             worker.log_event(_TOPIC, f"not used: worker {worker.address}: {fault}")
-            # Its nanny is closed as well: a new process would not be fitter.
+            # Its nanny is closed as well, because a new process would have the same fault.
             worker.loop.add_callback(worker.close, nanny=True, reason="drakegrasp-unfit")
 
 
@@ -96,24 +97,24 @@ class Admission(WorkerPlugin):  # type: ignore[misc]
 def admitted_workers(
     client: Client, config: Config, out: Path | None = None, meshes: Sequence[Path] = ()
 ) -> Iterator[bool]:
-    """Refuse workers that are not fit for the work; check those that join while the block runs.
+    """Reject unsuitable workers, and check workers that join while the block runs.
 
-    Yields whether the files of the dataset must travel, because a worker does not see them.
+    Yields whether the files of the dataset must be sent, because a worker does not see them.
 
     Args:
-        client: Of the cluster.
-        config: Its hand is among the versions that must agree.
-        out: Directory of the dataset; None for work that needs none.
-        meshes: Files elsewhere that workers read.
+        client: Client of the cluster.
+        config: Configuration, whose hand is among the versions that must agree.
+        out: Directory of the dataset; None for work without a dataset.
+        meshes: Files in other directories that workers read.
 
     Raises:
-        MachineError: If a worker that is there has several threads, or another version of
-            drakegrasp, Drake or the hand, or none of them can render.
+        MachineError: If a present worker has several threads, or another version of drakegrasp,
+            Drake or the hand, or if no worker can render.
     """
     with _shared(out, meshes) as shared:
         travels = shared is not None and _must_travel(client, shared)
 
-        # Refuse what the user must change. A hand that travels is the client's.
+        # Reject workers that the user must change. A hand that is sent has the client's version.
         versions = installed_versions(config)
         theirs = client.run(_own_versions, config, travels=travels)
         for address, threads in client.nthreads().items():
@@ -121,10 +122,10 @@ def admitted_workers(
             if fault is not None:
                 raise MachineError(f"worker {address}: {fault}")
 
-        # Do without machines that cannot render, if there are others.
+        # Do not use machines that cannot render, if there are others.
         hosts = _rendering_hosts(client)
 
-        # Set what this program can change: for the workers that are there and for later ones.
+        # Change settings that this program can change, for present and for later workers.
         client.run_on_scheduler(_saturate)
         client.subscribe_topic(_TOPIC, _print_message)
         try:
@@ -132,7 +133,7 @@ def admitted_workers(
             client.register_plugin(later)
             yield travels
         finally:
-            # A scheduler of the user's lives on; its later workers are not ours to check.
+            # A user's scheduler continues to run, and its later workers must not be checked by us.
             with suppress(Exception):
                 client.unsubscribe_topic(_TOPIC)
             with suppress(Exception):
@@ -141,11 +142,11 @@ def admitted_workers(
 
 @contextmanager
 def _shared(out: Path | None, meshes: Sequence[Path]) -> Iterator[Shared | None]:
-    """Yield what workers must see, with a file of random text in a dataset's directory."""
+    """Yield the files that workers must see, with a new probe file in the dataset's directory."""
     if out is None:
         yield None
         return
-    # One of each folder stands for the others.
+    # Check one file per folder.
     files = {path.parent: path for path in meshes}
     probe, text = temporary_name(out / "probe"), secrets.token_hex(16)
     try:
@@ -156,7 +157,7 @@ def _shared(out: Path | None, meshes: Sequence[Path]) -> Iterator[Shared | None]
 
 
 def _must_travel(client: Client, shared: Shared) -> bool:
-    """Return whether files must travel to the workers; if so, say why."""
+    """Return whether files must be sent to the workers; if so, print why."""
     seen = list(client.run(shared.is_seen).values())
     if seen and all(seen):
         return False
@@ -170,7 +171,7 @@ def _must_travel(client: Client, shared: Shared) -> bool:
 
 
 def _own_versions(config: Config, *, travels: bool) -> dict[str, str]:
-    """Return the versions of this process; without that of the hand if its files travel."""
+    """Return the versions of this process, without the hand's version if its files are sent."""
     if travels:
         return package_versions()
     try:
@@ -193,22 +194,22 @@ def unfitness(threads: int, theirs: Mapping[str, str], ours: Mapping[str, str]) 
 
 
 def _rendering_hosts(client: Client) -> frozenset[str]:
-    """Return the names of the workers' machines that can render; close the others' workers.
+    """Return the names of the machines that can render; close the workers of other machines.
 
-    One worker of each machine finds it out.
+    One worker of each machine renders a test image.
 
     Raises:
-        MachineError: If there are workers, and none can render.
+        MachineError: If there are workers, but no machine can render.
     """
     addresses: dict[str, list[str]] = {}
     for address, host in client.run(_host).items():
         addresses.setdefault(host, []).append(address)
     if not addresses:
-        return frozenset()  # those that join are asked then
+        return frozenset()  # workers that join are checked then
     found = client.run(_image_fault, workers=[workers[0] for workers in addresses.values()])
     faults = {host: found.get(workers[0]) for host, workers in addresses.items()}
 
-    # A machine without OpenGL may be one of hundreds.
+    # One machine without OpenGL, among hundreds, must not stop the build.
     bad = [host for host, fault in faults.items() if fault is not None]
     if bad and len(bad) == len(faults):
         raise MachineError(f"worker {addresses[bad[0]][0]}: {faults[bad[0]]}")
@@ -219,18 +220,18 @@ def _rendering_hosts(client: Client) -> frozenset[str]:
 
 
 def _host() -> str:
-    """Return the name of the machine that calls."""
+    """Return the name of this machine."""
     return socket.gethostname()
 
 
 def _image_fault() -> str | None:
-    """Return why this machine's workers cannot render, or None if they can."""
+    """Return why the workers of this machine cannot render, or None if they can."""
     ok, what = probe_image()
     return None if ok else f"must render a test image, got {what}; see `drakegrasp doctor` there"
 
 
 def _saturate(dask_scheduler: Scheduler) -> None:
-    """Set what a scheduler that was started by hand has not read from this program's settings."""
+    """Apply our settings to a scheduler, which does not have them if a user started it."""
     dask_scheduler.WORKER_SATURATION = SATURATION
     if dask_scheduler.worker_ttl:
         dask_scheduler.worker_ttl = max(dask_scheduler.worker_ttl, SILENCE_SECONDS)

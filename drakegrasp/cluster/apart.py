@@ -1,9 +1,9 @@
-"""A process beside a Dask worker that calls functions: it may die, and the worker does not.
+"""A process beside a Dask worker that calls functions, so that a crash does not kill the worker.
 
-In: a pickled function and its item, a `FileTask`. Out: the pickled result. Where workers see no
-file of the dataset, the journal of a task (`drakegrasp.runtime.journal`) is in the worker's own
-directory. So the worker must outlive the process that dies: it starts another one, which finds the
-journal and goes on.
+In: a pickled function and its item, a `FileTask`. Out: the pickled result. If workers do not see
+the files of the dataset, the journal of a task (`drakegrasp.runtime.journal`) is in the worker's
+own directory. So the worker must survive when the process dies. It starts another process, which
+finds the journal and continues.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import psutil
 from drakegrasp.errors import MachineError
 from drakegrasp.runtime.executor import moved_item
 
-#: Time between two looks at the memory of the process [s].
+#: Time between two checks of the memory of the process [s].
 LOOK_SECONDS = 0.1
 _NAME = "drakegrasp.cluster.apart"
 
@@ -35,16 +35,16 @@ class ApartError(Exception):
 
 
 class ProcessApart:
-    """A process that does one call after the other until it dies or is closed.
+    """A process that runs one call after the other until it dies or is closed.
 
-    Its caches, as of scenes, last from call to call.
+    Its caches, e.g. of scenes, are kept between calls.
     """
 
     def __init__(self, folder: Path) -> None:
         """Start the process.
 
         Args:
-            folder: Holds copies of the files that tasks read.
+            folder: Folder with copies of the files that tasks read.
         """
         self._connection, theirs = Pipe()
         with theirs:
@@ -55,15 +55,16 @@ class ProcessApart:
             )
 
     def call(self, request: bytes, memory: float) -> bytes:
-        """Return what a request gives.
+        """Return the pickled result of a request.
 
         Args:
             request: A pickled function and its item.
-            memory: Most memory of the process [byte]; above it is killed, as a nanny would.
+            memory: Maximum memory of the process [byte]. A process that exceeds it is killed, as a
+                nanny kills its worker.
 
         Raises:
             ApartError: If the process died.
-            Exception: What the function raised.
+            Exception: The error that the function raised.
         """
         try:
             self._connection.send_bytes(request)
@@ -87,8 +88,8 @@ class ProcessApart:
 
 
 def main(connection: Connection, folder: Path) -> None:
-    """Do what the worker asks for, until it closes the connection."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the client stops, and its workers with it
+    """Run the requests of the worker until it closes the connection."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the client stops its workers
     threading.Thread(target=_end_with, args=[connection.fileno()], daemon=True).start()
     with suppress(EOFError, ConnectionError):
         while True:
@@ -114,7 +115,7 @@ def _pickled_error(error: Exception) -> bytes:
 
 
 def _end_with(descriptor: int) -> None:
-    """End this process when the worker is gone, whatever it does then."""
+    """End this process when the worker has ended, even during a call."""
     poll = select.poll()
     poll.register(descriptor, 0)
     poll.poll()

@@ -1,7 +1,7 @@
-"""TLS certificates of a cluster: made for one run, or the user's own.
+"""TLS certificates of a cluster, created for one run or given by the user.
 
-With them, Dask's servers and clients refuse anybody who has none. Certificates that processes on
-other machines must read are files that only this user can read.
+With certificates, Dask's servers and clients reject connections without one. Certificates for
+processes on other machines are files that only this user can read.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from drakegrasp.errors import ConfigError, MachineError
 
 
 def make_certificates(folder: Path) -> tuple[Path, Path, Path]:
-    """Write an authority, a certificate and its key to a folder: ca.pem, cert.pem, key.pem.
+    """Write an authority, a certificate and its key as ca.pem, cert.pem and key.pem to a folder.
 
-    Anybody who can read them can use the cluster, so the folder must be private.
+    Any user who can read these files can use the cluster, so the folder must be private.
     """
     security = Security.temporary()
     paths = folder / "ca.pem", folder / "cert.pem", folder / "key.pem"
@@ -35,7 +35,7 @@ def make_certificates(folder: Path) -> tuple[Path, Path, Path]:
 def chosen_security(
     tls: bool, files: tuple[Path, Path, Path] | None, *, elsewhere: bool
 ) -> Security | None:
-    """Return the certificates that a caller gives; None if there are none.
+    """Return the certificates that a caller gives; None if the caller gives none.
 
     Args:
         tls: Whether connections need a certificate.
@@ -56,7 +56,7 @@ def chosen_security(
 
 
 def security_of(files: tuple[Path, Path, Path]) -> Security:
-    """Return Dask's settings for an authority, a certificate and its key, for every role."""
+    """Return Dask's security settings, which use the same certificate for every role."""
     ca, cert, key = (str(path.absolute()) for path in files)
     options: dict[str, Any] = {"require_encryption": True, "tls_ca_file": ca}
     for role in ("client", "scheduler", "worker"):
@@ -66,12 +66,12 @@ def security_of(files: tuple[Path, Path, Path]) -> Security:
 
 @contextmanager
 def private_directory(out: Path) -> Iterator[Path]:
-    """Yield a directory in `out` that only this user can enter, and remove it again.
+    """Yield a directory in `out` that only this user can enter, and remove it afterwards.
 
-    Directories of clients that were killed are removed as well: the caller holds the lock of `out`.
+    Directories of killed clients are also removed, because the caller holds the lock of `out`.
 
     Raises:
-        MachineError: If it cannot be made.
+        MachineError: If the directory cannot be created.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -84,7 +84,7 @@ def private_directory(out: Path) -> Iterator[Path]:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-        with suppress(OSError):  # only an empty directory goes: nothing was built
+        with suppress(OSError):  # removes only an empty directory, in which nothing was built
             out.rmdir()
 
 

@@ -1,8 +1,9 @@
-"""Connecting to Dask: a running scheduler, or workers on this machine that nobody else can use.
+"""Connects to Dask: to a running scheduler, or to workers on this machine that only we can use.
 
-Every user of a machine reaches the ports of its loopback address, and whoever connects to a Dask
-process can run any program in it. So all connections need a certificate, which this process makes
-and hands to its workers through a pipe. HTTP servers ask for none, so they are not started.
+All users of a machine can reach the ports of its loopback address, and whoever connects to a Dask
+process can run any program in it. So all connections need a certificate, which this process creates
+and sends to its workers through a pipe. Dask's HTTP servers do not require certificates, so they
+are not started.
 """
 
 from __future__ import annotations
@@ -38,20 +39,21 @@ from drakegrasp.runtime.journal import wall_limit
 LOOPBACK = "127.0.0.1"
 #: How long to wait for a scheduler to answer, and how long it may take to write its file [s].
 CONNECT_SECONDS, WRITE_SECONDS = 10, 2
-#: Module that a nanny loads before it starts its worker: it chooses the worker's allocator.
+#: Module that a nanny loads before it starts its worker, to choose the allocator of the worker.
 NANNY_PRELOAD = "drakegrasp.runtime.allocator"
-#: Tasks that the scheduler gives to a worker, per thread: a task that waits behind another would
-#: be blamed as well, when that one kills the worker.
+#: Number of tasks that the scheduler sends to a worker per thread. If a running task kills the
+#: worker, Dask would also blame a task that waits behind it.
 SATURATION = 1.0
-#: Time without a sign of life after which the scheduler gives a worker up [s]: longer than the
-#: limits of every step (see `runtime.journal`). A step that holds the interpreter gives none, and
-#: its journal tells more than the scheduler knows. A lost connection is noticed at once.
+#: Time without a heartbeat after which the scheduler gives up a worker [s]. It is longer than the
+#: limit of every step (see `runtime.journal`), because a step that holds the interpreter prevents
+#: heartbeats, and the journal detects a hang better than the scheduler. A lost connection is
+#: noticed at once.
 SILENCE_SECONDS = 2.0 * wall_limit(PREPARE_SECONDS)
-#: The variable that chooses a kernel of OpenBLAS, read when the library is loaded.
+#: Environment variable that chooses the kernel of OpenBLAS; it is read when the library is loaded.
 BLAS_KERNEL = "OPENBLAS_CORETYPE"
-#: The environment variables that every worker gets, on this machine and on others. Software OpenGL
-#: and BLAS would start threads beside the one process per core, and nothing that a worker does
-#: needs the network.
+#: Environment variables of every worker, on this machine and on others. They prevent software
+#: OpenGL and BLAS from starting threads in addition to the one process per core, and programs from
+#: using the network, which workers do not need.
 WORKER_ENVIRONMENT = {
     "LP_NUM_THREADS": "0",
     "DRAKE_ALLOW_NETWORK": "none",
@@ -62,7 +64,7 @@ WORKER_ENVIRONMENT = {
 
 
 class Workers(TypedDict, total=False):
-    """Where a public call has its work done if it is given no client; see `connect`."""
+    """Workers of a public call that is given no client; see `connect`."""
 
     workers: int | None
     scheduler: str | None
@@ -74,19 +76,19 @@ class Workers(TypedDict, total=False):
 def start_environment() -> dict[str, str]:
     """Return the environment variables of workers that we start.
 
-    Which kernel OpenBLAS runs is left to each machine, unless the caller's environment says it: the
-    last bits of a lift depend on it (`docs/explanation/determinism.md`).
+    The kernel of OpenBLAS is that of the caller's environment, because the last bits of a lift
+    depend on it (`docs/explanation/determinism.md`). If the caller chooses none, each machine does.
     """
     kernel = {name: os.environ[name] for name in (BLAS_KERNEL,) if name in os.environ}
     return {**WORKER_ENVIRONMENT, **kernel}
 
 
 def dask_settings() -> dict[str, Any]:
-    """Return the settings of Dask that every scheduler, nanny and worker of ours needs."""
+    """Return the Dask settings for every scheduler, nanny and worker that we start."""
     return {
         # A forked process hangs if its parent has rendered an image.
         "distributed.worker.multiprocessing-method": "spawn",
-        # Ctrl-C reaches every process of a terminal: the client stops, and then its workers.
+        # Ctrl-C reaches every process of a terminal, but the client stops its workers itself.
         "distributed.worker.preload": [
             "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
         ],
@@ -96,17 +98,17 @@ def dask_settings() -> dict[str, Any]:
         "distributed.scheduler.worker-ttl": f"{SILENCE_SECONDS:g}s",
         "distributed.nanny.pre-spawn-environ": start_environment(),
         "distributed.nanny.preload": [NANNY_PRELOAD],
-        # On a busy machine a worker takes long to start again; Dask would close its nanny.
+        # On a busy machine a worker restarts slowly, and Dask would close its nanny.
         "distributed.deploy.lost-worker-timeout": "60 s",
         "distributed.worker.memory.target": False,
         "distributed.worker.memory.spill": False,
-        # A paused worker has no task whose end would free memory: it would wait for ever.
+        # A paused worker has no other task that could free memory, so it would wait forever.
         "distributed.worker.memory.pause": False,
     }
 
 
 def dask_variables(settings: Mapping[str, Any]) -> dict[str, str]:
-    """Return settings of Dask as environment variables of a process that inherits nothing."""
+    """Return Dask settings as environment variables, for a process that inherits no settings."""
     return {
         "DASK_" + key.upper().replace(".", "__").replace("-", "_"): repr(value)
         for key, value in settings.items()
@@ -114,7 +116,7 @@ def dask_variables(settings: Mapping[str, Any]) -> dict[str, str]:
 
 
 def dashboard_line(client: Client) -> str:
-    """Return the link to the dashboard of a client's cluster, or how to install one."""
+    """Return a line with the link to the cluster's dashboard, or with how to install it."""
     if not has_dashboard():
         return "dashboard: none; pip install 'drakegrasp[dashboard]'"
     return f"dashboard: {client.dashboard_link}"
@@ -134,29 +136,30 @@ def connect(
     tls_files: tuple[Path, Path, Path] | None = None,
     memory: str | None = None,
 ) -> AbstractContextManager[Client]:
-    """Return what gives a Dask client while a block runs, for any number of calls.
+    """Return a context manager that yields a Dask client, for any number of calls.
 
     >>> with connect(workers=8) as client:                                  # doctest: +SKIP
     ...     verdicts = verify_grasps(grasps, on=data, client=client)
 
     Args:
-        workers: Processes on this machine, which are started; one per core if None.
+        workers: Number of processes to start on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
-        scheduler_file: Its JSON file, instead of the address.
-        tls: Whether the scheduler must want a certificate.
-        tls_files: Certificate authority, certificate and private key (PEM). Without them workers
-            on this machine get some of their own, and a running scheduler gets those of Dask's
-            settings (`distributed.comm.tls`).
-        memory: Limit per process on this machine, e.g. "2GB"; an equal share of it if None.
+        scheduler_file: JSON file of a running scheduler, instead of its address.
+        tls: Whether the scheduler must require a certificate.
+        tls_files: Certificate authority, certificate and private key (PEM). Without them, new
+            certificates are created for workers on this machine, and those of Dask's settings
+            (`distributed.comm.tls`) are used for a running scheduler.
+        memory: Memory limit per process on this machine, e.g. "2GB"; if None, an equal part of the
+            machine's memory.
 
     Raises:
         ConfigError: If the number of workers is below one or given with a scheduler, the address
-            is empty, the choice of TLS contradicts itself, or the scheduler wants no certificate
-            although `tls` says so.
+            is empty, the choice of TLS contradicts itself, or the scheduler requires no certificate
+            although `tls` is set.
         MachineError: If there is no scheduler at the address.
     """
-    # Python imports a script into each process that it starts: a call that is not under
-    # `if __name__ == "__main__"` would begin there as well.
+    # Python imports the script into each process that it starts, so a call that is not under
+    # `if __name__ == "__main__"` would run there as well.
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         sys.exit(1)
     elsewhere = bool(scheduler or scheduler_file)
@@ -182,10 +185,10 @@ def connect(
 
 
 def joined(client: Client | None, workers: Workers) -> AbstractContextManager[Client]:
-    """Return the caller's client, or what connects to the workers that a public call asks for.
+    """Return a context manager of the caller's client, or of a client of the requested workers.
 
     Raises:
-        ConfigError: If both are given; as `connect`.
+        ConfigError: If both are given, or as for `connect`.
     """
     if client is None:
         return connect(**workers)
@@ -198,7 +201,7 @@ def _connect_remote(
     scheduler: str | None, scheduler_file: str | Path | None, security: Security | None, tls: bool
 ) -> Client:
     address, file = scheduler, None if scheduler_file is None else str(scheduler_file)
-    # Dask waits for a missing file for ever.
+    # Dask would wait forever for a missing file.
     if file is not None and not scheduler:
         if not Path(file).is_file():
             raise MachineError(f"{file}: must be the file of a running Dask scheduler, got none")
@@ -221,10 +224,10 @@ def _connect_remote(
 
 
 def _address_of(file: Path) -> str | None:
-    """Return the address in a scheduler's file; None if it has none.
+    """Return the address in a scheduler's file; None if the file has no address.
 
-    A scheduler that starts has made its file before it writes it: half a file is read again, for
-    `WRITE_SECONDS`.
+    A starting scheduler creates its file before it writes the content, so an incomplete file is
+    read again for `WRITE_SECONDS`.
     """
     end = monotonic() + WRITE_SECONDS
     while True:
@@ -244,8 +247,9 @@ def _address_of(file: Path) -> str | None:
 class _RemoteClient(Client):
     """A client that closes at once if it cannot start.
 
-    Dask leaves the closing to the garbage collector. If that runs while the next client starts, it
-    waits for ever for the lock that this one holds (distributed 2026.8, `LoopRunner.stop`).
+    Dask leaves this to the garbage collector. If the collector runs while the next client starts,
+    it waits forever for the lock that the next client holds (distributed 2026.8,
+    `LoopRunner.stop`).
     """
 
     def start(self, **kwargs: Any) -> None:
@@ -259,11 +263,11 @@ class _RemoteClient(Client):
 
 @contextmanager
 def closing_cluster(cluster: SpecCluster) -> Iterator[None]:
-    """Close a cluster when the block ends; ignore a worker that takes long to end."""
+    """Close a cluster when the block ends; do not wait for a worker that takes long to end."""
     try:
         yield
     finally:
-        # On a busy machine a worker may not end within Dask's limit: it ends with this process.
+        # A worker that does not end within Dask's limit on a busy machine ends with this process.
         with suppress(TimeoutError):
             cluster.close()
 
@@ -284,7 +288,7 @@ def _start_local(workers: int, security: Security | None, memory: str) -> Iterat
 
 
 class _QuietScheduler(Scheduler):
-    """A scheduler without an HTTP server; no option of Dask leaves it out (distributed 2026.8)."""
+    """A scheduler without an HTTP server, which Dask has no option to disable (2026.8)."""
 
     def start_http_server(self, *_: Any, **__: Any) -> None:
         """Open no port."""
@@ -298,11 +302,11 @@ class _QuietWorker(Worker):
 
 
 class PrivateCluster(SpecCluster):
-    """A scheduler in this process, and workers of one thread, each under a nanny.
+    """A scheduler in this process, and workers with one thread, each under a nanny.
 
-    Its start may be interrupted. Dask cannot close a cluster that has not started, and at the end
-    of the program a traceback would say so (distributed 2026.8). Its processes end with this one
-    all the same.
+    The start may be interrupted. Dask cannot close a cluster that has not started, and would print
+    a traceback at the end of the program (distributed 2026.8). The processes of the cluster end
+    with this process in any case.
     """
 
     def __init__(
@@ -313,8 +317,8 @@ class PrivateCluster(SpecCluster):
         Args:
             workers: Number of processes.
             loop: Event loop in which the scheduler and the nannies run.
-            security: Certificates; made for this cluster, and in memory only, if None.
-            memory: Limit per process, e.g. "2GB"; "auto" for an equal share.
+            security: Certificates; if None, they are created for this cluster, only in memory.
+            memory: Memory limit per process, e.g. "2GB"; "auto" for equal parts of the memory.
         """
         security = security or Security.temporary()
         server = {"host": LOOPBACK, "protocol": "tls://", "security": security}
@@ -343,19 +347,20 @@ class PrivateCluster(SpecCluster):
             )
         except BaseException:
             self._instances.discard(self)
-            # A nanny whose worker did not start would tell this loop's log, which nobody reads.
+            # Do not log that a nanny's worker did not start.
             loop.asyncio_loop.set_exception_handler(lambda *_: None)  # type: ignore[attr-defined]
             raise
 
 
 @contextmanager
 def _undisturbed_loop() -> Iterator[IOLoop]:
-    """Run an event loop in a thread that no Ctrl-C reaches, nor the processes that it starts.
+    """Run an event loop in a thread that Ctrl-C does not interrupt, nor the processes it starts.
 
-    At a terminal Ctrl-C goes to every process. The client stops then, and its workers with it; one
+    At a terminal, Ctrl-C goes to every process. The client then stops its workers itself; a worker
     that has just begun to start would print a traceback instead.
     """
-    # The first process that a thread starts also starts this one, and clears the thread's mask.
+    # Start the resource tracker here. Otherwise the first process that the thread starts would
+    # start it, which clears the thread's signal mask.
     resource_tracker.ensure_running()
     runner = LoopRunner()
     runner.start()
