@@ -1,17 +1,17 @@
-"""Running tasks on Dask's workers, some of which die.
+"""Runs tasks on Dask's workers, some of which may die.
 
-In: a function and items. Out: the results, in any order. A few tasks per worker are in flight,
-whatever their number, and a task that is done is forgotten. Items that take almost no time go
-several to a task, because each task costs some messages. A task whose worker died is given to
-another; the items themselves make sure that this ends (see `drakegrasp.runtime.journal`), so the
-limit on deaths is generous. A task that rendered a blank image is retried: one worker's OpenGL may
-be broken.
+In: a function and items. Out: the results, in any order. A few tasks per worker are in flight, and
+a completed task is forgotten, so the memory does not grow with the number of tasks. Several items
+that take almost no time are put in one task, because each task costs some messages. A task whose
+worker died is given to another worker. The items themselves ensure that this ends (see
+`drakegrasp.runtime.journal`), so the limit on deaths is generous. A task that rendered a blank
+image is retried, because the OpenGL of a single worker may be broken.
 
-When there is no worker, the work waits if others may come: from SLURM's queue, or to a scheduler
-that somebody else runs. Workers that this process started itself do not come back.
+When there is no worker, the work waits if other workers may join, from a batch queue or at a
+scheduler that somebody else runs. Workers that this process started itself do not come back.
 
-`distributed.as_completed` with `add` would be the same loop, but its iterator cannot be left while
-it waits: workers could not be counted, nor their loss be noticed, while no task is done.
+`distributed.as_completed` with `add` would be a similar loop. But its iterator cannot be
+interrupted while it waits, so the loss of workers would not be noticed until a task is done.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from drakegrasp.runtime.executor import WorkerPool
 T = TypeVar("T")
 R = TypeVar("R")
 
-#: Tasks in flight per worker: one that runs, and one that waits so that the worker never does.
+#: Number of tasks in flight per worker: one that runs, and one that waits, to keep the worker busy.
 IN_FLIGHT = 2
-#: Items go together until their task takes about this long [s]: many times its messages.
+#: Items are combined until their task takes about this long [s], much longer than its messages.
 TASK_SECONDS = 0.25
-#: Most items of a task: the next items may take far longer than the last ones did.
+#: Maximum number of items in a task, because the next items may take far longer than the last.
 LARGEST = 4
 #: Time between two counts of the workers [s].
 COUNT_SECONDS = 2.0
-#: Time that a result may take from a worker to here before the workers are counted again [s].
+#: Time that the transfer of a result may take before the workers are counted again [s].
 GATHER_SECONDS = 30.0
-#: Time without any worker after which the work stops, if none can come by themselves [s].
+#: Time without any worker after which the work stops, if no worker can join by itself [s].
 LOST_SECONDS = 300.0
 #: Time without any worker after which the user is told [s]; shorter gaps are restarts.
 SAY_SECONDS = 60.0
@@ -61,10 +61,10 @@ class _PendingTask(Generic[T]):
     """A task in flight: some items, run one after the other.
 
     Attributes:
-        items: What the function is called with.
-        future: Of the task's last submission.
-        given_up: How often Dask gave it up.
-        blank: How often it rendered a blank image.
+        items: Items with which the function is called.
+        future: Future of the task's last submission.
+        given_up: Number of times that Dask gave up the task.
+        blank: Number of times that the task rendered a blank image.
     """
 
     items: Sequence[T]
@@ -75,16 +75,16 @@ class _PendingTask(Generic[T]):
 
 @dataclass(frozen=True)
 class _TaskResult(Generic[R]):
-    """What a task returns: the results of its first items, at least one, and its duration [s]."""
+    """The result of a task: the results of its first items, at least one, and its duration [s]."""
 
     results: list[R]
     seconds: float
 
 
 def _run_items(function: Callable[[T], R], items: Sequence[T]) -> _TaskResult[R]:
-    """Return the results up to the first item that raises; if that is the first, raise it.
+    """Return the results of the items before the first error; if there are none, raise the error.
 
-    An error then costs no results, and arrives as Dask sends errors.
+    In this way an error does not discard results, and Dask transfers it like any other error.
     """
     start, results = time.monotonic(), list[R]()
     for item in items:
@@ -108,8 +108,8 @@ class DaskExecutor:
         """Use the workers of a client.
 
         Args:
-            client: Of the cluster.
-            resubmissions: How often a task is submitted again that Dask gave up because its
+            client: Client of the cluster.
+            resubmissions: Number of times to submit a task again after Dask gave it up because its
                 workers died.
         """
         self._client, self._resubmissions = client, resubmissions
@@ -121,19 +121,19 @@ class DaskExecutor:
         self.pool = WorkerPool()
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-        """Yield function(item) of every item as they are done.
+        """Yield function(item) for every item, in the order in which they are done.
 
         Raises:
-            MachineError: If the workers died of an item again and again, or all of them or
-                the scheduler are lost.
-            Exception: What the function raised.
+            MachineError: If an item kills its workers repeatedly, or all workers or the scheduler
+                are lost.
+            Exception: The error that the function raised.
         """
         remaining, self._together = iter(items), 1
         done: SimpleQueue[str] = SimpleQueue()
         pending: dict[str, _PendingTask[T]] = {}
 
         while True:
-            # Keep a few tasks per worker in flight; items are taken only when there is room.
+            # Keep a few tasks per worker in flight; take items only when they can be submitted.
             self._count_workers()
             while len(pending) < IN_FLIGHT * max(1, len(self._workers)):
                 together = tuple(islice(remaining, self._together))
@@ -143,7 +143,7 @@ class DaskExecutor:
             if not pending:
                 return
 
-            # Wait for one; a task that failed through no fault of its own is submitted again.
+            # Wait for a task. If it failed because of its worker, submit it again.
             task = pending.pop(self._next_done(done))
             try:
                 result: _TaskResult[R] = self._gather(cast(Future, task.future))
@@ -152,7 +152,8 @@ class DaskExecutor:
                 self._submit(function, task, pending, done)
                 continue
 
-            # Items behind one that raised go again, and raise by themselves then.
+            # Submit the items from the one that raised an error again; then it is the first item,
+            # and its error is raised.
             self._adapt_together(result)
             rest = task.items[len(result.results) :]
             if rest:
@@ -167,16 +168,16 @@ class DaskExecutor:
         done: SimpleQueue[str],
     ) -> None:
         """Submit a task; its key goes into `done` when it ends."""
-        # A task writes files, so Dask must not take its result from an equal one before.
+        # A task writes files, so Dask must not reuse the result of an earlier equal task.
         future = self._client.submit(_run_items, function, task.items, pure=False)
         task.future, pending[future.key] = future, task
         future.add_done_callback(lambda ended: done.put(ended.key))
 
     def _next_done(self, done: SimpleQueue[str]) -> str:
-        """Return the key of a task that has ended, once there is one.
+        """Wait for a task to end, and return its key.
 
         Raises:
-            MachineError: If there is no worker for long.
+            MachineError: If there is no worker for a long time.
         """
         while True:
             try:
@@ -185,7 +186,7 @@ class DaskExecutor:
                 self._count_workers()
 
     def _gather(self, future: Future) -> Any:
-        """Return the result of a task that has ended, or raise what it raised."""
+        """Return the result of a task that has ended, or raise its error."""
         while not future.cancelled():
             try:
                 return future.result(timeout=GATHER_SECONDS)
@@ -196,16 +197,16 @@ class DaskExecutor:
         raise _scheduler_lost("its tasks are cancelled")
 
     def _adapt_together(self, result: _TaskResult[Any]) -> None:
-        """Choose how many of the next items go together, by how long the last ones took."""
+        """Choose the number of items of the next task by the duration of the last task."""
         fit = TASK_SECONDS * len(result.results) / max(result.seconds, 1e-6)
         self._together = int(max(1, min(fit, 2 * self._together, LARGEST)))
 
     def _refuse_retry(self, task: _PendingTask[Any], error: Exception) -> None:
-        """Refuse to submit a task again that failed too often.
+        """Check that a failed task may be submitted again.
 
         Raises:
-            MachineError: If workers died of it too often.
-            BlankImageError: If it rendered too many blank images.
+            MachineError: If the task killed its workers too often.
+            BlankImageError: If the task rendered too many blank images.
         """
         if isinstance(error, BlankImageError):
             task.blank += 1
@@ -217,10 +218,10 @@ class DaskExecutor:
             raise MachineError(f"workers died again and again: {error}") from None
 
     def _count_workers(self) -> None:
-        """Count the workers, unless that was done less than `COUNT_SECONDS` ago.
+        """Count the workers, unless they were counted less than `COUNT_SECONDS` ago.
 
         Raises:
-            MachineError: If the scheduler is lost, or all workers are for long.
+            MachineError: If the scheduler is lost, or there is no worker for a long time.
         """
         now = time.monotonic()
         if now - self._counted < COUNT_SECONDS:
@@ -231,7 +232,7 @@ class DaskExecutor:
         except (OSError, RuntimeError, TimeoutError) as error:
             raise _scheduler_lost(str(error)) from None
 
-        # Tell who wants to know.
+        # Notify the observers of the pool.
         joined, left = workers - self._workers, self._workers - workers
         if joined or left:
             self._workers, self.pool.size = workers, len(workers)
@@ -242,10 +243,10 @@ class DaskExecutor:
         self._check_empty(now)
 
     def _check_empty(self, now: float) -> None:
-        """Say that there is no worker if there has been none for long.
+        """Report if there has been no worker for a long time.
 
         Raises:
-            MachineError: If none can come either.
+            MachineError: If no worker can join either.
         """
         if self._workers:
             self._empty_since = None
@@ -265,15 +266,15 @@ def _scheduler_lost(reason: str) -> MachineError:
 
 
 def _may_come(cluster: Cluster | None) -> bool:
-    """Return whether workers may come by themselves: to somebody's scheduler, or from a queue."""
+    """Return whether workers may join by themselves, at a user's scheduler or from a queue."""
     return cluster is None or hasattr(cluster, "job_script")
 
 
 def _reopen(cluster: PrivateCluster) -> None:
-    """Replace the nannies of a cluster on this machine that gave up.
+    """Replace the nannies that gave up, in a cluster on this machine.
 
-    A nanny gives up when its worker dies while it starts; Dask drops a nanny whose worker is away
-    for long. Call this in the cluster's event loop.
+    A nanny gives up when its worker dies during the start, and Dask drops a nanny whose worker is
+    lost for a long time. Call this in the cluster's event loop.
     """
     for name, nanny in list(cluster.workers.items()):
         if nanny.status in (Status.closed, Status.failed):

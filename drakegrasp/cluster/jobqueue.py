@@ -1,8 +1,8 @@
 """Workers in jobs of a batch scheduler, with the user's jobqueue.yaml; needs extra `[jobqueue]`.
 
-A kind is a few lines: the class of dask-jobqueue, and in what its scheduler differs. A job's script
-means what it says, whatever is in the names of folders: dask-jobqueue (0.9) writes paths into it
-without quotes, a blank splits them, and the shell runs what is in `$(...)`.
+A kind is a short class that states the class of dask-jobqueue and the differences of its scheduler.
+Paths in a job's script are quoted here. dask-jobqueue (0.9) writes them without quotes, so the
+shell would split a path at a blank and run a command in `$(...)`.
 """
 
 from __future__ import annotations
@@ -30,26 +30,27 @@ from drakegrasp.cluster.connect import LOOPBACK, NANNY_PRELOAD, dask_settings, d
 from drakegrasp.cluster.kinds import REMOTE, Remote, memory_bytes
 from drakegrasp.errors import ConfigError, MachineError
 
-#: Memory of a worker, if neither the user nor jobqueue.yaml gives it.
+#: Memory of a worker, if neither the user nor jobqueue.yaml states it.
 WORKER_MEMORY = "2GB"
-#: Time between two looks for lost jobs [s]; a job that is missing twice in a row is lost.
+#: Time between two checks for lost jobs [s]; a job that is missing twice in a row is lost.
 REFILL_SECONDS = 20.0
-#: A worker ends by itself this long before its job's walltime, give or take the second [s]; less
-#: for short jobs. Then its unit is not cut off, and jobs do not all end together.
+#: Time before the walltime of its job at which a worker ends by itself, and the random variation of
+#: this time [s]; they are shorter for short jobs. In this way units are not interrupted, and jobs
+#: do not all end at the same time.
 LIFETIME_MARGIN, LIFETIME_STAGGER = 300.0, 120.0
 #: A number of days, hours, minutes or seconds.
 _NUMBER = re.compile("[0-9]{1,6}")
 
 
 class Jobs(Remote):
-    """Jobs of some cores each, with a worker on each core.
+    """Jobs with several cores each, and a worker on each core.
 
     Attributes:
         of: Class of dask-jobqueue.
         title: Name of the scheduler.
         test: Command that asks the scheduler whether it would run a script; empty if it has none.
-        alone: What a walltime in jobqueue.yaml that is one number is of [s].
-        pair: What the numbers of one with a single colon are of [s].
+        alone: Unit of a walltime in jobqueue.yaml that is a single number [s].
+        pair: Units of the two numbers of a walltime with a single colon [s].
     """
 
     options = (*REMOTE, "walltime")
@@ -60,7 +61,7 @@ class Jobs(Remote):
     pair: ClassVar[tuple[float, float]] = (60.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Refuse a malformed walltime, and jobs without a number of workers."""
+        """Reject a malformed walltime, and jobs without a number of workers."""
         super().__post_init__()
         if self.walltime is not None:
             walltime_seconds(self.walltime)
@@ -77,7 +78,7 @@ class Jobs(Remote):
         return dask.config.get(f"jobqueue.{self.of.job_cls.config_name}.{key}", None)
 
     def listens(self) -> bool:
-        """Return whether jobqueue.yaml says where the scheduler listens."""
+        """Return whether jobqueue.yaml states where the scheduler listens."""
         options = self.setting("scheduler-options") or {}
         return bool(self.setting("interface") or {"host", "interface"} & set(options))
 
@@ -86,7 +87,7 @@ class Jobs(Remote):
         return self.per_job * self.jobs
 
     def line(self) -> str:
-        """Return what each job asks for, in words."""
+        """Return a description of the resources that each job requests."""
         memory = "memory as in jobqueue.yaml" if self.memory is None else f"{self.memory} each"
         walltime = f"walltime {self._walltime() or 'as the queue has it'}"
         return (
@@ -94,7 +95,7 @@ class Jobs(Remote):
         )
 
     def _walltime(self) -> str | None:
-        """Return the time limit of a job; None if nobody says it."""
+        """Return the time limit of a job; None if it is not stated."""
         return self.walltime or self.setting("walltime")
 
     def seconds(self) -> float | None:
@@ -111,16 +112,16 @@ class Jobs(Remote):
         return self.per_job * memory_bytes(self.memory)
 
     def asks(self) -> dict[str, Any]:
-        """Return what this scheduler's jobs ask for, as options of its class."""
+        """Return the resources that a job requests, as options of the scheduler's class."""
         return {"walltime": self.told_walltime()}
 
     def told_walltime(self) -> str | None:
-        """Return the user's time limit as H:MM:SS; None: as the user's jobqueue.yaml says."""
+        """Return the user's time limit as H:MM:SS; None if jobqueue.yaml states it."""
         return None if self.walltime is None else clock(walltime_seconds(self.walltime))
 
     def job(self, security: Security | None) -> dict[str, Any]:
         """Return all options of a job."""
-        # Whatever is None or not named here is as the user's jobqueue.yaml says.
+        # Options that are None or not listed here are taken from the user's jobqueue.yaml.
         memory = None if self.memory is None else f"{self.job_memory()}B"
         return {
             "cores": self.per_job,
@@ -132,7 +133,7 @@ class Jobs(Remote):
                 *(self.setting("worker-extra-args") or ()),
                 *_lifetime(self.seconds()),
                 f"--dashboard-address={LOOPBACK}:0",
-                # The settings' preload is not read by the command that starts a worker.
+                # The command that starts a worker does not read the preload of the settings.
                 f"--preload-nanny={NANNY_PRELOAD}",
                 *([f"--host={LOOPBACK}"] if "host" in self.workers_listening() else []),
             ],
@@ -141,7 +142,7 @@ class Jobs(Remote):
         }
 
     def script(self, out: Path) -> str:
-        """Return the script of a job, but for the address of the scheduler and certificates."""
+        """Return the script of a job, with placeholders for scheduler address and certificates."""
         keys = out / ".tls-RUN"
         files = self.tls_files or (keys / "ca.pem", keys / "cert.pem", keys / "key.pem")
         options = self.job(security_of(files) if self.tls else None)
@@ -152,11 +153,11 @@ class Jobs(Remote):
         return str(job.job_script())
 
     def submission(self) -> str:
-        """Return the command that gives the scheduler a script."""
+        """Return the command that submits a script."""
         return str(self.of.job_cls.submit_command)
 
     def start(self, security: Security | None) -> SpecCluster:
-        """Submit the jobs, if the scheduler would run them, and others in place of those lost."""
+        """Submit the jobs, if the scheduler would run them, and replace lost jobs."""
         cluster = self.of(
             job_cls=quoted(self.of.job_cls),
             **self.job(security),
@@ -180,10 +181,10 @@ class Jobs(Remote):
         return cluster
 
     def refuse_bad_job(self, script: str) -> None:
-        """Ask the scheduler whether it would run a job: later nobody sees it fail.
+        """Ask the scheduler whether it would run a job, because a later failure is not visible.
 
         Raises:
-            MachineError: If the scheduler is not here, or would not run the job.
+            MachineError: If the scheduler's commands are missing, or it would not run the job.
         """
         command = shlex.split(self.submission())[0]
         if shutil.which(command) is None:
@@ -234,7 +235,7 @@ class Sge(Jobs):
     of, title = dask_jobqueue.SGECluster, "Grid Engine"
 
     def __post_init__(self) -> None:
-        """Refuse jobs of several cores without the site's parallel environment."""
+        """Reject jobs with several cores if the site's parallel environment is not stated."""
         super().__post_init__()
         directives = self.setting("job-extra-directives") or ()
         if self.per_job > 1 and not any("-pe " in directive for directive in directives):
@@ -286,17 +287,17 @@ def clock(seconds: float) -> str:
 def walltime_seconds(
     text: str, alone: float = 60.0, pair: tuple[float, float] = (60.0, 1.0)
 ) -> float:
-    """Return a time limit in seconds, by default of SLURM.
+    """Return a time limit in seconds; the default units are those of SLURM.
 
     SLURM's forms: M, M:S, H:M:S, D-H, D-H:M, D-H:M:S.
 
     Args:
         text: The time.
-        alone: What a lone number is of [s].
-        pair: What two numbers without days are of [s].
+        alone: Unit of a single number [s].
+        pair: Units of two numbers without days [s].
 
     Raises:
-        ConfigError: If the text is none of them.
+        ConfigError: If the text has none of these forms.
     """
     days, dash, rest = text.partition("-") if "-" in text else ("0", "", text)
     parts = rest.split(":")
@@ -316,9 +317,10 @@ def walltime_seconds(
 
 
 class _Quoted:
-    """A job of dask-jobqueue with every path of ours in quotes.
+    """A job of dask-jobqueue in which our paths are quoted.
 
-    What the user's jobqueue.yaml says of options and of lines of the script is shell already.
+    Options and script lines in the user's jobqueue.yaml are not quoted, because they are shell
+    code already.
     """
 
     config_name: str
@@ -338,7 +340,7 @@ class _Quoted:
         python = python or told(f"jobqueue.{self.config_name}.python") or sys.executable
         super().__init__(  # type: ignore[call-arg]
             *arguments,
-            # Given as `security`, the files of the certificates would not be quoted.
+            # If the certificates were given as `security`, their paths would not be quoted.
             worker_extra_args=[*worker_extra_args, *_tls_words(security)],
             python=shlex.quote(python),
             local_directory=None if folder is None else shlex.quote(str(folder)),
@@ -348,7 +350,7 @@ class _Quoted:
 
 @cache
 def quoted(job: type[Any]) -> type[Any]:
-    """Return a class of jobs with every path of ours in quotes."""
+    """Return a class of jobs in which our paths are quoted."""
     return types.new_class(f"Quoted{job.__name__}", (_Quoted, job))
 
 
@@ -364,13 +366,13 @@ def _tls_words(security: Security | None) -> list[str]:
 
 
 def _exports() -> list[str]:
-    """Return Dask's settings as lines of a job script, which inherits nothing."""
+    """Return Dask's settings as lines of a job script, because a job does not inherit settings."""
     told = dask_variables(dask_settings())
     return [f"export {name}={shlex.quote(value)}" for name, value in told.items()]
 
 
 def _lifetime(seconds: float | None) -> list[str]:
-    """Return the options by which a worker ends before its job's walltime [s]."""
+    """Return the options that make a worker end before the walltime [s] of its job."""
     if seconds is None:
         return []
     margin = min(LIFETIME_MARGIN, seconds / 4.0)
@@ -379,11 +381,11 @@ def _lifetime(seconds: float | None) -> list[str]:
 
 
 class _Refill:
-    """Submits a new job in place of each that ended: at its walltime, or with its machine.
+    """Replaces each job that ended at its walltime or because its machine failed.
 
-    `adapt(minimum_jobs=n, maximum_jobs=n)` of dask-jobqueue does not: it compares n with the jobs
-    that were asked for, and a job of several workers stays among these when it has ended (0.9,
-    distributed 2026.8).
+    `adapt(minimum_jobs=n, maximum_jobs=n)` of dask-jobqueue does not do this. It compares n with
+    the number of requested jobs, which still includes a job with several workers after its end
+    (0.9, distributed 2026.8).
     """
 
     def __init__(self, cluster: SpecCluster, jobs: int) -> None:
@@ -397,12 +399,13 @@ class _Refill:
         if cluster.status is not Status.running:
             return
 
-        # A job is there if it has a worker; one that still queues never was.
+        # A job is present if it has a worker. A job that is still queued is not yet present, and
+        # not missing.
         names = {str(w["name"]) for w in cluster.scheduler_info["workers"].values()}
         present = {job for job in cluster.worker_spec if _has_worker(str(job), names)}
         missing = self._seen - present
 
-        # Forget the lost jobs: to reach the number of jobs again, Dask submits new ones.
+        # Forget the lost jobs, so that Dask submits new ones to reach the number of jobs.
         for job in missing & self._missing:
             if job in cluster.workers:
                 await cluster.workers.pop(job).close()

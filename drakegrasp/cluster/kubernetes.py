@@ -1,9 +1,9 @@
-"""A cluster of pods: the manifest of dask-kubernetes' operator, which starts them.
+"""A cluster of pods, as a manifest for the operator of dask-kubernetes, which starts them.
 
-In: an image with drakegrasp, and a claim of a volume if one holds OUT. Out: a `DaskCluster` of
-kubernetes.dask.org/v1 (dask-kubernetes 2025.7), for `kubectl apply -f -`. Nothing is started from
-here: whoever applies it then connects by the scheduler's address. Scheduler and workers ask for a
-certificate, which a secret of the namespace holds.
+In: an image with drakegrasp, and a volume claim if a volume holds OUT. Out: a `DaskCluster` of
+kubernetes.dask.org/v1 (dask-kubernetes 2025.7), for `kubectl apply -f -`. This module starts
+nothing. The user applies the manifest and then connects to the scheduler's address. Scheduler and
+workers require a certificate, which is stored in a secret of the namespace.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from drakegrasp.cluster.connect import NANNY_PRELOAD, dask_settings, dask_variab
 from drakegrasp.cluster.kinds import Local, memory_bytes
 from drakegrasp.errors import ConfigError, MachineError
 
-#: Memory of a worker, if the user gives none.
+#: Memory of a worker, if the user does not state it.
 WORKER_MEMORY = "2GB"
-#: Ports of the scheduler: of Dask, and of its dashboard, which the operator asks.
+#: Ports of the scheduler, for Dask and for its dashboard, which the operator queries.
 PORT, DASHBOARD = 8786, 8787
-#: Where pods see the certificates, and the files there.
+#: Folder in which pods see the certificates, and the names of the files.
 KEYS = "/etc/drakegrasp-tls"
 FILES = {"ca-file": "ca.pem", "cert": "cert.pem", "key": "key.pem"}
 #: Names in Kubernetes (RFC 1123); the operator adds `-default-worker-` and ten characters.
@@ -34,14 +34,14 @@ _NAME, _LONGEST = re.compile("[a-z0-9]([-a-z0-9]*[a-z0-9])?"), 37
 
 @dataclass(kw_only=True)
 class Kubernetes(Local):
-    """Pods with a worker each, and one with the scheduler.
+    """Pods with one worker each, and a pod with the scheduler.
 
     Attributes:
-        image: Container image with drakegrasp, as pipelines/recipes/Dockerfile makes it.
-        claim: Name of the PersistentVolumeClaim in which OUT lies; pods see it at OUT's folder.
-            Without one files travel over the network.
-        name: Of the cluster.
-        namespace: Of the cluster.
+        image: Container image with drakegrasp, as pipelines/recipes/Dockerfile builds it.
+        claim: Name of the PersistentVolumeClaim of the volume that holds OUT. Pods mount it at the
+            folder of OUT. Without a claim, files are sent over the network.
+        name: Name of the cluster.
+        namespace: Namespace of the cluster.
     """
 
     starts: ClassVar[bool] = False
@@ -52,10 +52,10 @@ class Kubernetes(Local):
     namespace: str = "default"
 
     def __post_init__(self) -> None:
-        """Refuse what the operator or Kubernetes would refuse.
+        """Reject values that the operator or Kubernetes would reject.
 
         Raises:
-            ConfigError: If something is missing, or a name is none of Kubernetes.
+            ConfigError: If a value is missing, or a name is not a valid name in Kubernetes.
         """
         super().__post_init__()
         if self.workers is None:
@@ -88,12 +88,12 @@ class Kubernetes(Local):
         return f"{'tls' if self.tls else 'tcp'}://{host}:{PORT}"
 
     def line(self) -> str:
-        """Return what the manifest asks for, in words."""
+        """Return a description of what the manifest requests."""
         where = f"OUT in the claim {self.claim}" if self.claim else "which do not see OUT"
         return f"{self.workers} worker pods of {self.image}, {where}"
 
     def is_open(self) -> bool:
-        """Return whether others reach the scheduler: all pods of the cluster do."""
+        """Return True, because all pods of the Kubernetes cluster reach the scheduler."""
         return True
 
     def script(self, out: Path) -> str:
@@ -101,7 +101,7 @@ class Kubernetes(Local):
         return str(yaml.safe_dump(self.manifest(out), sort_keys=False))
 
     def client_options(self) -> list[str]:
-        """Return the options of a client in a pod that has the secret where the workers have it."""
+        """Return the options of a client in a pod that mounts the secret as the workers do."""
         tls = [word for k, file in FILES.items() for word in (f"--tls-{k}", f"{KEYS}/{file}")]
         return ["--scheduler", self.address, *(tls if self.tls else ())]
 
@@ -113,10 +113,10 @@ class Kubernetes(Local):
         """Return the `DaskCluster`.
 
         Args:
-            out: Directory of the dataset, absolute; its folder is where pods see the volume.
+            out: Absolute path of the dataset; pods mount the volume at its parent folder.
 
         Raises:
-            ConfigError: If there is a claim, and `out` is in no folder.
+            ConfigError: If there is a claim, and `out` is directly in the root folder.
         """
         if self.claim and out.parent == Path(out.anchor):
             raise ConfigError(f"--out must be in a folder of the claim, e.g. /data/OUT, got {out}")
@@ -130,7 +130,7 @@ class Kubernetes(Local):
         ]
         memory = memory_bytes(self.memory or WORKER_MEMORY)
         worker = [
-            # The address that the operator sets is without TLS.
+            # The operator sets an address without TLS.
             *(*python, "distributed.cli.dask_worker", self.address),
             *("--name", "$(DASK_WORKER_NAME)", "--nthreads", "1", "--memory-limit", f"{memory}B"),
             *("--preload-nanny", NANNY_PRELOAD, *tls),
@@ -164,7 +164,7 @@ class Kubernetes(Local):
         self, name: str, args: list[str], out: Path, memory: int | None, ports: dict[str, int]
     ) -> dict[str, Any]:
         """Return the specification of a pod with one container."""
-        # What it asks for, and the folders that it sees.
+        # The requested resources, and the mounted folders.
         asked = {"cpu": "1", **({} if memory is None else {"memory": str(memory)})}
         mounts, volumes = list[dict[str, str]](), list[dict[str, Any]]()
         if self.claim:
@@ -191,7 +191,7 @@ class Kubernetes(Local):
         return {"containers": [container], "volumes": volumes}
 
     def connected(self, out: Path) -> AbstractContextManager[Client]:
-        """Refuse: the operator starts the workers.
+        """Raise an error, because the operator starts the workers.
 
         Raises:
             MachineError: Always.

@@ -13,18 +13,18 @@ from drakegrasp.cluster.connect import LOOPBACK, start_environment
 from drakegrasp.cluster.kinds import Remote
 from drakegrasp.errors import ConfigError
 
-#: A scheduler on another machine ends by itself after this time without work: its client was
-#: killed.
+#: A scheduler on another machine ends by itself after this time without work, because its client
+#: must have been killed.
 IDLE_TIME = "1 hour"
 
 
 class Ssh(Remote):
-    """Hosts by name; one that is named twice has the workers twice."""
+    """Hosts by name; a host that is named twice has twice as many workers."""
 
     follow = (1, math.inf, "the names of the hosts")
 
     def __post_init__(self) -> None:
-        """Refuse hosts with a user's name, and numbers of workers that do not fit."""
+        """Reject hosts with a user name, and numbers of workers that do not fit the hosts."""
         super().__post_init__()
         for host in self.where:
             if "@" in host:
@@ -33,7 +33,7 @@ class Ssh(Remote):
                     "the key for it go into ~/.ssh/config"
                 )
 
-        # Each host has as many workers as the others.
+        # All hosts have the same number of workers.
         hosts, workers, cores = len(self.where), self.workers, self.cores
         if cores is not None and workers not in (None, hosts * cores):
             raise ConfigError(
@@ -57,7 +57,7 @@ class Ssh(Remote):
         return len(self.where) * self.per_host
 
     def line(self) -> str:
-        """Return what will be started, in words."""
+        """Return a description of the workers that will be started."""
         hosts = dict.fromkeys(self.where)
         on = f"{' '.join(hosts)}, scheduler on {self.where[0]}"
         return f"{self.count()} workers over ssh on {on}"
@@ -68,8 +68,8 @@ class Ssh(Remote):
         SSHCluster sends Dask's settings with every command that it runs on another machine.
 
         Raises:
-            ConfigError: If a path of a certificate has a quotation mark: Dask puts its commands
-                between two of them.
+            ConfigError: If a path of a certificate contains a single quotation mark, because Dask
+                puts its commands between such marks.
         """
         server = server_options(security)
         for path in server.get("security", {}).values():
