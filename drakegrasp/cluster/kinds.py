@@ -1,9 +1,9 @@
 """Kinds of clusters by name, as `drakegrasp submit --cluster` takes them.
 
 In: the options of a kind. Out: lines for the user, and a Dask client while a block runs. A kind is
-a class in a module of its own and a line in pyproject.toml; those of this machine and of a running
-scheduler are here. Workers on other machines inherit nothing, so each kind sends them
-`dask_settings`; nothing listens beyond this machine unless `host` or `interface` says so.
+a class in its own module and a line in pyproject.toml; the kinds for this machine and for a running
+scheduler are in this module. Workers on other machines do not inherit settings, so each kind sends
+them `dask_settings`. Other machines can connect only if `host` or `interface` allows it.
 """
 
 from __future__ import annotations
@@ -39,25 +39,25 @@ from drakegrasp.errors import ConfigError, MachineError
 
 #: Options of a cluster on other machines.
 REMOTE = ("workers", "cores", "memory", "host", "interface")
-#: More memory than a worker has [B].
+#: Maximum memory of a worker [B], more than any machine has.
 MOST_MEMORY = 10**15
 
 
 class AddressMissingError(ConfigError):
-    """Nothing says where a scheduler of workers on other machines listens."""
+    """The address at which a scheduler for workers on other machines listens is not stated."""
 
 
 @dataclass(kw_only=True)
 class Local:
-    """Workers on this machine, as on the command line; the base of all kinds.
+    """Workers on this machine, as on the command line; the base class of all kinds.
 
     Attributes:
-        starts: Whether `connected` starts or finds workers; else there is only a `script`.
-        follow: Least and largest number of words that follow the kind, and what they are.
-        options: The options that it has.
-        kind: Its name in the registry.
-        where: Hosts, the address of a scheduler, or its file.
-        workers: Number of processes in all.
+        starts: Whether `connected` starts or finds workers; otherwise there is only a `script`.
+        follow: Minimum and maximum number of words after the kind, and their description.
+        options: Names of the options that the kind has.
+        kind: Name of the kind in the registry.
+        where: Names of hosts, the address of a scheduler, or the path of a scheduler's file.
+        workers: Total number of processes.
         cores: Number of cores of each host or job, with a worker on each.
         memory: Memory of each worker, e.g. "2GB".
         walltime: Time limit of each job, as SLURM writes it: [D-]HH:MM:SS.
@@ -65,7 +65,7 @@ class Local:
         interface: Name of the network interface on which scheduler and workers listen.
         tls: Whether connections need a certificate.
         tls_files: Files in PEM format that every machine sees: authority, certificate and
-            private key. Without them, workers that are started get some that are made for this run.
+            private key. Without them, certificates are created for this run if workers are started.
     """
 
     starts: ClassVar[bool] = True
@@ -83,10 +83,10 @@ class Local:
     tls_files: tuple[Path, Path, Path] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what a cluster of this kind cannot be.
+        """Reject options that are not possible for this kind.
 
         Raises:
-            ConfigError: If the request contradicts itself, or lacks something.
+            ConfigError: If options contradict each other, or an option is missing.
             MachineError: If a package is missing.
         """
         least, most, what = self.follow
@@ -104,19 +104,19 @@ class Local:
             memory_bytes(self.memory)
 
     def count(self) -> int | None:
-        """Return how many workers there will be; None if that is known only when they start."""
+        """Return the number of workers; None if it is known only after the start."""
         return self.workers
 
     def line(self) -> str:
-        """Return what will be started, in words."""
+        """Return a description of what will be started."""
         return "workers on this machine"
 
     def is_open(self) -> bool:
-        """Return whether other machines reach the scheduler that is started."""
+        """Return whether other machines can reach the scheduler that is started."""
         return False
 
     def script(self, out: Path) -> str:
-        """Return what another program is given to start the workers; empty if there is none.
+        """Return the script with which another program starts workers; empty if there is none.
 
         Args:
             out: Directory of the dataset.
@@ -124,15 +124,15 @@ class Local:
         return ""
 
     def submission(self) -> str:
-        """Return the command that takes the script."""
+        """Return the command that submits the script."""
         return ""
 
     def client_options(self) -> list[str]:
-        """Return the options by which a client finds workers that the script starts."""
+        """Return the options with which a client finds the workers that the script starts."""
         return []
 
     def connected(self, out: Path) -> AbstractContextManager[Client]:
-        """Return what starts the workers when it is entered.
+        """Return a context manager that starts the workers and yields a client.
 
         Args:
             out: Directory that all machines see; certificates for this run are written there.
@@ -141,33 +141,33 @@ class Local:
 
 
 class Running(Local):
-    """The workers of a scheduler that runs, by its address."""
+    """The workers of a running scheduler, given by its address."""
 
     follow, options, how = (1, 1, "its address"), (), "scheduler"
 
     def line(self) -> str:
-        """Return what will be used, in words."""
+        """Return a description of the workers that will be used."""
         return f"the workers of {' '.join(self.where)}"
 
     def count(self) -> int | None:
-        """Return how many workers the scheduler has."""
+        """Return the number of workers of the scheduler."""
         with self.connected(Path()) as client:
             return max(1, len(client.nthreads()))
 
     def connected(self, out: Path) -> AbstractContextManager[Client]:
-        """Return what connects to the scheduler when it is entered."""
+        """Return a context manager that connects to the scheduler and yields a client."""
         found: dict[str, Any] = {self.how: self.where[0]}
         return connect(**found, tls=self.tls, tls_files=self.tls_files)
 
 
 class RunningFile(Running):
-    """The workers of a scheduler that runs, by the file that it wrote."""
+    """The workers of a running scheduler, given by the file that it wrote."""
 
     follow, how = (1, 1, "its path"), "scheduler_file"
 
 
 class Remote(Local):
-    """Workers that are started on other machines; a kind says how in `start`."""
+    """Workers that are started on other machines, by the method `start` of each kind."""
 
     options: ClassVar[tuple[str, ...]] = REMOTE
 
@@ -176,14 +176,14 @@ class Remote(Local):
         raise NotImplementedError
 
     def listens(self) -> bool:
-        """Return whether settings of the user's say where the scheduler listens."""
+        """Return whether the user's settings state where the scheduler listens."""
         return False
 
     def listening(self) -> dict[str, str]:
-        """Return the options that say where a scheduler listens; none if the user's settings do.
+        """Return the options that state where a scheduler listens; empty if user settings do.
 
         Raises:
-            AddressMissingError: If it is not said where to listen.
+            AddressMissingError: If neither options nor user settings state where to listen.
         """
         for name in ("host", "interface"):
             if (value := getattr(self, name)) is not None:
@@ -198,9 +198,9 @@ class Remote(Local):
         )
 
     def workers_listening(self) -> dict[str, str]:
-        """Return the options that say where workers listen."""
+        """Return the options that state where workers listen."""
         listening = self.listening()
-        # Without options a worker chooses an address by which other machines reach it.
+        # Without options, a worker chooses an address at which other machines reach it.
         here = "interface" in listening or is_loopback(listening.get("host", ""))
         return listening if here else {}
 
@@ -211,13 +211,13 @@ class Remote(Local):
 
     @contextmanager
     def connected(self, out: Path) -> Iterator[Client]:
-        """Run the cluster while the block runs; its certificates go with it."""
+        """Run the cluster while the block runs; its certificates are removed afterwards."""
         with self._security(out) as security, dask.config.set(dask_settings()):
             try:
                 cluster = self.start(security)
             except (ConfigError, MachineError):
                 raise
-            # Each kind of cluster fails in its own ways; to the user they are all the machine's.
+            # Each kind of cluster raises its own errors; report them all as errors of the machine.
             except Exception as error:
                 reason = str(error) or type(error).__name__
                 raise MachineError(f"the workers did not start: {reason}") from None
@@ -234,15 +234,15 @@ class Remote(Local):
 
 
 def cluster_of(kind: str, own: Sequence[str] = (), **options: Any) -> Local:
-    """Return the cluster that is asked for, see the attributes of `Local`; nothing is started.
+    """Return the requested cluster, without starting anything.
 
     Args:
-        kind: Its name in the registry.
-        own: `KEY=VALUE` of settings that only this kind has.
-        options: Of all kinds.
+        kind: Name of the kind in the registry.
+        own: `KEY=VALUE` texts of settings that only this kind has.
+        options: Options of all kinds, see the attributes of `Local`.
 
     Raises:
-        ConfigError: If the options contradict each other, or lack something.
+        ConfigError: If options contradict each other, or an option is missing.
         MachineError: If a package is missing.
     """
     found = registry.find("clusters", kind)
@@ -260,7 +260,7 @@ def cluster_of(kind: str, own: Sequence[str] = (), **options: Any) -> Local:
 
 
 def describe(cluster: Local) -> list[str]:
-    """Return what will be started, in lines for the user, with a warning of an open port."""
+    """Return lines for the user that describe the cluster, with a warning about an open port."""
     tls = cluster.tls
     lines = [cluster.line(), f"connections: {'TLS' if tls else 'not encrypted'}"]
     if not tls and cluster.is_open():
@@ -273,7 +273,7 @@ def describe(cluster: Local) -> list[str]:
 
 @contextmanager
 def present(cluster: AbstractContextManager[Client], show: bool) -> Iterator[Client]:
-    """Enter a cluster, say where its dashboard is, and wait for its first worker."""
+    """Enter a cluster, print the address of its dashboard, and wait for its first worker."""
     with cluster as client:
         if show and client.dashboard_link:  # workers on this machine have none
             sys.stderr.write(f"{dashboard_line(client)}\n")
@@ -284,7 +284,7 @@ def present(cluster: AbstractContextManager[Client], show: bool) -> Iterator[Cli
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine reaches an address."""
+    """Return whether an address can be reached only from this machine."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -295,7 +295,7 @@ def memory_bytes(text: str) -> int:
     """Return a size of memory such as "2GB" in bytes.
 
     Raises:
-        ConfigError: If the text is no such size.
+        ConfigError: If the text is not a valid size.
     """
     try:
         size = int(parse_bytes(text)) if text.strip() and text.isascii() else 0

@@ -1,17 +1,17 @@
-"""Tasks for workers that do not see the files of the dataset: bytes go there, and bytes come back.
+"""Runs tasks on workers that do not see the files of the dataset, by sending the files.
 
-In: an executor on Dask, and tasks that name the files which they read and write (`FileTask`). Out:
-their results, and the files, written here as the task would have written them there.
+In: an executor on Dask, and tasks that name the files that they read and write (`FileTask`). Out:
+the results, and the written files, which the client writes to the dataset.
 
-The client sends the content of a file to the scheduler once, under its SHA-256, while tasks that
-need it are on the way. A worker gets it from there when it lacks it, and keeps the files of its
-last tasks in its own directory. The task runs in a process beside the worker, in a folder with
-copies of the files: whatever kills that process leaves the worker alone, which starts another one.
-Its journal lies in that folder, so a step that kills its process is found as where workers see the
-dataset. What is lost with a worker is done again by another one, from the beginning. A client that
-is killed leaves the files of the tasks on their way at the scheduler, until that ends.
+The client sends the content of a file to the scheduler once, and the scheduler keeps it while tasks
+in flight need it. A worker gets missing files from the scheduler, and keeps the files of its last
+tasks in its own directory. A task runs in a process beside the worker, in a folder with copies of
+the files. If the process dies, the worker survives and starts another process. The journal of the
+task is in this folder, so a step that kills its process is identified in the same way as on workers
+that see the dataset. If a worker is lost, another worker runs its task from the beginning. If the
+client is killed, the files of tasks in flight stay at the scheduler until the scheduler ends.
 
-Functions whose items are no such tasks read what only this machine has: they run here.
+Functions whose items are not such tasks read files that only this machine has, so they run here.
 """
 
 from __future__ import annotations
@@ -47,27 +47,27 @@ from drakegrasp.runtime.files import write_atomic
 T = TypeVar("T")
 R = TypeVar("R")
 
-#: A worker keeps the files of so many of its last tasks.
+#: Number of last tasks whose files a worker keeps.
 KEPT_TASKS = 8
 #: Time that the scheduler may take to send a file [s].
 FETCH_SECONDS = 300
-#: Deaths in one task after which the machine must be at fault.
+#: Number of deaths in one task after which the machine must be the cause.
 MOST_DEATHS = 400
-#: Share of a worker's memory that it and the process beside it may use.
+#: Dask's setting for the fraction of its memory that a worker, with the process beside it, may use.
 _TERMINATE = "distributed.worker.memory.terminate"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Parcel:
-    """A task on its way to a worker.
+    """A task that is sent to a worker.
 
     Attributes:
-        number: Of the task.
-        build: Names what is sent by one client.
+        number: Number of the task.
+        build: Identifier of the client that sends the task.
         call: Pickled function and item.
-        files: Names at the scheduler of the files that it reads, which end with the SHA-256, by
-            their places.
-        writes: Places of the files that it writes or removes.
+        files: Names at the scheduler of the files that the task reads, by their relative paths. A
+            name ends with the SHA-256 of the file.
+        writes: Relative paths of the files that the task writes or removes.
     """
 
     number: int
@@ -79,12 +79,12 @@ class Parcel:
 
 @dataclass(frozen=True, kw_only=True)
 class Delivery:
-    """What comes back.
+    """The answer of a worker.
 
     Attributes:
-        number: Of the task.
-        result: Pickled.
-        files: Content of those that it wrote, by their places.
+        number: Number of the task.
+        result: Pickled result.
+        files: Content of the files that the task wrote, by their relative paths.
     """
 
     number: int
@@ -101,8 +101,8 @@ def by_wire(execute: Executor, client: Client, out: Path) -> Iterator[Executor]:
 
     Args:
         execute: Runs tasks on workers.
-        client: Of these workers.
-        out: Directory of the dataset, which this process alone sees.
+        client: Client of these workers.
+        out: Directory of the dataset, which only this process sees.
     """
     build = secrets.token_hex(8)
     try:
@@ -113,18 +113,18 @@ def by_wire(execute: Executor, client: Client, out: Path) -> Iterator[Executor]:
 
 
 class _Wire:
-    """An `Executor` that sends what tasks read and writes what they wrote."""
+    """An `Executor` that sends the files that tasks read, and writes the files that they wrote."""
 
     def __init__(self, execute: Executor, client: Client, out: Path, build: str) -> None:
         self._execute, self._client, self._out, self._build = execute, client, out, build
-        # Digests by what says that a file changed; names of contents that the scheduler has, by
-        # digest; how many tasks on their way need each.
+        # The digest of each file, by path, inode, size and time; the name of each content at the
+        # scheduler, by digest; and the number of tasks in flight that need the content.
         self._digests: dict[tuple[Any, ...], str] = {}
         self._names: dict[str, str] = {}
         self._uses, self._serial = Counter[str](), count()
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-        """Yield function(item) of every item; the files of a result are there before it."""
+        """Yield function(item) for every item, after the files of the task are written."""
         items = iter(items)
         first = list(islice(items, 1))
         if not (first and isinstance(task_of(first[0]), FileTask)):
@@ -162,7 +162,7 @@ class _Wire:
         )
 
     def _offer(self, path: Path) -> str:
-        """Have the scheduler keep a file for one task more; return its name there."""
+        """Store a file at the scheduler for one more task, and return its name there."""
         status = path.stat()
         key = path, status.st_ino, status.st_size, status.st_mtime_ns
         digest = self._digests.get(key, "")
@@ -170,7 +170,7 @@ class _Wire:
             content = path.read_bytes()
             digest = self._digests[key] = hashlib.sha256(content).hexdigest()
             if digest not in self._names:
-                # Dask forgets a variable a moment after it is told to: no name is used again.
+                # Dask deletes a variable with a delay, so no name is used again.
                 name = f"drakegrasp-{self._build}-{next(self._serial)}-{digest}"
                 self._names[digest] = name
                 Variable(name, client=self._client).set(content)
@@ -178,16 +178,16 @@ class _Wire:
         return self._names[digest]
 
     def _release(self, parcel: Parcel) -> None:
-        """Have the scheduler forget the files that no other task on its way needs."""
+        """Remove the files from the scheduler that no other task in flight needs."""
         for name in parcel.files.values():
             self._uses[name] -= 1
             if not self._uses[name]:
                 del self._uses[name], self._names[_digest_in(name)]
-                with suppress(OSError):  # the scheduler may be gone, and the files with it
+                with suppress(OSError):  # the scheduler may have ended
                     Variable(name, client=self._client).delete()
 
     def _write(self, places: Iterable[str], files: Mapping[str, bytes]) -> None:
-        """Write the files at some places, and remove those that are not there."""
+        """Write the returned files of a task, and remove those of its files that are missing."""
         for place in places:
             if place in files:
                 write_atomic(self._out / place, files[place])
@@ -197,7 +197,7 @@ class _Wire:
 
 @contextmanager
 def _processes_here() -> Iterator[Executor]:
-    """Yield what uses the cores of this machine; one of them where no process can start."""
+    """Yield an executor for the cores of this machine; one core if no process can start."""
     try:
         refuse_to_start_workers()
     except MachineError:
@@ -227,7 +227,7 @@ class _Copies:
         self._closed = False
 
     def do(self, parcel: Parcel, worker: Worker) -> Delivery:
-        """Do a task; start the process again when it dies."""
+        """Run a task; start the process again if it dies."""
         self._bring(parcel.files, worker)
         for _ in range(MOST_DEATHS):
             if self._closed:
@@ -242,7 +242,7 @@ class _Copies:
         raise MachineError("workers died again and again")
 
     def _bring(self, files: Mapping[str, str], worker: Worker) -> None:
-        """Get the files that are missing; remove those of tasks long ago."""
+        """Get the missing files; remove files that the last tasks did not need."""
         self._recent.append(files)
         for place in self._digests.keys() - set().union(*self._recent):
             (self._folder / place).unlink(missing_ok=True)
@@ -253,7 +253,7 @@ class _Copies:
                 self._digests[place] = _digest_in(name)
 
     def _taken(self, places: Iterable[str]) -> dict[str, bytes]:
-        """Return the files at some places, and remove them."""
+        """Return the content of files by their relative paths, and remove the files."""
         found = {}
         for place in places:
             path = self._folder / place
@@ -271,16 +271,16 @@ class _Copies:
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
-#: Of the build that this worker worked for last.
+#: Copies of the build for which this worker ran its last task.
 _copies: _Copies | None = None
 
 
 def do_parcel(parcel: Parcel) -> Delivery:
-    """Do a task on a worker; call it in its thread.
+    """Run a task on a worker; call this in the thread of the worker.
 
     Raises:
-        MachineError: If the process beside it dies again and again.
-        Exception: What the function raised.
+        MachineError: If the process beside the worker dies repeatedly.
+        Exception: The error that the function raised.
     """
     global _copies
     worker = get_worker()
@@ -291,7 +291,7 @@ def do_parcel(parcel: Parcel) -> Delivery:
 
 
 def leave(build: str | None = None) -> None:
-    """Forget the files of a build on this worker, or of any build if None."""
+    """Remove the files of a build from this worker; of any build if None."""
     global _copies
     if _copies is not None and build in (None, _copies.build):
         _copies.close()
