@@ -1,16 +1,18 @@
 """Episodes for LeRobot: attempts over time, as a LeRobotDataset of version 3.0.
 
 In: a dataset. Out: a folder that `LeRobotDataset(name, root=folder)` of lerobot 0.6 reads. Every
-attempt is simulated again, to the same bits, and is an episode at fixed frames per second: the palm
-approaches, the fingers close, the object is lifted. Poses are those of the simulation's steps,
-between two steps on the straight way. Two parts of an episode are not simulated: the approach, and
-the closing up to where geometry knows that the fingers meet nothing.
+attempt is simulated again, with results that are equal bit for bit, and becomes an episode with a
+fixed number of frames per second. In an episode the palm approaches, the fingers close, and the
+object is lifted. Poses are interpolated between the steps of the simulation. Two parts of an
+episode are not simulated: the approach, and the closing as far as geometry shows that the fingers
+touch nothing.
 
-We write the files ourselves: lerobot needs PyTorch, and versions of Python and of libraries that
-are not ours. A part of the dataset is a Parquet file of frames, one of episodes and a video of each
-camera, for ten minutes at most: lerobot computes times in a video in single precision.
+We write the files without lerobot, because it needs PyTorch, and versions of Python and of
+libraries that we do not use. A part of the dataset has a Parquet file of frames, one of episodes,
+and a video of each camera. It lasts at most ten minutes, because lerobot computes times in a video
+in single precision.
 
-Depth is video of 12 bits without loss, as lerobot's own. Needs the extra `[lerobot]`.
+Depth is lossless 12-bit video, as in lerobot's own datasets. Needs the extra `[lerobot]`.
 """
 
 from __future__ import annotations
@@ -45,41 +47,42 @@ from drakegrasp.simulation.scene_cache import cached_renderer
 from drakegrasp.vision.camera import Lens, fixed_viewpoints, look_at
 from drakegrasp.vision.rendering import paint, pose_hand, render
 
-#: What `drakegrasp export --help` says of the format.
+#: Description of the format in `drakegrasp export --help`.
 HELP = "LeRobot v3: an attempt is an episode, with colour and depth video"
-#: What the command counts.
+#: Name of the things that the command counts.
 COUNTS = "episode"
 
-#: Which attempts are episodes.
+#: Choices of the attempts that become episodes.
 Attempts: TypeAlias = Literal["samples", "failed", "all"]
-#: Frames per second are whole numbers up to this one.
+#: Maximum number of frames per second, which is a whole number.
 MOST_FPS = 120
 #: Version of the format.
 VERSION = "v3.0"
-#: How far the palm comes along +Gz [m].
+#: Distance that the palm approaches along +Gz [m].
 APPROACH = 0.1
 #: Values of the feature `phase`.
 PHASES = ("approach", "close", "lift")
 #: The cameras, see `viewpoints`, and the beginning of the names of their features.
 VIEWS, IMAGES = ("close", "front", "side"), "observation.images."
-#: Of all cameras: 320 x 240 pixels.
+#: Lens of all cameras: 320 x 240 pixels.
 LENS = Lens.of(ScenesConfig())
-#: What cameras that see the whole lift see beside its way [m], and their elevation [deg].
+#: Margin beside the path of the lift that cameras of the whole lift see [m], and their elevation
+#: [deg].
 BESIDE, ELEVATION_DEG = 0.2, 20.0
-#: Length of a part [s], and most files in a folder.
+#: Length of a part [s], and maximum number of files in a folder.
 PART_SECONDS, CHUNK = 600, 1000
-#: Depth per unit of a depth video [m], and the largest of its 12 bits.
+#: Depth per unit of a depth video [m], and the largest value of 12 bits.
 DEPTH_UNIT, DEPTH_LEVELS = 5e-4, 4095
 #: Quantiles of the statistics.
 QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 
-#: What lerobot calls the numbers of a pose.
+#: Lerobot's names of the numbers of a pose.
 POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 #: Columns that number frames and episodes.
 INDICES = ("frame_index", "episode_index", "index", "task_index")
 #: Name of a file in its folder.
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
-#: What lerobot's reader must know of each video, besides its size.
+#: Properties of each video that lerobot's reader needs, in addition to its size.
 COLOUR = {"video.codec": "h264", "video.pix_fmt": "yuv420p", "video.g": 2, "video.crf": 18}
 DEPTH = {
     "video.codec": "hevc",
@@ -92,11 +95,11 @@ DEPTH = {
     "video.use_log": False,
     "depth_unit": "m",
 }
-#: How the encoders make them. One thread gives the same bytes always.
+#: Options of the encoders. With one thread they always produce the same bytes.
 ONE_THREAD = "pools=none:frame-threads=1:log-level=error"
 COLOUR_OPTIONS = {"g": "2", "crf": "18", "threads": "1"}
 DEPTH_OPTIONS = {"g": "2", "threads": "1", "x265-params": f"lossless=1:{ONE_THREAD}"}
-#: What makes pandas read the column `task` as the index, as lerobot needs it.
+#: Metadata that make pandas read the column `task` as the index, as lerobot requires.
 TASK = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object"}
 PANDAS = {"index_columns": ["task"], "column_indexes": [], "columns": [TASK]}
 
@@ -153,14 +156,14 @@ def write_lerobot(
 
 
 def _chosen(out: Path, attempts: Attempts) -> list[dict[str, Any]]:
-    """Return what is known of the attempts to export: samples first, split by split."""
+    """Return the data of the attempts to export, with samples first, split by split."""
     trials = Trials(out)
     names = ("outcome", "removal", "split", "object_name", "class_name")
     columns = trials.columns(names)
     outcomes = [Outcome(int(value)) for value in columns["outcome"]]
     sample = columns["removal"] == Removal.KEPT
     held = np.array([outcome is Outcome.SUCCESS for outcome in outcomes])
-    # Nothing is known of a hand that was not lifted.
+    # It is not known whether a hand that was not lifted holds.
     known = np.array([o.stage >= Stage.CLOSED and o is not Outcome.NOT_LIFTED for o in outcomes])
     chosen = {"samples": sample, "failed": known & ~held, "all": known}[attempts]
     if not chosen.any():
@@ -182,10 +185,10 @@ def _chosen(out: Path, attempts: Attempts) -> list[dict[str, Any]]:
 
 
 def episode_frames(trial: TracedTrial, hand: Hand, fps: int) -> dict[str, npt.NDArray[Any]]:
-    """Return the columns of an episode by their names in the dataset, n frames of each.
+    """Return the columns of an episode by their names in the dataset, with n frames each.
 
     Args:
-        trial: What happened.
+        trial: The trial with its motion over time.
         hand: The hand, with all its fingers.
         fps: Frames per second. The last frame shows the end.
     """
@@ -199,7 +202,7 @@ def episode_frames(trial: TracedTrial, hand: Hand, fps: int) -> dict[str, npt.ND
     closes = np.inf if closed is None or lift is None else closed.duration
     phase = (times >= approach).astype(np.int64) + (times > approach + trial.free + closes)
 
-    # The palm comes along +Gz, never from below, and does not turn.
+    # The palm approaches along +Gz, never from below, and does not rotate.
     X_TG = trace.X_TG[0].copy()
     back = -X_TG[:3, 2] * [1.0, 1.0, X_TG[2, 2] < 0.0]
     start = X_TG.copy()
@@ -239,14 +242,14 @@ def episode_frames(trial: TracedTrial, hand: Hand, fps: int) -> dict[str, npt.ND
 
 
 def _between(times: Array, steps: Array, values: Array) -> Array:
-    """Return values (m, d) of n steps (n, d) at m times, that of the first or last one outside."""
+    """Return the values (n, d) of n steps, interpolated at m times (m, d) and constant outside."""
     return np.column_stack([np.interp(times, steps, column) for column in values.T])
 
 
 def _poses(p: Array, R: Rotation) -> Array:
     """Return positions (n, 3) and rotations as rows (n, 7), see `POSE_NAMES`."""
     quaternions = R.as_quat(canonical=True, scalar_first=True)
-    # Both signs mean a rotation: keep that of the frame before.
+    # Both signs of a quaternion mean the same rotation; keep the sign of the previous frame.
     jumps = np.einsum("ij,ij->i", quaternions[1:], quaternions[:-1]) < 0.0
     quaternions[1:] *= np.where(np.cumsum(jumps) % 2, -1.0, 1.0)[:, None]
     return np.hstack([p, quaternions])
@@ -256,7 +259,7 @@ def _poses(p: Array, R: Rotation) -> Array:
 
 
 def viewpoints(config: LiftConfig) -> dict[str, Array]:
-    """Return X_TC (4, 4) of the cameras by their names, fixed for a dataset.
+    """Return the poses X_TC (4, 4) of the cameras by their names; they are fixed for a dataset.
 
     `close` is the single fixed camera of scenes; `front` and `side` see the whole lift.
     """
@@ -297,7 +300,7 @@ def _pose(row: Array) -> Array:
 
 
 class _Video:
-    """A file of images, and how often each value is in those of the last episode."""
+    """A video file, and the counts of each value in the images of the last episode."""
 
     def __init__(self, path: Path, fps: int, shape: Sequence[int]) -> None:
         height, width, channels = shape
@@ -323,13 +326,13 @@ class _Video:
         self._frames += 1
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the remaining data and close the file."""
         self._file.mux(self._stream.encode(None))
         self._file.close()
 
 
 def features(hand: Hand) -> dict[str, dict[str, Any]]:
-    """Return what `info.json` says of each feature of a hand with j joints and k fingers."""
+    """Return the entries of `info.json` for the features of a hand with j joints and k fingers."""
     # Columns of the data.
     posture = [*(f"palm.{name}" for name in POSE_NAMES), *joint_order(hand)]
     forces = [f"{link}.f{axis}" for link in hand.fingertip_links for axis in "xyz"]
@@ -368,7 +371,7 @@ class _Writer:
     """Writes episodes one after the other.
 
     Args:
-        folder: Where to write.
+        folder: Folder of the dataset.
         fps: Frames per second.
         hand: The hand.
     """
@@ -376,13 +379,12 @@ class _Writer:
     def __init__(self, folder: Path, fps: int, hand: Hand) -> None:
         self._folder, self._fps, self._hand = folder, fps, hand
         self._features = features(hand)
-        # Of all episodes: their tasks and splits, the numbers of their frames, and how often each
-        # value is in their images.
+        # For all episodes: tasks, splits, numbers of frames, and counts of each value in images.
         self._tasks: dict[str, int] = {}
         self._splits: list[str] = []
         self._numbers: dict[str, list[npt.NDArray[Any]]] = {}
         self._counts: dict[str, npt.NDArray[np.int64]] = {}
-        # Of the part that is open: its number, its files, its episodes and their frames.
+        # For the open part: its number, its files, its episodes and their frames.
         self._part, self._length, self._frames = 0, 0, 0
         self._data: pq.ParquetWriter | None = None
         self._videos: dict[str, _Video] = {}
@@ -398,10 +400,10 @@ class _Writer:
         """Write an episode.
 
         Args:
-            task: What is done, in words.
-            said: What else is known of it, as columns of the episodes; `split` is one.
-            columns: Of its n frames, see `episode_frames`.
-            images: Of each frame, see `_images`.
+            task: Description of the task in words.
+            said: Other data of the episode, as columns of the episodes, including `split`.
+            columns: Columns of the n frames, see `episode_frames`.
+            images: Images of each frame, see `_images`.
         """
         data = self._data or self._open_part()
         number, length = len(self._splits), len(columns["phase"])
@@ -423,7 +425,7 @@ class _Writer:
             for name, image in seen.items():
                 self._videos[name].add(image)
 
-        # What is said of the episode.
+        # The row of the episode.
         stats = {name: _number_stats(values) for name, values in columns.items()}
         for name, values in columns.items():
             self._numbers.setdefault(name, []).append(values)
@@ -456,7 +458,7 @@ class _Writer:
             self._close_part()
 
     def finish(self) -> None:
-        """Write what is of all episodes."""
+        """Write the files about all episodes."""
         self._close_part()
         tasks = {"task_index": [*self._tasks.values()], "task": [*self._tasks]}
         table = pa.table(tasks).replace_schema_metadata({"pandas": json.dumps(PANDAS)})
@@ -511,7 +513,7 @@ class _Writer:
         self._data, self._part = None, self._part + 1
 
     def _path(self, folder: str, suffix: str) -> Path:
-        """Return the path of a file of the part that is open, whose folder is there."""
+        """Return the path of a file of the open part, and create its folder."""
         chunk, file = divmod(self._part, CHUNK)
         path = self._folder / folder / FILE.format(chunk_index=chunk, file_index=file)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -537,7 +539,7 @@ def _number_stats(values: npt.NDArray[Any]) -> dict[str, list[float]]:
 
 
 def _pixel_stats(counts: npt.NDArray[np.int64], frames: int) -> dict[str, list[Any]]:
-    """Return the statistics of images by how often each value is in their channels, (c, levels).
+    """Return the statistics of images from the counts of each value per channel (c, levels).
 
     Colours are in 0..1, depths in metres, and each statistic has the shape (c, 1, 1).
     """
