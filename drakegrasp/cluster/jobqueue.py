@@ -70,7 +70,7 @@ class Jobs(Remote):
         self.listening()
         self.per_job = int(self.cores or self.setting("cores") or 1)
         self.jobs = math.ceil(self.workers / self.per_job)
-        # None: jobqueue.yaml says that of a job; the queue has a limit.
+        # None means that jobqueue.yaml states the memory of a job.
         self.memory = self.memory or (None if self.setting("memory") else WORKER_MEMORY)
 
     def setting(self, key: str) -> Any:

@@ -132,7 +132,7 @@ def export_dataset(
 
 
 def options_of(form: str) -> tuple[str, ...]:
-    """Return the names of the options of an exporter: what it takes besides the first three."""
+    """Return the names of an exporter's options, which are its parameters after the first three."""
     return tuple(inspect.signature(registry.find("exporters", form)).parameters)[3:]
 
 

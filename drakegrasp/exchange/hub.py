@@ -419,7 +419,7 @@ def write_hub(
         out: See `export.export_dataset`.
         folder: See `export.export_dataset`.
         progress: See `export.export_dataset`.
-        publication: What the card and the metadata say of the publishers.
+        publication: Statement of the publishers for the card and the metadata.
 
     Raises:
         MachineError: If pyarrow is not installed.

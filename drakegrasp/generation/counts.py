@@ -60,8 +60,8 @@ class Counts:
             units = {of[0].object_name: of for of in headers_by_object(manifest) if of}
             self.target = Target(manifest.config, units)
 
-        # Progress: attempts, those of the first round, and those that were there before. Before the
-        # build only the number of the first round is known; refined ones come with the samples.
+        # Progress: all attempts, attempts of the first round, and reused attempts. Before the build
+        # only the number of the first round is known; refined attempts follow from the samples.
         self._pool, self._report = pool, report
         standoffs = len(manifest.config.candidates.standoffs)
         self._total = standoffs * sum(entry.candidates for entry in manifest.objects)
@@ -143,7 +143,7 @@ class Counts:
             enough = sum(min(found, self._each) for found in self._found.values())
             ends.append((enough, self._each * len(self._found)))
         made = [self._done * max(wanted / found, 1.0) for found, wanted in ends if found]
-        # What is left of the first round has as many refined attempts as what is done.
+        # Expect as many refined attempts per attempt of the first round as so far.
         whole = -(-self._total * self._done // self._first) if self._first else self._total
         return min([whole, *map(ceil, made)])
 

@@ -184,7 +184,7 @@ def _shared(tasks: int, workers: int, seconds: float) -> float:
 
 
 def _refined(config: Config, times: StageTimes) -> float:
-    """Return how many refined attempts an attempt of the first round leads to on average."""
+    """Return the mean number of refined attempts per attempt of the first round."""
     total, born = 0.0, config.refine.children * times.parents
     for _ in range(config.refine.generations):
         total += born
@@ -282,9 +282,9 @@ MEASURED = StageTimes(
 )
 
 
-#: By four built-in objects with 24 palm poses each (288 attempts, and 232 refined ones, preset
-#: `fast`, 2026-11-27); the time of an attempt by the builds of docs/results/yield.md. What is not
-#: named is as in `MEASURED`.
+#: Measured with four built-in objects with 24 palm poses each (288 attempts, and 232 refined
+#: attempts, preset `fast`, 2026-11-27). The time of an attempt is that of the builds of
+#: docs/results/yield.md. All other values are those of `MEASURED`.
 FAST = replace(
     MEASURED,
     attempt=0.1,
@@ -297,7 +297,7 @@ FAST = replace(
 
 
 def measured_times(config: Config) -> StageTimes:
-    """Return the times that were measured with a preset like a configuration."""
+    """Return the times that were measured with a preset similar to a configuration."""
     return FAST if "above" in config.candidates.method else MEASURED
 
 

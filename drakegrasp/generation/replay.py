@@ -131,16 +131,17 @@ def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TracedTrial:
-    """A trial that was run again, with what happened in it.
+    """A trial that was run again, with its states over time.
 
     Attributes:
         model: The object.
-        attempt: What was tried.
-        config: Of the object.
-        record: The result now.
-        trace: What happened, from where geometry no longer knows that the fingers meet nothing.
-        free: How long they had been closing by then [s].
-        q_open: (j,), positions of the joints when they began to [rad or m].
+        attempt: The attempt.
+        config: Configuration of the object.
+        record: Record of the replay.
+        trace: States over time. They begin when geometry no longer shows that the closing fingers
+            touch nothing.
+        free: Time of closing before the first state [s].
+        q_open: (j,), positions of the joints at the start of closing [rad or m].
     """
 
     model: ObjectModel
@@ -157,7 +158,7 @@ def trace_trial(out: str | Path, trial_id: int) -> TracedTrial | None:
     """Run one trial of a dataset again, and return its states over time.
 
     Returns:
-        None if it ends now before the fingers have closed.
+        The trial; None if the replay ends before the fingers have closed.
 
     Raises:
         DataError: If the dataset or the trial is not there.
