@@ -1,8 +1,8 @@
 """Reads files and names of unknown origin without waiting, endless reading or filling the memory.
 
-In: a path, and the maximum size of such a file. Out: its bytes, or an `OSError` that states what is
-there instead, as for any file that cannot be read. Links are followed, because a dataset from a hub
-consists of links into its cache.
+Input: a path, and the maximum size of such a file. Output: its bytes, or an `OSError` that states
+what is there instead, as for any file that cannot be read. Links are followed, because a dataset
+from a hub consists of links into its cache.
 
 Every mistake in JSON is a `ValueError`, and no text has two readings. Python's own reader accepts
 NaN and keeps the last of two equal keys. It raises other errors for bytes that are not text, for

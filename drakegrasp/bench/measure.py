@@ -1,7 +1,7 @@
 """Measures the cost of attempts on this machine, stage by stage, in this process alone.
 
-In: meshes and a configuration. Out: plain data for a JSON file. Costs are seconds of CPU time of
-this process, so that other work on the machine disturbs them as little as possible. The cost of
+Input: meshes and a configuration. Output: plain data for a JSON file. Costs are seconds of CPU time
+of this process, so that other work on the machine disturbs them as little as possible. The cost of
 preparing an object is counted separately, because a dataset pays it once.
 """
 

@@ -1,9 +1,9 @@
 """Simulates the same attempts in MuJoCo, to compare with Drake's speed and labels.
 
-In: a prepared object and attempts. Out: their outcomes. MuJoCo uses convex parts of the object for
-collisions, and contacts are points. No attempt is screened and no image is rendered. Otherwise the
-trial is that of `drakegrasp.simulation.trial`: the same hand, drive, pads, path and verdict. Needs
-the extra `[peer]`.
+Input: a prepared object and attempts. Output: their outcomes. MuJoCo uses convex parts of the
+object for collisions, and contacts are points. No attempt is screened and no image is rendered.
+Otherwise the trial is that of `drakegrasp.simulation.trial`: the same hand, drive, pads, path and
+verdict. Needs the extra `[peer]`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The options of commands, created from signatures and docstrings, and the request of a build.
 
-In: option values that click parsed. Out: a `BuildRequest` with the resolved configuration.
+Input: option values that click parsed. Output: a `BuildRequest` with the resolved configuration.
 
 A command lists its options in the section `Options` of its docstring, in the order of its help:
 

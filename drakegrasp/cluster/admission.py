@@ -1,10 +1,10 @@
 """Checks the workers at the start of a build, and each worker that joins later.
 
-In: a Dask client. Out: workers that produce the same results as this machine, and whether they see
-the files of the dataset. A worker that cannot render a test image is closed. A worker with several
-threads, or with another version of Drake, drakegrasp or the hand, is rejected. At the start this is
-an error; a worker that joins later is closed before its first task. If a worker does not see the
-files, or no worker has joined yet, the files are sent to all workers over the network, see
+Input: a Dask client. Output: workers that produce the same results as this machine, and whether
+they see the files of the dataset. A worker that cannot render a test image is closed. A worker with
+several threads, or with another version of Drake, drakegrasp or the hand, is rejected. At the start
+this is an error; a worker that joins later is closed before its first task. If a worker does not
+see the files, or no worker has joined yet, the files are sent to all workers over the network, see
 `drakegrasp.cluster.wire`.
 """
 

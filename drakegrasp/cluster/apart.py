@@ -1,9 +1,9 @@
 """A process beside a Dask worker that calls functions, so that a crash does not kill the worker.
 
-In: a pickled function and its item, a `FileTask`. Out: the pickled result. If workers do not see
-the files of the dataset, the journal of a task (`drakegrasp.runtime.journal`) is in the worker's
-own directory. So the worker must survive when the process dies. It starts another process, which
-finds the journal and continues.
+Input: a pickled function and its item, a `FileTask`. Output: the pickled result. If workers do not
+see the files of the dataset, the journal of a task (`drakegrasp.runtime.journal`) is in the
+worker's own directory. So the worker must survive when the process dies. It starts another process,
+which finds the journal and continues.
 """
 
 from __future__ import annotations

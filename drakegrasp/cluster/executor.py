@@ -1,9 +1,9 @@
 """Runs tasks on Dask's workers, some of which may die.
 
-In: a function and items. Out: the results, in any order. A few tasks per worker are in flight, and
-a completed task is forgotten, so the memory does not grow with the number of tasks. Several items
-that take almost no time are put in one task, because each task costs some messages. A task whose
-worker died is given to another worker. The items themselves ensure that this ends (see
+Input: a function and items. Output: the results, in any order. A few tasks per worker are in
+flight, and a completed task is forgotten, so the memory does not grow with the number of tasks.
+Several items that take almost no time are put in one task, because each task costs some messages. A
+task whose worker died is given to another worker. The items themselves ensure that this ends (see
 `drakegrasp.runtime.journal`), so the limit on deaths is generous. A task that rendered a blank
 image is retried, because the OpenGL of a single worker may be broken.
 

@@ -1,9 +1,9 @@
 """Kinds of clusters by name, as `drakegrasp submit --cluster` takes them.
 
-In: the options of a kind. Out: lines for the user, and a Dask client while a block runs. A kind is
-a class in its own module and a line in pyproject.toml; the kinds for this machine and for a running
-scheduler are in this module. Workers on other machines do not inherit settings, so each kind sends
-them `dask_settings`. Other machines can connect only if `host` or `interface` allows it.
+Input: the options of a kind. Output: lines for the user, and a Dask client while a block runs. A
+kind is a class in its own module and a line in pyproject.toml; the kinds for this machine and for a
+running scheduler are in this module. Workers on other machines do not inherit settings, so each
+kind sends them `dask_settings`. Other machines can connect only if `host` or `interface` allows it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A cluster of pods, as a manifest for the operator of dask-kubernetes, which starts them.
 
-In: an image with drakegrasp, and a volume claim if a volume holds OUT. Out: a `DaskCluster` of
-kubernetes.dask.org/v1 (dask-kubernetes 2025.7), for `kubectl apply -f -`. This module starts
+Input: an image with drakegrasp, and a volume claim if a volume holds OUT. Output: a `DaskCluster`
+of kubernetes.dask.org/v1 (dask-kubernetes 2025.7), for `kubectl apply -f -`. This module starts
 nothing. The user applies the manifest and then connects to the scheduler's address. Scheduler and
 workers require a certificate, which is stored in a secret of the namespace.
 """

@@ -1,7 +1,7 @@
 """Runs tasks on workers that do not see the files of the dataset, by sending the files.
 
-In: an executor on Dask, and tasks that name the files that they read and write (`FileTask`). Out:
-the results, and the written files, which the client writes to the dataset.
+Input: an executor on Dask, and tasks that name the files that they read and write (`FileTask`).
+Output: the results, and the written files, which the client writes to the dataset.
 
 The client sends the content of a file to the scheduler once, and the scheduler keeps it while tasks
 in flight need it. A worker gets missing files from the scheduler, and keeps the files of its last

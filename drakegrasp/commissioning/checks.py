@@ -1,7 +1,7 @@
 """Checks of a hand's files and geometry; nothing is simulated.
 
-In: a loaded hand. Out: a `Finding` per check: masses, limits, couplings and efforts of its files;
-palm, finger order, pads, and links that collide when the hand closes.
+Input: a loaded hand. Output: a `Finding` per check: masses, limits, couplings and efforts of its
+files; palm, finger order, pads, and links that collide when the hand closes.
 """
 
 from __future__ import annotations

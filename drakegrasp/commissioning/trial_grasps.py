@@ -1,10 +1,10 @@
 """`check_hand`: all checks of a hand, including trial grasps in which it lifts simple objects.
 
-In: a hand. Out: for each object the best of a few attempts. Their palm poses follow from how the
-fingertips close (`find_pinch`). The attempts are those of a build: `run_attempt` simulates them.
-The object hangs in the air until it is held. So gravity can act along the line on which the fingers
-close, across it, or in between. A hand whose fingers do not resist along that line holds in only
-some of these cases.
+Input: a hand. Output: for each object the best of a few attempts. Their palm poses follow from how
+the fingertips close (`find_pinch`). The attempts are those of a build: `run_attempt` simulates
+them. The object hangs in the air until it is held. So gravity can act along the line on which the
+fingers close, across it, or in between. A hand whose fingers do not resist along that line holds in
+only some of these cases.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """From shards to trials.hdf5, grasping_oto.hdf5, grasping_otm.hdf5 and their data card.
 
-In: a directory whose work units are all done. Out: the three files, all or none, and their card. An
-`Executor` runs the work in tasks: `assembly.survey` reads the shards of an object, `assembly.pack`
-compresses the chunks of a range of rows. This process decides which successes become samples, and
-writes the chunks to the files. It keeps a few numbers per success, whatever the number of attempts.
-It does not import Drake.
+Input: a directory whose work units are all done. Output: the three files, all or none, and their
+card. An `Executor` runs the work in tasks: `assembly.survey` reads the shards of an object,
+`assembly.pack` compresses the chunks of a range of rows. This process decides which successes
+become samples, and writes the chunks to the files. It keeps a few numbers per success, whatever the
+number of attempts. It does not import Drake.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The data card: what a dataset is, how it was made, how much it holds, and what it cannot do.
 
-In: the directory of a dataset. Out: the content of its card, a dictionary of JSON types, and two
-files with this content, `DATACARD.json` for programs and `DATACARD.md` for people. The card
+Input: the directory of a dataset. Output: the content of its card, a dictionary of JSON types, and
+two files with this content, `DATACARD.json` for programs and `DATACARD.md` for people. The card
 contains no time and no machine: the same files produce the same card.
 """
 

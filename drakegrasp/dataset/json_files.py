@@ -1,6 +1,7 @@
 """Reads the JSON files of a dataset as typed data and rejects values of another type.
 
-In: a file and a pydantic model. Out: the model, or a `DataError` that names the file and the key.
+Input: a file and a pydantic model. Output: the model, or a `DataError` that names the file and the
+key.
 """
 
 from __future__ import annotations

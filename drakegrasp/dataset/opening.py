@@ -1,10 +1,10 @@
 """Opens HDF5 files of a dataset for reading, and rejects files that differ from the schema.
 
-In: a path, or an open file and the fields of its groups. Out: an open file that contains every
-group, dataset and attribute of the schema with its type and shape; or every `Difference`. Only
-headers are read; `read_codes` also rejects numbers without a defined meaning. Commands reject a
-file at the first difference, and `drakegrasp check` lists all of them. The module needs only NumPy
-and h5py.
+Input: a path, or an open file and the fields of its groups. Output: an open file that contains
+every group, dataset and attribute of the schema with its type and shape; or every `Difference`.
+Only headers are read; `read_codes` also rejects numbers without a defined meaning. Commands reject
+a file at the first difference, and `drakegrasp check` lists all of them. The module needs only
+NumPy and h5py.
 """
 
 from __future__ import annotations

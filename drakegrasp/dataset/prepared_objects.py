@@ -1,8 +1,8 @@
 """Objects at rest with their palm poses, and the files that hold them.
 
-In: an object that `generation.prepare` has prepared. Out: `objects/<name>.npz` with the object and
-`objects/<name>.plan.h5` with its resting poses and palm poses, in the dataset's directory. Work
-units, `check` and `replay` read these two files and do not need the mesh file.
+Input: an object that `generation.prepare` has prepared. Output: `objects/<name>.npz` with the
+object and `objects/<name>.plan.h5` with its resting poses and palm poses, in the dataset's
+directory. Work units, `check` and `replay` read these two files and do not need the mesh file.
 """
 
 from __future__ import annotations

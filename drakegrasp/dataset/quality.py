@@ -1,9 +1,9 @@
 """Quality of grasps: how implausible they look, and how much disturbance they tolerate.
 
-In: columns of trials.hdf5. Out: a score of suspicion with its parts; for lifts that were repeated
-with disturbances (`simulation.robustness`), the fractions of repeats that end well, with intervals,
-and how well numbers of the first lift rank the grasps. Such a number never fills a column of
-p_hold.
+Input: columns of trials.hdf5. Output: a score of suspicion with its parts; for lifts that were
+repeated with disturbances (`simulation.robustness`), the fractions of repeats that end well, with
+intervals, and how well numbers of the first lift rank the grasps. Such a number never fills a
+column of p_hold.
 
 The score of suspicion tells which grasps a person should look at first. By itself it removes
 nothing; a limit in the configuration (`filters.max_suspicion`) can. Each part is a quantity that is

@@ -1,7 +1,7 @@
 """Files at an address, as s3://, gs://, hf://, https:// and all others that fsspec knows.
 
-In: a path or an address. Out: the path of a local file. A file at an address is downloaded once
-into a cache folder, and again when the store has another version of it. fsspec is loaded for
+Input: a path or an address. Output: the path of a local file. A file at an address is downloaded
+once into a cache folder, and again when the store has another version of it. fsspec is loaded for
 addresses only; the packages for each store are in the extra `[remote]`.
 """
 

@@ -1,8 +1,8 @@
 """The samples of a split as tensors of torch, which only this module imports.
 
-In: a `GraspDataset` and the names of fields. Out: a `torch.utils.data.Dataset`, whose items torch
-itself collates and moves between processes. The module can also be imported without torch, so that
-every module of the package can; `GraspDataset.to_torch` raises an error if torch is missing.
+Input: a `GraspDataset` and the names of fields. Output: a `torch.utils.data.Dataset`, whose items
+torch itself collates and moves between processes. The module can also be imported without torch, so
+that every module of the package can; `GraspDataset.to_torch` raises an error if torch is missing.
 
 A loader requests all samples of a batch at once. Their images are read directly into the block of
 the batch; in a worker this block is in memory that the worker shares with the training process.

@@ -1,10 +1,10 @@
 """Reads files of postures, in our own layouts and those of other tools, as attempts.
 
-In: a file or a folder of files, their hand, and the object or dataset rows that they are for. Out:
-one table, `Attempts`, or an error in one line that names the file and the mistake. Each format is
-an importer in the registry, found by the suffix of the file. This module reads our own layouts; the
-layouts of other tools are read by the modules named after them. docs/how-to/postures.md lists all
-layouts.
+Input: a file or a folder of files, their hand, and the object or dataset rows that they are for.
+Output: one table, `Attempts`, or an error in one line that names the file and the mistake. Each
+format is an importer in the registry, found by the suffix of the file. This module reads our own
+layouts; the layouts of other tools are read by the modules named after them.
+docs/how-to/postures.md lists all layouts.
 """
 
 from __future__ import annotations

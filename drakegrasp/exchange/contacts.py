@@ -1,7 +1,7 @@
 """Files of contacts: k points and k outward normals for each grasp, and optional columns.
 
-In: a .npy, CSV, HDF5 or Parquet file. Out: the numbers of the file, of any shape, with the dataset
-rows and the confidence that the file states, or an error in one line that names the file.
+Input: a .npy, CSV, HDF5 or Parquet file. Output: the numbers of the file, of any shape, with the
+dataset rows and the confidence that the file states, or an error in one line that names the file.
 """
 
 from __future__ import annotations

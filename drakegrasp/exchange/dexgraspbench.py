@@ -3,7 +3,7 @@
 This module writes samples of a dataset for evaluation by the benchmark's code, writes our own
 predictions for the MuJoCo protocols, and reads grasps of the benchmark as attempts.
 
-Out: a folder whose content is copied into the benchmark's repository. It has the hand (MJCF and
+Output: a folder whose content is copied into the benchmark's repository. It has the hand (MJCF and
 YAML), the objects (convex parts, and their volume, from which the benchmark computes the density)
 and a .npy file per grasp. This file is a dictionary with the object's pose and three postures of
 the hand. A posture is the palm link's position [m] and quaternion (w, x, y, z), followed by the

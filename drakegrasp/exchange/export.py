@@ -1,6 +1,6 @@
 """Exports the samples of a dataset in the format of another tool.
 
-In: the directory of a dataset and a format. Out: a new directory, which is either complete or
+Input: the directory of a dataset and a format. Output: a new directory, which is either complete or
 absent. Each format is a module with one function that writes a directory; the registry lists them.
 """
 

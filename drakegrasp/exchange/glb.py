@@ -1,9 +1,9 @@
 """Posed scenes: one GLB file per grasp, with the object and the hand's shapes after closing.
 
-In: a dataset. Out: `<object>/<trial_id>.glb`, which any viewer opens without a simulator. In glTF
-+Y points up, so our table frame {T} is rotated by -90 degrees about X. Each link is drawn as its
-collision shapes, which are convex. Nodes are named `object/NAME` and `hand/LINK`, because an object
-may have the same name as a link.
+Input: a dataset. Output: `<object>/<trial_id>.glb`, which any viewer opens without a simulator. In
+glTF +Y points up, so our table frame {T} is rotated by -90 degrees about X. Each link is drawn as
+its collision shapes, which are convex. Nodes are named `object/NAME` and `hand/LINK`, because an
+object may have the same name as a link.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The file formats of GraspGen (github NVlabs/GraspGen) other than isaac_grasp.
 
-In: a JSON file of GraspGen's datasets, with the grasps of one object and whether each grasp held
+Input: a JSON file of GraspGen's datasets, with the grasps of one object and whether each grasp held
 the object, or the HDF5 file that `scripts/inference_graspgen.py` writes, with the predicted grasps
-of many objects and their confidence. Out: palm poses without joints. They are poses of GraspGen's
-gripper frame (`graspgen` in a hand file) in the axes of the mesh file, in metres.
+of many objects and their confidence. Output: palm poses without joints. They are poses of
+GraspGen's gripper frame (`graspgen` in a hand file) in the axes of the mesh file, in metres.
 
 GraspGen's demo writes isaac_grasp, which `drakegrasp.exchange.isaac_grasp` reads.
 """

@@ -1,7 +1,7 @@
 """A folder for the Hugging Face Hub: Parquet files, a dataset card and Croissant metadata.
 
-In: a dataset. Out: `<camera>/<split>-00000-of-00001.parquet` for both cameras and all splits that
-have samples, `README.md` (whose head in YAML the Hub and `datasets` read) and `croissant.json`
+Input: a dataset. Output: `<camera>/<split>-00000-of-00001.parquet` for both cameras and all splits
+that have samples, `README.md` (whose head in YAML the Hub and `datasets` read) and `croissant.json`
 (mlcommons.org/croissant, version 1.1, with the fields of its RAI vocabulary 1.0).
 `datasets.load_dataset(folder, "oto")` reads it. If the dataset has a scenes.hdf5, there is also a
 configuration of views and a configuration of the grasps in the scenes. Their columns are those of

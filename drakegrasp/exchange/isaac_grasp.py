@@ -1,9 +1,9 @@
 """The format isaac_grasp 1.0 (nvidia-isaac-ros.github.io, "Isaac Grasp File").
 
-In: a dataset. Out: a file `<object>.yaml` per object, and `meshes/<object>.obj`, the object in {O}
-[m]. For each sample the YAML file has the pose of the palm link in {O}, the joint positions after
-closing and those of the open hand. The format allows additional keys. Ours state the conditions
-under which the sample held, so that the file can be read back as the same trial.
+Input: a dataset. Output: a file `<object>.yaml` per object, and `meshes/<object>.obj`, the object
+in {O} [m]. For each sample the YAML file has the pose of the palm link in {O}, the joint positions
+after closing and those of the open hand. The format allows additional keys. Ours state the
+conditions under which the sample held, so that the file can be read back as the same trial.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Episodes for LeRobot: attempts over time, as a LeRobotDataset of version 3.0.
 
-In: a dataset. Out: a folder that `LeRobotDataset(name, root=folder)` of lerobot 0.6 reads. Every
-attempt is simulated again, with results that are equal bit for bit, and becomes an episode with a
-fixed number of frames per second. In an episode the palm approaches, the fingers close, and the
-object is lifted. Poses are interpolated between the steps of the simulation. Two parts of an
+Input: a dataset. Output: a folder that `LeRobotDataset(name, root=folder)` of lerobot 0.6 reads.
+Every attempt is simulated again, with results that are equal bit for bit, and becomes an episode
+with a fixed number of frames per second. In an episode the palm approaches, the fingers close, and
+the object is lifted. Poses are interpolated between the steps of the simulation. Two parts of an
 episode are not simulated: the approach, and the closing as far as geometry shows that the fingers
 touch nothing.
 

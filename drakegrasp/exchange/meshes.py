@@ -1,6 +1,6 @@
 """Meshes for another group's network: the objects of a dataset in {O} [m], and tables of its rows.
 
-In: a dataset. Out: `<object>.obj` for each object, `objects.yaml` with their properties, and
+Input: a dataset. Output: `<object>.obj` for each object, `objects.yaml` with their properties, and
 `rows_<split>.csv` with one line per sample. From this folder `build --objects` builds the same
 objects. The frame of such a mesh file is {O}, so a pose that a network predicts in it is in {O}:
 `score` reads it with `--frame object`, and `verify --object` with any frame. The columns of the

@@ -1,6 +1,6 @@
 """Posed scenes for MuJoCo: one MJCF file per grasp, with the object, the table and the hand.
 
-In: a dataset. Out: `<object>/<trial_id>.xml`, which `mujoco.MjModel.from_xml_path` loads, and
+Input: a dataset. Output: `<object>/<trial_id>.xml`, which `mujoco.MjModel.from_xml_path` loads, and
 `meshes/`. All poses are in {T}. The keyframe `grasp` has the joint positions after closing, the
 object in its resting pose, and the same joint positions as commands of the motors. The mass is that
 of the object, without randomisation; the friction is that of the configuration or of the object.

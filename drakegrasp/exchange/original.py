@@ -1,9 +1,9 @@
 """The layout of the released code of Veres, Moussa and Taylor (github mveres01/grasping).
 
-In: a dataset. Out: `grasping_oto.hdf5` and `grasping_otm.hdf5` in the form that the loaders of the
-released code expect. Depth is the first channel of an image. A grasp is 9k numbers (27 for three
-fingers: points, normals and forces). Cameras have the axes of V-REP's sensors: +X left, +Y up,
-+Z forward.
+Input: a dataset. Output: `grasping_oto.hdf5` and `grasping_otm.hdf5` in the form that the loaders
+of the released code expect. Depth is the first channel of an image. A grasp is 9k numbers (27 for
+three fingers: points, normals and forces). Cameras have the axes of V-REP's sensors: +X left, +Y
+up, +Z forward.
 
 Data for which the layout has no place are left out: masks, joints, palm, the grasp at the end of
 the lift, and the conditions of an attempt except the mass, which is stored in `work2mass`. The

@@ -1,9 +1,9 @@
 """The trial setup of an object in this process, the steps of a trial, and the rows of a shard.
 
-In: a prepared object of a dataset, and attempts. Out: the predictions from geometry, the records of
-the trials, and the columns of a shard by the names of `drakegrasp.dataset.schema`: `/trials`, with
-a row per attempt, and `/looks`, with the images of each success. Nothing is written here. For a
-verdict, the filters of a dataset are applied to the columns of a single trial.
+Input: a prepared object of a dataset, and attempts. Output: the predictions from geometry, the
+records of the trials, and the columns of a shard by the names of `drakegrasp.dataset.schema`:
+`/trials`, with a row per attempt, and `/looks`, with the images of each success. Nothing is written
+here. For a verdict, the filters of a dataset are applied to the columns of a single trial.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Counts the progress of a build.
 
-In: the header and the outcomes of each completed work unit, in any order. Out: counts, the figures
-of the progress bar, and whether an object needs more grasps.
+Input: the header and the outcomes of each completed work unit, in any order. Output: counts, the
+figures of the progress bar, and whether an object needs more grasps.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Estimates the hours, core-hours and bytes of a build before it is started.
 
-In: the number of objects, the configuration, the number of workers, and the mean time of each
-stage. Out: for each stage, the number of tasks of the busiest worker times the mean time of a task.
+Input: the number of objects, the configuration, the number of workers, and the mean time of each
+stage. Output: for each stage, the number of tasks of the busiest worker times the mean time of a
+task.
 """
 
 from __future__ import annotations

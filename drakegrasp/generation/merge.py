@@ -1,8 +1,8 @@
 """Merges datasets that were built separately, by objects, by seeds or by work units.
 
-In: directories of datasets with the same configuration, except for the seed. Out: a directory with
-the files of their objects and shards, under names that distinguish seeds, and the assembled files.
-A mesh that was built with several seeds counts as one object in the split.
+Input: directories of datasets with the same configuration, except for the seed. Output: a directory
+with the files of their objects and shards, under names that distinguish seeds, and the assembled
+files. A mesh that was built with several seeds counts as one object in the split.
 """
 
 from __future__ import annotations

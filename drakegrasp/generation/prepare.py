@@ -1,6 +1,6 @@
 """Prepares one mesh as a task, and rejects a mesh whose preparation crashes or hangs.
 
-In: a mesh and the configuration, as plain data. Out: the object's files, and the entry in the
+Input: a mesh and the configuration, as plain data. Output: the object's files, and the entry in the
 manifest, which describes the object or states why the mesh was rejected.
 """
 

@@ -1,7 +1,7 @@
 """Creates scenes.hdf5 of an assembled dataset, with one task per object.
 
-In: the directory of a dataset, each prepared object and the rows of its closed hands in
-trials.hdf5. Out: the file, with object poses, images, closed hands and the contacts that the
+Input: the directory of a dataset, each prepared object and the rows of its closed hands in
+trials.hdf5. Output: the file, with object poses, images, closed hands and the contacts that the
 cameras see. It appears when it is complete, and its bytes do not depend on the workers.
 """
 

@@ -1,7 +1,7 @@
 """A hand, read from a YAML file and the model that the YAML file names.
 
-In: a YAML file and its SDFormat or URDF file. Out: a `Hand`, of any kind and with any number of
-fingers. `load_hand` reads the YAML file, lets Drake parse the model once, and checks the two
+Input: a YAML file and its SDFormat or URDF file. Output: a `Hand`, of any kind and with any number
+of fingers. `load_hand` reads the YAML file, lets Drake parse the model once, and checks the two
 against each other. It stores the joints of each finger as constants; `kinematics` needs no more.
 
 The coordinates of a hand with k fingers are c = (spread [rad], closing of fingers 1..k [rad, or m

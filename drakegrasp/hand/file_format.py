@@ -1,7 +1,7 @@
 """The keys of a hand file, version 1. Does not import Drake.
 
-In: a YAML file. Out: a `HandFile` whose values are valid by themselves; `description` checks them
-against the model. docs/how-to/add-a-hand.md lists the keys.
+Input: a YAML file. Output: a `HandFile` whose values are valid by themselves; `description` checks
+them against the model. docs/how-to/add-a-hand.md lists the keys.
 
 A joint either turns or slides. Positions of turning joints are angles [rad], positions of sliding
 joints are lengths [m].

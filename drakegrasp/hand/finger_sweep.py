@@ -1,9 +1,9 @@
 """Paths of points on a hand's surface while its fingers close at one spread angle.
 
-In: a `Hand` and a spread. Out: `HandPaths` in the palm frame. It has the points of the links that
-closing does not move. For each finger it has the points of the links that the finger moves, at
-closing positions from the open hand to the limit. The positions are half a degree apart (0.9 mm
-for a sliding joint). This is geometry only, without a simulation. "Closing angle" also means the
+Input: a `Hand` and a spread. Output: `HandPaths` in the palm frame. It has the points of the links
+that closing does not move. For each finger it has the points of the links that the finger moves, at
+closing positions from the open hand to the limit. The positions are half a degree apart (0.9 mm for
+a sliding joint). This is geometry only, without a simulation. "Closing angle" also means the
 position [m] of a closing joint that slides.
 
 The module also computes how the fingertips close on something between them: the `Opposition` of a

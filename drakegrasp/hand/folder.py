@@ -1,9 +1,9 @@
 """A folder that holds all files of a hand, and a digest of its content.
 
-In: a hand. Out: the content of such a folder: hand file, model, weights, licences, and meshes with
-the files that they name. Files below the hand file keep their places and bytes. The hand file and
-the model are rewritten only where they name something outside the folder or by an absolute path or
-a `package://` URI. The hand in such a folder produces the same folder and digest again.
+Input: a hand. Output: the content of such a folder: hand file, model, weights, licences, and meshes
+with the files that they name. Files below the hand file keep their places and bytes. The hand file
+and the model are rewritten only where they name something outside the folder or by an absolute path
+or a `package://` URI. The hand in such a folder produces the same folder and digest again.
 
 A dataset contains such a folder, see `carry_hand`. It is copied at the start of a build and read
 from then on, so that workers and later commands need no other file of the hand. Does not import

@@ -1,8 +1,8 @@
 """Forward kinematics of a hand.
 
-In: a `Hand` and its coordinates, the spread and the closing of each finger. Out: positions of the
-joints, poses of the links, limits of the coordinates. Uses NumPy only. Positions of turning joints
-are angles [rad], positions of sliding joints are lengths [m].
+Input: a `Hand` and its coordinates, the spread and the closing of each finger. Output: positions of
+the joints, poses of the links, limits of the coordinates. Uses NumPy only. Positions of turning
+joints are angles [rad], positions of sliding joints are lengths [m].
 """
 
 from __future__ import annotations

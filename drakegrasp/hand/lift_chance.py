@@ -1,6 +1,6 @@
 """The chance that a lift yields a sample, predicted when the hand has closed.
 
-In: the contacts of closed hands, and the weights in a small file next to the hand file. Out:
+Input: the contacts of closed hands, and the weights in a small file next to the hand file. Output:
 chances from a logistic model (docs/explanation/sampling.md). Its features are computed from
 normals, forces, distances and moments, and from nothing that identifies the object. Does not
 import Drake.

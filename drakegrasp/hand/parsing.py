@@ -1,6 +1,6 @@
 """The model of a hand: what Drake parses, what its text declares, and its joints as constants.
 
-In: an SDFormat or URDF file, and the hand file. Out:
+Input: an SDFormat or URDF file, and the hand file. Output:
 
 - the model's links and joints in a plant. Its motors and couplings are left out, because they come
   from the hand file;

@@ -1,7 +1,7 @@
 """Loads a configuration and fills its open values from the hand's file. Does not import Drake.
 
-In: a preset or a YAML file, and overrides. Out: a complete `Config`, whose stand-offs and spreads
-are numbers.
+Input: a preset or a YAML file, and overrides. Output: a complete `Config`, whose stand-offs and
+spreads are numbers.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The collision shapes of a hand's links, as convex sets of points.
 
-In: a hand's model. Out: for each link the corners of its collision shapes, in the link's frame.
-Every shape of a hand is convex (`models/README.md`), so its corners describe it completely.
+Input: a hand's model. Output: for each link the corners of its collision shapes, in the link's
+frame. Every shape of a hand is convex (`models/README.md`), so its corners describe it completely.
 """
 
 from __future__ import annotations

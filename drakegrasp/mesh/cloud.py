@@ -1,6 +1,6 @@
 """Solids from what a camera saw: the visible points of an object on the table, filled.
 
-In: points (n, 3) in {T}, whose table is z = 0. Out: distance fields in {T}. The back and the
+Input: points (n, 3) in {T}, whose table is z = 0. Output: distance fields in {T}. The back and the
 underside of the object are not seen, so a solid is a guess; two solids bracket the object. The
 convex hull of the points and of their projections on the table fills every hollow; the columns from
 the points down to the table keep handles and waists that are seen from above.

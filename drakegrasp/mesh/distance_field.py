@@ -1,6 +1,6 @@
 """Signed distances from an object's surface on a grid, for many points at a time.
 
-In: a closed surface of triangles. Out: a `DistanceField`. The simulation uses Drake's exact
+Input: a closed surface of triangles. Output: a `DistanceField`. The simulation uses Drake's exact
 distances; this field decides for many poses at once what need not be simulated. Its error is a
 fraction of the grid's spacing, see `DistanceField.error`.
 """

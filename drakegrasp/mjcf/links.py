@@ -1,9 +1,9 @@
 """Links of a hand as bodies of MuJoCo: inertia, collision shapes and their contacts.
 
-In: a hand that Drake has read. Out: bodies that are added to a specification; or the hand by itself
-as an MJCF whose world is the palm link, for tools that move the root themselves. In this MJCF each
-joint that a motor moves has a position actuator, and coupled joints follow. The root has no joint,
-and the joints of the preshape do not exist.
+Input: a hand that Drake has read. Output: bodies that are added to a specification; or the hand by
+itself as an MJCF whose world is the palm link, for tools that move the root themselves. In this
+MJCF each joint that a motor moves has a position actuator, and coupled joints follow. The root has
+no joint, and the joints of the preshape do not exist.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Object, table and hand as a model of MuJoCo, for the attempts of a build.
 
-In: a prepared object, a hand and the configuration. Out: a compiled `MujocoScene`. MuJoCo only
-collides convex shapes, so the object is divided into convex parts. Masses, inertias, joints, shapes
-and friction are those that Drake simulates. Needs the extra `[peer]`.
+Input: a prepared object, a hand and the configuration. Output: a compiled `MujocoScene`. MuJoCo
+only collides convex shapes, so the object is divided into convex parts. Masses, inertias, joints,
+shapes and friction are those that Drake simulates. Needs the extra `[peer]`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Actions of a person on a page: deciding, and running an attempt again.
 
-In: the directory of a dataset. Out: `reject.json`, which is always up to date on disk, and
+Input: the directory of a dataset. Output: `reject.json`, which is always up to date on disk, and
 recordings in a folder that is removed at the end.
 """
 

@@ -1,8 +1,8 @@
 """A gallery shows a table of rows, and a page shows one row of the table.
 
-In: the query of an address. Out: HTML. Each table is a `Gallery`, which defines how it is filtered
-and sorted, and the contents of its cards and pages. Jinja escapes every value; no page contains its
-own script or style, so the strictest content security policy can be used.
+Input: the query of an address. Output: HTML. Each table is a `Gallery`, which defines how it is
+filtered and sorted, and the contents of its cards and pages. Jinja escapes every value; no page
+contains its own script or style, so the strictest content security policy can be used.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Predictions and their verdicts on the page, with the rows of the dataset that they are for.
 
-In: the HDF5 file that `drakegrasp verify --out` writes, and a snapshot of the dataset. The values
-that filters and sorting need are in memory; all other values of a verdict are read when a page
-shows them. A field that the file lacks is read as without a value.
+Input: the HDF5 file that `drakegrasp verify --out` writes, and a snapshot of the dataset. The
+values that filters and sorting need are in memory; all other values of a verdict are read when a
+page shows them. A field that the file lacks is read as without a value.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The pages as files that a browser opens without a server: the server's pages, in a folder.
 
-In: a dataset, and results of predictions for its rows. Out: `index.html` and all pages that it
-links to, with the images, meshes and plots that they need. Decisions are shown but cannot be
+Input: a dataset, and results of predictions for its rows. Output: `index.html` and all pages that
+it links to, with the images, meshes and plots that they need. Decisions are shown but cannot be
 changed.
 """
 

@@ -1,7 +1,8 @@
 """Directions from which palms approach objects: coverage, rays around objects, and maps.
 
 Objects on the table are drawn in parallel projection, in a view {V} whose axes point right, up and
-towards the reader. In: attempts at some objects. Out: figures. Needs matplotlib, but not Drake.
+towards the reader. Input: attempts at some objects. Output: figures. Needs matplotlib, but not
+Drake.
 """
 
 from __future__ import annotations

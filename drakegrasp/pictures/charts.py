@@ -1,7 +1,7 @@
 """Charts of numbers: of a whole dataset, and of a score card.
 
-In: counts and columns, or a card that `scoring.card` has computed. Out: figures. Names are drawn
-literally: a dollar sign does not start a formula.
+Input: counts and columns, or a card that `scoring.card` has computed. Output: figures. Names are
+drawn literally: a dollar sign does not start a formula.
 """
 
 from __future__ import annotations

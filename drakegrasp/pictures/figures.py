@@ -1,7 +1,7 @@
 """All figures of a dataset as files: PNG, SVG, and their numbers as JSON.
 
-In: the directory of a dataset. Out: a folder of files; the same dataset produces the same bytes on
-the same machine.
+Input: the directory of a dataset. Output: a folder of files; the same dataset produces the same
+bytes on the same machine.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Recordings: an attempt as a single HTML file that any browser plays.
 
-In: a function that runs a simulation. Out: its result, which is equal to the last bit to that
+Input: a function that runs a simulation. Output: its result, which is equal to the last bit to that
 without a recording because the same code runs, and an HTML file that needs neither other files nor
 the network. An attempt that ends before it is simulated is shown at its start.
 """

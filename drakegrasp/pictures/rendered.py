@@ -1,8 +1,8 @@
 """Pictures that Drake renders: a hand, the objects of an audit, and the phases of a grasp.
 
-In: a hand; the rows of an audit; or a dataset and the number of a trial, whose poses are those in
-trials.hdf5: nothing is simulated. Out: figures. As in `vision.rendering`, all pictures must be
-rendered in one thread.
+Input: a hand; the rows of an audit; or a dataset and the number of a trial, whose poses are those
+in trials.hdf5: nothing is simulated. Output: figures. As in `vision.rendering`, all pictures must
+be rendered in one thread.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Comparison of the two samplers of palm poses: which approaches they try, and what they find.
 
-In: a dataset, and optionally another of the same objects by the other sampler. Out: the paper's
-Figure 2, palm poses of one object by both samplers, and numbers. Without the other dataset, the
-other sampler draws palm poses of that one object, which were not tried.
+Input: a dataset, and optionally another of the same objects by the other sampler. Output: the
+paper's Figure 2, palm poses of one object by both samplers, and numbers. Without the other dataset,
+the other sampler draws palm poses of that one object, which were not tried.
 """
 
 from __future__ import annotations

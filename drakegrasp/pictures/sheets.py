@@ -1,6 +1,6 @@
 """Sheets of samples: of a data file, of each class, and of scenes for training.
 
-In: a data file or scenes.hdf5. Out: figures. Needs matplotlib, but not Drake.
+Input: a data file or scenes.hdf5. Output: figures. Needs matplotlib, but not Drake.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A still scene: a hand, by itself or with an object on a table, posed and drawn.
 
-In: a hand, an object's model if there is one, and `Poses`. Out: poses of the links, overlaps of
-links, and pictures with their cameras, so that frames and contacts can be drawn over them. Nothing
-is simulated.
+Input: a hand, an object's model if there is one, and `Poses`. Output: poses of the links, overlaps
+of links, and pictures with their cameras, so that frames and contacts can be drawn over them.
+Nothing is simulated.
 
 For the 3D view of a browser, links and objects are JSON: a list of parts, each with its `colour`
 "#rrggbb", `vertices` (n, 3) as float32 [m] and `faces` (m, 3) as uint32, both little-endian in

@@ -1,7 +1,7 @@
 """Grasps and objects as DexGraspBench stores them.
 
-In: a .npy file with postures and the pose of an object, and the object's folder, which may come
-from an untrusted source. Out: `StoredGrasps`, the `GraspMotion` of one grasp, and an
+Input: a .npy file with postures and the pose of an object, and the object's folder, which may come
+from an untrusted source. Output: `StoredGrasps`, the `GraspMotion` of one grasp, and an
 `ObjectFolder`. Such a file is a pickle; only arrays, numbers, texts and containers are read from
 it, and no code is run.
 """

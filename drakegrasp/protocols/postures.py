@@ -1,7 +1,7 @@
 """Verdicts on stored postures under a protocol, one line of JSON each.
 
-In: grasp files in DexGraspBench's format, the MJCF of a hand, and a protocol by name. Out: one
-verdict per file, in order. A file that is not a valid grasp gets the verdict `invalid`.
+Input: grasp files in DexGraspBench's format, the MJCF of a hand, and a protocol by name. Output:
+one verdict per file, in order. A file that is not a valid grasp gets the verdict `invalid`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Hand and object in MuJoCo, with the numbers of a protocol.
 
-In: the MJCF of a hand, an object's convex parts and a protocol. Out: a `ProtocolScene`, which can
-be reset, moved, pushed and measured. The hand's root is welded to a body that moves on command, as
-in DexGraspBench (`src/util/hand_util.py`). Needs the extra `[peer]`.
+Input: the MJCF of a hand, an object's convex parts and a protocol. Output: a `ProtocolScene`, which
+can be reset, moved, pushed and measured. The hand's root is welded to a body that moves on command,
+as in DexGraspBench (`src/util/hand_util.py`). Needs the extra `[peer]`.
 """
 
 from __future__ import annotations

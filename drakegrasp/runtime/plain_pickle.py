@@ -1,8 +1,8 @@
 """Pickled dictionaries from untrusted sources, read without running any code.
 
-In: a .npy file whose one element is a Python object, as DexGraspBench writes them. Out: the object,
-if it consists of dictionaries, lists, texts, numbers and NumPy arrays; anything else is rejected
-before it is created.
+Input: a .npy file whose one element is a Python object, as DexGraspBench writes them. Output: the
+object, if it consists of dictionaries, lists, texts, numbers and NumPy arrays; anything else is
+rejected before it is created.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The frozen benchmark `drakegrasp-bench-1`: its objects, and its description on a card.
 
-In: a directory. Out: meshes with their own masses and frictions, for a build with the preset
+Input: a directory. Output: meshes with their own masses and frictions, for a build with the preset
 `bench1`, and a file that states where the meshes differ from the published ones. All draws come
 from `seeding`, so everybody who builds the benchmark gets the same objects.
 """

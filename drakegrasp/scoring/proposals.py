@@ -1,6 +1,6 @@
 """Proposals: grasps from above for what a camera saw, for users who have no network yet.
 
-In: an object's visible points in {T}, where the table is z = 0. Out: `Attempts`, which
+Input: an object's visible points in {T}, where the table is z = 0. Output: `Attempts`, which
 `scoring.ranking` orders, a build tries and a score judges like those of a network. The sampler
 `above` draws such palm poses at random around a whole mesh. Here they are few, and the visible
 points determine them.

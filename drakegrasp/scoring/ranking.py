@@ -1,7 +1,7 @@
 """Ranking: the order in which to try grasps, by closing the hand on points that a camera saw.
 
-In: grasps that anybody proposes, and an object's visible points in {T}, where the table is z = 0.
-Out: a score of each. Nothing is simulated and nothing is learned. The points become solids
+Input: grasps that anybody proposes, and an object's visible points in {T}, where the table is z =
+0. Output: a score of each. Nothing is simulated and nothing is learned. The points become solids
 (`mesh.cloud`), and the hand's geometry determines where each finger stops (`hand.finger_sweep`). A
 score is a mean over the solids and over small moves of the palm. `scoring.proposals` proposes
 grasps.

@@ -1,9 +1,9 @@
 """Reference rows: predictions that the program makes itself, to be scored beside a network's.
 
-In: the rows to score, and training rows. Out: a grasp per row, as contacts in the camera's frame or
-postures in {T}. `constant` and `random` never look at the image. The camera is at a fixed place
-relative to the palm, so a grasp in its frame reveals the wrist pose. A network that is not far
-above these two has learned nothing.
+Input: the rows to score, and training rows. Output: a grasp per row, as contacts in the camera's
+frame or postures in {T}. `constant` and `random` never look at the image. The camera is at a fixed
+place relative to the palm, so a grasp in its frame reveals the wrist pose. A network that is not
+far above these two has learned nothing.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Ranked predictions, and the part of each verdict that a score stores.
 
-In: arrays and files with m predictions for each row of a split, and verdicts of any rule on them.
-Out: `Attempts` in the order of rows and ranks, and a `Verdict` for each. Ranks follow the stated
-confidence, or the given order if none is stated. Verdicts are stored as lines of JSON under a key
-of what was tried, so an interrupted score can continue.
+Input: arrays and files with m predictions for each row of a split, and verdicts of any rule on
+them. Output: `Attempts` in the order of rows and ranks, and a `Verdict` for each. Ranks follow the
+stated confidence, or the given order if none is stated. Verdicts are stored as lines of JSON under
+a key of what was tried, so an interrupted score can continue.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Attempts from outside: many postures of several objects, and the palm poses of a build from them.
 
-In: what a file, a network or another tool states about n grasps. Out: one table, `Attempts`. A bad
-row keeps the reason why it is bad and does not affect other rows. The table is plain data and can
-be sent to another process. A build makes its `Candidates` and the `Attempt` of each row from it.
-Verification and scoring put its rows on their objects.
+Input: what a file, a network or another tool states about n grasps. Output: one table, `Attempts`.
+A bad row keeps the reason why it is bad and does not affect other rows. The table is plain data and
+can be sent to another process. A build makes its `Candidates` and the `Attempt` of each row from
+it. Verification and scoring put its rows on their objects.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Stage "sample": palm poses around an object, and the attempts that follow from them.
 
-In: the object's box and mesh, and its resting poses. Out: up to `candidates.max` palm poses X_OG
-and, for each, its resting pose and the distance along its palm ray to the object.
+Input: the object's box and mesh, and its resting poses. Output: up to `candidates.max` palm poses
+X_OG and, for each, its resting pose and the distance along its palm ray to the object.
 
 A sampler of the registry yields a sequence of poses at a resting pose. Resting poses and samplers
 take turns. The first n poses are the same for every `candidates.max` of at least n, so a dataset

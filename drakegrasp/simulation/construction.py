@@ -1,6 +1,6 @@
 """Building a scene: object, table and hand as one Drake diagram.
 
-In: an object, the physics configuration and, for grasps, a hand. Out: a `scene.Scene`, or a
+Input: an object, the physics configuration and, for grasps, a hand. Output: a `scene.Scene`, or a
 `scene.ObjectScene` without a hand.
 
 The hand is attached to the world by three prismatic joints and a frame that is welded to the palm.

@@ -1,7 +1,7 @@
 """The drive of the fingers: what keeps a closing joint from being pushed open during a lift.
 
-In: a scene whose closed hand is about to lift, and the kind of drive. With each kind, the motor's
-torque stays on:
+Input: a scene whose closed hand is about to lift, and the kind of drive. With each kind, the
+motor's torque stays on:
 
 * `torque`: only the motor holds the joint; a load larger than its torque pushes the joint open.
 * `worm`: the joint never opens. After each step its angle becomes the joint's lower limit. If the

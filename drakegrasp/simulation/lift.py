@@ -1,9 +1,9 @@
 """The lift of an attempt: the object is freed, and the wrist moves it to its target.
 
-In: a scene whose closed hand may lift, and the rules. Out: the contacts at the end, and the pose of
-the object then. First the wrist does not move for `lift.release_time`. So the motion of the object
-when it becomes free can be distinguished from the motion that the lift adds. Two things save time
-without changing the verdict:
+Input: a scene whose closed hand may lift, and the rules. Output: the contacts at the end, and the
+pose of the object then. First the wrist does not move for `lift.release_time`. So the motion of the
+object when it becomes free can be distinguished from the motion that the lift adds. Two things save
+time without changing the verdict:
 
 * While nothing moves in the hand, a step is `physics.coarse_steps` times as long, because a grasp
   at rest needs no fine steps. A second diagram takes the coarse steps; it takes over the state.

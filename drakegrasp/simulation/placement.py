@@ -1,8 +1,8 @@
 """An object at rest on the table, against which grasps are verified.
 
-In: a mesh file, a trimesh or a prepared object. Out: the object and its resting pose. Verification
-simulates at `canonical_pose`, so that no verdict depends on where the object stands on the table
-and how it is turned about the vertical.
+Input: a mesh file, a trimesh or a prepared object. Output: the object and its resting pose.
+Verification simulates at `canonical_pose`, so that no verdict depends on where the object stands on
+the table and how it is turned about the vertical.
 """
 
 from __future__ import annotations

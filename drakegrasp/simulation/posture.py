@@ -1,7 +1,7 @@
 """Postures: a wrist pose with or without the positions of all joints, and the trial of a posture.
 
-In: what a network or another tool states about a grasp. Out: a `Posture`, checked and in {O}; the
-`Attempt` of its trial; and its trial on an object. If a wrist pose has no joints, the open hand
+Input: what a network or another tool states about a grasp. Output: a `Posture`, checked and in {O};
+the `Attempt` of its trial; and its trial on an object. If a wrist pose has no joints, the open hand
 closes, as in an attempt of a sampler. If the joints follow the couplings of the hand file, the
 hand's own motors close the hand, as in every attempt. Otherwise each joint has its own motor, which
 moves from the pregrasp to the grasp and on to the squeeze.

@@ -1,11 +1,11 @@
 """How much disturbance a grasp tolerates: repeats with noise, and with less friction.
 
-In: an attempt that was lifted. Out: three results. First, how many repeats with noise on palm pose,
-friction and mass hold, and how many of them would be samples. Second, whether the attempt without
-noise would be a sample at half the time step. Third, the smallest friction at which it holds
-without noise, also at half the step. The repeats use the trial's own step, because the error of the
-step is numerical and reported separately. The stored lift is not counted. The noise depends only on
-the attempt's seed.
+Input: an attempt that was lifted. Output: three results. First, how many repeats with noise on palm
+pose, friction and mass hold, and how many of them would be samples. Second, whether the attempt
+without noise would be a sample at half the time step. Third, the smallest friction at which it
+holds without noise, also at half the step. The repeats use the trial's own step, because the error
+of the step is numerical and reported separately. The stored lift is not counted. The noise depends
+only on the attempt's seed.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The scenes and renderers that a process caches: building one costs as much as an attempt.
 
-In: an object, and what to simulate or draw it with. Out: its scene or its renderer, new or cached.
-The keys are digests of the content, so copies of an object share scenes and renderers. Objects
-under the same physics and hand also share a diagram, see `swap_object`. A scene that is reset gives
-the same bits as a new scene, so earlier use changes nothing.
+Input: an object, and what to simulate or draw it with. Output: its scene or its renderer, new or
+cached. The keys are digests of the content, so copies of an object share scenes and renderers.
+Objects under the same physics and hand also share a diagram, see `swap_object`. A scene that is
+reset gives the same bits as a new scene, so earlier use changes nothing.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Stage "screen": what geometry decides about attempts before anything is simulated.
 
-In: attempts at an object on the table. Out: a `Prediction` for each. Points on the hand's surface
-are looked up in the object's distance field: with the hand open at the start pose, and while each
-finger closes by itself. While the hand closes, object and wrist are static and each finger has one
-degree of freedom. Geometry therefore decides which link meets the object first, and where. Its
-errors come from the compliance of the contact, the spacing of the grid, and the spacing of the
-points. The margins of `ScreenConfig` cover these errors.
+Input: attempts at an object on the table. Output: a `Prediction` for each. Points on the hand's
+surface are looked up in the object's distance field: with the hand open at the start pose, and
+while each finger closes by itself. While the hand closes, object and wrist are static and each
+finger has one degree of freedom. Geometry therefore decides which link meets the object first, and
+where. Its errors come from the compliance of the contact, the spacing of the grid, and the spacing
+of the points. The margins of `ScreenConfig` cover these errors.
 
 An attempt counts as lost only if it is lost by more than the margin. Every step treats each point
 separately, so a prediction depends on its attempt alone, and not on the other attempts in the call.

@@ -1,6 +1,6 @@
 """Stage "settle": drop the object on the table and wait until it rests.
 
-In: a prepared object. Out: its resting pose X_TO, moved in x and y so that p_TO = (0, 0, z)
+Input: a prepared object. Output: its resting pose X_TO, moved in x and y so that p_TO = (0, 0, z)
 (Veres et al., "Initial Object and hand configurations").
 """
 

@@ -1,11 +1,11 @@
 """The states of a trial from step to step, with results that are the same to the last bit.
 
-In: the scene of an attempt, and a function that runs it. Out: its result, and a `Trace`. The scene
-that the function gets has a simulator whose monitor also looks at the state: positions, contact
-forces, and where motors of their own are commanded to. Drake calls a monitor between two steps, so
-no step begins or ends elsewhere, and what it computes for a look is what the next step begins with.
-At the start of a simulation only positions are read: what Drake then computes would outlive the
-paths that are commanded next.
+Input: the scene of an attempt, and a function that runs it. Output: its result, and a `Trace`. The
+scene that the function gets has a simulator whose monitor also looks at the state: positions,
+contact forces, and where motors of their own are commanded to. Drake calls a monitor between two
+steps, so no step begins or ends elsewhere, and what it computes for a look is what the next step
+begins with. At the start of a simulation only positions are read: what Drake then computes would
+outlive the paths that are commanded next.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The trial of one attempt, from its start pose to its verdict.
 
-`run_attempt` is the experiment; builds, verification and replays all call it. In: a scene, the
-object's resting pose and an attempt. Out: a `TrialRecord` with the outcome and all measurements.
+`run_attempt` is the experiment; builds, verification and replays all call it. Input: a scene, the
+object's resting pose and an attempt. Output: a `TrialRecord` with the outcome and all measurements.
 A failure of the physics is an outcome, not an exception. So is an error in Drake.
 """
 

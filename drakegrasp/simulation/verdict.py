@@ -1,8 +1,8 @@
 """The verdict on an attempt: what follows from its contacts, and how well it holds.
 
-In: contacts of one attempt, or of many with leading axes. Out: values of `Outcome`, and whether a
-grasp is a precision grasp and a stable grasp. Trials, builds and the check of a dataset all use
-these functions. Does not import Drake.
+Input: contacts of one attempt, or of many with leading axes. Output: values of `Outcome`, and
+whether a grasp is a precision grasp and a stable grasp. Trials, builds and the check of a dataset
+all use these functions. Does not import Drake.
 """
 
 from __future__ import annotations

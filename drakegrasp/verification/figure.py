@@ -1,8 +1,8 @@
 """Pictures of a verified grasp: a figure of its contacts on the object, and a recording.
 
-In: a verification. Out: a matplotlib figure, or an HTML file that plays the trial. The figure shows
-the object from two sides, then the last state that was reached with the hand, the verdict and a
-legend. The pictures come from `pictures.still_scene`, so they need OpenGL and a single thread.
+Input: a verification. Output: a matplotlib figure, or an HTML file that plays the trial. The figure
+shows the object from two sides, then the last state that was reached with the hand, the verdict and
+a legend. The pictures come from `pictures.still_scene`, so they need OpenGL and a single thread.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """What forces at a grasp's contacts can do within the hand's strength, without a simulation.
 
-In: predicted points and normals, or contacts, and the wrenches of a lift. Out: the smallest forces
-within the friction cones (`ContactForces`), margins of a grasp, and a `ForceVerdict`. The verdict
-states whether forces at the surface contacts that a prediction selects can support the lift.
+Input: predicted points and normals, or contacts, and the wrenches of a lift. Output: the smallest
+forces within the friction cones (`ContactForces`), margins of a grasp, and a `ForceVerdict`. The
+verdict states whether forces at the surface contacts that a prediction selects can support the
+lift.
 
 The forces solve a second-order cone program (M. Lobo, L. Vandenberghe, S. Boyd, H. Lebret,
 "Applications of second-order cone programming", 1998, section 3.4), with Clarabel through Drake. A

@@ -1,9 +1,9 @@
 """Possible faults in the numbers of a grasp that fails; hints do not change a verdict.
 
-In: a placed grasp. Out: how its contacts lie on the surface, and hints in words. A hint states that
-the same numbers would fit much better if they were read in another way: in another frame or unit,
-with normals that point the other way, or with the fingers in another order. All factors are own
-choices.
+Input: a placed grasp. Output: how its contacts lie on the surface, and hints in words. A hint
+states that the same numbers would fit much better if they were read in another way: in another
+frame or unit, with normals that point the other way, or with the fingers in another order. All
+factors are own choices.
 """
 
 from __future__ import annotations

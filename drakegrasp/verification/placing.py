@@ -1,8 +1,8 @@
 """The requests of a caller: each attempt in {O} of its object on the table.
 
-In: contacts or postures, with an object, with the objects of a dataset, or with rows of a dataset.
-Out: a `PlacedGrasp` for each. Every mistake of the caller is found here, before anything is
-simulated; a bad row is not a mistake of the caller.
+Input: contacts or postures, with an object, with the objects of a dataset, or with rows of a
+dataset. Output: a `PlacedGrasp` for each. Every mistake of the caller is found here, before
+anything is simulated; a bad row is not a mistake of the caller.
 """
 
 from __future__ import annotations

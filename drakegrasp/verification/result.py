@@ -1,6 +1,6 @@
 """The result of verifying one grasp: the verdict, what was simulated, and why, in sentences.
 
-In: what `verify` measured. Out: a `Verification` and its explanation. The explanation states
+Input: what `verify` measured. Output: a `Verification` and its explanation. The explanation states
 whether the grasp holds and why, what moved, how close the contacts are to the requested ones, and
 what forces at the contacts alone can do. Numbers in another frame or unit, or normals that point
 inwards, are reported first.

@@ -1,8 +1,8 @@
 """Files of verification results: JSON lines and HDF5.
 
-In: `Verification`s in the order of the caller's grasps. Out: a file with one object of strict JSON
-per line, and an HDF5 file with the fields `schema.VERIFICATION_FIELDS`. Equal results give equal
-HDF5 files, because only the JSON contains wall-clock times.
+Input: `Verification`s in the order of the caller's grasps. Output: a file with one object of strict
+JSON per line, and an HDF5 file with the fields `schema.VERIFICATION_FIELDS`. Equal results give
+equal HDF5 files, because only the JSON contains wall-clock times.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 """The verdict on grasps of objects, each given by its contacts in {O} or by a posture.
 
-In: `PlacedGrasp`s. Out: a `Verification` for each, in the caller's order. A posture is tried as
-given. For contacts, method `hand` finds palm poses that bring the fingertips to the points, and
+Input: `PlacedGrasp`s. Output: a `Verification` for each, in the caller's order. A posture is tried
+as given. For contacts, method `hand` finds palm poses that bring the fingertips to the points, and
 runs a trial from the best pose, as a build does. If that does not hold, it also tries the others.
-Method `forces` computes whether forces at the surface's own contacts can lift the object. Every
-row with contacts is tried, even if the numbers look wrong, and faults are judged afterwards from
-the measurements. A wrong prediction, a failed solver and a lost object are outcomes, not
-exceptions.
+Method `forces` computes whether forces at the surface's own contacts can lift the object. Every row
+with contacts is tried, even if the numbers look wrong, and faults are judged afterwards from the
+measurements. A wrong prediction, a failed solver and a lost object are outcomes, not exceptions.
 """
 
 from __future__ import annotations

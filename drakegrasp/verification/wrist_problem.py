@@ -1,7 +1,7 @@
 """The wrist problem: which palm pose and joints bring the fingertips to given contacts?
 
-In: a hand, k contact points with outward normals in {O}, and the height of the table. Out: the
-residuals whose sum of squares is minimised, and the clearances that must not be negative, with
+Input: a hand, k contact points with outward normals in {O}, and the height of the table. Output:
+the residuals whose sum of squares is minimised, and the clearances that must not be negative, with
 exact derivatives. `wrist_solver` minimises.
 
 The objective is that of Veres et al. (2017), appendix: sum |C_i - Y_i|^2 over the rotations and

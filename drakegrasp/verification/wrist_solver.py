@@ -1,9 +1,9 @@
 """Solving the wrist problem: SciPy's SLSQP from several starts.
 
-In: a hand and k contacts in {O}. Out: palm poses with joints, the best first. Contacts leave a
-family of palm poses open, so solutions from different starts are different palm poses for the same
-grasp. The starts come from a table of postures whose nominal fingertip contacts are close to the
-given contacts. Distances and angles among contacts and normals do not depend on the frame, so a
+Input: a hand and k contacts in {O}. Output: palm poses with joints, the best first. Contacts leave
+a family of palm poses open, so solutions from different starts are different palm poses for the
+same grasp. The starts come from a table of postures whose nominal fingertip contacts are close to
+the given contacts. Distances and angles among contacts and normals do not depend on the frame, so a
 tree finds the postures in which they are similar. Only these postures are aligned with the contacts
 (our own construction).
 """

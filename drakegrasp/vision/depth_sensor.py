@@ -11,8 +11,8 @@ baseline b.
   stripes beside near edges, on the side away from the projector. Such a pixel has the value `far`,
   like a pixel with nothing before the far plane.
 
-In: the clean depth image. Out: the image with errors, or clean depths recovered from it. Uses NumPy
-only.
+Input: the clean depth image. Output: the image with errors, or clean depths recovered from it. Uses
+NumPy only.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Rendering: RGB, depth and mask of the resting object from a camera pose.
 
-In: an object, its resting pose and a camera pose. Out: images of object and table. The renderer has
-its own diagram, without physics. The images of a dataset show no hand; those of a trial over time
-do (`build_renderer` with a hand, `pose_hand`).
+Input: an object, its resting pose and a camera pose. Output: images of object and table. The
+renderer has its own diagram, without physics. The images of a dataset show no hand; those of a
+trial over time do (`build_renderer` with a hand, `pose_hand`).
 
 A renderer must be built and used in one thread. Drake's first rendering thread owns the OpenGL
 context, and any other thread silently gets a blank image. A blank image is an error here.

@@ -1,6 +1,7 @@
 """Fit a network.
 
-In: batches. Out: the weights with the smallest loss in validation, and one printed line per epoch.
+Input: batches. Output: the weights with the smallest loss in validation, and one printed line per
+epoch.
 """
 
 from __future__ import annotations

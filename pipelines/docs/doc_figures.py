@@ -1,7 +1,7 @@
 """The figures of the README and the docs. They need matplotlib, but not Drake.
 
-In: data files, and pictures with their cameras (from `trial_pictures`). Out: PNG files, one of a
-trial from start to lift and one of all frames.
+Input: data files, and pictures with their cameras (from `trial_pictures`). Output: PNG files, one
+of a trial from start to lift and one of all frames.
 """
 
 from __future__ import annotations

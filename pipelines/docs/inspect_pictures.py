@@ -1,8 +1,8 @@
 """Take the pictures of the inspection page for the docs: galleries, a grasp, a prediction, a scene.
 
-In: a dataset's directory, and the results of `drakegrasp verify` for some of its rows. Out: one
-picture of each page, `inspect_NAME.png`. Predictions and scenes are left out if there are none. The
-script needs Playwright and the system's Chromium (`make test-browser` installs both).
+Input: a dataset's directory, and the results of `drakegrasp verify` for some of its rows. Output:
+one picture of each page, `inspect_NAME.png`. Predictions and scenes are left out if there are none.
+The script needs Playwright and the system's Chromium (`make test-browser` installs both).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Third-person pictures of the hand and object of a trial, for the README and the docs.
 
-In: a dataset's directory and the number of a trial. Out: pictures of its stages, rendered from the
-poses and joint positions in trials.hdf5, and the panels of the figure of all frames. Nothing is
-simulated.
+Input: a dataset's directory and the number of a trial. Output: pictures of its stages, rendered
+from the poses and joint positions in trials.hdf5, and the panels of the figure of all frames.
+Nothing is simulated.
 """
 
 from __future__ import annotations

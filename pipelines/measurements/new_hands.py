@@ -1,9 +1,9 @@
 """Draft hands from the models of dex-urdf, build a small dataset with each, and try it again.
 
-In: a checkout of dexsuite/dex-urdf and a folder of meshes in metres. Out: a table in Markdown,
-which reports the results of the first palm poses and of those refined about samples, and how many
-samples hold again if their palm poses and joints are passed back as postures. Steps whose results
-already exist are skipped. HAND may also be a hand of the package.
+Input: a checkout of dexsuite/dex-urdf and a folder of meshes in metres. Output: a table in
+Markdown, which reports the results of the first palm poses and of those refined about samples, and
+how many samples hold again if their palm poses and joints are passed back as postures. Steps whose
+results already exist are skipped. HAND may also be a hand of the package.
 
     python pipelines/measurements/new_hands.py DEX_URDF MESHES [HAND...] --out FOLDER
 """

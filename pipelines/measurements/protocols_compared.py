@@ -1,9 +1,9 @@
 """Compare the verdicts on DexGraspBench's published grasps by its own code and by our protocols.
 
-In: the folder of DexGraspBench, whose own evaluation has been run (`task=eval exp_name=example`),
-and the results of `drakegrasp verify --protocol`, one file of JSON lines per protocol. Out: a table
-in Markdown with the number of held grasps, Wilson's interval, and how many verdicts agree with
-those of the benchmark's code.
+Input: the folder of DexGraspBench, whose own evaluation has been run (`task=eval
+exp_name=example`), and the results of `drakegrasp verify --protocol`, one file of JSON lines per
+protocol. Output: a table in Markdown with the number of held grasps, Wilson's interval, and how
+many verdicts agree with those of the benchmark's code.
 
     python pipelines/measurements/protocols_compared.py DEXGRASPBENCH RESULTS.jsonl...
 

@@ -1,9 +1,9 @@
 """Try published grasps of the Shadow Hand in Drake, by the rules of DexGraspBench.
 
-In: the MJCF of DexGraspBench's Shadow Hand, and folders of its grasp files, with objects in its
-layout below `--assets`. Out: a line of JSON per grasp, and the number of held grasps. If verdicts
-of `drakegrasp verify --protocol dexgraspbench` on the same files are given, also the number of
-equal verdicts.
+Input: the MJCF of DexGraspBench's Shadow Hand, and folders of its grasp files, with objects in its
+layout below `--assets`. Output: a line of JSON per grasp, and the number of held grasps. If
+verdicts of `drakegrasp verify --protocol dexgraspbench` on the same files are given, also the
+number of equal verdicts.
 
 A grasp is held if the object stays in the hand whichever of its six axes points up. The closed hand
 is lifted by 10 cm six times, with an object of 0.1 kg and a friction of 0.6, and the object must

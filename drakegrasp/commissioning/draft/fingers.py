@@ -1,7 +1,7 @@
 """The fingers of a vendor's model: its palm, the joints of each finger, and how it may close.
 
-In: a `VendorModel`, and a person's answers. Out: the joints of each finger, with its `Closing`s:
-straight lines in the space of its joints, from open to closed.
+Input: a `VendorModel`, and a person's answers. Output: the joints of each finger, with its
+`Closing`s: straight lines in the space of its joints, from open to closed.
 
 Joints that turn about the same axis as the last joint, at zero, bend the finger and close together.
 The other joints (a spread, an abduction, a thumb's opposition) keep a position.

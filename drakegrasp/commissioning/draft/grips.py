@@ -1,8 +1,9 @@
 """Which fingers close against each other, where they touch, and whether other links collide first.
 
-In: the joints of a model's fingers, and their closings. Out: `Grip`s, the best first: a finger,
-often a thumb, and one or two fingers that it meets. For each pair of fingers, all closings of both
-are compared. The pad of a fingertip is the part of its surface that faces the closing motion.
+Input: the joints of a model's fingers, and their closings. Output: `Grip`s, the best first: a
+finger, often a thumb, and one or two fingers that it meets. For each pair of fingers, all closings
+of both are compared. The pad of a fingertip is the part of its surface that faces the closing
+motion.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A vendor's model as data: a tree of rigid links, and the joints between them.
 
-In: a `Source`, which Drake parses. Out: a `VendorModel`. In it, links that are welded to each other
-are one link, every moving link has a mass, and limits let mimic joints follow. The frame of a link
-is the frame of the joint to its parent.
+Input: a `Source`, which Drake parses. Output: a `VendorModel`. In it, links that are welded to each
+other are one link, every moving link has a mass, and limits let mimic joints follow. The frame of a
+link is the frame of the joint to its parent.
 """
 
 from __future__ import annotations

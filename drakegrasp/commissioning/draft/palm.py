@@ -1,8 +1,8 @@
 """The palm frame G of a grip: where the palm's surface is, and which direction it faces.
 
-In: a model and a `Grip`. Out: poses X_BG, the best first. Gz is perpendicular to the line along
-which the fingers close, and its ray from the palm to the pinch is free. Gy points to the finger
-that opposes the others.
+Input: a model and a `Grip`. Output: poses X_BG, the best first. Gz is perpendicular to the line
+along which the fingers close, and its ray from the palm to the pinch is free. Gy points to the
+finger that opposes the others.
 """
 
 from __future__ import annotations

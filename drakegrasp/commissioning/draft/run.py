@@ -1,9 +1,9 @@
 """Drafts a hand file from a vendor's model.
 
-In: a URDF, SDFormat or MJCF file, and a person's answers about the hand. Out: a complete folder
-with the hand file, which has a comment on each guessed line, the model as URDF, and meshes. Of
-several possible grips, the first one that passes `hand check` is used, or else the one that fails
-the fewest checks.
+Input: a URDF, SDFormat or MJCF file, and a person's answers about the hand. Output: a complete
+folder with the hand file, which has a comment on each guessed line, the model as URDF, and meshes.
+Of several possible grips, the first one that passes `hand check` is used, or else the one that
+fails the fewest checks.
 """
 
 from __future__ import annotations

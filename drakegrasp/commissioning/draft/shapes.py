@@ -1,8 +1,8 @@
 """Shapes of a vendor's links: primitives of Drake, and meshes of many formats.
 
-In: the XML of a model, the mesh files that it names, and the shapes that Drake parsed. Out: XML
-that names Wavefront files of a scratch folder, which Drake can read, and `Shape`s on the links. A
-shape that is not a primitive becomes triangles, few enough to be drawn quickly. A collision shape
+Input: the XML of a model, the mesh files that it names, and the shapes that Drake parsed. Output:
+XML that names Wavefront files of a scratch folder, which Drake can read, and `Shape`s on the links.
+A shape that is not a primitive becomes triangles, few enough to be drawn quickly. A collision shape
 becomes a convex hull.
 """
 

@@ -1,7 +1,7 @@
 """The text of a vendor's model, and the folders whose files it may use.
 
-In: a URDF, SDFormat or MJCF file. Out: its XML, complete except for meshes. A file with entities,
-too much nesting or endless includes is rejected before anything else reads it. Nothing is
+Input: a URDF, SDFormat or MJCF file. Output: its XML, complete except for meshes. A file with
+entities, too much nesting or endless includes is rejected before anything else reads it. Nothing is
 downloaded, and no file outside the folders is read.
 """
 

@@ -1,8 +1,8 @@
 """Drafts a hand file and its model from a grip and its palm frame.
 
-In: a `VendorModel`, a `Grip` and a `PalmFrame`. Out: the model, in which a positive position of a
-closing joint closes the finger, from 0 in the open hand; and the keys of a hand file, each with the
-reason for its value.
+Input: a `VendorModel`, a `Grip` and a `PalmFrame`. Output: the model, in which a positive position
+of a closing joint closes the finger, from 0 in the open hand; and the keys of a hand file, each
+with the reason for its value.
 
 A fingertip presses as hard as its weakest motor allows. With the motion dp/dc of the pad point as
 the finger closes, u = dp/dc / |dp/dc|, and the lever l_m of motor m (the motion of the pad point

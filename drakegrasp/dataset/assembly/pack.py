@@ -1,10 +1,10 @@
 """Packs rows of the dataset and copies them into its files.
 
-A task packs a range of rows, so that the client only has to copy them into the files. In: a range
-of rows that begins and ends at chunk borders, and the shards of these rows. Out: a part, which is
-an HDF5 file with the compressed chunks of the columns of /trials, the compressed images and masks
-of the samples among the rows, and the samples' other columns as records. The client copies a part
-and removes it.
+A task packs a range of rows, so that the client only has to copy them into the files. Input: a
+range of rows that begins and ends at chunk borders, and the shards of these rows. Output: a part,
+which is an HDF5 file with the compressed chunks of the columns of /trials, the compressed images
+and masks of the samples among the rows, and the samples' other columns as records. The client
+copies a part and removes it.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """What a check works with: files with any content, their rows, rules, and violations.
 
-In: an open HDF5 file. Out: a description of the file, as plain data with which any process can open
-it; batches of its rows; violations of rules in these rows. A rule does not get rows that broke an
-earlier rule, so the check reports a cause and not everything that follows from it. The rules here
-apply to the fields of any group: they check each value against the schema.
+Input: an open HDF5 file. Output: a description of the file, as plain data with which any process
+can open it; batches of its rows; violations of rules in these rows. A rule does not get rows that
+broke an earlier rule, so the check reports a cause and not everything that follows from it. The
+rules here apply to the fields of any group: they check each value against the schema.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """`drakegrasp check`: every rule on every row of a dataset, or of one of its files.
 
-In: a dataset's directory, or one of the files grasping_oto.hdf5, grasping_otm.hdf5, trials.hdf5 and
-scenes.hdf5. Out: a list of violations, empty for a valid dataset. Rows are read in batches, which
-bounds the memory, and an `Executor` judges them in tasks. Does not import Drake.
+Input: a dataset's directory, or one of the files grasping_oto.hdf5, grasping_otm.hdf5, trials.hdf5
+and scenes.hdf5. Output: a list of violations, empty for a valid dataset. Rows are read in batches,
+which bounds the memory, and an `Executor` judges them in tasks. Does not import Drake.
 
 The files of a whole dataset are first compared with what assembling its shards again produces:
 samples are derived by the functions that write them, and stored images are compared byte for byte.

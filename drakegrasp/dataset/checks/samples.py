@@ -1,8 +1,9 @@
 """Rules of grasping_oto.hdf5 and grasping_otm.hdf5: numbers, frames, images, splits.
 
-In: a data file and, if there is one, the dataset around it. Out: tasks that judge its samples, each
-by itself and against its trial and the mesh; the rules of its splits; points and distances in one
-image, which the rules of scenes also use. `run` compares each sample with its shard.
+Input: a data file and, if there is one, the dataset around it. Output: tasks that judge its
+samples, each by itself and against its trial and the mesh; the rules of its splits; points and
+distances in one image, which the rules of scenes also use. `run` compares each sample with its
+shard.
 """
 
 from __future__ import annotations

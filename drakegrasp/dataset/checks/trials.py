@@ -1,10 +1,10 @@
 """Rules of trials.hdf5: each attempt by itself, and against values derived again.
 
-In: the file, with the dataset around it if there is one. Out: tasks, each of which judges a range
-of attempts. `run` first compares the attempts with their shards. The rules here also apply to a
-single file: verdict and motion follow from contacts and poses, by the functions with which a trial
-decides. With the dataset, conditions, resting pose and chance follow from the functions with which
-a build draws and computes them.
+Input: the file, with the dataset around it if there is one. Output: tasks, each of which judges a
+range of attempts. `run` first compares the attempts with their shards. The rules here also apply to
+a single file: verdict and motion follow from contacts and poses, by the functions with which a
+trial decides. With the dataset, conditions, resting pose and chance follow from the functions with
+which a build draws and computes them.
 """
 
 from __future__ import annotations
