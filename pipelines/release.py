@@ -52,18 +52,22 @@ def disagreements(root: Path) -> list[str]:
     """Return how the changelog and the citation disagree with the version, one line each."""
     version = read_version(root)
     _, *sections = re.split(r"^## ", (root / "CHANGELOG.md").read_text("utf-8"), flags=re.M)
-    newest = sections[0].splitlines() if sections else [""]
+    # What comes after the release has no version yet.
+    released = [text for text in sections if not text.startswith("Unreleased\n")]
+    newest = released[0].splitlines() if released else [""]
     citation = yaml.safe_load((root / "CITATION.cff").read_text("utf-8"))
     title = f"{version} ({citation['date-released']})"
     faults = []
     if str(citation["version"]) != version:
         faults.append(f"CITATION.cff: version must be {version}, got {citation['version']}")
     if newest[0] != title:
-        faults.append(f"CHANGELOG.md: the first section must be {title}, got {newest[0]}")
+        faults.append(
+            f"CHANGELOG.md: the first section of a version must be {title}, got {newest[0]}"
+        )
     if len(newest) >= SECTION_LINES:
         faults.append(
-            f"CHANGELOG.md: the first section must have fewer than {SECTION_LINES} lines, "
-            f"got {len(newest)}"
+            "CHANGELOG.md: the first section of a version must have fewer than "
+            f"{SECTION_LINES} lines, got {len(newest)}"
         )
     return faults
 

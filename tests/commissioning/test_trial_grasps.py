@@ -62,7 +62,7 @@ def test_slip_of_fingers_that_are_pushed_open_is_told() -> None:
     assert finding.ok
     locked, own = finding.text.split(" with fingers that are locked, ")
     assert "slips by 0.1" in locked
-    assert own.startswith("slips by 6.")
+    assert own.startswith("and slips by 6.")
     assert own.endswith("with fingers that motors of its own strength keep closed")
 
 
