@@ -154,7 +154,7 @@ class ObjectConfig(_Section):
 
 
 class BuiltinConfig(_Section):
-    """The built-in objects in a build of `builtin`; ignored for mesh files.
+    """The built-in objects to use when building from `builtin`; ignored for mesh files.
 
     With two objects of a class, one is for training and one for testing.
     """
@@ -268,7 +268,7 @@ def _own_filters(value: Any, info: ValidationInfo) -> tuple[str, ...]:
 
 
 class CandidateConfig(_ExtensibleSection):
-    """The palm poses that are tried."""
+    """The palm poses to try."""
 
     # Sampler, or a list of samplers that take turns; a sampler that is named twice gets two turns.
     # A user-defined sampler is `file.py:Name`.

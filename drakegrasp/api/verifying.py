@@ -179,8 +179,8 @@ def verify_grasps(
         config: Hand, physics, lift and rules. If None, those of the placed object or of the
             dataset, or else the defaults. If it replaces a dataset's, values drawn for a row are
             not used.
-        client: A Dask client whose workers share the work. If None, this process verifies up to
-            four grasps, and workers of this machine verify more.
+        client: A Dask client whose workers share the work. If None, up to four grasps are verified
+            in this process, and more than four by workers on this machine.
         show: Whether to show progress on standard error.
 
     Raises:

@@ -43,8 +43,8 @@ class PeerTrial:
     Attributes:
         outcome: The verdict.
         lifted: Whether the closed hand was allowed to lift.
-        slip: Distance that {O} moved in {G} during the lift [m]; NaN if not lifted.
-        turn: Angle that {O} turned in {G} [rad]; NaN if not lifted.
+        slip: Distance by which {O} moved in {G} during the lift [m]; NaN if not lifted.
+        turn: Angle by which {O} rotated in {G} during the lift [rad]; NaN if not lifted.
     """
 
     outcome: Outcome

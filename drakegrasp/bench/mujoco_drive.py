@@ -54,7 +54,7 @@ class FingerDrive:
             self._model.jnt_range[self._joints, 1] = data.qpos[self._q]
 
     def update(self, data: mujoco.MjData) -> None:
-        """After a step, let worms follow the fingers that closed, or yield to a large load."""
+        """After a step, let each worm follow its finger if it closed, or yield to a large load."""
         if self._drive != "worm":
             return
 

@@ -2,7 +2,7 @@
 
 Every error is one line on standard error and an exit code: 0 done, 1 the work failed, 2 wrong
 usage, 130 Ctrl-C, 143 SIGTERM. Printed text has no control characters, whatever names it contains.
-In a help text common options come first, and rare options follow under a separate heading.
+In help output, common options come first, and rare options follow under a separate heading.
 """
 
 from __future__ import annotations

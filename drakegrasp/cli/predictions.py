@@ -100,10 +100,10 @@ def verify(
         --config YAML|PRESET: Configuration: a file, or the preset paper, fast, randomized or
             released. [default: that of the dataset, else the defaults]
         --set
-        --out NAME: Write NAME.jsonl and NAME.h5 instead of printing lines of JSON.
+        --out NAME: Write NAME.jsonl and NAME.h5 instead of printing JSON lines.
         CONNECTION
         --quiet: Show neither progress nor the table.
-        --json (as_json): Print the lines of JSON even with --out, without progress and table.
+        --json (as_json): Print the JSON lines even with --out, without progress and table.
     """
     from drakegrasp.protocols.protocol import find_protocol
 

@@ -54,7 +54,7 @@ def submit(
         drakegrasp submit --cluster slurm --workers 200 --interface ib0 OPTIONS
         drakegrasp submit --scheduler tls://10.0.0.1:8786 OPTIONS
 
-    The command first prints what will run and the expected duration; with --dry-run it stops then.
+    The command first prints what will run and the expected duration; with --dry-run it stops there.
     The same command continues an interrupted build, on any cluster. See docs/how-to/clusters.md for
     the details and pipelines/recipes/ for an example of each.
 

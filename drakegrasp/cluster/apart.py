@@ -1,9 +1,9 @@
 """A process beside a Dask worker that calls functions, so that a crash does not kill the worker.
 
-Input: a pickled function and its item, a `FileTask`. Output: the pickled result. If workers do not
-see the files of the dataset, the journal of a task (`drakegrasp.runtime.journal`) is in the
-worker's own directory. So the worker must survive when the process dies. It starts another process,
-which finds the journal and continues.
+Input: a pickled pair of a function and the `FileTask` to call it with. Output: the pickled result.
+If workers do not see the files of the dataset, the journal of a task (`drakegrasp.runtime.journal`)
+is in the worker's own directory. So the worker must survive when the process dies. It starts a new
+process, which finds the journal and continues.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class ProcessApart:
 
 
 def main(connection: Connection, folder: Path) -> None:
-    """Run the requests of the worker until it closes the connection."""
+    """Serve the worker's requests until it closes the connection."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the client stops its workers
     threading.Thread(target=_end_with, args=[connection.fileno()], daemon=True).start()
     with suppress(EOFError, ConnectionError):

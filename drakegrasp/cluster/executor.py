@@ -49,7 +49,7 @@ GATHER_SECONDS = 30.0
 LOST_SECONDS = 300.0
 #: Time without any worker after which the user is told [s]; shorter gaps are restarts.
 SAY_SECONDS = 60.0
-#: How often a task is submitted again after Dask gave it up (after four deaths each time).
+#: How often a task is submitted again after Dask gave up on it (after four deaths each time).
 RESUBMISSIONS = 100
 #: How often a task may render a blank image.
 BLANKS = 3
@@ -63,7 +63,7 @@ class _PendingTask(Generic[T]):
     Attributes:
         items: Items with which the function is called.
         future: Future of the task's last submission.
-        given_up: Number of times that Dask gave up the task.
+        given_up: Number of times that Dask gave up on the task.
         blank: Number of times that the task rendered a blank image.
     """
 
@@ -109,8 +109,8 @@ class DaskExecutor:
 
         Args:
             client: Client of the cluster.
-            resubmissions: Number of times to submit a task again after Dask gave it up because its
-                workers died.
+            resubmissions: Number of times to submit a task again after Dask gave up on it because
+                its workers died.
         """
         self._client, self._resubmissions = client, resubmissions
         self._workers: set[str] = set()

@@ -355,7 +355,7 @@ def quoted(job: type[Any]) -> type[Any]:
 
 
 def _tls_words(security: Security | None) -> list[str]:
-    """Return the options of a worker that name its certificates, as words of a shell."""
+    """Return a worker's options for its certificates, quoted as shell arguments."""
     files = {} if security is None else security.get_tls_config_for_role("worker")
     words = (
         (f"--tls-{key.replace('_', '-')}", shlex.quote(str(value)))

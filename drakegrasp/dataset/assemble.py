@@ -92,7 +92,7 @@ def assemble(
 
     Args:
         out: Directory of the dataset.
-        overrides: `key=value` texts that change the filters or the split of the dataset.
+        overrides: `key=value` strings that change the filters or the split of the dataset.
         rejected: Trials that an inspection rejects, as ids or identities; they do not become
             samples.
         execute: Executor of the tasks; the files do not depend on it.
@@ -101,8 +101,9 @@ def assemble(
     Raises:
         ConfigError: If an override cannot be used; nothing is changed.
         DataError: If a shard is missing or damaged, if a rejected trial is not a success, or if
-            another process builds in the directory; the old files and filters stay.
-        DiskFullError: If the disk has no room; the old files and filters stay.
+            another process is building in the directory; the old files and filters are left
+            unchanged.
+        DiskFullError: If the disk is full; the old files and filters are left unchanged.
     """
     # The lock would create a missing directory.
     if not out.is_dir():

@@ -344,7 +344,7 @@ def manifest_text(manifest: Manifest) -> bytes:
 
 
 def _digest(content: Mapping[str, Any]) -> str:
-    """Return the hash of all other keys of a manifest, whatever its layout."""
+    """Return the hash of a manifest's other keys; it does not depend on the layout of the file."""
     said = {key: value for key, value in content.items() if key != DIGEST}
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 

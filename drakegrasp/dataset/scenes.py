@@ -472,7 +472,10 @@ def count_scenes(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str,
 
 
 def _choice(stream: Stream, among: int, count: int) -> npt.NDArray[np.int64]:
-    """Return indices (count,) below `among`; distinct unless `among` is very large or too small."""
+    """Return `count` random indices below `among`.
+
+    They are distinct, unless `among` is less than `count` or more than `MANY * count`.
+    """
     if among > MANY * count:
         return stream.integers(among, count)
     return stream.permutation(max(count, among))[:count] % among

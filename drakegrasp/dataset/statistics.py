@@ -462,7 +462,7 @@ def split_shortfall(counts: Sequence[SplitCount], rule: str, config: SplitConfig
     empty = [name for name, count in samples.items() if asked[name] and not count]
 
     if rule == "class":
-        # By class, no fraction is requested for the test, and valid is drawn from the rest.
+        # By class, no fraction is requested for testing, and valid is drawn from the rest.
         if "train" in empty:
             return (
                 "no sample is for training: by class, a class trains if two of its objects have "

@@ -207,7 +207,7 @@ def read_columns(path: Path, hand: Hand, nameless: bool = False) -> dict[str, An
 
 
 def _named(raw: dict[str, Any], of: str | None) -> dict[str, Any]:
-    """Return the rows with a name for each object; `of` names the object of rows without a name."""
+    """Return the rows, each with an object name; `of` is the name for rows that have none."""
     objects = [name or of or "" for name in raw["objects"]]
     if raw.get("of_row") is not None and not any(objects):
         raise GraspError("postures must name an object in each row, got rows of a dataset alone")

@@ -65,7 +65,7 @@ HELP = (
     "'drakegrasp[peer]'"
 )
 
-#: Distance of pregrasp and squeeze from the grasp [rad]. For sliding joints it is multiplied by
+#: Distance of pregrasp and squeeze from the grasp [rad]. For prismatic joints it is multiplied by
 #: `description.SLIDE` [m/rad].
 APART = 0.2
 #: Folder of hand and objects in the benchmark's repository, and the name of the experiment.

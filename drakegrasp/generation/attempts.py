@@ -305,7 +305,7 @@ def look_at(setup: TrialSetup, attempt: Attempt, X_TO: Array) -> dict[str, AnyAr
     sample.
 
     Raises:
-        BlankImageError: If an image is blank, because OpenGL failed.
+        BlankImageError: If an image is blank because OpenGL failed.
     """
     return _seen(setup, attempt, X_TO, "oto") | _seen(setup, attempt, X_TO, "otm")
 

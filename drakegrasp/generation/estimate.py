@@ -73,7 +73,7 @@ class Plan:
 
     @property
     def core_hours(self) -> float:
-        """Hours of all workers together, including waiting, as requested from a cluster."""
+        """Total worker-hours, including idle time, as requested from a cluster."""
         return self.workers * self.hours
 
 

@@ -81,7 +81,7 @@ def make_scenes(
 
     Args:
         out: Directory of an assembled dataset.
-        overrides: `scenes.key=value` texts, which apply to this file only.
+        overrides: `scenes.key=value` strings, which apply to this file only.
         execute: Runs the tasks.
         progress: Called with the number of completed objects and of all objects.
 

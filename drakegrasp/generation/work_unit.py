@@ -1,4 +1,4 @@
-"""Work units: the attempts of one object at a range of its candidates, from trials to a shard.
+"""Work units: each runs the attempts at a range of one object's candidates and writes a shard.
 
 Refined palm poses are tried in the same unit as their parents, so no unit waits for another.
 

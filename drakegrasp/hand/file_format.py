@@ -3,8 +3,8 @@
 Input: a YAML file. Output: a `HandFile` whose values are valid by themselves; `description` checks
 them against the model. docs/how-to/add-a-hand.md lists the keys.
 
-A joint either turns or slides. Positions of turning joints are angles [rad], positions of sliding
-joints are lengths [m].
+A joint is either revolute or prismatic. Positions of revolute joints are angles [rad], positions of
+prismatic joints are lengths [m].
 """
 
 from __future__ import annotations
@@ -103,12 +103,12 @@ class Finger:
     name: Name
     fingertip: Name  # link, frame Fi
     closing_joint: Name  # the driven joint; a positive position closes
-    torque_limit: Positive | None = None  # of the motor, at a turning closing joint [N m]
-    force_limit: Positive | None = None  # of the motor, at a sliding closing joint [N]
+    torque_limit: Positive | None = None  # of the motor, at a revolute closing joint [N m]
+    force_limit: Positive | None = None  # of the motor, at a prismatic closing joint [N]
     rotor_inertia: NonNegative = 0.0  # of the motor [kg m^2]
     gear_ratio: Positive = 1.0  # motor angle / closing position [-, or rad/m]
-    holding_torque: Positive | None = None  # largest load of a stalled worm, turning joint [N m]
-    holding_force: Positive | None = None  # largest load of a stalled worm, sliding joint [N]
+    holding_torque: Positive | None = None  # largest load of a stalled worm, revolute joint [N m]
+    holding_force: Positive | None = None  # largest load of a stalled worm, prismatic joint [N]
     coupled: tuple[Coupling, ...] = ()
     driven_by: DrivenBy | None = None  # None: the finger has its own motor
     pad_region: tuple[HalfSpace, ...] = ()  # in Fi [m]; contact outside it is of another link
@@ -240,7 +240,7 @@ class HandFile(BaseModel):
     spread: Spread = Spread()
     preshape: dict[Name, Finite] = {}  # fixed joint positions [rad or m]
     preshapes: tuple[Preshape, ...] = ()  # one is drawn per attempt; empty: all fingers close
-    closing_speed_deg: Positive | None = None  # of turning closing joints [deg/s]
+    closing_speed_deg: Positive | None = None  # of revolute closing joints [deg/s]
     closing_speed: Positive | None = None  # of sliding closing joints [m/s]
     standoffs: Standoffs  # palm to surface [m]
     spreads_deg: Annotated[

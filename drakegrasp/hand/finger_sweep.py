@@ -3,7 +3,7 @@
 Input: a `Hand` and a spread. Output: `HandPaths` in the palm frame. It has the points of the links
 that closing does not move. For each finger it has the points of the links that the finger moves, at
 closing positions from the open hand to the limit. The positions are half a degree apart (0.9 mm for
-a sliding joint). This is geometry only, without a simulation. "Closing angle" also means the
+a prismatic joint). This is geometry only, without a simulation. "Closing angle" also means the
 position [m] of a closing joint that slides.
 
 The module also computes how the fingertips close on something between them: the `Opposition` of a
@@ -257,7 +257,7 @@ def even_points(corners: Array, spacing: float) -> Array:
     return dense[np.union1d(np.arange(len(corners)), first)]
 
 
-#: Number of postures that are tried for each group of fingers.
+#: Number of tested postures for each group of fingers.
 STEPS = 60
 #: Cost of a pinch in which one group has closed fully and the other group not at all [rad].
 UNEVEN = 1.0

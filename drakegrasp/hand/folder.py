@@ -69,7 +69,7 @@ def hand_digest(source: HandSource) -> str:
 
 
 def is_hand(source: HandSource, digest: str | None) -> bool:
-    """Return whether a digest is the digest of a hand's files.
+    """Return whether a hand's files have the given digest.
 
     Version 0.2 computed the digest from the model and the hand file before they are rewritten.
 
@@ -120,8 +120,8 @@ class HandFolder:
 
     Attributes:
         within: Folder that no file may leave, for a dataset's hand; None for another hand.
-        texts: Bytes of hand file, models and lines about licences, by their places.
-        files: Present paths of all other files, by their places.
+        texts: Bytes of hand file, models and lines about licences, keyed by place.
+        files: Current paths of all other files, keyed by place.
         counted: Places of the files in the digest, in their order; some of the files may be
             missing.
         licences: Places of the licences.
@@ -358,7 +358,7 @@ def carried_hand(out: Path, hand: str, digest: str) -> CarriedHand | None:
 
 
 def hand_places(config: Config) -> dict[str, Path]:
-    """Return the files of the hand that a dataset contains, by their places in its directory."""
+    """Return the hand files in a dataset, keyed by their paths in the dataset's directory."""
     carried = config.hand_source
     if not isinstance(carried, CarriedHand):
         return {}
@@ -421,7 +421,7 @@ def _is_there(carried: CarriedHand) -> bool:
 
 
 def _refuse_other_files(content: HandFolder, folder: Path) -> None:
-    """Reject a folder with files of the user: a build replaces and removes its content.
+    """Reject a folder that contains user files, because a build replaces and removes its content.
 
     Raises:
         DataError: If the folder exists and is not a copy of the hand from a build that was killed.

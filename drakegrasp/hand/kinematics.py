@@ -1,8 +1,8 @@
 """Forward kinematics of a hand.
 
 Input: a `Hand` and its coordinates, the spread and the closing of each finger. Output: positions of
-the joints, poses of the links, limits of the coordinates. Uses NumPy only. Positions of turning
-joints are angles [rad], positions of sliding joints are lengths [m].
+the joints, poses of the links, limits of the coordinates. Uses NumPy only. Positions of
+revolute joints are angles [rad], positions of prismatic joints are lengths [m].
 """
 
 from __future__ import annotations
@@ -255,21 +255,21 @@ def _motion(chain: Chain, j: int, position: Array) -> Array:
 def fingertip_forces(hand: Hand, drive: Drive) -> Array:
     """Return the largest force that each fingertip supports at its pad point, (k,) [N].
 
-    It is the torque (or force, for a sliding joint) that the finger supports at its closing joint,
-    divided by the lever of the pad point. The lever is that of `closing_levers` at the centre of
-    the closing joint's range. At the ends of the range, the Barrett Hand's force differs by -10 and
-    +19 %.
+    It is the torque (or force, for a prismatic joint) that the finger supports at its closing
+    joint, divided by the lever arm of the pad point, which is that of `closing_levers` at the
+    centre of the closing joint's range. At the ends of the range, the Barrett Hand's force differs
+    by -10 and +19 %.
 
     Only motors press. A load on a worm beyond its own motor's torque comes from the motors of the
     other fingers, which press through the object. So a finger supports at most the sum of their
     forces, and never more than its `holding_effort`. With the efforts τ_i of the motors and the
-    levers l_i:
+    lever arms l_i:
 
         N_i = τ_i / l_i                                                     (torque)
         N_i = min(max(τ_i / l_i, Σ_{j≠i} τ_j / l_j), `holding_effort` / l_i)   (worm, locked)
 
     Fingers that share a motor share its effort, as if they pressed equally. Then τ_i is the effort
-    of the motor, and l_i the sum of the levers of all its fingers, each times its
+    of the motor, and l_i the sum of the lever arms of all its fingers, each times its
     `Hand.closing_ratio`.
 
     Args:
@@ -318,8 +318,8 @@ def closing_levers(hand: Hand, closing: npt.ArrayLike) -> Array:
 
         l = |Σ_j r_j a_j × (P − o_j)|,   where a joint that slides along a_j adds r_j a_j instead.
 
-    By virtual work, this is the lever of a force along that motion, with coupled joints included:
-    the torque that `simulation.drive.opening_torques` measures, divided by the force.
+    By virtual work, this is the lever arm of a force along that motion, with coupled joints
+    included: the torque that `simulation.drive.opening_torques` measures, divided by the force.
 
     Args:
         hand: A hand with k fingers.

@@ -289,7 +289,7 @@ class Chain:
 
 
 def moving_joint(joint: Any) -> bool:
-    """Return whether a joint of a hand turns or slides."""
+    """Return whether a joint of a hand is revolute or prismatic."""
     return isinstance(joint, RevoluteJoint | PrismaticJoint)
 
 
@@ -330,7 +330,7 @@ def find_joints(plant: MultibodyPlant, instance: ModelInstanceIndex) -> list[Any
 
 
 def find_drives(described: HandFile, joints: Sequence[str]) -> dict[str, JointDrive]:
-    """Return what drives each joint that turns or slides, by the joint's name.
+    """Return what drives each revolute or prismatic joint, keyed by the joint's name.
 
     Args:
         described: The hand file.

@@ -129,7 +129,7 @@ def ray_span(corners: Array, start: Array, direction: Array) -> tuple[float, flo
 
     Args:
         corners: (n, 3) [m].
-        start: (3,), a point of the line [m].
+        start: (3,), a point on the line [m].
         direction: (3,), direction of the line; positions on the line are multiples of it, negative
             before the start.
     """

@@ -52,7 +52,7 @@ class Component:
 
 
 def find_components(vertices: Array, faces: Faces, notes: list[str]) -> list[Component]:
-    """Return the components of a surface, each with consistent faces and its own vertices.
+    """Return the components of a surface, each consistently oriented and with its own vertices.
 
     Args:
         vertices: (n, 3) [m].

@@ -117,7 +117,7 @@ def enumerate_pairs(counts: Faces) -> tuple[Faces, Faces]:
 
 
 def pair_blocks(counts: Faces, most: int) -> Iterator[tuple[Faces, Faces]]:
-    """Yield the pairs of `enumerate_pairs` in blocks of about `most` pairs."""
+    """Yield the pairs of `enumerate_pairs` in blocks of roughly `most` pairs each."""
     blocks = np.flatnonzero(np.diff(np.cumsum(counts) // most, prepend=0))
     for run in np.split(np.arange(len(counts)), blocks):
         i, j = enumerate_pairs(counts[run])

@@ -231,7 +231,7 @@ def set_inertia(body: mujoco.MjsBody, mass: float, com: Array, central: Array) -
 
 #: Gain [N m/rad] and maximum torque [N m] of each motor, damping [N m s/rad], and inertia of rotors
 #: [kg m^2]: those of the Shadow Hand of DexGraspBench (assets/hand/shadow/right_hand.xml). For
-#: sliding joints they are converted with `description.SLIDE`.
+#: prismatic joints they are converted with `description.SLIDE`.
 GAIN, TORQUE, DAMPING, ARMATURE = 5.0, 3.0, 0.05, 2e-4
 #: Links touch everything with MuJoCo's default masks, but not each other.
 _TOUCHES = (1, 0)

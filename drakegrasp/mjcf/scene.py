@@ -222,7 +222,7 @@ def _add_hand(spec: mujoco.MjSpec, hand: Hand, config: Config) -> list[SpreadJoi
 
 
 def _add_wrist(spec: mujoco.MjSpec) -> mujoco.MjsBody:
-    """Add three light bodies on sliding joints, which follow a path; return the last."""
+    """Add three light bodies on prismatic joints, which follow a path; return the last."""
     parent = spec.worldbody
     for name, axis in zip("xyz", np.eye(3), strict=True):
         parent = parent.add_body(name=f"wrist_{name}")

@@ -188,8 +188,8 @@ class MorphReport:
     Attributes:
         morphs: Number of morphs.
         first_draws: Number of morphs whose first draw could be used.
-        crossing: For each mesh with faces that pass through others, by name, the number of these
-            faces; its morphs have about as many.
+        crossing: Number of faces that pass through other faces, keyed by the name of the mesh; only
+            meshes with such faces. Their morphs have about as many.
         refused: Reasons why meshes have no morphs, one line each.
     """
 
@@ -270,7 +270,7 @@ def morph_meshes(
 def _morphs_of(
     source: MeshSource, per_mesh: int, seed: int
 ) -> tuple[dict[str, str], list[int], int]:
-    """Return the Wavefront texts of a mesh's morphs by name, their draws, and its crossing faces.
+    """Return the Wavefront files of a mesh's morphs by name, their draws, and its crossing faces.
 
     Raises:
         MeshError: If the mesh has no morphs.

@@ -306,7 +306,7 @@ def upright_vertices(mesh: trimesh.Trimesh, source: MeshSource) -> Array:
 
 
 def file_frame(source: MeshSource) -> Array:
-    """Return the pose X_OM (4, 4) of a file's frame M, whose lengths are in metres, in {O}.
+    """Return the pose X_OM (4, 4) in {O} of a mesh file's frame M, with lengths in metres.
 
     The origin of {O} is the centre of the bounding box of everything in the file.
 

@@ -87,7 +87,7 @@ class Attempts(Gallery):
         return self.snapshot.feature(name) if name in QUANTITIES else super().column(name)
 
     def matches(self, name: str, value: str) -> npt.NDArray[np.bool_]:
-        """Return which attempts (n,) have a value of a choice."""
+        """Return which attempts (n,) match a value of the filter `name`."""
         if name == "decision":
             return self._decided(value)
         if name == "split" and value in SPLIT_NAMES:
@@ -299,7 +299,7 @@ def _parts(row: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return further numbers of an attempt as names and texts, which are not shown elsewhere."""
+    """Return names and values, as strings, of an attempt's numbers that are not shown elsewhere."""
     key, rules = snapshot.key(i), snapshot.config.candidates
     s, standoffs = key.standoff_index, rules.standoffs
     standoff = f"{1e3 * standoffs[s]:.0f} mm" if s < len(standoffs) else str(s)
@@ -348,7 +348,7 @@ def _certificate(snapshot: Snapshot, i: int) -> list[tuple[str, str]]:
 
 
 def _pose_lines(name: str, row: dict[str, Any]) -> list[str]:
-    """Return the available palm poses and joints of an attempt as lines of JSON to copy."""
+    """Return the available poses and joint positions of an attempt as lines of one JSON object."""
     values: dict[str, Any] = {"object": name}
     for key in ("X_TO", "X_OG", "closed_q", "X_OG_lifted", "lifted_q"):
         value = unpack_pose(row[key]) if key.startswith("X_") else row[key]

@@ -205,10 +205,10 @@ class Snapshot:
         return AttemptKey(self.names[number], *rest)
 
     def label(self, i: int) -> str:
-        """Return the identity of an attempt for addresses: `9f86d081884c-345-2`.
+        """Return the ID of an attempt as used in URLs, e.g. `9f86d081884c-345-2`.
 
-        A refined attempt has its number in the family at the end: `9f86d081884c-345-2-7`. In a
-        later state of the files, an attempt has the same label, which no other attempt has.
+        A refined attempt has its number in the family at the end: `9f86d081884c-345-2-7`. An
+        attempt keeps its ID when the files change, and no other attempt gets this ID.
         """
         key, code = self.key(i), self.codes[self.table.object[i]]
         return f"{code}-{key.candidate}-{key.standoff_index}" + f"-{key.child}" * bool(key.child)

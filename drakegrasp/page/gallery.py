@@ -40,7 +40,7 @@ CODES: Mapping[str, Mapping[str, int]] = {
 
 
 def _shown(value: Any) -> Any:
-    """Return a value of a template for display: texts without control characters."""
+    """Return a template's value for display: strings without control characters."""
     return printable(value) if type(value) is str else value
 
 

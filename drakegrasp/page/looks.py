@@ -322,7 +322,7 @@ def hand_states(
     """Return the states `closed` and `lifted` of a 3D view, as far as a row reached them.
 
     Args:
-        row: Row of the dataset or of verdicts; a row of verdicts may lack columns.
+        row: Row of the dataset or of a table of verdicts, which may lack columns.
         X_TO: (4, 4), resting pose of the object.
         hand: Hand of the dataset.
         kind: See `contacts_of`.
@@ -366,7 +366,7 @@ def contacts_of(
     """Return the contacts of a row in {T}; empty if the row lacks them.
 
     Args:
-        row: Row of the dataset or of verdicts.
+        row: Row of the dataset or of a table of verdicts.
         when: Prefix of the names of the columns.
         X_TO: (4, 4), resting pose of the object.
         kind: Kind of the contacts in the view; only the kinds "" and `force` have forces.

@@ -123,7 +123,7 @@ class Predictions(Gallery):
             there = [n for n in (*VERDICTS, *QUANTITIES, "p_OQ") if n in group and n != "held"]
             columns = {name: group[name][:] for name in there}
 
-        # The largest value of the contacts; another hand may have another number of fingers.
+        # The largest value of the contacts; different hands may have different numbers of fingers.
         p_OQ, held = columns.pop("p_OQ"), outcome == Outcome.SUCCESS
         self._places = self.rows.trial_id
         true = snapshot.trials[self._places.tolist()]["closed_p_OQ"]

@@ -38,7 +38,7 @@ from drakegrasp.pictures.style import (
 
 #: A direction is covered if an approach is at most this far from it [deg].
 NEAR_DEG = 10.0
-#: Number of directions of the half sphere that are tested.
+#: Number of tested directions on the hemisphere above the table.
 PROBES = 2000
 #: Direction of the reader: about the vertical from +x, and above the horizontal [rad].
 AZIMUTH, ELEVATION = np.deg2rad(-55.0), np.deg2rad(20.0)
@@ -65,10 +65,11 @@ def approach_directions(X_TO: Array, X_OG: Array) -> Array:
 
 
 def coverage(directions: Array) -> float:
-    """Return the fraction of the half sphere above the table that is near an approach.
+    """Return the fraction of the hemisphere above the table that is near an approach direction.
 
-    A direction is near if the angle is at most NEAR_DEG. The tested directions are on a spiral that
-    represents equal areas (Fibonacci lattice; Gonzalez 2010, Mathematical Geosciences 42).
+    A tested direction is near an approach if the angle between them is at most NEAR_DEG. The tested
+    directions are on a spiral that represents equal areas (Fibonacci lattice; Gonzalez 2010,
+    Mathematical Geosciences 42).
 
     Args:
         directions: (n, 3), unit, in {T}.

@@ -37,7 +37,7 @@ RAYS = 220
 
 
 def samplers_figure(out: Path, other: Path | None = None) -> tuple[Figure, dict[str, Any]]:
-    """Return the palm poses of both samplers on one object, and their numbers.
+    """Return a figure of both samplers' palm poses on one object, and the compared numbers.
 
     Args:
         out: As in `compare_samplers`.
@@ -64,7 +64,7 @@ def samplers_figure(out: Path, other: Path | None = None) -> tuple[Figure, dict[
 
 
 class SamplerComparison(NamedTuple):
-    """Both samplers on one object, and their numbers.
+    """The palm poses of both samplers on one object, and the compared numbers.
 
     Attributes:
         shown: The object that is drawn.
@@ -208,10 +208,10 @@ def _other_method(config: Config) -> str:
 
 
 def _refuse_other_configuration(other: Path, config: Config) -> None:
-    """Raise an error if a dataset differs in more than the method of its palm poses.
+    """Reject a dataset that differs from this one in anything but the sampler of its palm poses.
 
     Raises:
-        DataError: If it does.
+        DataError: If any other setting that affects attempts differs.
     """
     # Settings that do not affect attempts may differ.
     wanted = config.candidates.model_copy(update={"method": _other_method(config)})

@@ -1,4 +1,4 @@
-"""Sheets of samples: of a data file, of each class, and of scenes for training.
+"""Overview figures with a grid of samples: of a data file, of each class, and of training scenes.
 
 Input: a data file or scenes.hdf5. Output: figures. Needs matplotlib, but not Drake.
 """

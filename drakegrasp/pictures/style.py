@@ -1,4 +1,4 @@
-"""What all figures share: colours, axes, legends, samples, and marks over pictures.
+"""Style shared by all figures: colours, axes, legends, samples, and marks drawn over images.
 
 A contact is drawn where the camera matrix projects it: a dot in its finger's colour and a short
 arrow along the outward normal. The dot is hollow if the object hides the contact.

@@ -295,9 +295,9 @@ class DexonomyHard(MujocoProtocol):
 
 
 class DexonomyHardAsRun(DexonomyHard):
-    """`dexonomy-hard` with the solver's settings in the code of the commit.
+    """`dexonomy-hard` with the solver settings in the code of the commit.
 
-    These are 2 noslip iterations and impratio 10.
+    The settings are 2 noslip iterations and impratio 10.
     """
 
     name = "dexonomy-hard-as-run"

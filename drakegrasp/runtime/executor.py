@@ -47,14 +47,14 @@ class Executor(Protocol):
 class FileTask(Protocol):
     """A task that works on files of a dataset; a worker that does not see them gets copies.
 
-    Places are paths within a directory, with slashes.
+    A place is a file's path within a directory, with slashes.
     """
 
     def reads(self) -> dict[str, Path]:
-        """Return the files that it reads and that are there, by their places."""
+        """Return the existing input files of the task, keyed by place."""
 
     def writes(self) -> tuple[str, ...]:
-        """Return the places of the files that it writes or removes."""
+        """Return the places of the files that the task writes or removes."""
 
     def moved(self, folder: Path) -> Self:
         """Return the task in a directory that holds the files at their places."""

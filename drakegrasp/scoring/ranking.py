@@ -41,7 +41,7 @@ FAR = 0.02
 PAD_GAP = 0.003
 #: The open hand is free unless it is deeper than this in object or table [m]; the solids are rough.
 DEEP = 0.003
-#: Lever by which a moment is divided to be compared with a force [m].
+#: Lever arm by which a moment is divided to be compared with a force [m].
 LEVER = 0.05
 #: Rounds and rate of the search for the fractions of force of the fingers.
 ROUNDS, RATE = 100, 1.0
@@ -194,7 +194,7 @@ def _closed(
 def _features(
     solid: Solid, hand: Hand, paths: HandPaths, X_TG: Array, closing: Array
 ) -> dict[str, Array]:
-    """Return score and features of palm poses (n, 4, 4) and starts of fingers (n, k) [rad or m]."""
+    """Return score and features of palm poses (n, 4, 4) and initial finger positions (n, k)."""
     # The open hand.
     lookup, rows = PointLookup(solid.field, np.eye(4), X_TG), np.arange(len(X_TG))
     starts = closing / _steps(paths)

@@ -2,7 +2,7 @@
 
 Input: arrays and files with m predictions for each row of a split, and verdicts of any rule on
 them. Output: `Attempts` in the order of rows and ranks, and a `Verdict` for each. Ranks follow the
-stated confidence, or the given order if none is stated. Verdicts are stored as lines of JSON under
+stated confidence, or the given order if none is stated. Verdicts are stored as JSON lines under
 a key of what was tried, so an interrupted score can continue.
 """
 
@@ -234,7 +234,7 @@ def _tuple(values: Array | None) -> tuple[float, ...]:
 
 
 class VerdictFile:
-    """Verdicts by the key of what was tried, stored as lines of JSON.
+    """Verdicts keyed by what was tried, stored as JSON lines.
 
     A line that was cut off by a crash is ignored, and its grasp is tried again.
 

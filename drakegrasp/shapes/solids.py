@@ -392,7 +392,8 @@ def _normals(points: Array, faces: Faces) -> Array:
 def _collapse(points: Array, faces: Faces, a: int, b: int) -> Faces | None:
     """Return the faces with vertex `b` merged into `a`.
 
-    None if this would pinch the surface, or fold it when both meet at their midpoint.
+    None if the merge would pinch the surface, or if moving both vertices to their midpoint would
+    fold it.
     """
     around_a = set(faces[(faces == a).any(axis=1)].ravel().tolist())
     around_b = set(faces[(faces == b).any(axis=1)].ravel().tolist())

@@ -99,7 +99,7 @@ class Attempts:
         confidence: (n,), for predictions: greater is better.
         link: Frame that the file gives poses of instead of the palm frame, shown in hints: the palm
             link or a frame of another tool; empty for the palm frame.
-        X_FG_xyzw: (n, 4, 4), for hints: X_FG if the quaternions had the order x, y, z, w.
+        X_FG_xyzw: (n, 4, 4), for hints: X_FG read with the quaternions in the order x, y, z, w.
         grasps: (n, 6k), for contacts: the numbers as they were given; None for postures.
         points, normals: (n, k, 3), contact points [m] and unit normals in the frame of the
             caller; NaN in rows without a valid grasp.
@@ -352,7 +352,7 @@ def make_attempts(
         conditions: (n, 3), `CONDITIONS`; NaN for those of the object and of the configuration.
         of_row: (n,), see `Attempts`.
         confidence: (n,), see `Attempts`.
-        X_FG_xyzw: (n, 4, 4), X_FG if the quaternions had the order x, y, z, w.
+        X_FG_xyzw: (n, 4, 4), X_FG read with the quaternions in the order x, y, z, w.
         alone: (n,), whether a row is a palm pose alone, without joints at any stage.
 
     Raises:
@@ -532,7 +532,7 @@ def _in_order(
 
 
 def _joint_rows(values: Any, shape: tuple[int, int], stage: str, turning: list[bool]) -> Array:
-    """Return joint positions as numbers (n, m); turning joints must be in radians."""
+    """Return joint positions as numbers (n, m); revolute joints must be in radians."""
     rows = _array(values, shape, f"{stage} joints")
 
     # If the numbers were degrees, most rows would have a joint beyond a whole turn.
@@ -568,7 +568,7 @@ def _numbers(
 ) -> Array:
     """Return an array of a shape; `bad` gets the reason for each row that is not finite.
 
-    A row of the mask `some` may be all NaN. With `each`, any single number may be NaN.
+    A row of the mask `some` may be all NaN. With `each`, individual numbers may be NaN.
     """
     if value is None:
         return np.full(shape, np.nan)

@@ -103,7 +103,7 @@ class Sampler(Protocol):
 
     @property
     def limit(self) -> int | None:
-        """Number of available poses; None for any number."""
+        """Number of available poses; None means unlimited."""
 
     def poses(self, count: int) -> Array:
         """Return the first poses (count, 4, 4)."""

@@ -10,9 +10,9 @@ and the plant needs no rotational wrist joints (our own construction).
 Friction and mass are values of a scene's context. They are set for an attempt without building the
 scene again, and the results have the same bits as those of a scene that was built with them.
 
-Three pitfalls of Drake 1.51.1 affect this module. Geometry on the world body crashes as soon as a
-joint is locked, so the table is a separate body. `AddMultibodyPlantSceneGraph` leaks the plant.
-Sampled output ports report the contacts of the previous step.
+Three pitfalls of Drake 1.51.1 affect this module. With geometry on the world body, Drake crashes as
+soon as a joint is locked, so the table is a separate body. `AddMultibodyPlantSceneGraph` leaks the
+plant. Sampled output ports report the contacts of the previous step.
 """
 
 from __future__ import annotations

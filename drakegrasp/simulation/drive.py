@@ -154,16 +154,16 @@ def _start_worms(scene: Scene) -> None:
 
 
 def _turn_worms(scene: Scene, _: Context) -> EventStatus:
-    """Between two steps: follow the fingers that closed, and yield to a load that is too large.
+    """Between two steps, let each worm follow its finger if it closed, or yield to a large load.
 
     With the position q, the lower limit l and the load τ (`opening_torques`) of a closing joint:
 
         it holds:   l ← max(l, q);   it yields from the step on at which τ > τ_hold
-        it yields:  l ← that of the hand's files, and the motor applies up to τ_hold;
+        it yields:  l ← the limit in the hand's files, and the motor applies up to τ_hold;
                     it holds again, with l ← q, once dq/dt ≥ −`STANDING` u
 
-    where τ_hold is the finger's `holding_effort` and u its `Hand.closing_unit`. For a joint that
-    closes towards smaller positions, q, l and dq/dt have the opposite sign.
+    where τ_hold is the finger's `holding_effort` and u its `Hand.closing_unit`. For a joint whose
+    position decreases as it closes, the signs of q, l and dq/dt are reversed in these formulas.
     """
     signs = _closing_signs(scene)
     angles, rates = signs * closing_angles(scene), signs * closing_rates(scene)

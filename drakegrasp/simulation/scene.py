@@ -39,7 +39,7 @@ from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.objects.model import ObjectModel
 
-#: A joint that turns or slides.
+#: A revolute or prismatic joint.
 ClosingJoint: TypeAlias = RevoluteJoint | PrismaticJoint
 
 
@@ -361,7 +361,8 @@ def advance(scene: ObjectScene, duration: float) -> None:
 def closing_rates(scene: Scene) -> Array:
     """Return the speed of each closing joint (m,), in its unit [1/s].
 
-    With these units (`Scene.closing_units`), one speed limit applies to turning and sliding joints.
+    With these units (`Scene.closing_units`), one speed limit applies to revolute and prismatic
+    joints.
     """
     rates = [joint.GetOneVelocity(scene.context) for joint in scene.closing_joints]
     return np.array(rates) / scene.closing_units

@@ -70,7 +70,7 @@ class GraspContacts:
 
     @property
     def p_OcmQ(self) -> Array:
-        """(n, 3), arms of all points about the centre of mass, finger by finger, in {O} [m]."""
+        """(n, 3), lever arms of all points about the centre of mass, by finger, in {O} [m]."""
         points = np.asarray(self.p_OQ, dtype=float) - np.asarray(self.p_OOcm, dtype=float)
         return points.reshape(-1, 3)
 
@@ -274,7 +274,7 @@ def grasp_map(p_OcmQ: Array) -> Array:
 FRICTION_EDGES = 16
 #: An epsilon below this is a rounding error: the origin is on the surface of the hull.
 ROUNDING = 1e-9
-#: Largest friction coefficient that is tried, and the tolerance of the smallest one.
+#: Largest friction coefficient to try, and the tolerance of the smallest one.
 MAX_FRICTION, FRICTION_TOLERANCE = 10.0, 1e-4
 
 
@@ -471,7 +471,7 @@ def patch_points(model: ObjectModel, contacts: Table) -> tuple[Array, Array]:
     """Return points (k, m, 3) [m] of the patches around k contacts, and normals (k, m, 3) there.
 
     A patch is its contact and a ring of `RING_POINTS` points around it, each with the normal of its
-    face. The ring has the surface points that are closest to a circle with the radius
+    face. The ring consists of the surface points that are closest to a circle with the radius
     `TORSION_RADIUS` in the contact's tangent plane. Of equally close faces, the one that is most
     parallel to the contact's face is used. So a patch ends at an edge of 90 degrees or more, and
     bends around a blunter edge.

@@ -1,8 +1,8 @@
 """Possible faults in the numbers of a grasp that fails; hints do not change a verdict.
 
 Input: a placed grasp. Output: how its contacts lie on the surface, and hints in words. A hint
-states that the same numbers would fit much better if they were read in another way: in another
-frame or unit, with normals that point the other way, or with the fingers in another order. All
+states that the same numbers would fit much better if they were read in a different way: in a
+different frame or unit, with reversed normals, or with the fingers in a different order. All
 factors are own choices.
 """
 

@@ -131,7 +131,7 @@ def _shape(row: Any) -> tuple[int, ...] | None:
 
 
 def in_frame(table: Attempts, frame: str, X_TC: Array | None) -> Attempts:
-    """Return contacts with the frame that a caller states for them.
+    """Return the table with the frame that the caller specifies for its contacts.
 
     Args:
         table: Table of n grasps.

@@ -377,8 +377,8 @@ class WristProblem:
         up_O: (3,), the table's upward normal in {O}.
         height: Height of the origin of {O} above the table [m].
         X_OS: (4, 4), palm pose of the start, at zero angles and translations.
-        posture: (1 + m,), coordinates of the start [rad, or m if a finger slides]; the solution
-            stays near them if the contacts leave them open.
+        posture: (1 + m,), starting coordinates [rad, or m if a finger slides]; coordinates that the
+            contacts do not determine stay near these values.
     """
 
     constants: HandConstants

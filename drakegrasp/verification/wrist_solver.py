@@ -45,7 +45,7 @@ MAX_CLOSINGS = 5000
 #: Largest angles in the table [rad]: spread fingers point sideways, and closed fingers almost make
 #: a fist.
 MAX_SPREAD, MAX_CLOSING = np.deg2rad(45.0), np.deg2rad(112.0)
-#: Lever that converts angles between normals to lengths when contacts are compared [m].
+#: Lever arm that converts angles between normals to lengths when contacts are compared [m].
 LEVER = 0.02
 #: Number of postures that are aligned with the contacts.
 NEAREST = 96
@@ -234,7 +234,8 @@ def _align(p_GP: Array, n_G: Array, p_OQ: Array, n_O: Array) -> tuple[Array, Arr
 
 #: Number of starts, and so of solutions.
 STARTS = 5
-#: Number of turns that are tried: two contacts leave the palm's turn about their line open.
+#: Number of tried rotations of the palm about the line through two contacts, which do not determine
+#: this rotation.
 TURNS = 36
 #: Unit of the objective [m^2]: residuals of a few millimetres give values of order one.
 UNIT = 0.005**2
@@ -263,7 +264,7 @@ class WristFit:
         objective: Sum of squared residuals at the end of SLSQP, before each finger was moved onto
             its point [m^2].
         residual: (k,), distance of each predicted point from its fingertip's surface [m].
-        normal_error: (k,), angle between each pad's inward and the predicted normal [rad].
+        normal_error: (k,), angle between each pad's inward normal and the predicted normal [rad].
         status: SLSQP's exit mode; 0 is success.
         message: SLSQP's message for the exit mode.
         iterations, evaluations: Numbers of SLSQP's iterations and of evaluations of the problem.

@@ -17,9 +17,9 @@ _HEAD = f"""<!-- Made by `make docs-pages` from shapes/catalog.py: change that. 
 
 # Built-in objects
 
-{len(CLASSES)} classes of everyday objects are included in the package, so that a dataset needs no
-meshes. They follow the kinds of objects in the paper. Their shapes and sizes are our own and fit a
-hand of the Barrett Hand's size.
+{len(CLASSES)} classes of everyday objects are included in the package, so you can build a dataset
+without mesh files. They follow the kinds of objects in the paper. Their shapes and sizes are our
+own and fit a hand of the Barrett Hand's size.
 
 ![The first object of every class](../images/builtin.png)
 
@@ -40,7 +40,7 @@ on every machine.
 
 `--per-class` (`builtin.per_class`) is {BuiltinConfig().per_class} by default: one object of a class
 is [tested](outcomes.md#split), and the others train. Both options are stored in `manifest.json`,
-and a build continues only with the same values.
+and a build can be resumed only with the same values.
 
 Every object is one watertight solid of at most 3000 triangles. It stands or lies on z = 0 as on a
 table, with z up, and keeps this pose when it is dropped. Hollow objects have walls of 4.5 to 6 mm.

@@ -211,7 +211,7 @@ def _arms(mujoco: Any, model: Any, a: int) -> list[tuple[int, float]]:
     if kind != kinds.mjTRN_TENDON:
         return []
 
-    # A tendon that is a sum of joints; a spatial tendon has other levers in each posture.
+    # A tendon that is a sum of joints; the lever arms of a spatial tendon differ between postures.
     first = model.tendon_adr[target]
     wraps = slice(first, first + model.tendon_num[target])
     rows = zip(model.wrap_type[wraps], model.wrap_objid[wraps], model.wrap_prm[wraps], strict=True)

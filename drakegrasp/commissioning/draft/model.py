@@ -52,7 +52,7 @@ from drakegrasp.hand.parsing import (
 ROOM = 0.5
 #: Smallest and largest size of a hand, including an arm [m]; other sizes mean other units.
 SIZES = (0.03, 3.0)
-#: Smallest and largest limit of turning joints [rad], and range of masses of a hand, including an
+#: Smallest and largest limit of revolute joints [rad], and range of masses of a hand, including an
 #: arm [kg]; other values mean other units.
 SMALLEST_TURN, LARGEST_TURN, MASSES = 0.1, 2.0 * np.pi, (0.01, 60.0)
 #: Reach of a hull beyond its mesh from which there is a note [m]; own choice, half of a fingertip.
@@ -95,7 +95,7 @@ class Link:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VendorJoint:
-    """A joint that turns or slides; at position 0 the child's frame is at X_PJ in the parent.
+    """A revolute or prismatic joint; at position 0 the child's frame is at X_PJ in the parent.
 
     Attributes:
         name: Name of the joint.

@@ -19,7 +19,7 @@ from drakegrasp.commissioning.draft.model import VendorModel
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
 from drakegrasp.hand.shapes import ray_span
 
-#: Step of the directions that are tried [deg], and largest angle from an axis of the palm that is
+#: Step between the tested directions [deg], and largest angle from an axis of the palm that is
 #: replaced by the axis.
 STEP_DEG, ALIGNED = 15, np.deg2rad(15.0)
 #: Smallest distance of the pinch in front of the palm [m].

@@ -204,7 +204,7 @@ def _flow(value: Any) -> str:
     return text.removesuffix("\n").removesuffix("\n...").strip()
 
 
-#: Number of grips that are tried, number of palm frames with each, and fractions of the closing at
+#: Number of tested grips, number of palm frames with each, and fractions of the closing at
 #: which links are placed.
 GRIPS, FRAMES, SHARES = 6, 2, (0.0, 0.25, 0.5, 0.75, 1.0)
 #: Number of postures in which links of different fingers are compared.

@@ -5,8 +5,8 @@ of a closing joint closes the finger, from 0 in the open hand; and the keys of a
 with the reason for its value.
 
 A fingertip presses as hard as its weakest motor allows. With the motion dp/dc of the pad point as
-the finger closes, u = dp/dc / |dp/dc|, and the lever l_m of motor m (the motion of the pad point
-along u per motion of the motor's joint), the closing joint's limit is
+the finger closes, u = dp/dc / |dp/dc|, and the lever arm l_m of motor m (the motion of the pad
+point along u per motion of the motor's joint), the closing joint's limit is
 
     T = |dp/dc| · min_m (effort_m / l_m).
 
@@ -38,7 +38,7 @@ from drakegrasp.simulation.construction import FINGER_DAMPING
 POSSIBLE = {False: (0.005, 20.0), True: (0.5, 1000.0)}
 #: Fingers that share a motor must be open together, within this tolerance [rad or m].
 SAME = 1e-6
-#: A motor whose lever is shorter than this does not affect the grasp [m/rad].
+#: A motor whose lever arm is shorter than this does not affect the grasp [m/rad].
 LEVER = 1e-3
 #: Usual closing speeds [rad/s], [m/s].
 TURNING, SLIDING = np.deg2rad(60.0), 0.1
@@ -48,7 +48,7 @@ HOLDING = 2.0
 STANDOFFS = (0.45, 0.65, 0.8)
 #: Payload as a fraction of the mass that friction supports.
 PAYLOAD = 0.5
-#: Spreads that are tried if two joints spread fingers [deg], and minimum range of such joints
+#: Tested spreads if two joints spread fingers [deg], and minimum range of such joints
 #: [rad].
 SPREADS_DEG, SPREADING = [0.0, 11.25, 22.5], 0.9
 #: Names of fingers, found in the names of their links.
@@ -69,7 +69,8 @@ class Draft:
         model: The model of the hand.
         tree: Keys and values of the hand file.
         reasons: Reason for a value, by the path of its key, as in "palm.p_BG".
-        changed: Lines for the head of the model: joints whose positions are not the vendor's.
+        changed: Lines for the comment at the top of the model; they name the joints whose positions
+            differ from the vendor's.
         grip: The fingers, in the vendor's positions.
     """
 
@@ -343,7 +344,7 @@ def _effort(model: VendorModel, leader: str, effort: float | None) -> float:
 
 
 def _levers(model: VendorModel, member: Member, step: int) -> tuple[float, dict[str, float]]:
-    """Return |dp/dc| and the lever of each motor at a step [m/rad, or m/m]."""
+    """Return |dp/dc| and the lever arm of each motor at a step [m/rad, or m/m]."""
     closing, columns, X = member.closing, [], np.eye(4)
     for joint, position in zip(member.joints, closing.path()[step], strict=True):
         X_BJ = X @ joint.X_PJ

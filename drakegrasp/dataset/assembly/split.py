@@ -1,8 +1,8 @@
 """Postprocessing: which samples are for training, validation and test, by class or by object.
 
 Pure functions of names and numbers. The rule by class is that of the paper (Veres et al.): one
-object of each class is for the test. The rule by object is for meshes that are each a class of
-their own; the rule by class would put all of these into the test split.
+object of each class is for testing. The rule by object is for meshes that are each a class of their
+own; the rule by class would put all of these into the test split.
 """
 
 from __future__ import annotations
@@ -130,8 +130,8 @@ def _split_by_object(
     """Return the indices of the samples of each split by object.
 
     Each group of objects draws a number from the seed and its own name. The groups with samples are
-    ordered by this number: the first fraction is for the test, the last for validation, and those
-    between are for training. One more group therefore moves at most one other group across each of
+    ordered by this number: the first ones are for testing, the last ones for validation, and those
+    between for training. An additional group therefore moves at most one other group across each of
     the two borders, and none from test to validation or back.
     """
     # The groups that have samples, in the order of their numbers.

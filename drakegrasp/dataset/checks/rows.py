@@ -102,7 +102,7 @@ class Violation:
 
 
 def of_file(file: str, what: str, got: object, group: str = "") -> Violation:
-    """Return a violation of a whole file, or of a whole group of it."""
+    """Return a violation that affects a whole file, or a whole group in the file."""
     return Violation(file=file, group=group, what=what, got=str(got))
 
 
@@ -271,7 +271,7 @@ def look_at(name: str, file: h5py.File, camera: str, findings: Findings) -> Chec
     rules, fields = kinds.get(camera, (OF_CAMERA, DATA_TABLES))
     config, attributes, counts = None, dict[str, Any](), dict[str, int]()
 
-    # Another schema version has another layout, so only the version is reported.
+    # A different schema version has a different layout, so only the version is reported.
     if not is_readable(version := file.attrs.get("schema_version", "none")):
         what = f"attribute schema_version must be {SCHEMA_VERSION}"
         findings.add([of_file(name, what, f"{version}; {OTHER_SCHEMA}")])

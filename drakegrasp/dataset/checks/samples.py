@@ -469,7 +469,7 @@ def beyond_box(p_OQ: Array, p_OC: Array, half_extents: Array, slack: Array) -> f
 
 
 def splits(data: CheckedFile, entries: Mapping[str, ObjectEntry]) -> Iterator[Violation]:
-    """A trial is at most one sample, and the test split has the objects that the seed draws.
+    """Each trial is at most one sample, and the test split has the objects drawn from the seed.
 
     Args:
         data: The data file.

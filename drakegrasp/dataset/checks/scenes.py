@@ -1,6 +1,6 @@
 """Rules of scenes.hdf5: what is on the table, what the cameras see, the closed hands.
 
-Input: the file, and the dataset around it if there is one. Output: tasks that judge one scene each.
+Input: the file, and the dataset that contains it, if any. Output: tasks that judge one scene each.
 Grasps are derived again from their trials, and the contacts that a camera sees from its images, by
 the functions that create scenes; pictures are compared with the mesh and the table.
 """
