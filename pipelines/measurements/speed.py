@@ -9,6 +9,7 @@ are more reliable, if they are printed.
 
 from __future__ import annotations
 
+import attempt_phases
 import build_overhead
 import click
 import inspect_speed
@@ -23,6 +24,7 @@ COMMANDS = {
     "build": build_overhead,
     "loader": loader_speed,
     "page": inspect_speed,
+    "phases": attempt_phases,
     "prepare": prepare_memory,
     "scenes": scene_speed,
     "verdicts": verify_speed,
