@@ -293,7 +293,7 @@ def ray_end(corners: Array) -> float:
     """Return the distance [m] at which the ray along +Gz leaves a convex hull; 0 if it misses.
 
     Args:
-        corners: (n, 3), points in {G} whose convex hull is meant [m].
+        corners: (n, 3), points in {G} that span the convex hull [m].
     """
     span = ray_span(corners, np.zeros(3), np.array([0.0, 0.0, 1.0]))
     return 0.0 if span is None or span[0] > RAY else max(span[1], 0.0)

@@ -194,7 +194,7 @@ def _closed(
 def _features(
     solid: Solid, hand: Hand, paths: HandPaths, X_TG: Array, closing: Array
 ) -> dict[str, Array]:
-    """Return score and features of palm poses (n, 4, 4) and initial finger positions (n, k)."""
+    """Return score and features of poses (n, 4, 4) with initial closings (n, k) [rad or m]."""
     # The open hand.
     lookup, rows = PointLookup(solid.field, np.eye(4), X_TG), np.arange(len(X_TG))
     starts = closing / _steps(paths)

@@ -70,7 +70,7 @@ class GraspContacts:
 
     @property
     def p_OcmQ(self) -> Array:
-        """(n, 3), lever arms of all points about the centre of mass, by finger, in {O} [m]."""
+        """(n, 3), vectors from the centre of mass to all points, finger by finger, in {O} [m]."""
         points = np.asarray(self.p_OQ, dtype=float) - np.asarray(self.p_OOcm, dtype=float)
         return points.reshape(-1, 3)
 

@@ -82,7 +82,7 @@ _CONTRACT = """## What makes two files equal
 The same command produces the same arrays, whatever the number of workers, the order in which they
 work, and the number of interruptions: nothing in these files depends on the clock or the machine's
 name. `time_close` and `time_lift` are simulated seconds. This holds on one machine with one set of
-library versions (`manifest.json` lists them); another CPU or another version of Drake may round
+library versions (`manifest.json` lists them); a different CPU or Drake version may round
 differently. The exceptions are the outcomes `timeout` and `crashed`: an attempt that computes for
 longer than `attempt_seconds` (60 s; an attempt usually takes about one second), or that ends its
 process again and again, depends more on the machine than on the grasp, and may end differently

@@ -13,7 +13,7 @@ def main(page: str, description: str, argv: Sequence[str] | None = None) -> int:
 
     Args:
         page: Markdown text of the page.
-        description: Description of what the script writes, for its help text.
+        description: Description of what the script writes, for its help output.
         argv: Arguments of the command line; those of the process if None.
     """
     parser = argparse.ArgumentParser(description=description)

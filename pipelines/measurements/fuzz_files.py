@@ -4,7 +4,7 @@
     python pipelines/measurements/fuzz_files.py OUT --count 3000 --seed 0 > fuzz.jsonl
 
 Each case damages one file of a copy of OUT: a bit is flipped, the end is cut off, all columns are
-made longer, two columns are swapped, JSON gets another value or another structure, or another kind
+made longer, two columns are swapped, JSON gets a different value or structure, or a different kind
 of file (a pipe, a device, a folder, a file of 1 TB) replaces the file. Then the loaders, `stats`
 and `check` read the copy, each in its own process with 2 GB of memory and 20 s of CPU time; with
 `--all` every command that reads a dataset reads it. The output of a command and the files that it
