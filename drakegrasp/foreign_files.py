@@ -64,7 +64,7 @@ def refuse_irregular(path: Path, largest: int | None = None) -> None:
 
 
 def refuse_link(folder: Path) -> None:
-    """Reject a link where a command writes into a dataset, because it may lead anywhere.
+    """Reject a symbolic link as a folder to write to: it may lead out of the dataset.
 
     Raises:
         DataError: If the folder is a link.

@@ -216,7 +216,7 @@ class Pbs(Jobs):
 
 
 class Lsf(Jobs):
-    """LSF: memory of a job by -M, in the unit of lsf.conf, and minutes."""
+    """LSF: -M limits the memory of a job, in the unit of lsf.conf; times are in minutes."""
 
     of, title = dask_jobqueue.LSFCluster, "LSF"
     alone, pair = 60.0, (3600.0, 60.0)

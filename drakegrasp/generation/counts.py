@@ -30,7 +30,7 @@ ENDED_SHARE, FEW_ENDED = 0.02, 10
 
 
 class Counts:
-    """Counts of completed work, whose memory does not grow with the number of work units.
+    """Counts of completed work; their memory does not grow with the number of work units.
 
     For `max_grasps` it stores, for each object, the candidate up to which all units are done and
     the grasps of these units. It also stores the grasps of the units beyond this first gap; they

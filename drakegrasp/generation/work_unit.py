@@ -442,7 +442,7 @@ def find_tasks(out: Path, manifest: Manifest) -> Iterator[SurveyTask]:
 
 
 def find_units(config: Config, task: SurveyTask) -> tuple[list[UnitSummary], list[tuple[str, str]]]:
-    """Find the completed units of an object of a dataset, up to its last requested grasp.
+    """Find an object's completed units in a dataset, up to the last requested grasp.
 
     The folder is listed once, and the seals of its shards are verified. A build that continues runs
     this in all its workers.

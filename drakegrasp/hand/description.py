@@ -146,7 +146,7 @@ class Hand:
 
     @property
     def closing_ratio(self) -> Array:
-        """(k, m), closing position of each finger per closing position of each motor's finger."""
+        """(k, m), ratio of each closing position to that of the finger with each motor."""
         names = [self.fingers[i].name for i in self.motor_fingers]
         ratio = np.zeros((self.num_fingers, len(names)))
         for i, finger in enumerate(self.fingers):

@@ -28,7 +28,7 @@ PAIRS = 65_536
 def first_hits(triangles: Array, p: Array, z: Array) -> Array:
     """Return the distance (n,) [m] at which each ray first meets a triangle; inf if it meets none.
 
-    Möller and Trumbore's test (1997); a ray through an edge or a corner meets the triangle.
+    Möller and Trumbore's test (1997); a ray through an edge or a corner counts as a hit.
 
     Args:
         triangles: Corners (m, 3, 3) [m].

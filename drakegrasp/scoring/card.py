@@ -1,7 +1,7 @@
 """The card of a score: everything that others need to compare with the score or to repeat it.
 
-Input: the judged sets and their origin. Output: plain JSON types, and the same as Markdown. The
-card has no times and no number of workers, so equal verdicts give equal cards.
+Input: the judged sets and their origin. Output: plain JSON types, and the same content as
+Markdown. The card has no times and no number of workers, so equal verdicts give equal cards.
 """
 
 from __future__ import annotations

@@ -136,7 +136,7 @@ def tube(path: npt.ArrayLike, radius: npt.ArrayLike, *, edge: float = EDGE) -> t
 
 
 def hoop(path: Array, radius: float, *, edge: float) -> list[trimesh.Trimesh]:
-    """Return a round bar along a closed curve (k, 3), whose ends coincide, as two parts."""
+    """Return the two parts of a round bar along a closed curve (k, 3) whose ends coincide."""
     half = len(path) // 2
     return [tube(part, radius, edge=edge) for part in (path[: half + 2], path[half - 1 :])]
 

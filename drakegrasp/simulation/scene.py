@@ -128,8 +128,8 @@ class Scene(ObjectScene):
         holding_efforts: Torque or force that each motor's worm holds; None if unknown.
         driven: The joints that each motor moves, with their ratios.
         still_joints: Names of the joints that no motor moves.
-        joint_trajectory: The path that separate motors of all joints follow; None for the motors of
-            the hand file.
+        joint_trajectory: The path to follow if every joint has its own motor; None for the motors
+            of the hand file.
         parts: Each shape of the hand with a point inside it, (3,) in the shape's frame [m].
         coarse_scene: Returns the scene whose step is `physics.coarse_steps` times as long; every
             call returns the same scene. None if there is no such scene.

@@ -411,7 +411,7 @@ def _move(model: ObjectModel, X_OG: Array, paths: Sequence[FingerPath], ratio: A
 
 
 def _meeting(lookup: PointLookup, path: FingerPath) -> Array:
-    """Return the place (n,) on a path, in steps, at which a finger meets the object, or inf.
+    """Return at which step (n,) of its path a finger meets the object; inf if it never does.
 
     For a finger that is within the object when the hand is open, the place is negative: how far the
     finger would have to open. No point moves by more than the largest `travel` per step, so the

@@ -220,7 +220,7 @@ def replace_meshes(source: Source, folder: Path) -> tuple[dict[str, Shape], list
 
 
 def _replace(mesh: Element, source: Source, convert: Callable[[str, Path], str]) -> None:
-    """Replace the file of a mesh in URDF or SDFormat."""
+    """Change the file that a mesh element of a URDF or SDFormat model names."""
     if source.root.tag == "robot":
         mesh.set("filename", convert(mesh.get("filename", ""), source.folder))
         return
