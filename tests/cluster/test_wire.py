@@ -5,6 +5,7 @@ from __future__ import annotations
 import filecmp
 import itertools
 import os
+import pickle
 import signal
 import threading
 import time
@@ -171,11 +172,21 @@ def test_error_of_a_task_is_raised_here_and_nothing_is_kept(client: Client, out:
         assert list(execute(abs, [-1])) == [1]
 
 
-def test_process_that_takes_too_much_memory_is_killed(tmp_path: Path, out: Path) -> None:
-    process = ProcessApart(tmp_path)
-    with pytest.raises(wire.ApartError):
-        process.call(b"", memory=1.0)
-    process.close()
+class Slow:
+    """Takes a minute to be unpickled."""
+
+    def __reduce__(self) -> tuple[Callable[[float], None], tuple[float]]:
+        return time.sleep, (60.0,)
+
+
+def test_process_that_takes_too_much_memory_is_killed(tmp_path: Path) -> None:
+    process, began = ProcessApart(tmp_path), time.monotonic()
+    try:
+        with pytest.raises(wire.ApartError):
+            process.call(pickle.dumps(Slow()), memory=1.0)
+    finally:
+        process.close()
+    assert time.monotonic() - began < 30.0
 
 
 @pytest.mark.sim
