@@ -32,7 +32,7 @@ from drakegrasp.runtime.progress import Report
 from drakegrasp.simulation.attempts import CONDITIONS
 
 #: Description of the format in `drakegrasp export --help`.
-HELP = "the objects [m] and tables of the rows, for a network of others"
+HELP = "the objects [m] and tables of the rows, for another network"
 #: Columns of the object's pose X_TO on the table: position [m] and quaternion.
 PLACE = tuple(f"object_{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
 

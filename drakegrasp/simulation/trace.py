@@ -1,11 +1,11 @@
-"""The states of a trial from step to step, with results that are the same to the last bit.
+"""Records the states of a trial after each step, without changing a bit of its results.
 
 Input: the scene of an attempt, and a function that runs it. Output: its result, and a `Trace`. The
-scene that the function gets has a simulator whose monitor also looks at the state: positions,
-contact forces, and where motors of their own are commanded to. Drake calls a monitor between two
-steps, so no step begins or ends elsewhere, and what it computes for a look is what the next step
-begins with. At the start of a simulation only positions are read: what Drake then computes would
-outlive the paths that are commanded next.
+function gets a scene whose simulator has one more monitor, which reads the state: positions,
+contact forces, and the commanded positions of joints with their own motors. Drake calls a monitor
+between two steps, so the steps stay the same, and the next step starts from the values that Drake
+computed for the monitor. At the start of a simulation only positions are read: contact forces that
+Drake computed there would stay cached after the next paths are commanded.
 """
 
 from __future__ import annotations
@@ -34,22 +34,23 @@ from drakegrasp.simulation.scene import (
 
 Result = TypeVar("Result")
 
-#: Steps are much longer; two looks that are nearer are of one state [s].
+#: Two readings closer than this are of one state; steps are much longer [s].
 SAME = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trace:
-    """What a hand with k fingers and j joints did in a trial, at n times.
+    """The motion of a hand with k fingers and j joints in a trial, at n times.
 
     Attributes:
         joints: Names of the joints, in the plant's order.
-        times: (n,), simulated time since the trial began [s], rising.
+        times: (n,), simulated time since the start of the trial [s], increasing.
         X_TG, X_TO: (n, 4, 4), poses of palm and object.
         q: (n, j), positions of the joints [rad or m].
-        commanded: (n, j), positions to which motors of their own are commanded; NaN for all others.
-        rates: (j,), speed of the joints that the hand file's motors close, and 0 for all others
-            [rad/s or m/s].
+        commanded: (n, j), commanded positions of joints with their own motors [rad or m]; NaN for
+            all other joints.
+        rates: (j,), speed at which the hand file's motors close each joint [rad/s or m/s]; 0 for
+            all other joints.
         f_T: (n, k, 3), force of each fingertip's link on the object in {T} [N].
     """
 
@@ -64,12 +65,12 @@ class Trace:
 
 
 def traced(scene: Scene, hand: Hand, run: Callable[[Scene], Result]) -> tuple[Result, Trace]:
-    """Return the result of `run` and the states that its simulation went through.
+    """Return the result of `run` and the states of its simulation.
 
     Args:
-        scene: Of the hand, or of one of its preshapes; it can be used again afterwards.
+        scene: Scene of the hand or of one of its preshapes; it can be reused afterwards.
         hand: The hand with all its fingers.
-        run: Simulates in the scene that it is given, which shares the diagram of the one above.
+        run: Simulates in the scene that it receives, which shares the diagram of `scene`.
     """
     looks = _Looks(hand)
     try:
@@ -82,7 +83,7 @@ def traced(scene: Scene, hand: Hand, run: Callable[[Scene], Result]) -> tuple[Re
 
 @dataclass(eq=False)
 class _Looks:
-    """The states that were seen since a simulation last began, each a row of `columns`."""
+    """The states since the last start of a simulation, one row per state."""
 
     hand: Hand
     simulators: list[Simulator] = field(default_factory=list)
@@ -90,7 +91,7 @@ class _Looks:
     rates: Array = field(default_factory=lambda: np.zeros(0))
 
     def watched(self, scene: Scene) -> Scene:
-        """Return a scene whose simulator tells its states, and so do those that continue it."""
+        """Return a scene whose states are recorded, as are those of the scenes that continue it."""
         others: dict[str, Any] = {
             name: cache(lambda known=known: self.watched(known()))
             for name in ("coarse_scene", "own_motors")
@@ -102,7 +103,7 @@ class _Looks:
         )
 
     def look(self, scene: Scene) -> None:
-        """Add the state of a scene, unless it is the last one again."""
+        """Add the state of a scene, unless it is the same as the last one."""
         begins = scene.time == 0.0
         if begins:
             self.rows, self.rates = [], _closing_rates(scene)
@@ -128,7 +129,7 @@ class _Looks:
         )
 
     def trace(self, scene: Scene) -> Trace:
-        """Return all that was seen, nothing of a trial that was not simulated."""
+        """Return the recorded states; they are empty if nothing was simulated."""
         names = ("times", "X_TG", "X_TO", "q", "commanded", "f_T")
         columns = [*zip(*self.rows, strict=True)] or [()] * len(names)
         seen = {name: np.array(each) for name, each in zip(names, columns, strict=True)}
@@ -136,7 +137,7 @@ class _Looks:
 
 
 def _places(scene: Scene) -> list[int]:
-    """Return the place of each closing joint among all joints."""
+    """Return the index of each closing joint among all joints."""
     names = hand_joint_names(scene)
     return [names.index(joint.name()) for joint in scene.closing_joints]
 
@@ -154,7 +155,7 @@ def _closing_rates(scene: Scene) -> Array:
 
 
 class _Watched:
-    """A simulator with one more monitor, which looks after the simulation's own."""
+    """A simulator with one more monitor, which runs after the monitor that the trial sets."""
 
     def __init__(self, simulator: Simulator, look: Callable[[], None]) -> None:
         self._simulator, self._look = simulator, look
