@@ -44,21 +44,22 @@ class ProcessApart:
         """Start the process.
 
         Args:
-            folder: Folder with copies of the files that tasks read.
+            folder: Working directory of the process.
         """
         self._connection, theirs = Pipe()
         with theirs:
             number = theirs.fileno()
-            command = [sys.executable, "-P", "-m", _NAME, str(number), str(folder)]
+            command = [sys.executable, "-P", "-m", _NAME, str(number)]
             self._process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, pass_fds=[number], cwd=folder
             )
 
-    def call(self, request: bytes, memory: float) -> bytes:
+    def call(self, request: bytes, folder: Path, memory: float) -> bytes:
         """Return the pickled result of a request.
 
         Args:
             request: A pickled function and its item.
+            folder: Folder with copies of the files that the task reads.
             memory: Maximum memory of the process [byte]. A process that exceeds it is killed, as a
                 nanny kills its worker.
 
@@ -67,7 +68,7 @@ class ProcessApart:
             Exception: The error that the function raised.
         """
         try:
-            self._connection.send_bytes(request)
+            self._connection.send((request, folder))
             while not self._connection.poll(LOOK_SECONDS):
                 with suppress(psutil.Error):
                     if psutil.Process(self._process.pid).memory_info().rss > memory:
@@ -87,13 +88,13 @@ class ProcessApart:
         self._process.wait()
 
 
-def main(connection: Connection, folder: Path) -> None:
+def main(connection: Connection) -> None:
     """Serve the worker's requests until it closes the connection."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the client stops its workers
     threading.Thread(target=_end_with, args=[connection.fileno()], daemon=True).start()
     with suppress(EOFError, ConnectionError):
         while True:
-            connection.send_bytes(pickle.dumps(_answer(connection.recv_bytes(), folder)))
+            connection.send_bytes(pickle.dumps(_answer(*connection.recv())))
 
 
 def _answer(request: bytes, folder: Path) -> tuple[bool, bytes]:
@@ -123,4 +124,4 @@ def _end_with(descriptor: int) -> None:
 
 
 if __name__ == "__main__":
-    main(Connection(int(sys.argv[1])), Path(sys.argv[2]))
+    main(Connection(int(sys.argv[1])))

@@ -9,7 +9,8 @@ tasks in its own directory. A task runs in a process beside the worker, in a fol
 the files. If the process dies, the worker survives and starts another process. The journal of the
 task is in this folder, so a step that kills its process is identified in the same way as on workers
 that see the dataset. If a worker is lost, another worker runs its task from the beginning. If the
-client is killed, the files of tasks in flight stay at the scheduler until the scheduler ends.
+client is killed, the scheduler forgets its files when the connection ends, and workers remove their
+copies with the next tasks. Several clients may use the same workers at the same time.
 
 Functions whose items are not such tasks read files that only this machine has, so they run here.
 """
@@ -29,7 +30,8 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import dask
-from distributed import Client, Variable, Worker, get_worker
+from distributed import Client, Scheduler, Variable, Worker, get_worker
+from distributed.diagnostics.plugin import SchedulerPlugin
 from distributed.utils import sync
 
 from drakegrasp.cluster.apart import ApartError, ProcessApart
@@ -63,7 +65,7 @@ class Parcel:
 
     Attributes:
         number: Number of the task.
-        build: Identifier of the client that sends the task.
+        build: Identifier of the build, which is the folder of its files on a worker.
         call: Pickled function and item.
         files: Names at the scheduler of the files that the task reads, by their relative paths. A
             name ends with the SHA-256 of the file.
@@ -105,6 +107,7 @@ def by_wire(execute: Executor, client: Client, out: Path) -> Iterator[Executor]:
         out: Directory of the dataset, which only this process sees.
     """
     build = secrets.token_hex(8)
+    client.register_plugin(ForgetFiles())
     try:
         yield _Wire(execute, client, out, build)
     finally:
@@ -171,7 +174,7 @@ class _Wire:
             digest = self._digests[key] = hashlib.sha256(content).hexdigest()
             if digest not in self._names:
                 # Dask deletes a variable with a delay, so no name is used again.
-                name = f"drakegrasp-{self._build}-{next(self._serial)}-{digest}"
+                name = f"{_prefix(self._client.id)}{self._build}-{next(self._serial)}-{digest}"
                 self._names[digest] = name
                 Variable(name, client=self._client).set(content)
         self._uses[self._names[digest]] += 1
@@ -207,9 +210,29 @@ def _processes_here() -> Iterator[Executor]:
         yield here
 
 
+def _prefix(client: str) -> str:
+    """Return how the names of a client's files at the scheduler begin."""
+    return f"drakegrasp-{client}-"
+
+
 def _digest_in(name: str) -> str:
     """Return the SHA-256 in the name of a file at the scheduler."""
     return name.rpartition("-")[2]
+
+
+# At the scheduler
+
+
+class ForgetFiles(SchedulerPlugin):  # type: ignore[misc]
+    """Removes the files of a client from the scheduler when its connection ends."""
+
+    name, idempotent = "drakegrasp-files", True
+
+    def remove_client(self, scheduler: Scheduler, client: str) -> None:
+        """Remove the files; Dask calls this."""
+        variables = scheduler.extensions["variables"].variables
+        for name in [name for name in variables if name.startswith(_prefix(client))]:
+            del variables[name]
 
 
 # At a worker
@@ -218,60 +241,68 @@ def _digest_in(name: str) -> str:
 class _Copies:
     """A worker's folder with copies of files, and the process that works there."""
 
-    def __init__(self, folder: Path, build: str) -> None:
-        self.build, self._folder = build, folder
-        folder.mkdir()
-        self._digests: dict[str, str] = {}
-        self._recent = deque[Mapping[str, str]](maxlen=KEPT_TASKS)
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        # The digest of each file, and the files of the last tasks, by build and relative path.
+        self._digests = dict[Path, str]()
+        self._recent = deque[Iterable[Path]](maxlen=KEPT_TASKS)
         self._process: ProcessApart | None = None
-        self._closed = False
+        self._running, self._left = "", set[str]()
 
     def do(self, parcel: Parcel, worker: Worker) -> Delivery:
         """Run a task; start the process again if it dies."""
-        self._bring(parcel.files, worker)
-        for _ in range(MOST_DEATHS):
-            if self._closed:
-                break
-            self._process = self._process or ProcessApart(self._folder)
-            try:
-                result = self._process.call(parcel.call, _memory(worker))
-            except ApartError:
-                self._process = None
-                continue
-            return Delivery(number=parcel.number, result=result, files=self._taken(parcel.writes))
-        raise MachineError("workers died again and again")
+        self._running, here = parcel.build, self._folder / parcel.build
+        try:
+            here.mkdir(parents=True, exist_ok=True)
+            self._bring({Path(parcel.build, place): n for place, n in parcel.files.items()}, worker)
+            for _ in range(MOST_DEATHS):
+                if parcel.build in self._left:
+                    break
+                process = self._process = self._process or ProcessApart(self._folder)
+                try:
+                    result = process.call(parcel.call, here, _memory(worker))
+                except ApartError:
+                    self._process = None
+                    continue
+                files = self._taken(parcel)
+                return Delivery(number=parcel.number, result=result, files=files)
+            raise MachineError("workers died again and again")
+        finally:
+            self._running = ""
 
-    def _bring(self, files: Mapping[str, str], worker: Worker) -> None:
+    def _bring(self, files: Mapping[Path, str], worker: Worker) -> None:
         """Get the missing files; remove files that the last tasks did not need."""
         self._recent.append(files)
-        for place in self._digests.keys() - set().union(*self._recent):
-            (self._folder / place).unlink(missing_ok=True)
-            del self._digests[place]
-        for place, name in files.items():
-            if self._digests.get(place) != _digest_in(name):
-                write_atomic(self._folder / place, _fetched(name, worker))
-                self._digests[place] = _digest_in(name)
+        for path in self._digests.keys() - set().union(*self._recent):
+            (self._folder / path).unlink(missing_ok=True)
+            del self._digests[path]
+        for path, name in files.items():
+            if self._digests.get(path) != _digest_in(name):
+                write_atomic(self._folder / path, _fetched(name, worker))
+                self._digests[path] = _digest_in(name)
 
-    def _taken(self, places: Iterable[str]) -> dict[str, bytes]:
-        """Return the content of files by their relative paths, and remove the files."""
+    def _taken(self, parcel: Parcel) -> dict[str, bytes]:
+        """Return the files that a task wrote by their relative paths, and remove them."""
         found = {}
-        for place in places:
-            path = self._folder / place
+        for place in parcel.writes:
+            path = self._folder / parcel.build / place
             if path.is_file():
                 found[place] = path.read_bytes()
                 path.unlink()
-            self._digests.pop(place, None)
+            self._digests.pop(Path(parcel.build, place), None)
         return found
 
-    def close(self) -> None:
-        """End the process, and remove the folder."""
-        self._closed = True
-        if self._process is not None:
-            self._process.close()
-        shutil.rmtree(self._folder, ignore_errors=True)
+    def leave(self, build: str) -> None:
+        """Remove the files of a build, and end the process unless another build uses it."""
+        self._left.add(build)
+        process = self._process
+        if process is not None and self._running in ("", build):
+            self._process = None
+            process.close()
+        shutil.rmtree(self._folder / build, ignore_errors=True)
 
 
-#: Copies of the build for which this worker ran its last task.
+#: Copies on this worker.
 _copies: _Copies | None = None
 
 
@@ -284,18 +315,14 @@ def do_parcel(parcel: Parcel) -> Delivery:
     """
     global _copies
     worker = get_worker()
-    if _copies is None or _copies.build != parcel.build:
-        leave()
-        _copies = _Copies(Path(worker.local_directory) / f"drakegrasp-{parcel.build}", parcel.build)
+    _copies = _copies or _Copies(Path(worker.local_directory) / "drakegrasp")
     return _copies.do(parcel, worker)
 
 
-def leave(build: str | None = None) -> None:
-    """Remove the files of a build from this worker; of any build if None."""
-    global _copies
-    if _copies is not None and build in (None, _copies.build):
-        _copies.close()
-        _copies = None
+def leave(build: str) -> None:
+    """Remove the files of a build from this worker."""
+    if _copies is not None:
+        _copies.leave(build)
 
 
 def _fetched(name: str, worker: Worker) -> bytes:

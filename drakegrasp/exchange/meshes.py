@@ -33,12 +33,14 @@ from drakegrasp.simulation.attempts import CONDITIONS
 
 #: Description of the format in `drakegrasp export --help`.
 HELP = "the objects [m] and tables of the rows, for another network"
+#: Name of the things that the command counts.
+COUNTS = "object"
 #: Columns of the object's pose X_TO on the table: position [m] and quaternion.
 PLACE = tuple(f"object_{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
 
 
 def write_meshes(out: Path, folder: Path, progress: Report) -> int:
-    """Write the objects of a dataset and return the number of its rows; see `export_dataset`."""
+    """Write the objects of a dataset and return their number; see `export_dataset`."""
     manifest = read_manifest(out)
     said = {}
     for done, entry in enumerate(manifest.objects, start=1):
@@ -59,13 +61,12 @@ def write_meshes(out: Path, folder: Path, progress: Report) -> int:
 
     # Write one table for each split that has rows.
     scale_of = {entry.name: entry.scale for entry in manifest.objects}
-    trials, count = Trials(out), 0
+    trials = Trials(out)
     for split in SPLITS:
         data = GraspDataset(out / DATA_FILES["oto"], split=split, fewer_fingers=True)
         if len(data):
             _write_rows(folder / f"rows_{split}.csv", trials[data.column("trial_id")], scale_of)
-        count += len(data)
-    return count
+    return len(manifest.objects)
 
 
 def _write_rows(path: Path, samples: Trials, scale_of: Mapping[str, float]) -> None:

@@ -267,7 +267,7 @@ def _more(card: Mapping[str, Any]) -> list[str]:
             if measure.startswith("success@"):
                 lines.append(f"* {name}, {measure}: {_interval(value)}")
         for group in each["calibration"]:
-            share = f"{_percent(group['share'])} of {group['count']}"
+            share = f"{_percent(group['share'])} % of {group['count']}"
             lines.append(f"* {name}, confidence {group['confidence']:.3g}: {share}")
         lines += [f"* {name}, {n} no grasp: {why}" for why, n in each["invalid"].items()]
     for name, others in card["above"].items():

@@ -33,12 +33,15 @@ from drakegrasp.cluster.wire import by_wire
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import MachineError
-from drakegrasp.generation.pipeline import BuildReport, build
+from drakegrasp.frames import make_pose, rotation_about
+from drakegrasp.generation.pipeline import BuildReport, build, posture_config
+from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import WorkerPool, in_order, run_here
 from drakegrasp.runtime.journal import VARIABLE
+from drakegrasp.simulation.attempts import Attempts, make_attempts
 
 pytestmark = pytest.mark.cluster
 
@@ -117,7 +120,7 @@ def test_files_go_once_and_results_come_back(
     tasks = [Join(out=out, number=number) for number in range(12)]
     with by_wire(DaskExecutor(client), client, out) as execute:
         assert list(in_order(execute)(join, tasks)) == list(range(12))
-        (copies,) = Path(next(iter(client.run(local_directory).values()))).glob("drakegrasp-*")
+        (copies,) = Path(next(iter(client.run(local_directory).values())), "drakegrasp").iterdir()
         assert len(list(copies.glob("in/*"))) == 1 + wire.KEPT_TASKS
         assert not list(copies.glob("out/*"))
         assert not (out / "old").exists()
@@ -131,6 +134,42 @@ def test_files_go_once_and_results_come_back(
         assert len(fetched) == len(set(fetched)) == 14
     assert not copies.exists()
     assert_nothing_kept(client)
+
+
+def test_builds_at_the_same_time_keep_their_copies_and_share_a_process(
+    client: Client, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put(out, 4)
+    fetched, fetch = list[str](), wire._fetched
+    monkeypatch.setattr(wire, "_fetched", lambda *args: fetched.append(args[0]) or fetch(*args))
+    started, start = list[Path](), wire.ProcessApart
+    monkeypatch.setattr(
+        wire, "ProcessApart", lambda folder: started.append(folder) or start(folder)
+    )
+    tasks = [Join(out=out, number=number) for number in range(4)]
+    with by_wire(DaskExecutor(client), client, out) as one:
+        list(one(join, tasks[:1]))
+        with by_wire(DaskExecutor(client), client, out) as other:
+            done = zip(one(join, tasks), other(join, tasks), strict=True)
+            assert sorted(done) == [(i, i) for i in range(4)]
+        assert len(started) == 1
+        assert len(fetched) == len(set(fetched)) == 2 * 5
+        assert list(one(join, tasks)) == list(range(4))
+
+
+def test_scheduler_forgets_the_files_of_a_client_that_is_killed(client: Client, out: Path) -> None:
+    put(out, 1)
+    with by_wire(DaskExecutor(client), client, out) as execute:
+        with Client(client.scheduler.address, set_as_default=False) as killed:
+            killed.register_plugin(wire.ForgetFiles())
+            wire._Wire(execute, killed, out, "a")._offer(out / "in/common")
+            wire._Wire(execute, client, out, "b")._offer(out / "in/0")
+            assert len(client.run_on_scheduler(variables)) == 2
+        end = time.monotonic() + 30.0
+        while len(left := client.run_on_scheduler(variables)) > 1 and time.monotonic() < end:
+            time.sleep(0.01)
+        assert [client.id in name for name in left] == [True]
+        wire.Variable(left[0], client=client).delete()
 
 
 def local_directory(dask_worker: Worker) -> str:
@@ -183,7 +222,7 @@ def test_process_that_takes_too_much_memory_is_killed(tmp_path: Path) -> None:
     process, began = ProcessApart(tmp_path), time.monotonic()
     try:
         with pytest.raises(wire.ApartError):
-            process.call(pickle.dumps(Slow()), memory=1.0)
+            process.call(pickle.dumps(Slow()), tmp_path, memory=1.0)
     finally:
         process.close()
     assert time.monotonic() - began < 30.0
@@ -203,10 +242,29 @@ def test_every_kind_of_task_gives_the_same_bytes(
         assert (file["trials/child"][:] > 0).any() == bool(config.refine.children)
 
 
-def build_by_wire(client: Client, meshes: Path, out: Path, config: Config) -> BuildReport:
+@pytest.mark.nightly
+@pytest.mark.sim
+def test_postures_travel(client: Client, meshes: Path, out: Path, tmp_path: Path) -> None:
+    """Two palm poses over the box, along either edge, replace the drawn ones."""
+    over = make_pose(rotation_about([1.0, 0.0, 0.0], np.pi), [0.0, 0.0, 0.162])
+    turned = over @ make_pose(rotation_about([0.0, 0.0, 1.0], np.pi / 2), np.zeros(3))
+    names, X_TG = ["1_box_a"] * 2, np.stack([over, turned])
+    given = make_attempts(load_hand(), names, X_FG=X_TG, frame="table", resting=[0, 0])
+    config, here = posture_config(load_config(overrides=FAST), given), tmp_path / "here"
+    build(find_meshes(meshes), here, config, run_here, postures=given, show=False)
+    build_by_wire(client, meshes, out, config, given)
+    assert_same_files(here, out)
+    with h5py.File(out / "trials.hdf5") as file:
+        assert file["trials/posture_row"][:].tolist() == [0.0, 1.0]
+        np.testing.assert_array_equal(file["trials/outcome"][:], Outcome.SUCCESS)
+
+
+def build_by_wire(
+    client: Client, meshes: Path, out: Path, config: Config, postures: Attempts | None = None
+) -> BuildReport:
     with by_wire(DaskExecutor(client), client, out) as execute:
-        sources = find_meshes(meshes)
-        return build(sources, out, config, execute, pool=WorkerPool(), show=False)
+        rest = {"pool": WorkerPool(), "postures": postures, "show": False}
+        return build(find_meshes(meshes), out, config, execute, **rest)
 
 
 @pytest.mark.nightly

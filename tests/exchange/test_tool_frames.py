@@ -21,10 +21,12 @@ from drakegrasp.verification.placing import PlacedGrasp
 
 #: What the public descriptions say: the palm link's pose in the tool's frame, as position and
 #: quaternion w, x, y, z. GraspGen's hand.stl is the panda_hand's collision mesh turned by +90
-#: degrees about z; the MJCF of DexGraspBench has the palm at these poses in its world, which is the
-#: root of its grasps.
+#: degrees about z. In GraspGenX's description of the Barrett Hand finger 3 is on +x, and its joint
+#: is 59.1 mm above the origin, not 75.4 mm. The MJCF of DexGraspBench has the palm at these poses
+#: in its world, which is the root of its grasps.
 X_AB = {
     ("franka", "graspgen"): ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 1.0]),
+    ("barrett", "graspgen"): ([0.0, 0.0, 0.0591 - 0.0754], [1.0, 0.0, 0.0, -1.0]),
     ("allegro", "dexgraspbench"): ([0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 1.0]),
     ("allegro_four", "dexgraspbench"): ([0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 1.0]),
     ("leap", "dexgraspbench"): ([0.0, 0.0, 0.1], [0.0, 1.0, 0.0, 0.0]),
