@@ -1,12 +1,22 @@
-"""Draw faults in the rules that decide labels, and write them as a table for `planted_faults.py`.
+"""Draw faults over all rooms of the package, and write them as a table for `planted_faults.py`.
 
-A fault changes one operator, number, condition, call or result in a module of nine packages: `<`
-becomes `>=`, `+` becomes `-`, 0 becomes 1, `and` becomes `or`. Half of the faults are in simulation
-and verification. Texts of messages and annotations stay unchanged, and so do modules that only draw
-or describe. The same seed draws the same faults from the same source. The script writes YAML. The
-tests of a fault are those of its module, then others of its package, then tests of other packages
-that import the module. Faults that were examined and change no result are listed in
-`equivalent_faults.yaml`.
+A fault changes one expression or statement of a module. Its kind is one of
+
+- bound: `<` becomes `<=`, `>=` becomes `>`;
+- swapped: two neighbouring positional arguments of a call change places;
+- branch: the body of an `if` without `else` never runs, or `a if c else b` takes the wrong value;
+- unit: a factor such as 1e3 becomes 1, `np.deg2rad(x)` becomes `x`;
+- frame: `invert_pose(X)` becomes `X`, `multiply(A, B)` becomes `multiply(B, A)`, `A.T` becomes `A`;
+- operator: `<` becomes `>=`, `+` becomes `-`, `and` becomes `or`, `min` becomes `max`;
+- number: 0 becomes 1, 5 becomes 10, `True` becomes `False`;
+- result: a function returns None, or a call that is a statement is left out.
+
+Each room gets equally many faults. In a room first the kind is drawn, then the fault, so that rare
+kinds are as frequent as common ones. Texts of messages and annotations stay unchanged, and so do
+the numbers of pages and pictures, which are layout. The same seed draws the same faults from the
+same source. The tests of a fault are those of its module, then others of its room, then tests of
+other rooms that import the module. Faults that were examined and change no result are listed in
+`equivalent_faults.yaml`; they are not drawn.
 """
 
 from __future__ import annotations
@@ -16,28 +26,29 @@ import ast
 import random
 import sys
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
+from itertools import islice, pairwise, zip_longest
 from pathlib import Path
 
 import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 EQUIVALENT = Path(__file__).with_name("equivalent_faults.yaml")
-#: The packages from which half of the faults are drawn, and the other packages.
-JUDGES = ("simulation", "verification")
-OTHERS = ("hand", "mesh", "objects", "vision", "dataset", "generation", "scoring")
-#: Modules and folders that draw a picture or describe results: they decide nothing.
-_TELLING = {
-    *("dataset/card.py", "generation/cautions.py", "hand/files.py", "scoring/card.py"),
-    *("verification/figure.py", "vision/probe_image.py"),
-}
-#: Maximum number of imports between a module and a test, in its package and elsewhere.
-NEAR, NEAR_ELSEWHERE = 2, 1
+#: The room of the modules that lie directly in the package.
+ROOT_ROOM = "drakegrasp"
+#: Rooms that draw: their numbers are widths, margins and colours.
+LAYOUT = ("page", "pictures")
+#: Maximum number of imports between a module and a test of another room.
+NEAR = 1
 #: Maximum number of test files for a fault.
 MOST_TESTS = 16
-#: An option of pytest that leaves slow tests out.
-QUICK = "-mnot server and not slow"
+#: An option of pytest that selects the tests that `make test` runs.
+FIRST_TIER = "-mnot server and not nightly and not browser"
+_BOUNDS = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">"}
+_UNITS = {1e-9, 1e-6, 1e-3, 1e-2, 1e2, 1e3, 1e6, 1e9}
+_ANGLES = {"deg2rad", "rad2deg", "radians", "degrees"}
+_INVERSES = {"invert_pose", "inv"}
 _OPERATORS: dict[type[ast.AST], str] = {
     ast.Lt: ">=",
     ast.LtE: ">",
@@ -65,18 +76,22 @@ _NAMES = {"any": "all", "all": "any", "min": "max", "max": "min", "minimum": "ma
 _NAMES |= {"maximum": "minimum", "argmin": "argmax", "argmax": "argmin", "floor": "ceil"}
 
 
-def modules(rooms: Sequence[str]) -> list[str]:
-    """Return the modules of packages in which faults are drawn, in the order of their paths."""
-    found = sorted(
-        path.relative_to(ROOT / "drakegrasp")
-        for room in rooms
-        for path in (ROOT / "drakegrasp" / room).rglob("*.py")
-        if path.name != "__init__.py"
-    )
-    if gone := [name for name in _TELLING if not (ROOT / "drakegrasp" / name).exists()]:
-        sys.exit(f"modules that tell must be there, got none for {', '.join(sorted(gone))}")
-    telling = [p for p in found if {str(p), *map(str, p.parents)} & _TELLING]
-    return [f"drakegrasp/{path}" for path in found if path not in telling]
+#: Kind of a change, the node that is replaced, and its new text.
+_Change = tuple[str, ast.expr | ast.stmt, str]
+_Text = Callable[[ast.expr | ast.stmt | ast.keyword], str]
+
+
+def rooms() -> list[str]:
+    """Return the names of the rooms that have modules."""
+    folders = (ROOT / "drakegrasp").iterdir()
+    return [ROOT_ROOM, *sorted(path.name for path in folders if any(path.glob("*.py")))]
+
+
+def modules(room: str) -> list[str]:
+    """Return the modules of a room in the order of their paths."""
+    folder = ROOT / "drakegrasp"
+    found = folder.glob("*.py") if room == ROOT_ROOM else (folder / room).rglob("*.py")
+    return sorted(str(path.relative_to(ROOT)) for path in found if path.name != "__init__.py")
 
 
 @cache
@@ -107,13 +122,13 @@ def _distances(test: str) -> dict[str, int]:
 
 def tests_of(name: str) -> list[str]:
     """Return the test files that must notice a fault of a module, the nearest first."""
-    room, stem = name.split("/")[1], Path(name).stem
+    folder, stem = Path(name).parts[1:-1][:1], Path(name).stem
     ranked = []
     for path in sorted((ROOT / "tests").rglob("test_*.py")):
         test = str(path.relative_to(ROOT))
         distance = _distances(test).get(name, sys.maxsize)
-        inside = path.relative_to(ROOT).parts[1] == room
-        if distance <= (NEAR if inside else NEAR_ELSEWHERE):
+        inside = path.relative_to(ROOT).parts[1:-1][:1] == folder
+        if inside or distance <= NEAR:
             ranked.append((stem not in path.stem, not inside, distance, test))
     return [test for *_, test in sorted(ranked)][:MOST_TESTS]
 
@@ -121,21 +136,28 @@ def tests_of(name: str) -> list[str]:
 def faults_of(name: str) -> Iterator[dict[str, object]]:
     """Yield every fault of a module as a table entry, in the order of the source text."""
     text = (ROOT / name).read_text(encoding="utf-8")
+    lines = text.encode().splitlines(keepends=True)
     tests = tests_of(name)
-    tree = ast.parse(text)
-    lines = text.splitlines(keepends=True)
-    for node in _deciding(tree):
-        for new in _changes(node, text):
+
+    def own(node: ast.expr | ast.stmt | ast.keyword) -> str:
+        """Return the text of a node; `ast.get_source_segment` would split the file each time."""
+        last = (node.end_lineno or node.lineno) - 1
+        end = sum(map(len, lines[node.lineno - 1 : last])) + (node.end_col_offset or 0)
+        return b"".join(lines[node.lineno - 1 : last + 1])[node.col_offset : end].decode()
+
+    for above in _deciding(ast.parse(text)):
+        for kind, node, new in _changes(above, own):
             first, last = node.lineno - 1, (node.end_lineno or node.lineno) - 1
-            head = lines[first].encode()[: node.col_offset].decode()
-            tail = lines[last].encode()[node.end_col_offset or 0 :].decode()
+            head = lines[first][: node.col_offset].decode()
+            tail = lines[last][node.end_col_offset or 0 :].decode()
             yield {
-                "fault": f"line {node.lineno}: {ast.get_source_segment(text, node)} -> {new}",
+                "fault": f"line {node.lineno}: {own(node)} -> {new}",
+                "kind": kind,
                 "file": name,
                 "line": node.lineno,
-                "old": "".join(lines[first : last + 1]),
+                "old": b"".join(lines[first : last + 1]).decode(),
                 "new": f"{head}{new}{tail}",
-                "tests": [*tests, QUICK],
+                "tests": [*tests, FIRST_TIER],
             }
 
 
@@ -154,45 +176,83 @@ def _deciding(node: ast.AST) -> Iterator[ast.expr | ast.stmt]:
             yield from _deciding(child)
 
 
-def _changes(node: ast.AST, text: str) -> Iterator[str]:
-    """Yield the texts with which faults replace a node."""
-
-    def own(part: ast.AST) -> str:
-        return ast.get_source_segment(text, part) or ""
-
+def _changes(node: ast.expr | ast.stmt, own: _Text) -> Iterator[_Change]:
+    """Yield the changes of a node; `own` returns the text of a node."""
     match node:
         case ast.Constant(value=bool()):
-            yield str(not node.value)
+            yield "number", node, str(not node.value)
+        case ast.Constant(value=int() | float()) if node.value in _UNITS:
+            yield "unit", node, "1"
         case ast.Constant(value=int() | float()):
-            yield "1" if node.value == 0 else "0" if node.value == 1 else f"(2 * {own(node)})"
+            new = "1" if node.value == 0 else "0" if node.value == 1 else f"(2 * {own(node)})"
+            yield "number", node, new
         case ast.Compare(ops=[operator], comparators=[right]):
-            yield f"({own(node.left)}) {_OPERATORS[type(operator)]} ({own(right)})"
+            left = own(node.left)
+            if new := _BOUNDS.get(type(operator)):
+                yield "bound", node, f"({left}) {new} ({own(right)})"
+            yield "operator", node, f"({left}) {_OPERATORS[type(operator)]} ({own(right)})"
+        case ast.BinOp(op=ast.MatMult()):
+            yield "frame", node, f"({own(node.right)}) @ ({own(node.left)})"
         case ast.BinOp() if type(node.op) in _OPERATORS:
-            yield f"({own(node.left)}) {_OPERATORS[type(node.op)]} ({own(node.right)})"
+            new = _OPERATORS[type(node.op)]
+            yield "operator", node, f"({own(node.left)}) {new} ({own(node.right)})"
         case ast.BoolOp():
-            yield f" {_OPERATORS[type(node.op)]} ".join(f"({own(v)})" for v in node.values)
+            new = f" {_OPERATORS[type(node.op)]} ".join(f"({own(v)})" for v in node.values)
+            yield "operator", node, new
         case ast.UnaryOp(op=ast.Not() | ast.Invert() | ast.USub()):
-            yield f"({own(node.operand)})"
+            yield "operator", node, f"({own(node.operand)})"
+        case ast.If(orelse=[]) if own(node.test) != "TYPE_CHECKING":
+            yield "branch", node.test, "False"
         case ast.IfExp():
-            yield f"({own(node.body)}) if not ({own(node.test)}) else ({own(node.orelse)})"
+            new = f"({own(node.body)}) if not ({own(node.test)}) else ({own(node.orelse)})"
+            yield "branch", node, new
+        case ast.Attribute(attr="T"):
+            yield "frame", node, f"({own(node.value)})"
         case ast.Attribute() if node.attr in _NAMES:
-            yield f"({own(node.value)}).{_NAMES[node.attr]}"
+            yield "operator", node, f"({own(node.value)}).{_NAMES[node.attr]}"
         case ast.Name() if node.id in _NAMES:
-            yield _NAMES[node.id]
+            yield "operator", node, _NAMES[node.id]
+        case ast.Call():
+            yield from _changes_of_call(node, own)
         case ast.Expr(value=ast.Call()):
-            yield "pass"
+            yield "result", node, "pass"
         case ast.Return(value=ast.expr()):
-            yield "return None"
+            yield "result", node, "return None"
         case ast.Break() | ast.Continue():
-            yield "pass"
+            yield "result", node, "pass"
 
 
-def name_equivalent(faults: Sequence[dict[str, object]]) -> None:
-    """Add to faults why they change no result, if somebody has examined them."""
-    known = {(e["file"], e["new"]): e["why"] for e in yaml.safe_load(EQUIVALENT.read_text())}
-    for fault in faults:
-        if why := known.get((fault["file"], str(fault["new"]).strip())):
-            fault["equivalent"] = why
+def _changes_of_call(node: ast.Call, own: _Text) -> Iterator[_Change]:
+    """Yield the changes of a call; `own` returns the text of a node."""
+    called = own(node.func).rpartition(".")[2]
+    arguments = [own(argument) for argument in node.args]
+    if len(arguments) == 1 and called in _ANGLES:
+        yield "unit", node, f"({arguments[0]})"
+    if len(arguments) == 1 and called in _INVERSES:
+        yield "frame", node, f"({arguments[0]})"
+    for i, (first, second) in enumerate(pairwise(arguments)):
+        if first == second or called == "isinstance" or "*" in (first[0], second[0]):
+            continue
+        given = [*arguments[:i], second, first, *arguments[i + 2 :], *map(own, node.keywords)]
+        kind = "frame" if called == "multiply" else "swapped"
+        yield kind, node, f"{own(node.func)}({', '.join(given)})"
+
+
+def drawn_in(room: str, seed: int) -> Iterator[dict[str, object]]:
+    """Yield the faults of a room in the order in which they are drawn, without equivalent ones."""
+    stream = random.Random(f"{seed} {room}")
+    known = {(e["file"], e["new"]) for e in yaml.safe_load(EQUIVALENT.read_text(encoding="utf-8"))}
+    kinds: dict[object, list[dict[str, object]]] = {}
+    for fault in (fault for name in modules(room) for fault in faults_of(name)):
+        if fault["kind"] != "number" or room not in LAYOUT:
+            kinds.setdefault(fault["kind"], []).append(fault)
+    while kinds:
+        kind = stream.choice(sorted(kinds, key=str))
+        fault = kinds[kind].pop(stream.randrange(len(kinds[kind])))
+        if not kinds[kind]:
+            del kinds[kind]
+        if (fault["file"], str(fault["new"]).strip()) not in known:
+            yield fault
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -200,13 +260,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=150, help="number of faults (default: 150)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the random draw (default: 0)")
+    parser.add_argument(
+        "--rooms",
+        nargs="+",
+        choices=rooms(),
+        default=rooms(),
+        metavar="ROOM",
+        help="folders of the package, or drakegrasp for the modules in none (default: all)",
+    )
     arguments = parser.parse_args(argv)
-    drawn, stream = [], random.Random(arguments.seed)
-    for rooms, count in ((JUDGES, (arguments.count + 1) // 2), (OTHERS, arguments.count // 2)):
-        every = [fault for name in modules(rooms) for fault in faults_of(name)]
-        drawn += stream.sample(every, count)
-        sys.stderr.write(f"{count} of {len(every)} faults in {', '.join(rooms)}\n")
-    name_equivalent(drawn)
+    given = list(arguments.rooms)
+    random.Random(arguments.seed).shuffle(given)
+    faults = [drawn_in(room, arguments.seed) for room in given]
+    in_turn = (fault for turn in zip_longest(*faults) for fault in turn if fault)
+    drawn = list(islice(in_turn, arguments.count))
     yaml.safe_dump(drawn, sys.stdout, sort_keys=False, allow_unicode=True)
     return 0
 
