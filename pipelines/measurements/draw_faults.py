@@ -45,7 +45,7 @@ NEAR = 1
 MOST_TESTS = 16
 #: An option of pytest that selects the tests that `make test` runs.
 FIRST_TIER = "-mnot server and not nightly and not browser"
-_BOUNDS = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">"}
+_BOUNDS: dict[type[ast.AST], str] = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">"}
 _UNITS = {1e-9, 1e-6, 1e-3, 1e-2, 1e2, 1e3, 1e6, 1e9}
 _ANGLES = {"deg2rad", "rad2deg", "radians", "degrees"}
 _INVERSES = {"invert_pose", "inv"}
@@ -188,8 +188,8 @@ def _changes(node: ast.expr | ast.stmt, own: _Text) -> Iterator[_Change]:
             yield "number", node, new
         case ast.Compare(ops=[operator], comparators=[right]):
             left = own(node.left)
-            if new := _BOUNDS.get(type(operator)):
-                yield "bound", node, f"({left}) {new} ({own(right)})"
+            if type(operator) in _BOUNDS:
+                yield "bound", node, f"({left}) {_BOUNDS[type(operator)]} ({own(right)})"
             yield "operator", node, f"({left}) {_OPERATORS[type(operator)]} ({own(right)})"
         case ast.BinOp(op=ast.MatMult()):
             yield "frame", node, f"({own(node.right)}) @ ({own(node.left)})"
