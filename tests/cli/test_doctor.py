@@ -101,14 +101,14 @@ def test_what_is_missing_is_told_with_what_mends_it(
         ("raise SystemExit(3)", "nothing"),
         ("", "the renderer must print two numbers, got 'nothing'"),
         ("print('what?')", "the renderer must print two numbers, got 'what?'"),
-        ("import time; time.sleep(60)", "no image within 1 s"),
+        ("import time; time.sleep(60)", "no image within 0.3 s"),
     ],
 )
 def test_image_that_fails_is_told_and_kills_nobody(
     monkeypatch: pytest.MonkeyPatch, child: str, what: str
 ) -> None:
     monkeypatch.setattr(probe_image, "_CHILD", child)
-    monkeypatch.setattr(probe_image, "IMAGE_SECONDS", 1.0 if "sleep" in child else 60.0)
+    monkeypatch.setattr(probe_image, "IMAGE_SECONDS", 0.3 if "sleep" in child else 60.0)
     finding = doctor.check_image()
     assert (finding.ok, finding.what) == (False, what)
     assert finding.remedy == EGL

@@ -93,12 +93,15 @@ def _task_of(seconds: float) -> str:
     return str(get_worker().get_current_task())
 
 
-def test_quick_items_go_together_and_slow_ones_alone(client: Client) -> None:
+def test_quick_items_go_together_and_slow_ones_alone(
+    client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
     execute = DaskExecutor(client)
     together = list(execute(_task_of, [0.0] * 400))
     assert len(together) == 400
     assert len(set(together)) < 2 * 400 / tasks.LARGEST
     assert max(Counter(together).values()) <= tasks.LARGEST
+    monkeypatch.setattr(tasks, "TASK_SECONDS", 0.05)
     alone = list(execute(_task_of, [1.5 * tasks.TASK_SECONDS] * 12))
     assert len(set(alone)) == 12
 
@@ -156,7 +159,7 @@ def test_where_workers_may_come_the_work_waits(cluster: LocalCluster) -> None:
         results = execute(str, [1, 2, 3, 4])
         found = [next(results)]
         cluster.scale(0)
-        threading.Timer(2.0, lambda: cluster.scale(1)).start()
+        threading.Timer(1.0, lambda: cluster.scale(1)).start()
         client.run_on_scheduler(lambda dask_scheduler: None)
         while client.nthreads():
             time.sleep(0.05)

@@ -42,14 +42,14 @@ async def slow_app(scope: Any, receive: Any, send: Any) -> None:
     if scope["type"] == "http":
         while (await receive()).get("more_body"):
             pass
-        await asyncio.sleep(0.8)
+        await asyncio.sleep(0.4)
         headers = [(b"content-length", b"2")]
         await send({"type": "http.response.start", "status": 200, "headers": headers})
         await send({"type": "http.response.body", "body": b"ok"})
 
 
 def test_request_that_does_not_end_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serving, "REQUEST_SECONDS", 0.4)
+    monkeypatch.setattr(serving, "REQUEST_SECONDS", 0.2)
     config = serving.server_config(slow_app)
     config.lifespan = "off"
     server, listener = uvicorn.Server(config), listen(0)

@@ -145,7 +145,7 @@ if __name__ == "__main__":
     print("begins", flush=True)
     try:
         with processes(2) as execute:
-            list(execute(time.sleep, [1.0] * 60))
+            list(execute(time.sleep, [0.2] * 300))
     except KeyboardInterrupt:
         print("stopped")
 """
