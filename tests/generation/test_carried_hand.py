@@ -34,7 +34,7 @@ LICENCE = "The Tongs Licence"
 
 #: A can of 0.2 kg, at one stand-off; lifts are quick.
 SETTINGS = (
-    *("builtin.per_class=1", "objects.mass=0.2", "camera.size=32", "candidates.max=18"),
+    *("builtin.per_class=1", "objects.mass=0.2", "camera.size=32", "candidates.max=9"),
     *("candidates.standoffs=[0.07]", "lift.max_speed=1", "lift.max_acceleration=10"),
     *("filters.outlier_sigma=0", "filters.require=held"),
 )
