@@ -253,7 +253,7 @@ def test_what_is_no_verdict_is_refused_in_one_line(
 def test_a_dataset_of_both_is_sound_and_imports_no_code(own: Path) -> None:
     write_fixed(own / "meshes", "8_wineglass_flute")
     sources, out = find_meshes(own / "meshes"), own / "out"
-    rules = [*SMALL, "candidates.max=12", "camera.size=32"]
+    rules = [*SMALL, "candidates.max=5", "camera.size=32"]
     half = (
         "class Half:\n  def keep(self, successes): return successes.trial_id.argsort() % 2 == 0\n"
     )
