@@ -11,6 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from helpers import datasets
 from helpers.assertions import arrays_of, assert_same_arrays
 from helpers.datasets import (
     BOTH,
@@ -57,6 +58,14 @@ def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same under another seed. Read only."""
     folder = tmp_path_factory.mktemp("other")
     return make_dataset(folder / "out", folder, overrides=["seed=1"])
+
+
+@pytest.fixture(scope="module")
+def merged(sound: Path, other: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Both in one. Read only."""
+    into = tmp_path_factory.mktemp("merged") / "into"
+    merge(into, [sound, other])
+    return into
 
 
 @pytest.fixture
@@ -119,16 +128,14 @@ def test_where_files_cannot_be_linked_they_are_copied(
     assert check_dataset(tmp_path / "into") == []
 
 
-def test_halves_by_seeds_keep_everything(sound: Path, other: Path, tmp_path: Path) -> None:
-    into = tmp_path / "into"
-    merge(into, [sound, other])
-    assert check_dataset(into) == []
-    manifest = read_manifest(into)
+def test_halves_by_seeds_keep_everything(sound: Path, other: Path, merged: Path) -> None:
+    assert check_dataset(merged) == []
+    manifest = read_manifest(merged)
     assert [entry.name for entry in manifest.objects] == NAMES + [f"{n}-seed-1" for n in NAMES]
     assert [manifest.config_of(entry.name).seed for entry in manifest.objects] == 3 * [0] + 3 * [1]
     for source, suffix in ((sound, ""), (other, "-seed-1")):
         for name in NAMES:
-            theirs, ours = rows_of(source, name), rows_of(into, name + suffix)
+            theirs, ours = rows_of(source, name), rows_of(merged, name + suffix)
             for key, values in theirs.items():
                 assert np.array_equal(values, ours[key], equal_nan=values.dtype.kind == "f"), (
                     name,
@@ -136,7 +143,10 @@ def test_halves_by_seeds_keep_everything(sound: Path, other: Path, tmp_path: Pat
                 )
 
 
-def test_a_hand_counts_by_its_files_and_not_by_their_folder(tmp_path: Path) -> None:
+def test_a_hand_counts_by_its_files_and_not_by_their_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(datasets, "BOXES", dict([*BOXES.items()][:1]))
     outs = []
     for seed in "01":
         folder = shutil.copytree(MODELS, tmp_path / f"hands{seed}")
@@ -147,20 +157,27 @@ def test_a_hand_counts_by_its_files_and_not_by_their_folder(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("rule", few(["class", "object"], 1))
-def test_a_mesh_under_two_seeds_is_in_one_split(rule: str, tmp_path: Path) -> None:
-    split = f"split.by={rule}"
-    outs = [
-        make_dataset(tmp_path / seed, tmp_path / "meshes", overrides=[f"seed={seed}", split])
-        for seed in "01"
-    ]
-    merge(tmp_path / "into", outs)
-    assert check_dataset(tmp_path / "into") == []
+def test_a_mesh_under_two_seeds_is_in_one_split(rule: str, merged: Path, tmp_path: Path) -> None:
+    """By class as usual, where a class has two objects; and by object."""
+    into = merged
+    if rule == "object":
+        into, split = tmp_path / "into", f"split.by={rule}"
+        merge(
+            into,
+            [
+                make_dataset(
+                    tmp_path / seed, tmp_path / "meshes", overrides=[f"seed={seed}", split]
+                )
+                for seed in "01"
+            ],
+        )
+        assert check_dataset(into) == []
     home = {
         name.removesuffix("-seed-1"): set[str]()
-        for name in (entry.name for entry in read_manifest(tmp_path / "into").objects)
+        for name in (entry.name for entry in read_manifest(into).objects)
     }
     for part in ("train", "valid", "test"):
-        data = GraspDataset(tmp_path / "into" / OTO, split=part)
+        data = GraspDataset(into / OTO, split=part)
         for name in data.column("object_props/object_name"):
             home[name.removesuffix("-seed-1")].add("test" if part == "test" else "other")
     assert {len(parts) for parts in home.values()} == {1}
@@ -168,26 +185,22 @@ def test_a_mesh_under_two_seeds_is_in_one_split(rule: str, tmp_path: Path) -> No
     assert {"other"} in home.values()
 
 
-def test_samples_of_two_seeds_that_are_alike_weigh_less(
-    sound: Path, other: Path, tmp_path: Path
-) -> None:
+def test_samples_of_two_seeds_that_are_alike_weigh_less(sound: Path, merged: Path) -> None:
     """The boxes have the same palm poses under both seeds."""
-    merge(tmp_path / "into", [sound, other])
     one, both = (
         GraspDataset(out / OTO, split="test").column("grasp_props/weight")
-        for out in (sound, tmp_path / "into")
+        for out in (sound, merged)
     )
     assert np.array_equal(both, np.tile(one / 2, 2))
 
 
 def test_the_same_again_is_taken_once_and_merged_datasets_are_merged(
-    sound: Path, other: Path, copy: Path, tmp_path: Path
+    sound: Path, other: Path, merged: Path, copy: Path, tmp_path: Path
 ) -> None:
     merge(tmp_path / "once", [sound, copy])
     assert_same_arrays(tmp_path / "once" / TRIALS, sound / TRIALS)
-    merge(tmp_path / "into", [sound, other])
-    merge(tmp_path / "again", [tmp_path / "into", other, copy])
-    assert_same_arrays(tmp_path / "again" / TRIALS, tmp_path / "into" / TRIALS)
+    merge(tmp_path / "again", [merged, other, copy])
+    assert_same_arrays(tmp_path / "again" / TRIALS, merged / TRIALS)
 
 
 def test_of_an_object_that_was_tried_for_longer_all_is_taken(
@@ -316,10 +329,9 @@ def test_a_directory_in_use_is_refused(sound: Path, copy: Path) -> None:
         merge(copy, [sound])
 
 
-def test_several_seeds_are_not_built_on(sound: Path, other: Path, tmp_path: Path) -> None:
-    merge(tmp_path / "into", [sound, other])
+def test_several_seeds_are_not_built_on(sound: Path, merged: Path) -> None:
     with pytest.raises(DataError, match="must be of one seed to be built on"):
-        claim_directory(tmp_path / "into", read_manifest(sound).config)
+        claim_directory(merged, read_manifest(sound).config)
 
 
 @pytest.mark.nightly
