@@ -16,6 +16,8 @@ DEV    := $(VENV)/.installed-dev
 # Software OpenGL must not start threads beside the workers, and nothing needs the network.
 export LP_NUM_THREADS := 0
 export DRAKE_ALLOW_NETWORK := none
+# Containers often set this; each process of the tests would compile tests and package again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: FORCE help install demo test test-fast test-nightly test-browser test-torch test-cluster \
 	lint format docs docs-pages package release clean

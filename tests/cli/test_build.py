@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -125,16 +126,16 @@ def test_assemble_that_works_keeps_its_filters(out: Path) -> None:
     assert read_manifest(out).config.filters.max_slip == SLIP / 2
 
 
-#: Assembles copies of a dataset without samples, and dies at the first rename, the second, ...
+#: Assembles copies of a dataset without samples, and dies at the rename that is the copy's name.
 DIE = """
 import os, signal, sys
-from drakegrasp.generation.counts import Counts
-from drakegrasp.generation.pipeline import build
-from drakegrasp.generation.work_unit import UnitSummary
+from pathlib import Path
+import rich.progress
 from drakegrasp.cli.main import main
-from drakegrasp.config import Config
+from drakegrasp.dataset.assemble import assemble
 rename, (setting, *copies) = os.replace, sys.argv[1:]
-for left, copy in enumerate(copies):
+for copy in copies:
+    left = int(Path(copy).name)
     def replace(*names, **options):
         global left
         if not left:
@@ -149,17 +150,27 @@ for left, copy in enumerate(copies):
 """
 
 
+#: The renames at which assembling is killed in the first tier, and the others.
+FIRST = (0, LISTED, LISTED + 1, RENAMES - 1)
+OTHERS = tuple(k for k in range(RENAMES) if k not in FIRST)
+
+
 @pytest.fixture(scope="module")
-def killed(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """A dataset of one box whose assembling was killed at each of its renames."""
-    folder = tmp_path_factory.mktemp("killed")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(datasets, "BOXES", dict([*datasets.BOXES.items()][:1]))
-        whole = make_dataset(folder / "whole", folder / "meshes")
-    copies = [Path(shutil.copytree(whole, folder / str(k))) for k in range(RENAMES)]
-    command = [sys.executable, "-c", DIE, SLIPPED[1], *map(str, copies)]
-    subprocess.run(command, check=True, capture_output=True)
-    return copies
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Path]:
+    """Returns a dataset of one box whose assembling was killed at a rename. Read only."""
+
+    @cache
+    def kill(renames: tuple[int, ...]) -> Path:
+        folder = tmp_path_factory.mktemp("killed")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(datasets, "BOXES", dict([*datasets.BOXES.items()][:1]))
+            whole = make_dataset(folder / "whole", folder / "meshes")
+        copies = [shutil.copytree(whole, folder / str(k)) for k in renames]
+        command = [sys.executable, "-c", DIE, SLIPPED[1], *map(str, copies)]
+        subprocess.run(command, check=True, capture_output=True)
+        return folder
+
+    return lambda rename: kill(FIRST if rename in FIRST else OTHERS) / str(rename)
 
 
 def samples(out: Path) -> list[int]:
@@ -178,15 +189,19 @@ def samples(out: Path) -> list[int]:
     [
         *(("stats", k) for k in (0, LISTED, RENAMES - 1)),
         *((command, LISTED + 1) for command in ("check", "assemble")),
-        *(in_second_tier(("stats", k)) for k in range(1, RENAMES - 1) if k != LISTED),
+        *(in_second_tier(("stats", k)) for k in (*OTHERS, LISTED + 1)),
     ],
 )
 def test_files_appear_together_whenever_assembling_is_killed(
-    killed: list[Path], tmp_path: Path, rename: int, command: str, monkeypatch: pytest.MonkeyPatch
+    killed: Callable[[int], Path],
+    tmp_path: Path,
+    rename: int,
+    command: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A reader refuses what is half done, and the next command completes it."""
     monkeypatch.setattr(file_set, "PATIENCE", 0.1)
-    out = Path(shutil.copytree(killed[rename], tmp_path / "out"))
+    out = Path(shutil.copytree(killed(rename), tmp_path / "out"))
 
     # Before the list of new files has its name, the old files count.
     if rename >= LISTED:
