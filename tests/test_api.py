@@ -19,6 +19,7 @@ from drakegrasp.api.building import build_dataset, build_on
 from drakegrasp.api.verifying import (
     PlacedObject,
     place_object,
+    run_verification,
     verify_grasp,
     verify_grasps,
     verify_rows,
@@ -26,10 +27,11 @@ from drakegrasp.api.verifying import (
 from drakegrasp.cluster.connect import connect
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import ConfigError, GraspError, MeshError
+from drakegrasp.errors import ConfigError, GraspError, MachineError, MeshError
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.progress import silent
 from drakegrasp.verification.hints import find_hints
 from drakegrasp.verification.placing import PlacedGrasp, place_on_object, place_on_rows
@@ -324,7 +326,28 @@ def test_work_is_for_a_client_or_for_workers(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_build_that_gets_no_workers_leaves_nothing(small_meshes: Path, tmp_path: Path) -> None:
+    sources = find_meshes(small_meshes)
+    with pytest.raises(MachineError, match="no workers"):
+        build_on(_none(), sources, tmp_path / "out", load_config(), show=False)
+    assert not (tmp_path / "out").exists()
+
+
+@contextmanager
+def _none() -> Iterator[Client]:
+    raise MachineError("no workers")
+    yield
+
+
 @contextmanager
 def _never() -> Iterator[Client]:
     pytest.fail("a cluster was started")
     yield
+
+
+def test_one_worker_is_this_process(cube: PlacedObject, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = "drakegrasp.api.verifying"
+    monkeypatch.setattr(f"{module}.FEW_GRASPS", 0)
+    monkeypatch.setattr(f"{module}.verify_batch", lambda grasps, execute, *_, **__: [execute])
+    grasps = place(GRASP.ravel(), cube)
+    assert run_verification(grasps, workers=1, show=False) == [run_here]

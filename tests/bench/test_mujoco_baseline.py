@@ -76,8 +76,9 @@ def test_what_geometry_decides_is_not_simulated(
 ) -> None:
     attempt = from_above(cube, STANDOFF)
     assert baseline.run(replace(attempt, ray_hits=False)).outcome is Outcome.RAY_MISS
-    below = attempt.X_OG @ make_pose(np.eye(3), [0.0, 0.0, 0.3])
-    assert baseline.run(replace(attempt, X_OG=below)).outcome is Outcome.BELOW_TABLE
+    for height in (-0.1, 0.0):
+        below = make_pose(attempt.X_OG[:3, :3], [0.0, 0.0, height - cube.half_extents[2]])
+        assert baseline.run(replace(attempt, X_OG=below)).outcome is Outcome.BELOW_TABLE
 
 
 def test_slippery_cube_is_not_held(cube: ObjectModel, config: Config) -> None:
@@ -244,6 +245,13 @@ def test_own_friction_of_the_object_is_that_of_both_pairs(cube: ObjectModel) -> 
     assert own.geom("table").friction[0] == 0.2
     assert set(own.geom_friction[own.geom_bodyid == body, 0].tolist()) == {0.2}
     np.testing.assert_allclose(own.geom_friction[:, 1], own.geom_friction[:, 0] * TORSION_RADIUS)
+
+
+def test_wrist_is_light_but_no_contact_moves_it(cube: ObjectModel, config: Config) -> None:
+    own = build_mujoco_scene(cube, load_hand(config.hand), config).model
+    for name in ("wrist_x", "wrist_y", "wrist_z"):
+        assert own.body(name).mass[0] == 0.01
+        assert own.dof_armature[own.joint(name).dofadr[0]] == mujoco_scene.IMMOVABLE
 
 
 def test_wrist_waits_while_the_object_is_released(

@@ -9,9 +9,10 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from drakegrasp.cli.tables import funnel_table, hold_table, preshape_table
+from drakegrasp.cli.tables import audit_table, funnel_table, hold_table, preshape_table
 from drakegrasp.dataset.statistics import NO_NAME, Funnel, PreshapeCount
 from drakegrasp.filters import Removal
+from drakegrasp.objects.audit import AuditRow
 from drakegrasp.outcomes import Outcome
 
 
@@ -113,3 +114,25 @@ def test_preshape_table_has_a_row_of_each_and_says_which_is_of_none() -> None:
     assert [NO_NAME, "3", "1", "0", "0"] in cells(text)
     assert "all fingers close" in text
     assert "all fingers close" not in printed(preshape_table(counts[:1]))
+
+
+def test_audit_is_in_millimetres_and_megabytes() -> None:
+    fit = AuditRow(
+        name="1_mug",
+        class_name="mug",
+        status="fit",
+        notes=("one", "[two]"),
+        faces=1200,
+        bodies=1,
+        watertight=True,
+        extents=(0.05, 0.06, 0.07),
+        wall=0.0031,
+        collision_error=0.0004,
+        memory=2.6e6,
+        preparing=425e6,
+    )
+    refused = AuditRow(name="2_box", class_name="box", status="refused", notes=("open",))
+    text = cells(printed(audit_table([fit, refused])))
+    numbers = ["1,200", "50x60x70", "1", "yes", "3.1", "0.4", "3", "425"]
+    assert ["1_mug", "fit", *numbers, "one"] in text
+    assert ["2_box", "refused", *"-" * 8, "open"] in text

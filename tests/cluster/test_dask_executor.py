@@ -9,10 +9,11 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from dask.utils import parse_timedelta
-from distributed import Client, LocalCluster, SpecCluster, get_worker
+from distributed import Client, KilledWorker, LocalCluster, SpecCluster, get_worker
 
 from drakegrasp.cluster import executor as tasks
 from drakegrasp.cluster.connect import connect, dask_settings
@@ -70,6 +71,21 @@ def test_blank_image_is_tried_again_but_not_for_ever(client: Client, tmp_path: P
     assert sorted(execute(_blank_at_first, names)) == names
     with pytest.raises(BlankImageError):
         list(execute(_blank_at_first, [str(tmp_path / "f3")]))
+
+
+def _killed_at_first(path: str) -> str:
+    """Fail once as a task whose workers died."""
+    if not Path(path).exists():
+        Path(path).touch()
+        raise KilledWorker("task", SimpleNamespace(address="tcp://127.0.0.1:1"), 0)
+    return path
+
+
+def test_task_whose_workers_died_is_tried_as_often_as_asked(client: Client, tmp_path: Path) -> None:
+    first, second = str(tmp_path / "a"), str(tmp_path / "b")
+    assert list(DaskExecutor(client, resubmissions=1)(_killed_at_first, [first])) == [first]
+    with pytest.raises(MachineError, match="workers died again and again"):
+        list(DaskExecutor(client)(_killed_at_first, [second]))
 
 
 def test_items_are_taken_as_there_is_room(client: Client) -> None:

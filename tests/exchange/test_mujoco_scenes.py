@@ -52,3 +52,15 @@ def test_motors_keep_the_fingers_where_they_are(
     at = model.key_qpos[0][model.jnt_qposadr[joints]]
     np.testing.assert_allclose(model.key_ctrl[0], at)
     assert model.body("object").mass[0] == pytest.approx(1.0)
+
+
+def test_object_touches_with_its_convex_parts(
+    exported: Callable[[str], Path], grasps: list[ClosedGrasp]
+) -> None:
+    path = exported("mjcf") / grasps[0].object_name / f"{grasps[0].trial_id}.xml"
+    model = mujoco.MjModel.from_xml_path(str(path))
+    # A box is one part, with its own edges.
+    (part,) = np.flatnonzero(model.geom_bodyid == model.body("object").id)
+    np.testing.assert_allclose(model.geom_aabb[part], [0.0, 0.0, 0.0, 0.025, 0.03, 0.05], atol=1e-7)
+    np.testing.assert_allclose(model.geom_friction[part, 0], grasps[0].conditions[0])
+    assert model.geom_condim[part] == 4

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from drakegrasp.errors import MeshError
 from drakegrasp.mesh.loading import load_mesh
@@ -329,6 +330,19 @@ def test_what_is_not_as_declared_is_refused_in_one_line(tmp_path, case):
 
 def test_a_skin_in_its_bind_pose_is_read(tmp_path):
     assert load_mesh(write(tmp_path, "a.glb", skinned_glb(0.0))).volume == pytest.approx(1.0)
+
+
+def test_node_is_scaled_then_turned_then_moved(tmp_path):
+    turn, scale, place = (
+        Rotation.from_euler("xyz", [0.4, 0.7, 1.1]),
+        [1.0, 2.0, 3.0],
+        [4.0, 5.0, 6.0],
+    )
+    pose = {"rotation": turn.as_quat().tolist(), "scale": scale, "translation": place}
+    mesh = load_mesh(write(tmp_path, "a.glb", edited_glb(lambda g: [{"mesh": 0, **pose}])))
+    wanted = turn.apply(CUBE * scale) + place
+    found = [np.linalg.norm(mesh.vertices - corner, axis=1).min() for corner in wanted]
+    np.testing.assert_allclose(found, 0.0, atol=1e-6)
 
 
 def test_order_of_existing_datasets_stays(tmp_path):

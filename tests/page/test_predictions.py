@@ -136,7 +136,7 @@ def _of_others(file: h5py.File) -> None:
 
 
 def _beyond(file: h5py.File) -> None:
-    file["rows/trial_id"][1] = 99
+    file["rows/trial_id"][1] = 36
 
 
 def _another_object(file: h5py.File) -> None:

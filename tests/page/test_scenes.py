@@ -142,6 +142,17 @@ def change(name: str, value: object) -> Callable[[Path], None]:
     return spoil
 
 
+def test_grasp_without_a_pose_is_not_drawn(spoiled: Path) -> None:
+    def palms() -> int:
+        with TestClient(make_app(Inspection(spoiled)), base_url="http://127.0.0.1:8321") as client:
+            label = label_of(cards(client, "sort=row&order=up")[0])
+            return client.get(f"/scene/{label}").text.count('"z": ')
+
+    before = palms()
+    change("grasps/X_TG", np.nan)(spoiled / "scenes.hdf5")
+    assert palms() == before - 1
+
+
 @pytest.mark.parametrize(
     ("spoil", "line"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from io import BytesIO
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from matplotlib.image import imread
 from drakegrasp.pictures.charts import (
     GROUPS,
     MAX_OBJECTS,
+    card_picture,
     draw_counts,
     draw_distributions,
     draw_objects,
@@ -58,6 +60,34 @@ def test_names_are_drawn_as_they_are(name: str) -> None:
     svg = svg_bytes(draw_objects([name], counts)).decode()
     assert "<script" not in svg
     assert svg == svg_bytes(draw_objects([name], counts)).decode()
+
+
+def test_panels_of_a_card_state_what_they_draw(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drakegrasp.pictures.charts.png_bytes", lambda figure, dpi: figure)
+    each = {
+        "measures": {"headline": {"value": 0.5, "low": 0.25, "high": 0.75}, "held": {"value": 0.6}},
+        "held_within_mm": {"0": 0.0, "20": 0.5, "40": 0.6},
+        "calibration": [{"confidence": 0.1, "share": 0.2}, {"confidence": 0.9, "share": 0.7}],
+    }
+    card = {
+        "sets": {"net": each},
+        "headline": ["net"],
+        "measures": ["held"],
+        "limit_mm": 20.0,
+        "rows": 8,
+        "objects": 2,
+        "classes": 1,
+        "dataset": {"file": "data.hdf5", "split": "test", "rows_sha256": "0" * 64},
+        "settings": {"versions": {"drake": "1", "drakegrasp": "2"}},
+    }
+    figure: Any = card_picture(card)
+    headline, curves, calibration = figure.axes
+    assert headline.get_xlabel() == "per cent of rows, mean over objects"
+    assert curves.get_xlabel() == "d: farthest contact from the one asked for [mm]"
+    assert calibration.get_xlabel() == "stated confidence, five groups"
+    assert [line.get_xdata().tolist() for line in headline.lines] == [[25.0, 75.0], [50.0], [60.0]]
+    assert curves.lines[0].get_xydata().tolist() == [[0.0, 0.0], [20.0, 50.0], [40.0, 60.0]]
+    assert calibration.lines[0].get_xydata().tolist() == [[0.1, 20.0], [0.9, 70.0]]
 
 
 def panels(image: np.ndarray, mask: np.ndarray) -> list[np.ndarray]:

@@ -124,6 +124,22 @@ def test_verification_without_a_trial_shows_the_object_and_contacts_that_forces_
     assert (b"predicted/1" in everything) == judged
 
 
+def test_arrow_of_a_contact_begins_at_the_contact(
+    cube: ObjectModel, config: Config, tmp_path: Path
+) -> None:
+    verified = not_simulated(cube, config, forces=some_forces())
+    record_verification(verified, tmp_path / "v.html")
+    said = map(msgpack.unpackb, commands_of(tmp_path / "v.html"))
+    places = {
+        command["path"].partition("predicted/")[2]: np.reshape(command["matrix"], (4, 4)).T
+        for command in said
+        if command["type"] == "set_transform"
+    }
+    np.testing.assert_allclose(places["1"][:3, [2, 3]].T, [NHAT_Q_O[0], P_OQ[0]], atol=1e-12)
+    assert places["1/shaft"][2, 3] == pytest.approx((recording.ARROW - recording.HEAD) / 2.0)
+    assert places["1/head"][2, 3] == pytest.approx(recording.ARROW)
+
+
 def test_only_this_machine_is_served_and_only_meanwhile(
     cube: ObjectModel,
     attempt: Attempt,

@@ -97,6 +97,7 @@ ATTACKS = {
         RECONSTRUCT, (np.ndarray, (0,), b"b"), (1, (1,), object_field(), False, b"A" * 8)
     ),
     "object scalar": lambda: Call(SCALAR, (np.dtype("O"), b"A" * 8)),
+    "object scalar of a list": lambda: Call(SCALAR, (np.dtype("O"), [0.5])),
     "short array": lambda: Call(
         RECONSTRUCT, (np.ndarray, (0,), b"b"), (1, (1000,), np.dtype("f8"), False, b"A" * 8)
     ),

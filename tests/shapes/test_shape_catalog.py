@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections import Counter
@@ -11,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers.tiers import few
+from helpers import tiers
 from scipy.spatial import ConvexHull
 
 from drakegrasp.config import BuiltinConfig
@@ -32,6 +33,9 @@ from drakegrasp.shapes.catalog import (
     mm,
     pieces,
 )
+
+#: Volume [cm^3] and area [cm^2] of the smallest and the largest object of each class.
+SIZES = json.loads((Path(tiers.__file__).parent / "shapes.json").read_text(encoding="utf-8"))
 
 #: What lies lower than this bears on the table [m].
 CONTACT_HEIGHT = 0.001
@@ -56,7 +60,7 @@ def build(object_class: ObjectClass, which: str) -> trimesh.Trimesh:
     return object_class.shape(**{name: value(span, which) for name, span in spans})
 
 
-@pytest.fixture(params=few(["low", "high"], 1))
+@pytest.fixture(params=tiers.few(["low", "high"], 1))
 def which(request: pytest.FixtureRequest) -> str:
     return request.param
 
@@ -65,6 +69,8 @@ def which(request: pytest.FixtureRequest) -> str:
 def test_mesh_is_a_sound_object_for_the_hand(object_class: ObjectClass, which: str) -> None:
     """The objects that are drawn are between these; `test_equal_draws` has their hash."""
     mesh = build(object_class, which)
+    sizes = [1e6 * mesh.volume, 1e4 * mesh.area]
+    assert sizes == pytest.approx(SIZES[f"{object_class.name} {which}"], rel=1e-4)
 
     # One outward solid, whose surface does not cross itself.
     assert mesh.is_watertight

@@ -249,10 +249,8 @@ def _bends(
     cost += 0.0 if from_zero or slides else NOT_ZERO
 
     # The other motors follow in usual ratios, or each through its whole range.
-    ratios: list[tuple[float, ...]] = [()]
-    if len(spans) > 1:
-        whole = tuple((top - max(0.0, bottom)) / (high - start) for _, bottom, top in spans[1:])
-        ratios = [*RATIOS.get(len(spans), ()), whole]
+    whole = tuple((top - max(0.0, bottom)) / (high - start) for _, bottom, top in spans[1:])
+    ratios = [*RATIOS.get(len(spans), ()), whole]
     found = []
     for bent, own in product(BENT if len(spans) > 1 else (0.0,), ratios):
         q0, gain, limit = np.zeros(len(joints)), np.zeros(len(joints)), np.inf

@@ -52,10 +52,10 @@ def test_points_too_far_from_the_surface_are_off_it(box, inside):
 
 
 def test_normals_too_far_from_the_surfaces_own_are_off_it(box):
-    angles = [MAX_ANGLE - 1e-6, MAX_ANGLE + 1e-6, np.pi]
-    found = surface_contacts(box, [[HALF, 0.0, 0.0]] * 3, [leaning(angle) for angle in angles])
+    angles = [MAX_ANGLE - 1e-6, MAX_ANGLE, MAX_ANGLE + 1e-6, np.pi]
+    found = surface_contacts(box, [[HALF, 0.0, 0.0]] * 4, [leaning(angle) for angle in angles])
     assert np.allclose(found.angle, angles)
-    assert found.off_surface.tolist() == [False, True, True]
+    assert found.off_surface.tolist() == [False, False, True, True]
 
 
 def test_at_an_edge_the_normal_chooses_between_the_faces(box):
