@@ -27,7 +27,8 @@ pytestmark = pytest.mark.sim
 
 @pytest.fixture(scope="module")
 def config() -> Config:
-    return load_config(overrides=["certify.repeats=2", "certify.friction_steps=3"])
+    quick = ["lift.max_speed=2", "lift.max_acceleration=5", "lift.hold_time=0.1"]
+    return load_config(overrides=["certify.repeats=2", "certify.friction_steps=3", *quick])
 
 
 def certified(cube, config: Config, *, height: float = STANDOFF, **options) -> dict[str, float]:
