@@ -55,6 +55,9 @@ pytestmark = pytest.mark.sim
 
 NAME = "1_box_a"
 HAND = load_hand()
+#: Lifts are quick.
+QUICK = ("lift.max_speed=2", "lift.max_acceleration=10", "lift.hold_time=0.1")
+CONFIG = load_config(overrides=QUICK)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +71,7 @@ def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def table(tmp_path_factory: pytest.TempPathFactory) -> Attempts:
     """Rows of the cube: held by the hand's motors, held by own ones, inside it, below the table."""
     model = box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3, NAME)
-    config, attempt = load_config(), from_above(model, STANDOFF)
+    config, attempt = CONFIG, from_above(model, STANDOFF)
     scene = build_scene(model, config.physics, HAND)
     held = run_attempt(scene, standing(model), attempt, config)
     start = joint_positions(HAND, 0.0, np.zeros(3))
@@ -93,7 +96,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Attempts:
 
 
 def built(meshes: Path, out: Path, table: Attempts, config: Config | None = None) -> Path:
-    config = posture_config(config or load_config(), table)
+    config = posture_config(config or CONFIG, table)
     build(find_meshes(meshes), out, config, run_here, postures=table, show=False)
     return out
 
@@ -129,7 +132,7 @@ def test_trial_of_a_posture_is_replayed_from_the_dataset_alone(dataset, row):
 
 
 def test_plan_keeps_what_the_file_said(dataset, table):
-    config = posture_config(load_config(), table)
+    config = posture_config(CONFIG, table)
     kept = load_prepared(dataset, NAME, config).candidates.postures
     np.testing.assert_array_equal(kept.q_pregrasp, table.q_pregrasp)
     assert kept.said.tolist() == ["mine", "", "", ""]
@@ -143,7 +146,7 @@ def test_plan_whose_texts_are_nested_too_deeply_is_refused_in_a_line(dataset, ta
         file["said"] = np.frombuffer(b"[" * 100_000, dtype=np.uint8)
     seal(path)
     with pytest.raises(DataError, match="must hold postures, got none: values nested too deeply"):
-        load_prepared(tmp_path, NAME, posture_config(load_config(), table))
+        load_prepared(tmp_path, NAME, posture_config(CONFIG, table))
 
 
 def test_dataset_without_the_columns_reads_as_one_of_samplers(dataset, tmp_path):
@@ -157,7 +160,7 @@ def test_dataset_without_the_columns_reads_as_one_of_samplers(dataset, tmp_path)
 
 @pytest.mark.nightly
 def test_more_rows_complete_the_dataset_of_fewer(meshes, table, dataset, tmp_path):
-    fewer = load_config(overrides=["candidates.max=2"])
+    fewer = load_config(overrides=[*QUICK, "candidates.max=2"])
     out = built(meshes, tmp_path / "out", table, fewer)
     assert len(Trials(out)) == 2
     assert_same_arrays(built(meshes, out, table) / "trials.hdf5", dataset / "trials.hdf5")
@@ -189,7 +192,7 @@ def test_rows_that_are_no_posture_are_told_and_spoil_no_other(meshes, table, dat
         scale=scale,
     )
     mixed = mixed.refuse(unknown_objects(mixed, [NAME]))
-    config = posture_config(load_config(), mixed)
+    config = posture_config(CONFIG, mixed)
     report = build(find_meshes(meshes), tmp_path, config, run_here, postures=mixed, show=False)
     trials, alone = Trials(tmp_path), Trials(dataset)
     assert trials["posture_row"].tolist() == [0.0, 3.0]
@@ -215,7 +218,7 @@ def test_file_without_any_posture_is_refused(meshes, table, tmp_path):
     with pytest.raises(
         GraspError, match=r"must be of an object that is built: 4 of 4 rows .*got 'cup'"
     ):
-        build_on(nullcontext(None), find_meshes(meshes), tmp_path, load_config(),
+        build_on(nullcontext(None), find_meshes(meshes), tmp_path, CONFIG,
                  postures=replace(table, objects=("cup",) * 4))  # fmt: skip
 
 
@@ -228,7 +231,7 @@ def of_preshapes(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
     """The cube held by two fingers, given back with its preshape, without, and begun."""
     folder = tmp_path_factory.mktemp("shaped")
     config = load_config(
-        overrides=[f"hand={write_with_preshapes(folder, all='F1 F2 F3', pair='F1 F3')}"]
+        overrides=[*QUICK, f"hand={write_with_preshapes(folder, all='F1 F2 F3', pair='F1 F3')}"]
     )
     hand, model = load_hand(config.hand), box_model(folder, [CUBE] * 3, NAME)
     attempt, pair = from_above(model, STANDOFF), hand.at(1)
@@ -329,7 +332,7 @@ def test_postures_in_the_frame_of_the_mesh_file_are_moved_to_the_object(tmp_path
     there = table.X_FG.copy()
     there[:, :3, 3] += CUBE / 2.0
     moved = replace(table, X_FG=there, frame="mesh")
-    prepared = prepare(source, posture_config(load_config(), moved), moved)
+    prepared = prepare(source, posture_config(CONFIG, moved), moved)
     np.testing.assert_allclose(prepared.candidates.X_OG, table.X_FG, atol=1e-9)
 
     # On a mesh its frame is known, on an object alone it is not.
