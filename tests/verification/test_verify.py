@@ -29,7 +29,10 @@ from drakegrasp.verification.verify import verify_placed
 
 pytestmark = pytest.mark.sim
 
-CONFIG = load_config()
+#: Lifts are quick.
+CONFIG = load_config(
+    overrides=["lift.max_speed=2", "lift.max_acceleration=10", "lift.hold_time=0.1"]
+)
 HAND = load_hand()
 X_TC = make_pose(Rotation.from_euler("xyz", [2.0, 0.4, -1.0]).as_matrix(), [0.1, 0.3, 0.4])
 
