@@ -233,6 +233,7 @@ def write_field(group: h5py.Group, field: Field, values: AnyArray) -> h5py.Datas
     dataset = create_field(group, field, values.shape[1:], len(values))
     if len(values):
         dataset[...] = values
+    dataset.flush()  # see `write_fixed`
     return dataset
 
 
@@ -274,7 +275,7 @@ def write_fixed(group: h5py.Group, field: Field, values: AnyArray) -> None:
     if not len(values):
         group.create_dataset(field.name, data=values, dtype=field.dtype)
         return
-    group.create_dataset(
+    dataset = group.create_dataset(
         field.name,
         data=values,
         dtype=field.dtype,
@@ -283,6 +284,10 @@ def write_fixed(group: h5py.Group, field: Field, values: AnyArray) -> None:
         compression_opts=GZIP_LEVEL,
         shuffle=True,
     )
+    # HDF5 finds places for the chunks when the last reference to the dataset is gone. A profiler in
+    # another thread, such as that of Dask's workers, keeps references for a while, and the places
+    # would depend on the time.
+    dataset.flush()
 
 
 class ImageRows:

@@ -57,6 +57,23 @@ def test_same_shard_gives_the_same_bytes(tmp_path: Path) -> None:
     assert write_shard(tmp_path / "a", shard).read_bytes() == two.read_bytes()
 
 
+def test_profiler_that_holds_a_column_does_not_change_the_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As that of Dask's workers, which holds what the functions hold that it sees."""
+    one, held = write_shard(tmp_path / "a", some_shard()), list[h5py.Dataset]()
+    create = h5py.Group.create_dataset
+
+    def creating(*args: Any, **options: Any) -> h5py.Dataset:
+        dataset = create(*args, **options)
+        held.extend([] if held else [dataset])
+        return dataset
+
+    monkeypatch.setattr(h5py.Group, "create_dataset", creating)
+    two = write_shard(tmp_path / "b", some_shard())
+    assert one.read_bytes() == two.read_bytes()
+
+
 def test_shard_holds_values_and_little_else(tmp_path: Path) -> None:
     """HDF5 spends two kilobytes on a column that can grow and says what it means."""
     with h5py.File(write_shard(tmp_path, some_shard())) as file:
