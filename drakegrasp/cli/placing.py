@@ -179,8 +179,8 @@ def _place_on_rows(
         config=given,
         overrides=overrides,
     )
-    if table.bare:
-        say(table.bare, err=True)
+    for told in filter(None, (table.bare, table.left_out)):
+        say(told, err=True)
     return placed, config, PredictedRows.of(path, data.split, rows)
 
 

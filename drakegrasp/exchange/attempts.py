@@ -230,9 +230,13 @@ def _made(hand: Hand, raw: dict[str, Any]) -> Attempts:
 def _for_rows(path: Path, hand: Hand, data: GraspDataset, read_as: Mapping[str, str]) -> Attempts:
     """Return the postures that are for rows of a split, see `read_attempts`."""
     tables, files = list[Attempts](), files_in(path) if path.is_dir() else [path]
+    without = set[str]()
     for each in files:
         with named(each):
-            raw = _of_split(_raw(each, hand, read_as, nameless=True), data)
+            told = _raw(each, hand, read_as, nameless=True)
+            raw = _of_split(told, data)
+            if raw.get("of_objects"):
+                without |= set(told["objects"]) - set(raw["objects"])
             if len(raw["objects"]):
                 # The confidences of different files cannot be compared, unless each file is for
                 # objects of its own.
@@ -243,7 +247,8 @@ def _for_rows(path: Path, hand: Hand, data: GraspDataset, read_as: Mapping[str, 
         raise GraspError(
             f"{path}: samples must be of {data.split} in {data.path.name} (--split), got none"
         )
-    return join_attempts(tables) if len(tables) > 1 else tables[0]
+    table = join_attempts(tables) if len(tables) > 1 else tables[0]
+    return replace(table, without_rows=tuple(sorted(without)))
 
 
 def _of_split(raw: dict[str, Any], data: GraspDataset) -> dict[str, Any]:

@@ -179,6 +179,7 @@ def _warnings(
         )
     if len(grouping.rows) < total:
         found.append(f"{len(grouping.rows)} of the {total} rows of the split were scored")
+    found += sorted({ranked.left_out for each in sets for ranked in each.ranked} - {""})
     if known_objects:
         found.append(f"{known_objects} test objects are training objects, by their names")
     if not any(REFERENCES[each.name].trained for each in sets if each.name in REFERENCES):

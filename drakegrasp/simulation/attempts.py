@@ -64,7 +64,7 @@ _DECIDING = (
     *("scale", "log_density", "said", "preshape", "row"),
 )
 #: Attributes of a table that apply to all its rows together.
-_OF_ALL = ("frame", "link", "file", "sha256")
+_OF_ALL = ("frame", "link", "file", "sha256", "without_rows")
 #: Conditions that an attempt may have drawn, in the order of `Attempts.conditions`.
 CONDITIONS = ("friction_hand", "friction_table", "mass")
 
@@ -106,6 +106,7 @@ class Attempts:
         normalised: (n,), whether a normal was not of unit length.
         rank: (n,), for predictions: 0 for the best prediction of its row or object, see `ranked`.
         file, sha256: Source of predictions to score, and its hash.
+        without_rows: For predictions: objects that the files name and the split has no row of.
     """
 
     objects: tuple[str, ...]
@@ -135,6 +136,7 @@ class Attempts:
     rank: Any = None
     file: str = ""
     sha256: str = ""
+    without_rows: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -210,6 +212,13 @@ class Attempts:
             f"{len(rows):,} of {len(self):,} rows of the postures have a palm pose and no joints: "
             "the open hand closes"
         )
+
+    @property
+    def left_out(self) -> str:
+        """A message on the objects of which the split has no row; empty if there are none."""
+        if not self.without_rows:
+            return ""
+        return f"grasps are left out, as the split has no row of {listed(self.without_rows)}"
 
     def shapes(self, i: int, hand: Hand) -> tuple[str, ...]:
         """Return the preshapes in which a row is tried: the one that it names, or each preshape."""

@@ -54,8 +54,8 @@ def test_a_file_of_its_datasets_is_read_in_its_gripper_frame(tmp_path: Path) -> 
     np.testing.assert_array_equal(table.scale, [0.5, 0.5])
     # Another hand has no such frame, and its caller says which it is.
     with pytest.raises(GraspError, match="got 'graspgen'"):
-        read_attempts(tmp_path / "a.json", load_hand())
-    table = read_attempts(tmp_path / "a.json", load_hand(), read_as={"link": "palm"})
+        read_attempts(tmp_path / "a.json", load_hand("leap"))
+    table = read_attempts(tmp_path / "a.json", load_hand("leap"), read_as={"link": "palm"})
     np.testing.assert_allclose(table.X_FG, X_MA, atol=1e-12)
 
 

@@ -77,8 +77,9 @@ def test_grasps_of_an_object_are_for_each_of_its_rows_and_ranked(out, tmp_path):
     np.testing.assert_array_equal(table.of_row, np.repeat(rows, 2))
     np.testing.assert_array_equal(table.confidence, np.tile([0.7, 0.2], len(rows)))
     assert table.frame == "object" and set(table.invalid) == {""}
+    assert table.left_out == "grasps are left out, as the split has no row of unknown"
     with pytest.raises(GraspError, match="link must be 'palm'"):
-        rank_file(folder, data, {"link": "graspgen"})
+        rank_file(folder, data, {"link": "dexgraspbench"})
 
 
 def test_the_caller_says_the_preshape_of_rows_that_name_none(tmp_path):
