@@ -34,7 +34,7 @@ settings.load_profile("drakegrasp")
 
 
 def pytest_collection_finish() -> None:
-    """Leave what is there before the tests out of garbage collections, which are much quicker."""
+    """Leave what is there before the tests out of garbage collections: a full one takes 0.2 s."""
     gc.collect()
     gc.freeze()
 
