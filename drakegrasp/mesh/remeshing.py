@@ -8,9 +8,9 @@ takes much memory, and then decimates; a surface of at most `MOST_FACES` faces i
 The other functions prepare surfaces that support an object. Each face of a rigid hydroelastic
 surface yields one contact polygon, and each polygon has one point of force: a base of two triangles
 is supported at two points and tips over; a base of many small faces is supported nearly up to its
-rim. So `resting_hull` divides each plane facet of a convex hull into a fan of triangles around a
-point inside it. A facet with long edges also gets a narrow rim, so that it is supported near its
-border: with fans only, a box that is set down from 2 mm falls over. `subdivide` splits long edges.
+rim. So `resting_hull` divides each plane facet of a convex hull into a narrow rim, by which it is
+supported near its border, and a fan of few triangles inside it: with fans only, boxes and cylinders
+that are set down from 2 mm fall over. `subdivide` splits long edges.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import fast_simplification
 import numpy as np
 import trimesh
 
-from drakegrasp.arithmetic import dot, norm
+from drakegrasp.arithmetic import dot
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import edge_ids, find_components, part_touching_edges
@@ -305,14 +305,15 @@ def _deviation(vertices: Array, solid: Solid) -> float:
 #: Triangles of the hull belong to one facet if their corners are this close to the plane of the
 #: facet's largest triangle [m], and the cosine between their normals is at least this.
 FLATNESS, ALIKE = 1e-5, 0.99
-#: Facets with a smaller extent are not changed; facets with a longer edge get a rim [m].
-SMALL, LONG = 0.01, 0.02
-#: Width of the rim, as a fraction of the way from the border to the inner point.
-RIM = 0.1
+#: Facets with a smaller extent are not changed [m].
+SMALL = 0.01
+#: Width of the rim, as a fraction of the way from the border to the inner point, and the largest
+#: number of corners of the ring inside it.
+RIM, RING = 0.1, 8
 
 
 def resting_hull(points: Array) -> Solid:
-    """Return the convex hull of points (n, 3) [m] as a closed surface, with its facets as fans.
+    """Return the convex hull of points (n, 3) [m] as a closed surface, its facets as rims and fans.
 
     Facets that are plane within `FLATNESS` keep only the corners of their border.
     """
@@ -330,18 +331,18 @@ def resting_hull(points: Array) -> Solid:
         weights = face_areas(vertices, facet)
         centroid = weights @ vertices[facet].mean(axis=1) / weights.sum()
 
-        # Two narrow triangles inside of each edge.
-        if norm(np.roll(corners, -1, axis=0) - corners).max() > LONG:
-            inner = count + np.arange(len(border))
-            after, inner_after = np.roll(border, -1), np.roll(inner, -1)
-            triangles.append(np.column_stack((border, after, inner_after)))
-            triangles.append(np.column_stack((border, inner_after, inner)))
-            blocks.append(corners + RIM * (centroid - corners))
-            border, count = inner, count + len(inner)
+        # A rim of narrow triangles between the border and a ring of few of its corners.
+        of_ring = np.arange(min(len(border), RING)) * len(border) // min(len(border), RING)
+        ring, after = count + np.arange(len(of_ring)), np.roll(border, -1)
+        nearest = ring[np.searchsorted(of_ring, np.arange(len(border)), side="right") - 1]
+        ring_after = np.roll(ring, -1)
+        triangles.append(np.column_stack((border, after, nearest)))
+        triangles.append(np.column_stack((ring, border[np.roll(of_ring, -1)], ring_after)))
+        blocks.append(corners[of_ring] + RIM * (centroid - corners[of_ring]))
+        count += len(ring)
 
         # The fan.
-        middle = np.full(len(border), count)
-        triangles.append(np.column_stack((border, np.roll(border, -1), middle)))
+        triangles.append(np.column_stack((ring, ring_after, np.full(len(ring), count))))
         blocks.append(centroid[None])
         count += 1
     vertices, faces = compact(np.vstack(blocks), np.vstack(triangles))
