@@ -331,18 +331,19 @@ def resting_hull(points: Array) -> Solid:
         weights = face_areas(vertices, facet)
         centroid = weights @ vertices[facet].mean(axis=1) / weights.sum()
 
-        # A rim of narrow triangles between the border and a ring of few of its corners.
-        of_ring = np.arange(min(len(border), RING)) * len(border) // min(len(border), RING)
-        ring, after = count + np.arange(len(of_ring)), np.roll(border, -1)
-        nearest = ring[np.searchsorted(of_ring, np.arange(len(border)), side="right") - 1]
+        # A rim of narrow triangles between the border and a ring of a few of its corners.
+        size = min(len(border), RING)
+        picked = np.arange(size) * len(border) // size
+        ring = count + np.arange(size)
         ring_after = np.roll(ring, -1)
-        triangles.append(np.column_stack((border, after, nearest)))
-        triangles.append(np.column_stack((ring, border[np.roll(of_ring, -1)], ring_after)))
-        blocks.append(corners[of_ring] + RIM * (centroid - corners[of_ring]))
-        count += len(ring)
+        nearest = ring[np.searchsorted(picked, np.arange(len(border)), side="right") - 1]
+        triangles.append(np.column_stack((border, np.roll(border, -1), nearest)))
+        triangles.append(np.column_stack((ring, border[np.roll(picked, -1)], ring_after)))
+        blocks.append(corners[picked] + RIM * (centroid - corners[picked]))
+        count += size
 
         # The fan.
-        triangles.append(np.column_stack((ring, ring_after, np.full(len(ring), count))))
+        triangles.append(np.column_stack((ring, ring_after, np.full(size, count))))
         blocks.append(centroid[None])
         count += 1
     vertices, faces = compact(np.vstack(blocks), np.vstack(triangles))
