@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import copy
 import pickle
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
 from distributed import Client
 
+from drakegrasp.api import verifying
 from drakegrasp.api.building import build_dataset, build_on
 from drakegrasp.api.verifying import (
     PlacedObject,
@@ -127,6 +129,27 @@ def test_results_are_delivered_in_order_from_any_executor(
     assert delivered == [0, 1, 2]
     assert [r.p_OQ[0, 0] for r in results] == pytest.approx(grasps[:, 0], abs=1e-4)
     assert all(r.placed is placed[0].placed for r in results)
+
+
+@pytest.mark.parametrize(("count", "sizes"), [(9, [2, 2, 2, 2, 1]), (200, [16] * 12 + [8])])
+def test_workers_get_tasks_of_few_grasps(
+    cube: PlacedObject, monkeypatch: pytest.MonkeyPatch, count: int, sizes: list[int]
+) -> None:
+    """One worker gets four tasks or more, and no task has more than 16 grasps."""
+    (result,) = verify_batch(place(GRASP.reshape(1, 18), cube), run_here, silent)
+    client, given = SimpleNamespace(nthreads=lambda: {"worker": 1}), list[int]()
+
+    def execute(_: object, tasks: Iterable[list[PlacedGrasp]]) -> Iterator[object]:
+        for task in tasks:
+            given.append(len(task))
+            yield [(grasp.index, result) for grasp in task]
+
+    monkeypatch.setattr(verifying, "joined", lambda *_: nullcontext(client))
+    monkeypatch.setattr(verifying, "admitted_workers", lambda *_: nullcontext())
+    monkeypatch.setattr(verifying, "DaskExecutor", lambda _: execute)
+    placed = place(np.tile(GRASP.ravel(), (count, 1)), cube)
+    run_verification(placed, client=client, show=False)  # type: ignore[arg-type]
+    assert given == sizes
 
 
 @pytest.mark.parametrize("where", [{}, {"frame": "camera", "X_TC": np.eye(4)}])

@@ -104,6 +104,16 @@ def test_motors_have_the_gains_of_the_benchmark(folder: Path, settings: dict[str
     assert (np.abs(model.actuator_forcerange) == 3.0).all()
 
 
+def test_motors_of_fingers_that_slide_work_in_metres() -> None:
+    """A metre is ten radians, as in `description.SLIDE`; a force of 1 N then is 0.1 N m."""
+    model = make_hand_model(load_hand("franka")).compile()
+    np.testing.assert_allclose(model.dof_damping, [5.0, 5.0])
+    np.testing.assert_allclose(model.dof_armature, [0.02, 0.02])
+    np.testing.assert_allclose(model.actuator_gainprm[:, 0], 500.0)
+    np.testing.assert_allclose(model.actuator_biasprm[:, 1], -500.0)
+    np.testing.assert_allclose(model.actuator_forcerange, [[-30.0, 30.0]])
+
+
 def test_settings_name_links_of_the_model(folder: Path, settings: dict[str, Any]) -> None:
     model = mujoco.MjModel.from_xml_path(str(folder / settings["xml_path"]))
     bodies = {model.body(i).name for i in range(model.nbody)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -14,15 +15,18 @@ from helpers.shards import some_shard
 from drakegrasp.dataset.hdf5 import write_field
 from drakegrasp.dataset.schema import Field
 from drakegrasp.dataset.shards import write_shard
+from drakegrasp.errors import DataError
 from drakegrasp.runtime import files
 from drakegrasp.runtime.environment import host_label
 from drakegrasp.runtime.files import (
     LIST_NAME,
     atomic_folder,
+    complete_replacement,
     atomic_hdf5,
     probe_folder,
     replaced_together,
     sweep_temporary,
+    temporary_name,
     write_atomic,
 )
 
@@ -129,6 +133,18 @@ def test_files_that_are_replaced_together_are_on_the_disk_before_their_list(
     assert listed in seen and {tmp_path / "a", tmp_path / "b"} <= seen
     assert listed not in left
     assert [(tmp_path / name).read_text() for name in ("a", "b")] == ["a", "b"]
+
+
+def test_list_of_what_is_no_file_is_refused(tmp_path: Path) -> None:
+    """A folder or a link of the right name must not replace a file."""
+    (tmp_path / "file").write_text("old")
+    for make in (Path.mkdir, lambda path: path.symlink_to(tmp_path / "file")):
+        new = temporary_name(tmp_path / "file")
+        make(new)
+        (tmp_path / LIST_NAME).write_text(json.dumps({"file": new.name}))
+        with pytest.raises(DataError, match=r"must be a list of files .*, which is no file"):
+            complete_replacement(tmp_path)
+        assert (tmp_path / "file").read_text() == "old"
 
 
 def watch_sync(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, set[Path]]]:
