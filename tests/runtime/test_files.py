@@ -21,8 +21,8 @@ from drakegrasp.runtime.environment import host_label
 from drakegrasp.runtime.files import (
     LIST_NAME,
     atomic_folder,
-    complete_replacement,
     atomic_hdf5,
+    complete_replacement,
     probe_folder,
     replaced_together,
     sweep_temporary,
