@@ -228,6 +228,19 @@ def test_process_that_takes_too_much_memory_is_killed(tmp_path: Path) -> None:
     assert time.monotonic() - began < 30.0
 
 
+def test_process_does_its_calls_though_ctrl_c_reaches_it(tmp_path: Path) -> None:
+    """The client stops its workers itself."""
+    put(tmp_path, 1)
+    process = ProcessApart(tmp_path)
+    try:
+        for _ in range(2):
+            call = pickle.dumps((join, Join(out=tmp_path, number=0)))
+            assert pickle.loads(process.call(call, tmp_path, memory=1e12)) == 0
+            process._process.send_signal(signal.SIGINT)
+    finally:
+        process.close()
+
+
 @pytest.mark.sim
 @pytest.mark.parametrize("settings", [SAMPLE, in_second_tier(EVERY_STEP)])
 def test_every_kind_of_task_gives_the_same_bytes(

@@ -17,6 +17,7 @@ from drakegrasp.cli.main import main
 from drakegrasp.commissioning.draft.fingers import Answers
 from drakegrasp.commissioning.draft.model import doubtful_units, read_model
 from drakegrasp.commissioning.draft.run import NewHand, draft_hand
+from drakegrasp.commissioning.draft.shapes import THIN, Shape
 from drakegrasp.commissioning.draft.source import read_source
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import Hand, load_hand
@@ -97,6 +98,22 @@ def test_fingers_oppose_a_thumb_whose_base_is_turned(tmp_path: Path) -> None:
     assert set(hand.preshape) == {"thumb_turn"}
     # The palm faces +x of its link.
     assert hand.X_BG[0, 2] > 0.9
+
+
+def test_a_hand_of_four_fingers_grasps_with_three(tmp_path: Path) -> None:
+    ring = MITTEN[MITTEN.index('<link name="index') : MITTEN.index('<link name="middle')]
+    ring = ring.replace("index", "ring").replace("0 0.022 0", "0 0 0")
+    hand = load_hand(draft(tmp_path, MITTEN.replace("</robot>", ring + "</robot>")).path)
+    assert len(hand.fingers) == 3 and hand.fingers[-1].name == "thumb"
+
+
+def test_a_mesh_without_thickness_gets_some_on_both_sides() -> None:
+    corners = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0], [0.02, 0.06, 0.0], [0.0, 0.06, 0.0]])
+    hull = Shape(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]])).hull()
+    assert hull.vertices is not None
+    half = THIN / 2.0
+    np.testing.assert_allclose(hull.vertices.min(axis=0), [-half] * 3)
+    np.testing.assert_allclose(hull.vertices.max(axis=0), [0.02 + half, 0.06 + half, half])
 
 
 BAR = link("bar", 0.01, box("0.01 0.01 0.02", "0 0 0.01"))

@@ -345,6 +345,21 @@ def test_node_is_scaled_then_turned_then_moved(tmp_path):
     np.testing.assert_allclose(found, 0.0, atol=1e-6)
 
 
+def test_child_is_moved_in_the_axes_of_its_parent(tmp_path):
+    turn = Rotation.from_euler("xyz", [0.4, 0.7, 1.1])
+    parent = {"rotation": turn.as_quat().tolist(), "translation": [4.0, 5.0, 6.0]}
+    child = {"mesh": 0, "translation": [1.0, 2.0, 3.0]}
+
+    def edit(g):
+        g.extra.update(scene=0, scenes=[{"nodes": [0]}])
+        return [{"children": [1], **parent}, child]
+
+    mesh = load_mesh(write(tmp_path, "a.glb", edited_glb(edit)))
+    wanted = turn.apply(CUBE + [1.0, 2.0, 3.0]) + [4.0, 5.0, 6.0]
+    found = [np.linalg.norm(mesh.vertices - corner, axis=1).min() for corner in wanted]
+    np.testing.assert_allclose(found, 0.0, atol=1e-6)
+
+
 def test_order_of_existing_datasets_stays(tmp_path):
     """The last material of a Wavefront file comes first, as trimesh has it."""
     far = [[k + 8 for k in q] for q in QUADS]

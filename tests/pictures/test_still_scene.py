@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from helpers.pages import surface_of
 
-from drakegrasp.frames import make_pose, rotation_about
+from drakegrasp.errors import MachineError
+from drakegrasp.frames import Array, make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import fingertip_poses
 from drakegrasp.hand.shapes import link_shapes
+from drakegrasp.pictures.rendered import picture_hand
 from drakegrasp.pictures.still_scene import Poses, StillScene, link_surfaces
 
 HAND = load_hand()
@@ -40,3 +44,20 @@ def test_each_link_fills_its_collision_shapes(scene: StillScene) -> None:
         box = np.array([corners.min(axis=0), corners.max(axis=0)])
         # The corners of a cylinder enclose its circle.
         np.testing.assert_allclose(surface_of(content).bounds, box, atol=1.5e-3)
+
+
+def test_a_hand_is_seen_from_beside_and_above(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """25 degrees beside the line along which it closes, 20 degrees above the palm's plane."""
+    seen: list[Array] = []
+
+    def picture(scene: StillScene, X_WC: Array, *_: object) -> None:
+        seen.append(-X_WC[:3, 2])
+        raise MachineError("no OpenGL")
+
+    monkeypatch.setattr(StillScene, "picture", picture)
+    with pytest.raises(MachineError, match="no OpenGL"):
+        picture_hand(load_hand(), tmp_path / "hand.png", across=np.deg2rad(30.0))
+    x, y, z = seen[0]
+    np.testing.assert_allclose(np.rad2deg([np.arctan2(y, x), np.arcsin(z)]), [55.0, 20.0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -123,6 +124,21 @@ def test_postures_take_0_4_seconds_each(hand: Path, box: ObjectFolder) -> None:
         scene.reset(jaws(0.01).pregrasp, np.array(HERE))
         protocol.squeeze(scene, jaws(0.01))
         assert scene._data.time == pytest.approx(seconds)
+
+
+def test_motors_are_commanded_where_their_own_joints_shall_go(
+    box: ObjectFolder, tmp_path: Path
+) -> None:
+    """A hand with its motors in another order than its joints, and one that moves half as far."""
+    left, right = re.findall(r" *<position .*?/>\n", HAND)
+    text = HAND.replace(left + right, right.replace("/>", ' gear="0.5"/>') + left)
+    (tmp_path / "hand.xml").write_text(text)
+    scene = ProtocolScene(DexGraspBench(), tmp_path / "hand.xml", box)
+    start, end = (np.array([*HERE, 0.01 * k, 0.02 * k]) for k in (1, 2))
+    scene.reset(start, np.array(HERE))
+    np.testing.assert_allclose(scene._data.ctrl, [0.01, 0.01])
+    scene.move(start, end, changes=2, steps=1)
+    np.testing.assert_allclose(scene._data.ctrl, [0.02, 0.02])
 
 
 def test_solver_against_slip_keeps_the_box_from_creeping(judge: Judge) -> None:

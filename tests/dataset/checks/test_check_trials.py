@@ -31,6 +31,7 @@ from helpers.datasets import (
     must_find,
     must_find_without_shards,
     set_at,
+    turned,
 )
 
 from drakegrasp.dataset.manifest import claim_directory, read_manifest
@@ -132,6 +133,14 @@ def test_a_wrong_value_of_a_trial_is_found(out: Path, cases: dict[int, str]) -> 
     from_shard = ((row, f"{name} must follow from its shard") for row, name, *_ in spoilt)
     must_find(out, *((TRIALS, "/trials", row, what) for row, what in from_shard))
     must_find_without_shards(out, *((TRIALS, "/trials", row, what) for row, *_, what in spoilt))
+
+
+def test_slip_is_the_objects_motion_in_the_hand(out: Path) -> None:
+    """A palm that turns about its own origin moves an object beside this origin."""
+    turn = turned(0.2, [1.0, 0.0, 0.0])
+    change(out, TRIALS, "trials/X_OG_lifted", SUCCESS, turn)
+    broken = [f"{name} must follow from X_OG and X_OG_lifted" for name in ("slip", "turn")]
+    must_find_without_shards(out, *((TRIALS, "/trials", SUCCESS, what) for what in broken))
 
 
 def end(slip: float) -> Callable[[Path, int], None]:

@@ -265,6 +265,20 @@ def test_a_table_in_the_way_pushes_the_hand_up():
     assert pushed >= 3
 
 
+def test_each_finger_is_moved_onto_its_point():
+    """SLSQP ends up to a tenth of a millimetre away where no posture meets points and normals alike."""
+    hand, constants = hand_of("barrett"), hand_constants(hand_of("barrett"))
+    for seed in range(3):
+        made = touched("barrett", seed)
+        p_OQ = made.p_OQ + 0.003 * np.array([[1.0], [0.0], [-1.0]]) * made.nhat_Q_O
+        found = fit_wrist(hand, p_OQ, made.nhat_Q_O, up_O=UP, height=HIGH)[0]
+        X_GF = fingertip_poses(hand, spread=found.spread, closing=found.closing)
+        X_FO = invert_pose(found.X_OG @ X_GF)
+        p_FQ = np.einsum("kab,kb->ka", X_FO[:, :3, :3], p_OQ) + X_FO[:, :3, 3]
+        distance = signed_distance(constants.pads, p_FQ).distance
+        assert np.abs(distance).max() < 1e-7, distance
+
+
 def test_contacts_out_of_reach_leave_a_large_residual():
     angle = 2.0 * np.pi * np.arange(3) / 3.0
     outward = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(3)])
