@@ -355,7 +355,7 @@ def test_child_is_moved_in_the_axes_of_its_parent(tmp_path):
         return [{"children": [1], **parent}, child]
 
     mesh = load_mesh(write(tmp_path, "a.glb", edited_glb(edit)))
-    wanted = turn.apply(CUBE + [1.0, 2.0, 3.0]) + [4.0, 5.0, 6.0]
+    wanted = turn.apply(CUBE + np.array([1.0, 2.0, 3.0])) + np.array([4.0, 5.0, 6.0])
     found = [np.linalg.norm(mesh.vertices - corner, axis=1).min() for corner in wanted]
     np.testing.assert_allclose(found, 0.0, atol=1e-6)
 

@@ -127,7 +127,7 @@ def test_postures_take_0_4_seconds_each(hand: Path, box: ObjectFolder) -> None:
 
 
 def test_motors_are_commanded_where_their_own_joints_shall_go(
-    box: ObjectFolder, tmp_path: Path
+    box: ObjectFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A hand with its motors in another order than its joints, and one that moves half as far."""
     left, right = re.findall(r" *<position .*?/>\n", HAND)
@@ -137,8 +137,10 @@ def test_motors_are_commanded_where_their_own_joints_shall_go(
     start, end = (np.array([*HERE, 0.01 * k, 0.02 * k]) for k in (1, 2))
     scene.reset(start, np.array(HERE))
     np.testing.assert_allclose(scene._data.ctrl, [0.01, 0.01])
+    given: list[np.ndarray] = []
+    monkeypatch.setattr(scene, "step", lambda _: given.append(scene._data.ctrl.copy()))
     scene.move(start, end, changes=2, steps=1)
-    np.testing.assert_allclose(scene._data.ctrl, [0.02, 0.02])
+    np.testing.assert_allclose(given, [[0.015, 0.015], [0.02, 0.02]])
 
 
 def test_solver_against_slip_keeps_the_box_from_creeping(judge: Judge) -> None:

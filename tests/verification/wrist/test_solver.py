@@ -266,7 +266,7 @@ def test_a_table_in_the_way_pushes_the_hand_up():
 
 
 def test_each_finger_is_moved_onto_its_point():
-    """SLSQP ends up to a tenth of a millimetre away where no posture meets points and normals alike."""
+    """SLSQP alone leaves hundredths of a millimetre if no posture meets points and normals."""
     hand, constants = hand_of("barrett"), hand_constants(hand_of("barrett"))
     for seed in range(3):
         made = touched("barrett", seed)
