@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -95,6 +96,19 @@ def test_the_card_has_the_command_as_it_was_given(
     said = error_line(run(*words, "--workers", 1, "--quiet"))
     given = shlex.split(said.partition("drakegrasp ")[2])
     assert sorted(given) == sorted(map(str, words))
+
+
+def test_shares_and_their_intervals_are_printed_as_percent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    share = {"value": 0.25, "low": 0.125, "high": 0.5}
+    scored = SimpleNamespace(card={"headline": {"net.npy": share}})
+    monkeypatch.setattr("drakegrasp.api.scoring.score", lambda *_, **__: scored)
+    data = make_dataset(tmp_path / "out", tmp_path / "meshes") / OTO
+    np.save(tmp_path / "net.npy", np.zeros((1, 18)))
+    words = ("score", tmp_path / "net.npy", "--dataset", data, "--out", tmp_path / "card")
+    result = run(*words, "--workers", 1, "--quiet")
+    assert result.stdout.splitlines()[0] == "net.npy: 25.0 % (12.5 to 50.0)"
 
 
 def test_mistakes_are_one_line(tmp_path: Path) -> None:

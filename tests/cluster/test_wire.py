@@ -7,6 +7,7 @@ import itertools
 import os
 import pickle
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -228,8 +229,11 @@ def test_process_that_takes_too_much_memory_is_killed(tmp_path: Path) -> None:
     assert time.monotonic() - began < 30.0
 
 
-def test_process_does_its_calls_though_ctrl_c_reaches_it(tmp_path: Path) -> None:
+def test_process_does_its_calls_though_ctrl_c_reaches_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The client stops its workers itself."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(map(os.path.abspath, sys.path)))
     put(tmp_path, 1)
     process = ProcessApart(tmp_path)
     try:
