@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 import trimesh
 from distributed import Client, LocalCluster, Worker
-from helpers import builds
 from helpers.builds import FAST
 from helpers.file_tasks import Join, join
 from helpers.tiers import in_second_tier
@@ -80,7 +79,7 @@ def client() -> Iterator[Client]:
 @pytest.fixture
 def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A directory that the process beside a worker does not see: its own one is another."""
-    monkeypatch.setenv("PYTHONPATH", str(Path(builds.__file__).parent.parent))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(map(os.path.abspath, sys.path)))
     monkeypatch.chdir(tmp_path)
     return Path("/proc/self/cwd/out")
 
