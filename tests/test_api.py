@@ -16,7 +16,7 @@ import pytest
 import trimesh
 from distributed import Client
 
-from drakegrasp.api import verifying
+from drakegrasp.api import building, verifying
 from drakegrasp.api.building import build_dataset, build_on
 from drakegrasp.api.verifying import (
     PlacedObject,
@@ -374,3 +374,19 @@ def test_one_worker_is_this_process(cube: PlacedObject, monkeypatch: pytest.Monk
     monkeypatch.setattr(f"{module}.verify_batch", lambda grasps, execute, *_, **__: [execute])
     grasps = place(GRASP.ravel(), cube)
     assert run_verification(grasps, workers=1, show=False) == [run_here]
+
+
+def test_workers_are_asked_whether_they_see_the_meshes_of_a_build(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    trimesh.creation.box([EDGE] * 3).export(folder / "1_box_a.obj")
+
+    def refuse(_client: object, _config: object, _out: Path, meshes: list[Path]) -> None:
+        raise MachineError(f"asked for {', '.join(path.name for path in meshes)}")
+
+    monkeypatch.setattr(building, "admitted_workers", refuse)
+    client = nullcontext(SimpleNamespace(dashboard_link=""))
+    with pytest.raises(MachineError, match="asked for 1_box_a"):
+        build_on(client, find_meshes(folder), tmp_path / "out", load_config(), show=False)  # type: ignore[arg-type]
