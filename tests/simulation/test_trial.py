@@ -358,6 +358,21 @@ def test_friction_is_the_effective_one_on_both_pairs(tmp_path, hand):
         assert 2.0 * mu * partner / (mu + partner) == pytest.approx(effective)
 
 
+@pytest.mark.parametrize("place", [(0.0, 0.0), (0.3, 0.15), (-0.7, 0.7)])
+def test_a_block_sinks_into_the_table_alike_everywhere(tmp_path, place):
+    """On a soft table of modulus E, a base A is where E d A / 0.05 m carries the weight."""
+    model = box_model(tmp_path, [0.08, 0.08, 0.04])
+    physics = load_config(overrides=["physics.table_modulus=1e5"]).physics
+    scene = build_object_scene(model, physics)
+    X_WO = X_WT @ standing(model)
+    X_WO[:2, 3] += place
+    reset_object(scene, X_WO)
+    scene.simulator.Initialize()
+    advance(scene, 1.0)
+    depth = X_WO[2, 3] - scene.pose(scene.object)[2, 3]
+    assert depth == pytest.approx(model.mass * GRAVITY * 0.05 / (1e5 * 0.08**2), rel=0.02)
+
+
 def test_table_friction_stops_a_sliding_block(tmp_path):
     """A block of speed v slides v^2 / (2 mu g) before it stops.
 
@@ -367,10 +382,12 @@ def test_table_friction_stops_a_sliding_block(tmp_path):
     physics = load_config(
         overrides=["physics.friction_table=0.5", "physics.time_step=0.0002"]
     ).physics
-    speeds = []
-    for start in (0.5, 1.0):
+    slid = {}
+    for start, x in ((0.5, 0.0), (0.5, 0.3), (1.0, 0.0)):
         scene = build_object_scene(model, physics)
-        reset_object(scene, X_WT @ standing(model))
+        X_WO = X_WT @ standing(model)
+        X_WO[0, 3] += x
+        reset_object(scene, X_WO)
         scene.simulator.Initialize()
         advance(scene, 0.1)
         velocity = np.zeros(6)
@@ -379,9 +396,10 @@ def test_table_friction_stops_a_sliding_block(tmp_path):
         before = scene.pose(scene.object)[0, 3]
         advance(scene, 0.3)
         assert np.abs(scene.plant.GetVelocities(scene.context)).max() < 1e-3
-        speeds.append((start, scene.pose(scene.object)[0, 3] - before))
-    for start, distance in speeds:
-        assert distance == pytest.approx(start**2 / (2.0 * 0.5 * GRAVITY), rel=0.1)
+        slid[start, x] = scene.pose(scene.object)[0, 3] - before
+        assert slid[start, x] == pytest.approx(start**2 / (2.0 * 0.5 * GRAVITY), rel=0.1)
+    # No border of the table's parts is where objects stand.
+    assert slid[0.5, 0.3] == pytest.approx(slid[0.5, 0.0], rel=1e-3)
 
 
 def test_camera_stands_behind_the_palm(cube, config):
