@@ -7,11 +7,13 @@ import gc
 import os
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 import trimesh
 from helpers.datasets import CERTIFIED, make_dataset
+from helpers.golden import Golden, compare
 from helpers.meshes import G3DB, SMALL, write_fixed
 from helpers.objects import CUBE, box_model
 from hypothesis import HealthCheck, settings
@@ -31,6 +33,17 @@ os.environ.setdefault("DRAKE_ALLOW_NETWORK", "none")
 # Shared machines stall now and then; an example is never too slow by itself, nor is its making.
 settings.register_profile("drakegrasp", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("drakegrasp")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option that stores whole outputs anew, see `helpers/golden.py`."""
+    parser.addoption("--write-golden", action="store_true", help="write tests/golden anew")
+
+
+@pytest.fixture
+def golden(request: pytest.FixtureRequest) -> Golden:
+    """Returns a function that compares a text with the stored one of a name."""
+    return partial(compare, write=bool(request.config.getoption("--write-golden")))
 
 
 def pytest_collection_finish() -> None:

@@ -1,0 +1,145 @@
+"""Whole outputs that tests compare with stored texts, `tests/golden/NAME.txt`.
+
+`pytest --write-golden` writes the texts anew; then `git diff` shows what has changed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+FOLDER = Path(__file__).parents[1] / "golden"
+#: A number with decimals: it is stored in five digits, and need only be near.
+DECIMAL = re.compile(r"-?\d+\.\d+(?:e[-+]?\d+)?")
+
+Golden = Callable[[str, str], None]
+
+
+def compare(name: str, text: str, *, write: bool) -> None:
+    """Fail at the first line that is not as stored; with `write`, store the text instead."""
+    path = FOLDER / f"{name}.txt"
+    text = DECIMAL.sub(lambda found: short(float(found[0])), text.rstrip()) + "\n"
+    if write:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    stored = path.read_text(encoding="utf-8").splitlines()
+    for number, (expected, found) in enumerate(zip_longest(stored, text.splitlines()), start=1):
+        assert _near(expected, found), f"{path.name}:{number}\nstored: {expected}\nfound:  {found}"
+
+
+def short(value: float) -> str:
+    """Return a number with five digits; what is only rounding is 0."""
+    return f"{0.0 if abs(value) < 1e-7 else value:#.5g}"
+
+
+def _near(expected: str | None, found: str | None) -> bool:
+    """Return whether two lines are equal but for the last digits of numbers."""
+    if expected is None or found is None or expected == found:
+        return expected == found
+    numbers = [[float(n) for n in DECIMAL.findall(line)] for line in (expected, found)]
+    return DECIMAL.sub("", expected) == DECIMAL.sub("", found) and np.allclose(
+        *numbers, rtol=1e-3, atol=1e-6
+    )
+
+
+# Figures.
+
+
+def drawn(figure: Figure, *, pixels: bool = True) -> str:
+    """Return what a figure shows: positions, limits, words, and the data of all marks.
+
+    Without `pixels`, images are described by their size alone: those that OpenGL rendered.
+    """
+    lines = [f"figure {_list(figure.get_size_inches())}", *_texts(figure.texts, "")]
+    for legend in figure.legends:
+        lines += _legend(legend, "")
+    for axes in figure.axes:
+        lines += _axes(axes, pixels)
+    return "\n".join(lines)
+
+
+def _axes(axes: Axes, pixels: bool) -> Iterator[str]:
+    limits = f"x {_list(axes.get_xlim())} y {_list(axes.get_ylim())}"
+    yield f"axes {_list(axes.get_position().bounds)} {limits}"
+    words = (axes.get_title(), axes.get_xlabel(), axes.get_ylabel())
+    yield f"  words {words} {axes.get_xscale()}"
+    for kind, labels in (("x", axes.get_xticklabels()), ("y", axes.get_yticklabels())):
+        if said := [label.get_text() for label in labels if label.get_text()]:
+            yield f"  {kind} {said}"
+    yield from _texts(axes.texts, "  ")
+    if (legend := axes.get_legend()) is not None:
+        yield from _legend(legend, "  ")
+    for line in axes.lines:
+        look = f"{to_hex(line.get_color())} {line.get_marker()} {line.get_linewidth():g}"
+        yield f"  line {look} {points(line.get_xydata())}"
+    for patch in axes.patches:
+        path = patch.get_path().transformed(patch.get_patch_transform())
+        yield f"  patch {to_hex(patch.get_facecolor(), True)} {_list(path.get_extents().bounds)}"
+    for found in axes.collections:
+        colours = [*found.get_facecolor(), *found.get_edgecolor()][:1]
+        corners = [np.asarray(path.vertices) for path in found.get_paths()]
+        places = points(np.concatenate(corners)) if corners else "none"
+        yield f"  {type(found).__name__} {len(corners)} {list(map(to_hex, colours))} {places}"
+    for image in axes.images:
+        values = np.asarray(image.get_array())
+        content = points(values.reshape(-1, values.shape[-1])) if pixels else ""
+        yield f"  image {values.shape} {_list(image.get_extent())} {content}".rstrip()
+
+
+def _texts(texts: Iterable[Text], indent: str) -> Iterator[str]:
+    for text in texts:
+        if text.get_text():
+            where = f"{_list(text.get_position())} {text.get_ha()} {text.get_va()}"
+            how = f"{text.get_fontsize():g} {to_hex(text.get_color())}"
+            yield f"{indent}text {text.get_text()!r} {where} {how}"
+
+
+def _legend(legend: Any, indent: str) -> Iterator[str]:
+    for handle, text in zip(legend.legend_handles, legend.get_texts(), strict=True):
+        colour = _colour(handle)
+        yield f"{indent}legend {text.get_text()!r} {colour}"
+
+
+def _colour(handle: Artist) -> str:
+    for get in ("get_facecolor", "get_color"):
+        if hasattr(handle, get):
+            return str(to_hex(getattr(handle, get)()))
+    return type(handle).__name__
+
+
+def points(values: Any) -> str:
+    """Return the points of an array (n, d): all of a few, else their number, mean and ends."""
+    found = np.asarray(values, dtype=float)
+    if len(found) <= 6:
+        return " ".join(map(_list, found))
+    whole = np.nanmean(found, axis=0), np.nanmin(found, axis=0), np.nanmax(found, axis=0)
+    return f"n={len(found)} " + " ".join(map(_list, (*whole, found[0], found[-1])))
+
+
+def _list(values: Any) -> str:
+    return "(" + ", ".join(short(float(value)) for value in np.ravel(values)) + ")"
+
+
+# Data.
+
+
+def flat(value: Any, name: str = "") -> Iterator[str]:
+    """Yield a line for each value of nested data; a list of numbers is one value."""
+    if isinstance(value, dict):
+        for key, part in value.items():
+            yield from flat(part, f"{name}/{key}")
+    elif isinstance(value, list) and any(isinstance(part, dict | list) for part in value):
+        for number, part in enumerate(value):
+            yield from flat(part, f"{name}/{number}")
+    else:
+        yield f"{name} = {value!r}"

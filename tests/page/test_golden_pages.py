@@ -1,0 +1,64 @@
+"""Whole pages of small datasets, compared with stored texts; see `helpers/golden.py`."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from pathlib import Path
+
+import pytest
+from helpers.datasets import CERTIFIED, make_dataset
+from helpers.golden import Golden, flat
+from helpers.pages import get
+from helpers.predictions import write_predictions
+from starlette.testclient import TestClient
+
+from drakegrasp.page.app import Inspection, make_app
+
+#: Data in a page.
+DATA = re.compile(r'(<script type="application/json"[^>]*>)(.*?)(</script>)', re.DOTALL)
+
+
+def tags(page: str, **replaced: object) -> str:
+    """Return a page with a tag in each line and data value by value.
+
+    Texts are replaced by names, so that a page does not depend on the folder of a test.
+    """
+    for name, text in replaced.items():
+        page = page.replace(str(text), name)
+    data = [content for _, content, _ in DATA.findall(page)]
+    lines = re.sub(r">\s+|>(?=<)", ">\n", DATA.sub(r"\1\3", page)).splitlines()
+    values = [line for content in data for line in flat(json.loads(html.unescape(content)))]
+    return "\n".join([*(line.strip() for line in lines if line.strip()), *values])
+
+
+@pytest.fixture(scope="module")
+def certified(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset with all columns that there are. Read only."""
+    folder = tmp_path_factory.mktemp("golden")
+    return make_dataset(folder / "out", folder, overrides=CERTIFIED)
+
+
+@pytest.mark.parametrize(
+    ("name", "address"),
+    [
+        ("gallery", "/?object=1_box_a&outcome=any&sort=row&order=up"),
+        ("grasp", "/grasp/1-3-2?sort=slip"),
+        ("grasp_failed", "/grasp/0-1-1?outcome=any"),
+        ("plots", "/plots"),
+        ("predictions", "/predictions?sort=row&order=up"),
+        ("prediction", "/prediction/1"),
+        ("prediction_not_closed", "/prediction/2"),
+    ],
+)
+def test_page(certified: Path, tmp_path: Path, golden: Golden, name: str, address: str) -> None:
+    inspection = Inspection(certified, write_predictions(certified, tmp_path / "run.h5"))
+    with TestClient(make_app(inspection), base_url="http://127.0.0.1:8321") as client:
+        answer = get(client, address)
+    assert answer.status_code == 200
+    # The head and the dialogs of all pages are those of the gallery.
+    text = answer.text
+    if name != "gallery":
+        text = "".join(re.findall(r"<script type=.*?</script>|<main.*?</main>", text, re.DOTALL))
+    golden(f"pages/{name}", tags(text, OUT=certified, TOKEN=inspection.token))
