@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from helpers.golden import Golden, drawn
 from helpers.machine import needs_egl
 from matplotlib.figure import Figure
 
-from drakegrasp.errors import MachineError
 from drakegrasp.pictures import figures, rendered
 from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
 
