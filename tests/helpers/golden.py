@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 FOLDER = Path(__file__).parents[1] / "golden"
-#: A number with decimals: it is stored in five digits, and need only be near.
+#: A number with decimals, which need only be near.
 DECIMAL = re.compile(r"-?\d+\.\d+(?:e[-+]?\d+)?")
 
 Golden = Callable[[str, str], None]
@@ -28,13 +28,18 @@ Golden = Callable[[str, str], None]
 def compare(name: str, text: str, *, write: bool) -> None:
     """Fail at the first line that is not as stored; with `write`, store the text instead."""
     path = FOLDER / f"{name}.txt"
-    text = DECIMAL.sub(lambda found: short(float(found[0])), text.rstrip()) + "\n"
+    text = text.rstrip() + "\n"
     if write:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
     stored = path.read_text(encoding="utf-8").splitlines()
     for number, (expected, found) in enumerate(zip_longest(stored, text.splitlines()), start=1):
         assert _near(expected, found), f"{path.name}:{number}\nstored: {expected}\nfound:  {found}"
+
+
+def rounded(text: str) -> str:
+    """Return a text whose numbers with decimals have five digits."""
+    return DECIMAL.sub(lambda found: short(float(found[0])), text)
 
 
 def short(value: float) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from helpers.datasets import CERTIFIED, make_dataset
-from helpers.golden import Golden, flat
+from helpers.golden import Golden, flat, rounded
 from helpers.pages import get
 from helpers.predictions import write_predictions
 from starlette.testclient import TestClient
@@ -30,7 +30,7 @@ def tags(page: str, **replaced: object) -> str:
     data = [content for _, content, _ in DATA.findall(page)]
     lines = re.sub(r">\s+|>(?=<)", ">\n", DATA.sub(r"\1\3", page)).splitlines()
     values = [line for content in data for line in flat(json.loads(html.unescape(content)))]
-    return "\n".join([*(line.strip() for line in lines if line.strip()), *values])
+    return rounded("\n".join([*(line.strip() for line in lines if line.strip()), *values]))
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,144 @@
+"""Whole outputs of commands, compared with stored texts; see `helpers/golden.py`."""
+
+from __future__ import annotations
+
+from io import StringIO
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import click
+import pytest
+import trimesh
+from helpers.commands import run
+from helpers.datasets import SLIPPED, end_lift
+from helpers.golden import Golden
+from rich.console import Console
+from rich.table import Table
+
+from drakegrasp.cli.main import main
+from drakegrasp.cli.tables import bench_lines, bench_table, score_table, verdict_table
+from drakegrasp.outcomes import Outcome
+
+
+def options_of(name: str, command: click.Command) -> list[str]:
+    """Return a line for each parameter of a command and of its own commands."""
+    lines = []
+    for option in command.params:
+        kind, default = option.type, option.default
+        bounded = isinstance(kind, click.Choice | click.IntRange | click.FloatRange)
+        words = [name, "/".join([*option.opts, *option.secondary_opts])]
+        words.append(repr(kind) if bounded else kind.name)
+        words += [str(default)] if isinstance(default, bool | int | float | str) else []
+        words += [flag for flag in ("required", "multiple", "is_flag") if vars(option).get(flag)]
+        lines.append(" ".join(words))
+    if isinstance(command, click.Group):
+        context = click.Context(command)
+        for own in command.list_commands(context):
+            found = command.get_command(context, own)
+            assert found is not None
+            lines += options_of(f"{name} {own}".strip(), found)
+    return lines
+
+
+def test_options(golden: Golden) -> None:
+    golden("commands/options", "\n".join(options_of("", main)))
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("stats", ["stats", "OUT"]),
+        ("stats_json", ["stats", "OUT", "--json"]),
+        ("check", ["check", "OUT"]),
+        ("assemble", ["assemble", "OUT", "--set", "split.test_fraction=0.4"]),
+        ("assemble_rejected", ["assemble", "OUT", "--reject", "REJECT"]),
+        ("audit", ["audit", "MESHES"]),
+        ("hands", ["hand", "list"]),
+        ("objects", ["objects", "list"]),
+    ],
+)
+def test_output(out: Path, tmp_path: Path, golden: Golden, name: str, arguments: list[str]) -> None:
+    if name == "stats":
+        end_lift(out, SLIPPED, 0.02)
+    meshes, reject = tmp_path / "meshes", tmp_path / "reject.txt"
+    meshes.mkdir()
+    trimesh.creation.box([50.0, 70.0, 150.0]).subdivide().export(meshes / "1_tall.obj")
+    trimesh.creation.box([0.05, 0.07, 0.15]).subdivide().export(meshes / "2_box.obj")
+    (meshes / "3_none.obj").write_text("v 0 0 0\n")
+    reject.write_text("0\n3\n")
+    paths = {"OUT": out, "MESHES": meshes, "REJECT": reject}
+    result = run(*(paths.get(argument, argument) for argument in arguments))
+    errors = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+    text = "\n".join([f"exit {result.exit_code}", result.stdout, *errors])
+    for word, path in paths.items():
+        text = text.replace(str(path), word)
+    golden(f"commands/{name}", "\n".join(line.rstrip() for line in text.splitlines()))
+
+
+def printed(table: Table) -> str:
+    text = StringIO()
+    Console(width=200, file=text).print(table)
+    return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
+
+
+def rates(**more: Any) -> dict[str, Any]:
+    """Return the rates of a made-up benchmark."""
+    return {
+        "attempts": 1200,
+        "outcomes": {"success": 25, "dropped": 3, "below_table": 1172},
+        "resolved_per_core_second": 12.34,
+        "grasps_per_core_hour": 1234.5,
+        "seconds": {"scene": 1.25, "field": 2.25, "screen": 3.5, "try": 40.0, "look": 5.5},
+        **more,
+    }
+
+
+def test_tables_of_a_benchmark(golden: Golden) -> None:
+    mujoco = {"grasps_per_core_hour": 800.0, "ratio": 1.543}
+    report = {
+        "objects": [
+            rates(name="1_mug", faces=3456, peer=mujoco),
+            rates(name="2_box", outcomes={}, peer={**mujoco, "ratio": None}),
+        ],
+        "all": rates(peer={"grasps_per_core_hour": 900.0, "median_ratio": 1.5}),
+        "versions": {"drake": "1.2", "mujoco": "3.4"},
+        "peak_memory": 2.5e9,
+        "cpu": "a processor",
+    }
+    alone = {**report, "objects": [rates(name="1_mug", faces=3456)], "all": rates()}
+    tables = [printed(bench_table(each)) for each in (report, alone)]
+    golden("commands/bench", "\n".join([*tables, *bench_lines(report)]))
+
+
+def test_table_of_verdicts(golden: Golden) -> None:
+    def result(outcome: Outcome, **more: bool) -> Any:
+        usual = dict.fromkeys(("success", "precision", "stable", "sample", "held_any"), False)
+        return SimpleNamespace(outcome=outcome, **usual | more)
+
+    results = [
+        result(Outcome.SUCCESS, success=True, precision=True, held_any=True),
+        result(Outcome.SUCCESS, precision=True, stable=True, sample=True, held_any=True),
+        *[result(Outcome.DROPPED, held_any=i == 0) for i in range(5)],
+        *[result(Outcome.INVALID)] * 3,
+        *[result(Outcome.TIMEOUT)] * 2,
+    ]
+    golden("commands/verdicts", printed(verdict_table(results)))
+
+
+def test_table_of_scores(golden: Golden) -> None:
+    def measures(value: float) -> dict[str, Any]:
+        one = {"value": value, "low": value / 2.0, "high": 1.0 - value / 2.0}
+        return {"measures": {"headline": one, "held": {"value": value / 4.0}}}
+
+    card = {
+        "sets": {"net": measures(0.123), "own": measures(0.5)},
+        "measures": ["headline", "held"],
+        "settings": {},
+        "objects": 7,
+        "intervals": {"drawn": "objects"},
+    }
+    seconds = {"net": 1.234, "own": 10.0}
+    other = {**card, "settings": {"protocol": {"protocol": "shake"}}, "objects": 1}
+    tables = [printed(score_table(each, seconds)) for each in (card, other)]
+    golden("commands/scores", "\n".join(tables))
