@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
-from helpers.golden import Golden, drawn
+from helpers.golden import Golden, drawn, points
 from helpers.machine import needs_egl
 from matplotlib.figure import Figure
+from pydrake.geometry import Cylinder, Role
 
+from drakegrasp.config import CameraConfig
+from drakegrasp.frames import Array, make_pose, rotation_about
+from drakegrasp.hand.description import load_hand
+from drakegrasp.objects.audit import AuditRow
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.pictures import figures, rendered
 from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
+from drakegrasp.pictures.rendered import frustum, object_sheet, picture_hand
+from drakegrasp.pictures.still_scene import StillScene, camera_pose
+from drakegrasp.vision.camera import Picture
 
 
 @pytest.fixture
@@ -36,3 +48,96 @@ def test_figures_of_a_dataset(
     for name, figure in zip(written.names, pages, strict=True):
         golden(f"figures/{name}", drawn(figure, pixels=name != "phases"))
     golden("figures/numbers", (tmp_path / NUMBERS_FILE).read_text(encoding="utf-8"))
+
+
+def shapes_of(scene: StillScene) -> Iterator[str]:
+    """Yield a line for each shape that shows a scene, with its size, pose and colour."""
+    inspector = scene._graph.model_inspector()
+    for shape in inspector.GetAllGeometryIds(Role.kIllustration):
+        what, properties = inspector.GetShape(shape), inspector.GetIllustrationProperties(shape)
+        colour = properties.GetProperty("phong", "diffuse")
+        pose = inspector.GetPoseInFrame(shape).GetAsMatrix34()
+        size = [what.radius(), what.length()] if isinstance(what, Cylinder) else []
+        rgb = colour.r(), colour.g(), colour.b()
+        yield f"{inspector.GetName(shape)} {size} {points(pose)} {points([rgb])}"
+
+
+def test_hand_with_its_pads_and_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, golden: Golden
+) -> None:
+    """The palm's axes and those of other tools, pads, and three panels from one camera."""
+    lines: list[str] = []
+
+    def picture(scene: StillScene, X_WC: Array, size: tuple[int, int], *_: object) -> Picture:
+        lines.extend([] if lines else shapes_of(scene))
+        lines.append(f"panel {size} {points(X_WC)} {points(scene.link_pose(scene.links[-1]))}")
+        return Picture(image=np.zeros((2, 2, 3), np.uint8), K=np.eye(3), X_WC=X_WC)
+
+    monkeypatch.setattr(StillScene, "picture", picture)
+
+    def save(figure: Figure, *_: object, **__: object) -> None:
+        lines.append(drawn(figure))
+
+    monkeypatch.setattr(rendered, "save_figure", save)
+    picture_hand(load_hand("franka"), tmp_path / "hand.png", across=np.deg2rad(30.0))
+    golden("figures/hand", "\n".join(lines))
+
+
+def test_objects_of_an_audit(
+    cube: ObjectModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, golden: Golden
+) -> None:
+    """Each is seen by a camera at a distance at which it fills the picture."""
+    lines: list[str] = []
+
+    def render(lens: CameraConfig, X_TO: Array, X_TC: Array) -> SimpleNamespace:
+        lines.append(f"{lens.size} {lens.fov_y_deg} {points([[lens.near, lens.far]])}")
+        lines.append(f"{points(X_TO)} {points(X_TC)}")
+        image = np.arange(48.0).reshape(4, 3, 4) / 48.0
+        return SimpleNamespace(image=image)
+
+    def save(figure: Figure, *_: object, **__: object) -> None:
+        lines.append(drawn(figure))
+
+    monkeypatch.setattr(rendered, "build_renderer", lambda model, camera: camera)
+    monkeypatch.setattr(rendered, "render", render)
+    monkeypatch.setattr(rendered, "save_figure", save)
+    long = " ".join(["its faces are open,"] * 18)
+    status = [("fit", cube), ("refused", None)] * 5
+    rows = [AuditRow(name=f"{i}_a_name_that_is_too_long_to_fit", class_name="", status=word,
+                     notes=(long,), warnings=("w",) * (i % 2), model=model)
+            for i, (word, model) in enumerate(status)]  # fmt: skip
+    object_sheet(rows, tmp_path / "sheet.png")
+    golden("figures/audit", "\n".join(lines))
+
+
+def test_camera_of_a_still_scene() -> None:
+    """It looks along a line of a known direction at the middle of points, which fill its view."""
+    points_W = np.array([[0.1, 0.2, 0.3], [0.3, 0.2, 0.3]])
+    X_WC = camera_pose(points_W, np.deg2rad(90.0), np.deg2rad(30.0), fill=2.0)
+    # From +y and 30 degrees above; the sphere's radius is half the distance, and the links'.
+    distance = (0.1 + 0.035) / np.sin(np.deg2rad(13.0)) / 2.0
+    back = np.array([0.0, np.cos(np.pi / 6.0), 0.5])
+    np.testing.assert_allclose(X_WC[:3, 3], [0.2, 0.2, 0.3] + distance * back, atol=1e-12)
+    np.testing.assert_allclose(X_WC[:3, :3].T, [[-1, 0, 0], [0, 0.5, -(0.75**0.5)], -back],
+                               atol=1e-12)  # fmt: skip
+
+
+def test_field_of_view_is_drawn_to_its_depth() -> None:
+    """The corners are those of the outer pixels, and each has a line from the camera."""
+    K = np.array([[2.0, 0.0, 1.5], [0.0, 2.0, 1.5], [0.0, 0.0, 1.0]])
+    X_WC = make_pose(rotation_about([0.0, 0.0, 1.0], np.pi / 2.0), [1.0, 2.0, 3.0])
+    frame, *rays = frustum(X_WC, K, 4, 0.5)
+    # Two pixels beside the middle are (2 / f) * depth = 0.5 m, turned by 90 degrees.
+    corners = np.array([[1.5, 1.5], [1.5, 2.5], [0.5, 2.5], [0.5, 1.5], [1.5, 1.5]])
+    np.testing.assert_allclose(frame, np.column_stack([corners, np.full(5, 3.5)]), atol=1e-12)
+    for corner, ray in zip(frame, rays, strict=False):
+        np.testing.assert_allclose(ray, [[1.0, 2.0, 3.0], corner], atol=1e-12)
+    assert len(rays) == 4
+
+
+def test_pads_are_drawn_on_both_sides_and_face_out() -> None:
+    pad = np.array([[[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.0]]])
+    vertices, faces = rendered._lifted(pad)
+    np.testing.assert_allclose(vertices[:, 2], [4e-4] * 3 + [-4e-4] * 3)
+    sides = np.cross(*(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2)))
+    np.testing.assert_allclose(sides, [[0.0, 0.0, 4.0], [0.0, 0.0, -4.0]], atol=1e-12)
