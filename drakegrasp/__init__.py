@@ -43,11 +43,13 @@ if TYPE_CHECKING:
     from drakegrasp.hand.description import Hand, load_hand
     from drakegrasp.hand.settings import load_config
     from drakegrasp.outcomes import Outcome
+    from drakegrasp.scoring.network import GraspNetwork, load_network
     from drakegrasp.scoring.proposals import propose
     from drakegrasp.scoring.ranking import Ranking, rank
     from drakegrasp.scoring.run import Score
     from drakegrasp.simulation.posture import Posture, make_posture, run_trial
     from drakegrasp.verification.result import PoseTrial, Verification
+    from drakegrasp.vision.depth_image import cloud_from_depth, fit_table
 
 __version__ = metadata.version("drakegrasp")
 
@@ -62,6 +64,7 @@ _HOMES = {
     "DrakegraspError": "errors",
     "GraspDataset": "dataset.reader",
     "GraspError": "errors",
+    "GraspNetwork": "scoring.network",
     "Hand": "hand.description",
     "HandError": "errors",
     "MachineError": "errors",
@@ -80,9 +83,12 @@ _HOMES = {
     "Violation": "dataset.checks.rows",
     "build_dataset": "api.building",
     "check_dataset": "dataset.checks.run",
+    "cloud_from_depth": "vision.depth_image",
     "connect": "cluster.connect",
+    "fit_table": "vision.depth_image",
     "load_config": "hand.settings",
     "load_hand": "hand.description",
+    "load_network": "scoring.network",
     "make_benchmark": "api.building",
     "make_posture": "simulation.posture",
     "pack_grasp": "grasp",
@@ -109,6 +115,7 @@ __all__ = [
     "DrakegraspError",
     "GraspDataset",
     "GraspError",
+    "GraspNetwork",
     "Hand",
     "HandError",
     "MachineError",
@@ -127,9 +134,12 @@ __all__ = [
     "Violation",
     "build_dataset",
     "check_dataset",
+    "cloud_from_depth",
     "connect",
+    "fit_table",
     "load_config",
     "load_hand",
+    "load_network",
     "make_benchmark",
     "make_posture",
     "pack_grasp",

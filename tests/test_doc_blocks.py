@@ -52,6 +52,7 @@ NOT_RUN = {
     "drakegrasp inspect ": "serves until Ctrl-C; tests/page/test_serve.py",
     "drakegrasp figures OUT --compare ": "wants two datasets; tests/pictures/test_picture_files.py",
     "drakegrasp merge ": "wants two datasets; tests/generation/test_merge.py",
+    "drakegrasp predict ": "wants a network's input; tests/cli/test_predict.py",
     "drakegrasp score ": "tries hundreds of grasps; tests/cli/test_score_command.py",
     "drakegrasp bench-set ": "simulates for hours; tests/scoring/test_benchmark.py",
     "drakegrasp hand new ": "a model that may not be shipped; tests/commissioning/test_new_hand.py",
@@ -78,6 +79,7 @@ NO_CODE = {
 }
 #: Blocks marked `py`: Python that is not run as it stands, by a part of it, and why.
 PY_NOT_RUN = {
+    "dg.fit_table(": "wants a depth image; tests/vision/test_depth_image.py",
     "dg.build_dataset(": "simulates for hours; tests/test_api.py",
     "datasets.load_dataset(": "tests/exchange/hub/test_hub.py reads a folder so",
     "lerobot.datasets": "wants LeRobot; tests/exchange/test_lerobot.py",

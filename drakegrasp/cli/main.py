@@ -28,6 +28,7 @@ from drakegrasp.cli.datasets import (
 )
 from drakegrasp.cli.models import audit, hand, objects
 from drakegrasp.cli.options import PATH
+from drakegrasp.cli.predict import predict
 from drakegrasp.cli.predictions import score, verify
 from drakegrasp.cli.submit import submit
 from drakegrasp.cli.views import export, figures, inspect_
@@ -63,7 +64,7 @@ def doctor(directory: Path) -> None:
 # The help lists the commands in this order.
 for _command in (
     *(doctor, objects, audit, hand, build, submit, assemble, merge, scenes, check, stats, inspect_),
-    *(figures, replay, verify, score, bench_set, export, bench),
+    *(figures, replay, predict, verify, score, bench_set, export, bench),
 ):
     main.add_command(_command)
 

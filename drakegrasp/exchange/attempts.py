@@ -1,4 +1,4 @@
-"""Reads files of postures, in our own layouts and those of other tools, as attempts.
+"""Reads and writes files of postures, in our own layouts and those of other tools, as attempts.
 
 Input: a file or a folder of files, their hand, and the object or dataset rows that they are for.
 Output: one table, `Attempts`, or an error in one line that names the file and the mistake. Each
@@ -40,9 +40,11 @@ from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.protocols.files import is_grasp_file
+from drakegrasp.runtime.files import atomic_path
 from drakegrasp.runtime.plain_pickle import npy_header
 from drakegrasp.simulation.attempts import (
     CONDITIONS,
+    UNTOLD,
     Attempts,
     join_attempts,
     make_attempts,
@@ -51,6 +53,7 @@ from drakegrasp.simulation.attempts import (
     taken,
     xyzw_poses,
 )
+from drakegrasp.simulation.posture import joint_order
 from drakegrasp.verification.placing import choose_rows, read_several
 from drakegrasp.verification.prediction import read_grasps
 
@@ -204,6 +207,44 @@ def read_palms(path: Path, hand: Hand, nameless: bool = False) -> dict[str, Any]
 def read_columns(path: Path, hand: Hand, nameless: bool = False) -> dict[str, Any]:
     """Return the postures of a table; if `nameless`, objects need no names."""
     return _of_columns(*_read_columns(path), nameless)
+
+
+def write_attempts(path: Path, table: Attempts, hand: Hand) -> None:
+    """Write postures as an HDF5 file of arrays in our own layout, which `read_attempts` reads.
+
+    Args:
+        path: The file; an older one is replaced.
+        table: Postures with joints, in a frame whose poses do not need the mesh file.
+        hand: The hand.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    texts = {
+        "object": table.objects,
+        "joints": joint_order(hand),
+        "source": table.said,
+        "preshape": table.preshape if any(table.preshape) else None,
+    }
+    arrays = {
+        "X_FG": table.X_FG,
+        "q_grasp": table.q_grasp,
+        "q_pregrasp": table.q_pregrasp,
+        "X_TC": table.X_TC,
+        "resting": None if (table.resting == UNTOLD).all() else table.resting,
+        "row": table.of_row,
+        "confidence": table.confidence,
+    }
+
+    # Columns without values are left out.
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        file["frame"] = table.frame
+        for name, words in texts.items():
+            if words is not None:
+                file[name] = np.array(words, dtype=h5py.string_dtype())
+        for name, values in arrays.items():
+            if values is not None:
+                file[name] = values
 
 
 def _named(raw: dict[str, Any], of: str | None) -> dict[str, Any]:

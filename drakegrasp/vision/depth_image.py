@@ -1,0 +1,294 @@
+"""Depth images of a user's own camera: the points of an object, and the table below it.
+
+Input: a depth image in metres, the camera matrix, and a mask of the object. Output: points in {T},
+for `scoring.network` and `scoring.ranking`. The pose of the camera over the table is known, or it
+follows from the plane on which the object stands. Pixels without a depth (0, NaN or infinite) are
+left out. Image files and camera files are read here too.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import Array, dot, multiply, norm
+from drakegrasp.errors import GraspError, one_line
+from drakegrasp.foreign_files import read_content, read_json
+from drakegrasp.frames import as_numbers, invert_pose, make_pose, read_pose, transform_points
+from drakegrasp.seeding import Stream
+from drakegrasp.vision.camera import unproject
+
+#: The median depth of an image is in this range [m]; a depth in another unit is not.
+DEPTHS = 0.03, 30.0
+#: Minimum number of object pixels with a depth.
+FEWEST = 10
+#: A pixel is on a plane if it is closer to it than this fraction of its depth: the error of depth
+#: cameras grows with the depth.
+ON_PLANE = 0.01
+#: Fraction of the pixels beside the object that must be on the table's plane.
+LEAST_SHARE = 0.15
+#: Planes through three random pixels that are tried, and number of pixels that judge them.
+PLANES, JUDGES = 1000, 4000
+#: The object stands on a plane if almost none of its points is deeper than this below it, and its
+#: lowest point is not higher than this above it [m].
+BELOW, ABOVE = 0.02, 0.08
+#: Fraction of the object's points that may be outliers.
+OUTLIERS = 0.02
+#: Rounds of least squares after the choice of a plane.
+ROUNDS = 5
+
+
+def cloud_from_depth(
+    depth: npt.ArrayLike, K: npt.ArrayLike, mask: npt.ArrayLike, X_TC: npt.ArrayLike
+) -> Array:
+    """Return what a depth image shows of an object, as points (n, 3) in {T} [m].
+
+    The table is z = 0 in {T}, and +z is up. The axes of the camera are those of OpenCV: x to the
+    right of the image, y down, z forwards. Pixel centres have integer coordinates.
+
+    Args:
+        depth: (h, w), along the camera's z axis [m]; 0, NaN or infinite where it is unknown.
+        K: Camera matrix (3, 3) [px].
+        mask: (h, w), not 0 on the object.
+        X_TC: Pose of the camera over the table (4, 4), known or from `fit_table`.
+
+    Raises:
+        GraspError: If an argument is invalid, the depth is not in metres, or the mask has fewer
+            than 10 pixels with a depth.
+    """
+    own, _ = _points(depth, K, mask)
+    return transform_points(read_pose(X_TC, "X_TC"), own)
+
+
+def fit_table(
+    depth: npt.ArrayLike, K: npt.ArrayLike, mask: npt.ArrayLike
+) -> tuple[Array, float, float]:
+    """Return the pose of a camera over the table on which an object stands.
+
+    Of the planes on which the object stands, the one with most pixels is the table (RANSAC), and is
+    fitted to its pixels by least squares. The draws are seeded. The origin of {T} is on the plane
+    below the object, +Tz points to the side of the camera, and +Tx to the right of the image.
+
+    Args:
+        depth: (h, w), see `cloud_from_depth`.
+        K: Camera matrix (3, 3) [px].
+        mask: (h, w), not 0 on the object.
+
+    Returns:
+        X_TC (4, 4); the root mean square of the distances from the plane, of the pixels on it [m];
+        and the fraction of the pixels beside the object that are on it.
+
+    Raises:
+        GraspError: See `cloud_from_depth`; or if fewer than 15 % of the pixels beside the object
+            are on such a plane.
+    """
+    own, others = _points(depth, K, mask)
+    few = "give the pose of the camera (X_TC)"
+    if len(others) < 3:
+        raise GraspError(f"depth must show the table beside the object, got none of it: {few}")
+    normal, offset = _table_plane(own, others)
+
+    # Least squares on the pixels that are on the plane.
+    for _ in range(ROUNDS):
+        near = _on_plane(others, normal, offset)
+        if near.mean() < LEAST_SHARE:
+            raise GraspError(
+                f"depth must show the table on at least {LEAST_SHARE:.0%} of the pixels beside the "
+                f"object, got {near.mean():.0%} on the best plane below it: {few}"
+            )
+        middle = others[near].mean(axis=0)
+        centred = others[near] - middle
+        normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]  # of the smallest variance
+        normal *= -np.sign(dot(normal, middle))
+        offset = float(dot(normal, middle))
+    residual = float(np.sqrt(((dot(others[near], normal) - offset) ** 2).mean()))
+
+    # +Tx is the right of the image, or its top if the image's right is along +Tz.
+    right = next(axis for axis in ([1.0, 0, 0], [0, -1.0, 0]) if abs(dot(axis, normal)) < 0.9)
+    x = right - dot(right, normal) * normal
+    x /= norm(x)
+    below = own.mean(axis=0)
+    below = below - (dot(below, normal) - offset) * normal
+    X_CT = make_pose(np.column_stack([x, np.cross(normal, x), normal]), below)
+    return invert_pose(X_CT), residual, float(near.mean())
+
+
+def _points(depth: npt.ArrayLike, K: npt.ArrayLike, mask: npt.ArrayLike) -> tuple[Array, Array]:
+    """Return the points p_CQ (n, 3) and (m, 3) of the object and beside it [m], after all checks.
+
+    Raises:
+        GraspError: See `cloud_from_depth`.
+    """
+    z = as_numbers(depth, "depth must be an image (h, w) in metres")
+    if z.ndim != 2:
+        raise GraspError(f"depth must be an image (h, w), got an array of shape {z.shape}")
+    own = np.asarray(mask) != 0
+    if own.shape != z.shape:
+        raise GraspError(f"mask must be {z.shape}, as the depth image, got {own.shape}")
+    known = np.isfinite(z) & (z > 0.0)
+    if (count := int((own & known).sum())) < FEWEST:
+        raise GraspError(
+            f"mask must have at least {FEWEST} pixels with a depth, got {count} "
+            f"of {int(own.sum()):,} pixels"
+        )
+    median = float(np.median(z[known]))
+    if not DEPTHS[0] <= median <= DEPTHS[1]:
+        raise GraspError(
+            f"depth must be in metres, with a median of {DEPTHS[0]} to {DEPTHS[1]:g}, "
+            f"got {median:.3g}: is it in another unit?"
+        )
+
+    lens = read_lens(K)
+    parts = (np.nonzero(known & chosen) for chosen in (own, ~own))
+    own_points, others = (unproject(lens, np.column_stack([u, v]), z[v, u]) for v, u in parts)
+    return own_points, others
+
+
+def _table_plane(own: Array, others: Array) -> tuple[Array, float]:
+    """Return normal (3,) and offset [m] of the plane with most points, on which the object stands.
+
+    The camera is on the positive side of the plane.
+    """
+    stream = Stream(0, PLANES, JUDGES)
+    judges = others[stream.permutation(len(others))[:JUDGES]]
+    a, b, c = judges[stream.integers(len(judges), 3 * PLANES)].reshape(3, PLANES, 3)
+    normals = np.cross(b - a, c - a)
+    length = norm(normals)
+    normals, a = normals[length > 0.0] / length[length > 0.0, None], a[length > 0.0]
+    normals *= -np.sign(dot(normals, a))[:, None]
+    offsets = dot(normals, a)
+
+    # The object stands on a plane if it is above it, and not far.
+    heights = multiply(own[:: -(-len(own) // JUDGES)], normals.T) - offsets
+    low = np.quantile(heights, OUTLIERS, axis=0)
+    stands = (low > -BELOW) & (low < ABOVE)
+    if not stands.any():
+        raise GraspError(
+            "depth must show the table on which the object stands, got no plane below the object: "
+            "give the pose of the camera (X_TC)"
+        )
+    counts = np.array(
+        [_on_plane(judges, n, d).sum() for n, d in zip(normals, offsets, strict=True)]
+    )
+    best = int(np.argmax(np.where(stands, counts, -1)))
+    return normals[best], float(offsets[best])
+
+
+def _on_plane(points: Array, normal: Array, offset: float) -> npt.NDArray[np.bool_]:
+    """Return which points p_CQ (n, 3) [m] are on a plane."""
+    return np.abs(dot(points, normal) - offset) < ON_PLANE * points[:, 2]
+
+
+def read_lens(K: npt.ArrayLike) -> Array:
+    """Return a camera matrix (3, 3) [px], after checking it.
+
+    Raises:
+        GraspError: If it is not the matrix of a camera.
+    """
+    must = "camera must be a matrix (3, 3) with fx 0 cx, 0 fy cy, 0 0 1 in pixels"
+    lens = as_numbers(K, must)
+    if lens.shape != (3, 3):
+        raise GraspError(f"{must}, got an array of shape {lens.shape}")
+    zeros = lens[[0, 1, 2, 2], [1, 0, 0, 1]]
+    if (
+        not np.isfinite(lens).all()
+        or zeros.any()
+        or lens[2, 2] != 1.0
+        or min(lens[0, 0], lens[1, 1]) <= 0
+    ):
+        raise GraspError(f"{must}, got {' '.join(f'{value:g}' for value in lens.ravel())}")
+    return lens
+
+
+# Files
+
+
+def read_camera(text: str) -> Array:
+    """Return the camera matrix (3, 3) [px] of the text "fx fy cx cy", or of a JSON file.
+
+    The file has a matrix, or an object with `K`, `k` or `camera_matrix`, or with `fx`, `fy`, `cx`
+    and `cy`.
+
+    Raises:
+        GraspError: If it is neither.
+    """
+    # Four numbers.
+    must = "camera must be fx,fy,cx,cy in pixels, or a JSON file with K"
+    numbers = text.replace(",", " ").split()
+    try:
+        f_u, f_v, c_u, c_v = map(float, numbers)
+    except ValueError:
+        path = Path(text)
+        if not path.is_file():
+            raise GraspError(f"{must}, got {text!r}") from None
+    else:
+        return read_lens([[f_u, 0.0, c_u], [0.0, f_v, c_v], [0.0, 0.0, 1.0]])
+
+    # A file.
+    try:
+        content = read_json(path)
+    except (OSError, ValueError) as error:
+        raise GraspError(f"{path}: {must}, got: {one_line(error)}") from None
+    if isinstance(content, dict):
+        if {"fx", "fy", "cx", "cy"} <= content.keys():
+            f_u, f_v, c_u, c_v = (content[key] for key in ("fx", "fy", "cx", "cy"))
+            content = [[f_u, 0.0, c_u], [0.0, f_v, c_v], [0.0, 0.0, 1.0]]
+        else:
+            content = next((content[k] for k in ("K", "k", "camera_matrix") if k in content), None)
+    try:
+        return read_lens(np.reshape(as_numbers(content, must), (3, 3)))
+    except ValueError as error:  # also another number of values
+        raise GraspError(f"{path}: {one_line(error)}") from None
+
+
+def read_depth_png(path: Path, scale: float) -> Array:
+    """Return the depths (h, w) [m] of a PNG with one channel of 16 bits.
+
+    Args:
+        path: The file.
+        scale: Metres per unit of the file.
+
+    Raises:
+        GraspError: If it is another file.
+    """
+    pixels = _pixels(path)
+    if pixels.ndim != 2 or pixels.dtype.itemsize < 2:
+        raise GraspError(
+            f"{path}: must be a depth image of 16 bits and one channel, "
+            f"got {pixels.dtype} of shape {pixels.shape}"
+        )
+    return np.asarray(scale * pixels.astype(float))
+
+
+def read_mask(path: Path) -> npt.NDArray[np.bool_]:
+    """Return the mask (h, w) of an image file or a .npy file: where any channel is not 0.
+
+    Raises:
+        GraspError: If the file is neither.
+    """
+    pixels = _pixels(path)
+    if pixels.ndim == 3:
+        # A fourth channel is the opacity.
+        pixels = np.asarray(pixels[:, :, :3].any(axis=2))
+    if pixels.ndim != 2:
+        raise GraspError(f"{path}: must be an image, got an array of shape {pixels.shape}")
+    return np.asarray(pixels != 0)
+
+
+def _pixels(path: Path) -> npt.NDArray[Any]:
+    """Return the pixels of an image, (h, w) or (h, w, channels)."""
+    from PIL import Image
+
+    # Pillow raises all kinds of exceptions for damaged files.
+    try:
+        content = io.BytesIO(read_content(path))
+        if path.suffix.lower() == ".npy":
+            return np.asarray(np.lib.format.read_array(content, allow_pickle=False))
+        with Image.open(content) as image:
+            return np.asarray(image)
+    except Exception as error:
+        raise GraspError(f"{path}: must be an image, got: {one_line(error)}") from None

@@ -1,0 +1,51 @@
+"""A network proposes grasps for what a camera saw, and puts the best first."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import drakegrasp as dg
+from drakegrasp.scoring.network import DEFAULT
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    """A cup-sized box on the table, seen from above and from two sides."""
+    points = np.random.default_rng(0).uniform([-0.04, -0.03, 0.0], [0.04, 0.03, 0.1], (3000, 3))
+    points[:1000, 2], points[1000:2000, 0], points[2000:, 1] = 0.1, 0.04, 0.03
+    return points
+
+
+@pytest.fixture(scope="module")
+def network():
+    return dg.load_network()
+
+
+def test_grasps_come_with_the_best_first(network, cloud):
+    found = network.predict(cloud, "mug")
+    assert found.frame == "table" and set(found.objects) == {"mug"} and not any(found.invalid)
+    assert (np.diff(found.confidence) <= 0.0).all() and 0.5 < found.confidence[0] <= 1.0
+    assert found.row.tolist() == list(range(len(found)))
+
+    # They are those that `propose` returns, in the order of their confidence.
+    proposed = dg.propose(cloud, network.hand)
+    known = {X.tobytes(): q for X, q in zip(proposed.X_FG, proposed.q_grasp, strict=True)}
+    for X, q in zip(found.X_FG, found.q_grasp, strict=True):
+        np.testing.assert_array_equal(known.pop(X.tobytes()), q)
+    assert not known
+
+    few = network.predict(cloud, count=2)
+    np.testing.assert_array_equal(few.X_FG, found.X_FG[:2])
+    np.testing.assert_array_equal(few.confidence, found.confidence[:2])
+
+
+def test_a_network_is_known_by_its_name(network):
+    assert network.name == DEFAULT and network.hand.name == "barrett"
+    with pytest.raises(dg.GraspError, match=r"barrett-1.*got 'magic'"):
+        dg.load_network("magic")
+
+
+def test_the_number_of_grasps_is_positive(network, cloud):
+    with pytest.raises(dg.GraspError, match="count must be 1 or more, got 0"):
+        network.predict(cloud, count=0)
