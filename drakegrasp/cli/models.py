@@ -226,7 +226,10 @@ def new_hand(
     picture = drafted.path.with_suffix(".png")
     if drafted.findings[0].name != "files":
         _draw(drafted.path, picture)
-        say(f"Look at {picture}: pads must face each other, and Gz (blue) leave the palm.")
+        say(
+            f"Look at {picture}: pads must face each other, and Gz (blue) must point out of the "
+            "palm."
+        )
     say(f"Then: drakegrasp hand check {drafted.path}")
     if not all(finding.ok for finding in drafted.findings):
         sys.exit(1)

@@ -174,13 +174,13 @@ def _verify_by_lift(
     if not quiet:
         make_console(stderr=True).print(verdict_table(results))
         if best := [result.held for result in results if result.rank == 0]:
-            say(f"{sum(best)} of {len(best)} grasps that are ranked first hold", err=True)
+            say(f"{sum(best)} of {len(best)} best-ranked grasps hold", err=True)
         for hint, count in count_hints(result.hints for result in results):
             say(f"{count} of {len(results)} grasps would fit much better: {hint}", err=True)
         if lost := sum(result.misplaced and not result.hints for result in results):
             say(
-                f"{lost} of {len(results)} grasps are off the object, in every frame and unit that "
-                "is known here",
+                f"{lost} of {len(results)} grasps are far from the object in every known frame and "
+                "unit",
                 err=True,
             )
 

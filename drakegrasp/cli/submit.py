@@ -137,7 +137,7 @@ def _give_script(cluster: Local, out: Path, file: Path | None) -> None:
             raise click.UsageError(f"--script must not be given with --cluster {cluster.kind}")
         return
     if file is None:
-        say(f"\nscript for {cluster.submission()}:\n\n{script.rstrip()}\n")
+        say(f"\nscript of each job, for {cluster.submission()}:\n\n{script.rstrip()}\n")
     else:
         file.write_text(script, encoding="utf-8")
         say(f"{cluster.submission()} {shlex.quote(str(file))}")

@@ -149,9 +149,9 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
     if funnel.refined.any():
         tried, held, samples = funnel.refined.sum(axis=0).tolist()
         caption = (
-            f"refined: palm poses about those of samples, {counted(tried, 'attempt')}, "
-            f"{held:,} held, {counted(samples, 'sample')}; all other columns but the last are of "
-            "the first round"
+            f"refined: palm poses near those of samples: {counted(tried, 'attempt')}, {held:,} "
+            f"held, {counted(samples, 'sample')}; the other columns except the last count the "
+            "first round only"
         )
     return _table_of_objects("From palm poses to samples", heads, funnel, row, caption)
 
@@ -159,17 +159,17 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
 def hold_table(funnel: Funnel) -> Table:
     """Return how well the successes hold, with a row per object and a row for all objects."""
     notes = [
-        "held: the outcome success; precision: with the fingertips alone; stable: of these, moved "
-        "by less than 5 mm and 5° in the hand"
+        "held: the outcome success; precision: held with the fingertips alone; stable: precision, "
+        "and the object moved by less than 5 mm and 5° in the hand"
     ]
     # If lifts were chosen by their predicted probability, only audited lifts yield the fraction.
     held, stable, head = funnel.outcomes[:, Outcome.SUCCESS], funnel.stable, "stable\nof held"
     whole, part = held, stable
     if not funnel.all_lifted:
-        head, (whole, part) = "in the audit:\nstable of held", funnel.audited.T[1:3]
+        head, (whole, part) = "stable of held\n(audit)", funnel.audited.T[1:3]
         notes.append(
-            "in the audit: a part of the hands was lifted whatever the chance of a sample; their "
-            "counts alone show which fraction of the held grasps is stable"
+            "audit: one attempt in ten, drawn at random, is lifted even if a sample is improbable; "
+            "only these lifts show which fraction of the held grasps is stable"
         )
     if note := held_note(funnel):
         notes.append(note)
@@ -178,7 +178,7 @@ def hold_table(funnel: Funnel) -> Table:
         counts = (funnel.outcomes.sum(axis=1), held, funnel.precision, stable)
         all_held, all_stable = int(whole[objects].sum()), int(part[objects].sum())
         share = f"{all_stable / all_held:.0%}" if all_held else "-"
-        if not funnel.all_lifted:
+        if all_held and not funnel.all_lifted:
             share = f"{all_stable:,} of {all_held:,}, {share}"
         return [*(_count(count[objects].sum()) for count in counts), share]
 
@@ -338,8 +338,8 @@ _VERDICTS = {
     "success": "success: contacts as requested",
     "precision": "precision",
     "stable": "stable",
-    "sample": "sample, but for images",
-    "held_any": "held, with the best of the wrist poses",
+    "sample": "sample (images not judged)",
+    "held_any": "held by any of the wrist poses",
 }
 
 

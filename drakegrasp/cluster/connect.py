@@ -110,15 +110,20 @@ def dask_settings() -> dict[str, Any]:
 def dask_variables(settings: Mapping[str, Any]) -> dict[str, str]:
     """Return Dask settings as environment variables, for a process that inherits no settings."""
     return {
-        "DASK_" + key.upper().replace(".", "__").replace("-", "_"): repr(value)
+        "DASK_" + key.upper().replace(".", "__").replace("-", "_"): _literal(value)
         for key, value in settings.items()
     }
+
+
+def _literal(value: Any) -> str:
+    """Return a value as a Python literal; texts in double quotes, which shell scripts can quote."""
+    return json.dumps(value) if isinstance(value, str | list | dict) else repr(value)
 
 
 def dashboard_line(client: Client) -> str:
     """Return a line with the link to the cluster's dashboard, or with how to install it."""
     if not has_dashboard():
-        return "dashboard: none; pip install 'drakegrasp[dashboard]'"
+        return "dashboard: not installed (pip install 'drakegrasp[dashboard]')"
     return f"dashboard: {client.dashboard_link}"
 
 

@@ -28,7 +28,7 @@ from tornado.ioloop import PeriodicCallback
 from drakegrasp.cluster.certificates import security_of
 from drakegrasp.cluster.connect import LOOPBACK, NANNY_PRELOAD, dask_settings, dask_variables
 from drakegrasp.cluster.kinds import REMOTE, Remote, memory_bytes
-from drakegrasp.errors import ConfigError, MachineError
+from drakegrasp.errors import ConfigError, MachineError, counted
 
 #: Memory of a worker, if neither the user nor jobqueue.yaml states it.
 WORKER_MEMORY = "2GB"
@@ -88,11 +88,12 @@ class Jobs(Remote):
 
     def line(self) -> str:
         """Return a description of the resources that each job requests."""
-        memory = "memory as in jobqueue.yaml" if self.memory is None else f"{self.memory} each"
-        walltime = f"walltime {self._walltime() or 'as the queue has it'}"
-        return (
-            f"{self.count()} workers in {self.title} jobs of {self.per_job}, {memory}, {walltime}"
+        memory = (
+            "memory as in jobqueue.yaml" if self.memory is None else f"{self.memory} per worker"
         )
+        walltime = f"walltime {self._walltime() or 'of the queue'}"
+        jobs = f"{counted(self.jobs, f'{self.title} job')} ({self.per_job} in each)"
+        return f"{counted(self.count(), 'worker')} in {jobs}, {memory}, {walltime}"
 
     def _walltime(self) -> str | None:
         """Return the time limit of a job; None if it is not stated."""

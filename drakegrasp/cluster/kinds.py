@@ -35,7 +35,7 @@ from drakegrasp.cluster.connect import (
     dashboard_line,
     dask_settings,
 )
-from drakegrasp.errors import ConfigError, MachineError
+from drakegrasp.errors import ConfigError, MachineError, counted
 
 #: Options of a cluster on other machines.
 REMOTE = ("workers", "cores", "memory", "host", "interface")
@@ -109,7 +109,8 @@ class Local:
 
     def line(self) -> str:
         """Return a description of what will be started."""
-        return "workers on this machine"
+        count = self.count()
+        return f"{counted(count, 'worker')} on this machine" if count else "workers on this machine"
 
     def is_open(self) -> bool:
         """Return whether other machines can reach the scheduler that is started."""

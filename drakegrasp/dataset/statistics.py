@@ -296,19 +296,17 @@ def held_note(funnel: Funnel) -> str:
     moved, left = funnel.outcomes[:, [Outcome.MOVED, Outcome.NOT_LIFTED]].sum(axis=0).tolist()
     reasons = []
     if moved:
-        reasons.append(
-            "lifts that were ended without a verdict, as the object moved more in the hand than a "
-            f"sample may (moved): {moved:,}"
-        )
+        ended = f"{counted(moved, 'lift')} ended early, without a verdict (moved)"
+        reasons.append(f"{ended}, because the object moved more in the hand than a sample may")
     if left:
         lifts, held, stable, samples = funnel.audited.sum(axis=0).tolist()
         # Before the files are assembled, it is unknown which successes are samples.
         found = [f"{held:,} held", f"{stable:,} stable"]
         found += [counted(samples, "sample")] if funnel.removals.any() else []
         reasons.append(
-            f"closed hands that were not lifted, as their chance of a sample is small or their "
-            f"image too flat: {left:,}; "
-            f"lifted in any case: {lifts:,}, of them {', '.join(found)}"
+            f"{counted(left, 'closed hand')} did not lift (not_lifted), because a sample was "
+            f"improbable or the image too flat; {counted(lifts, 'lift')} of the audit: "
+            f"{', '.join(found)}"
         )
     return f"the number of held grasps is a lower bound: {'; '.join(reasons)}" if reasons else ""
 
@@ -484,12 +482,11 @@ def split_shortfall(counts: Sequence[SplitCount], rule: str, config: SplitConfig
     ]
     if not off:
         return ""
-    told = ", ".join(
-        f"{name} {samples[name] / total:.0%} (asked {asked[name]:.0%})" for name in samples
-    )
+    told = ", ".join(f"{name} {samples[name] / total:.0%} ({asked[name]:.0%})" for name in samples)
     objects = sum(count.objects for count in counts)
+    verb = "is" if objects == 1 else "are"
     return (
-        f"the split is of other shares than asked: {told}, as whole objects are drawn and only "
-        f"{objects:,} have samples that count. What would help: more objects, or as many samples "
-        "of each (--samples-per-object)"
+        f"the fractions of the split differ from the requested ones (in brackets): {told}. Whole "
+        f"objects are drawn, and {counted(objects, 'object')} with samples {verb} too few. What "
+        "would help: more objects, or equally many samples of each (--samples-per-object)"
     )

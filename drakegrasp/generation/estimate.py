@@ -279,7 +279,7 @@ MEASURED = StageTimes(
     success_bytes=66e3,
     sample_bytes=71e3,
     object_bytes=215e3,
-    source="measured on 30 G3DB meshes, preset paper; --times for those of your own",
+    source="measured on 30 G3DB meshes with the preset paper; --times FILE uses your own",
 )
 
 
@@ -293,7 +293,7 @@ FAST = replace(
     samples=0.30,
     parents=0.035,
     refined_parents=0.24,
-    source="measured on 4 built-in objects, preset fast; --times for those of your own",
+    source="measured on 4 built-in objects with the preset fast; --times FILE uses your own",
 )
 
 

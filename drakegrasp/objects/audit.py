@@ -165,7 +165,7 @@ def _audit_one(source: MeshSource, opening: float, flat: tuple[float, float]) ->
     try:
         mesh, _ = load_source(source)
     except MeshError as error:
-        return AuditRow(**known, status="refused", notes=(str(error),))
+        return AuditRow(**known, status="refused", notes=_reason(error, source))
 
     # The file's surface.
     vertices, faces = upright_vertices(mesh, source), np.asarray(mesh.faces)
@@ -184,13 +184,18 @@ def _audit_one(source: MeshSource, opening: float, flat: tuple[float, float]) ->
     try:
         model = prepare_object(source)
     except MeshError as error:
-        row = AuditRow(**known, status="refused", notes=(str(error),))
+        row = AuditRow(**known, status="refused", notes=_reason(error, source))
     else:
         known |= _measures(model, vertices, faces)
         known["units_guess"] = guess_units(diagonal(model.visual_vertices), source.scale)
         status: Status = "repaired" if model.notes else "fit"
         row = AuditRow(**known, status=status, notes=model.notes, model=model)
     return replace(row, warnings=tuple(_warnings(row, opening, *flat)))
+
+
+def _reason(error: MeshError, source: MeshSource) -> tuple[str]:
+    """Return why a mesh is refused, without its file name, which the row states."""
+    return (str(error).removeprefix(f"{source.path.name}: "),)
 
 
 def guess_units(size: float, scale: float) -> str | None:

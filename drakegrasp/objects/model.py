@@ -220,9 +220,9 @@ def make_object(
     if not config.min_diagonal <= size <= config.max_diagonal:
         raise MeshError(
             f"the diagonal of the bounding box must be {config.min_diagonal:g} m to "
-            f"{config.max_diagonal:g} m, got {size:.4g} m{unit}: give the "
-            f"file's unit with units ({', '.join(UNITS)}; --units on the command line) or for this "
-            f"mesh in {MANIFEST_NAME}"
+            f"{config.max_diagonal:g} m, got {size:.4g} m{unit}: state the "
+            f"unit of the file with --units (units in Python; {', '.join(UNITS)}) or in "
+            f"{MANIFEST_NAME}"
         )
 
     # One watertight solid, with no more faces than there is memory to repair.

@@ -174,16 +174,18 @@ def _warnings(
     found = []
     if len(grouping.names) < FEW_OBJECTS:
         found.append(
-            f"only {counted(len(grouping.names), 'test object')}: intervals of fewer than "
-            f"{FEW_OBJECTS} are too narrow, and an order of methods may not last"
+            f"only {counted(len(grouping.names), 'test object')}: with fewer than "
+            f"{FEW_OBJECTS} the intervals are too narrow, and the order of methods may change"
         )
     if len(grouping.rows) < total:
         found.append(f"{len(grouping.rows)} of the {total} rows of the split were scored")
     found += sorted({ranked.left_out for each in sets for ranked in each.ranked} - {""})
     if known_objects:
-        found.append(f"{known_objects} test objects are training objects, by their names")
+        found.append(f"{counted(known_objects, 'test object')} also in training, by name")
     if not any(REFERENCES[each.name].trained for each in sets if each.name in REFERENCES):
-        found.append("no blind row stands beside the score, so it says little (--train)")
+        found.append(
+            "no reference row that ignores the image was scored, so the score says little (--train)"
+        )
 
     # Count verdicts that give no information about the grasp.
     without = ("solver_error", "timeout", "crashed")
@@ -252,7 +254,7 @@ def _more(card: Mapping[str, Any]) -> list[str]:
         depth = "-" if each["penetration"] is None else f"{1e3 * each['penetration']:.2f}"
         variance = " ".join(map(_percent, each["diversity"] or ())) or "-"
         rows.append([name, depth, _percent(each["coverage"]), variance])
-    lines += ["", "## Beside it", ""]
+    lines += ["", "## Other measures", ""]
     lines += _table(["set", "penetration [mm]", "coverage [%]", "diversity"], rows)
     lines += [
         "",

@@ -375,8 +375,8 @@ def _misplaced(verified: Verification) -> Iterator[str]:
         yield f"This would fit much better: {verified.hint_text}."
     elif all_far:
         yield (
-            "They fit in no other frame or unit that is known here; are they in the frame of a "
-            "camera whose pose is not given, or for another object?"
+            "They fit in no other known frame or unit. Are they in the frame of a camera whose "
+            "pose is not given, or do they belong to another object?"
         )
 
 
@@ -398,8 +398,8 @@ def _contacts(verified: Verification) -> Iterator[str]:
     # After closing, and whether that is a success.
     angle = np.rad2deg(np.nanmax(np.append(errors[1], 0.0)))
     yield (
-        f"After closing, they touch the object within {in_mm(verified.farthest_contact)} of the "
-        f"predicted points, and within {angle:.0f}° of the predicted normals."
+        f"After closing, the fingertips touch the object within {in_mm(verified.farthest_contact)} "
+        f"of the predicted points, and within {angle:.0f}° of the predicted normals."
     )
     if verified.held and not verified.success:
         finger = int(np.nanargmax(errors[0])) + 1

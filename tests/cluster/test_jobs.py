@@ -125,7 +125,9 @@ def test_each_scheduler_is_asked_in_its_own_words(
     assert "--lifetime 5100s" in script
     assert f"--tls-key {tmp_path}/.tls-RUN/key.pem --protocol tls://" in script
     assert not list(tmp_path.iterdir())
-    assert f"6 workers in {type(cluster).title} jobs of 3, 2GB each" in cluster.line()
+    assert (
+        f"6 workers in 2 {type(cluster).title} jobs (3 in each), 2GB per worker" in cluster.line()
+    )
 
 
 def test_times_of_the_users_file_are_read_as_its_scheduler_does() -> None:

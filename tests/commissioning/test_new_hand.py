@@ -180,7 +180,7 @@ def test_what_of_a_joints_range_is_not_used_is_noted(tmp_path: Path) -> None:
     text = text.replace('xyz="0 0 0"/><axis xyz="0 -1', 'xyz="0 -0.045 0"/><axis xyz="0 -1')
     for side, note in zip(("left", "right"), sorted(draft(tmp_path, text).notes), strict=True):
         assert note.startswith(
-            f"joint {side}_slide: the hand is open at 0 of -0.045..0.005 m, so 0.005 m are not used"
+            f"joint {side}_slide: the open hand is at 0 in the range -0.045..0.005 m, so 0.005 m"
         )
 
 
@@ -230,7 +230,9 @@ def test_a_licence_above_the_model_is_copied_and_told_of(tmp_path: Path) -> None
     model = write_model(vendor, MITTEN)
     drafted = draft_hand(model, tmp_path / "out")
     assert (drafted.path.parent / "LICENSE").read_text() == "MIT"
-    assert f"{root / 'LICENSE'} is copied: see that the model is under it" in drafted.notes
+    assert (
+        f"{root / 'LICENSE'} is copied: check that it is the licence of the model" in drafted.notes
+    )
     (root / "LICENSE").unlink()
     assert not (draft_hand(model, tmp_path / "bare").path.parent / "LICENSE").exists()
 

@@ -120,9 +120,9 @@ URDF = {
     "origin that is no number": ('xyz="0 0 0.1"', 'xyz="0 0 nan"', -1,
                                  "xyz of joint '\\w+' must be a number, got '0 0 nan'"),
     "xacro's call": (">\n", '><xacro:finger xmlns:xacro="http://ros.org/xacro"/>\n', 1,
-                     "in which xacro left nothing to expand, got '<finger>'"),
+                     "must be a model without xacro, got '<finger>'"),
     "xacro's argument": ("</robot>", "<gazebo><p>$(find hand)/x</p></gazebo></robot>", -1,
-                         r"in which xacro left nothing to expand, got '\$\(find hand\)/x'"),
+                         r"must be a model without xacro, got '\$\(find hand\)/x'"),
 }
 #: And of the jaws in MJCF.
 MJCF = {

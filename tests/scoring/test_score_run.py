@@ -184,10 +184,10 @@ def test_what_cannot_be_scored_is_refused(data, change, message):
 
 def test_without_blind_rows_a_card_says_so(data):
     card = scored(data, references=("own",)).card
-    assert any(warning.startswith("no blind row") for warning in card["warnings"])
+    assert any(warning.startswith("no reference row") for warning in card["warnings"])
 
 
-TRAINED_ON = "2 test objects are training objects, by their names"
+TRAINED_ON = "2 test objects also in training, by name"
 
 
 def test_objects_that_were_trained_on_are_a_warning(data):

@@ -427,7 +427,9 @@ def _weld(
             notes.append(f"link {name}: the model gives no mass; {mass}")
     elif wrong or not total.IsPhysicallyValid():
         got = f" ({wrong[0]})" if wrong else ""
-        notes.append(f"link {name}: no body has the model's inertia{got}; that of its shapes")
+        notes.append(
+            f"link {name}: the model's inertia is impossible{got}; that of its shapes is used"
+        )
         likely = solid_inertia(collisions) if collisions else ball
         total = SpatialInertia(total.get_mass(), likely.get_com(), likely.get_unit_inertia())
     shapes = {"collisions": tuple(collisions), "visuals": tuple(visuals)}

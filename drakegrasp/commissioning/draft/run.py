@@ -273,7 +273,7 @@ def draft_hand(
         for licence in licences:
             shutil.copyfile(licence, folder / licence.name)
     far = {str(each) for each in licences if each.parent != path.resolve().parent}
-    notes = [f"{each} is copied: see that the model is under it" for each in sorted(far)]
+    notes = [f"{each} is copied: check that it is the licence of the model" for each in sorted(far)]
     notes = [*doubts, *model.notes, *unused_parts(model, best.grip, answers), *notes]
     return NewHand(path=out / written.name, notes=tuple(notes), findings=findings)
 

@@ -181,8 +181,8 @@ def _refuse_xacro(root: Element, path: Path) -> None:
         left += [text.strip() for text in texts if "${" in text or "$(" in text]
         if left:
             raise HandError(
-                f"{path}: must be a model in which xacro left nothing to expand, got {left[0]!r}: "
-                "run `xacro` on its source"
+                f"{path}: must be a model without xacro, got {left[0]!r}: first convert "
+                "the file with `xacro`"
             )
 
 

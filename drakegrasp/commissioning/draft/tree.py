@@ -385,7 +385,7 @@ def _reasons(model: VendorModel, grip: Grip, frame: PalmFrame, answers: Answers)
 
     # For each finger.
     effort = f"effort of {answers.effort:g} (given)" if answers.effort else "the model's effort"
-    limit = f"from {effort}; no side presses more than the other"
+    limit = f"{effort}, reduced where one side would press harder than the other"
     for i, member in enumerate(grip.members):
         flipped = member.sign != 1.0 or member.zero != 0.0
         in_model = any(joint.name in model.mimics for joint in member.joints)
@@ -422,9 +422,9 @@ def unused_parts(model: VendorModel, grip: Grip, answers: Answers) -> Iterator[s
         unit = "m" if joint.slides else "rad"
         whole = f"{joint.limits[0]:.4g}..{joint.limits[1]:.4g} {unit}"
         yield (
-            f"joint {joint.name}: the hand is open at {member.zero:g} of {whole}, so "
-            f"{-lower:.3g} {unit} are not used: to use them, move its zero in the model to where "
-            "it is fully open"
+            f"joint {joint.name}: the open hand is at {member.zero:g} in the range {whole}, so "
+            f"{-lower:.3g} {unit} of the range are not used; to use them, move the joint's zero in "
+            "the model to where the hand is fully open"
         )
 
     # Find the fingers that do not grasp, with the reason.
