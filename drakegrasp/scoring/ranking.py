@@ -1,16 +1,17 @@
 """Ranking: the order in which to try grasps, by closing the hand on points that a camera saw.
 
 Input: grasps that anybody proposes, and an object's visible points in {T}, where the table is z =
-0. Output: a score of each. Nothing is simulated and nothing is learned. The points become solids
-(`mesh.cloud`), and the hand's geometry determines where each finger stops (`hand.finger_sweep`). A
-score is a mean over the solids and over small moves of the palm. `scoring.proposals` proposes
-grasps.
+0. Output: a score of each. Nothing is simulated. The points become solids (`mesh.cloud`), and the
+hand's geometry determines where each finger stops (`hand.finger_sweep`). A score is a mean over the
+solids and over small moves of the palm, or the chance that a learned `scoring.judge` computes from
+all of them. `scoring.proposals` proposes grasps.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ from drakegrasp.frames import read_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.finger_sweep import FingerPath, HandPaths, hand_paths
 from drakegrasp.mesh.cloud import Solid, column_solid, hull_solid, read_cloud
+from drakegrasp.scoring.judge import Judge, features_of, load_judge
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.attempts import Attempts
 from drakegrasp.simulation.posture import start_of
@@ -49,6 +51,8 @@ ROUNDS, RATE = 100, 1.0
 #: were fitted to lifts of the Barrett Hand, see docs/results/choice.md.
 WEIGHTS = {"push": 4.0, "opposition": 2.0, "arm": -20.0, "gap": -50.0}
 CONSTANT = -3.0
+#: Columns of a ranking, see `Ranking`.
+COLUMNS = ("clearance", "table", "touch", "gap", "push", "opposition", "arm", "robust")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,8 +60,9 @@ class Ranking:
     """The scores of n proposals, and the features that determine them.
 
     Attributes:
-        score: (n,), 0 to 1, greater is better: an estimate of the probability that the hand holds;
-            -1 for a row that is not a posture.
+        score: (n,), 0 to 1, greater is better: an estimate of the probability that the hand holds,
+            or with a judge the chance that the grasp is a sample; -1 for a row that is not a
+            posture.
         order: (n,), indices of the proposals, best first; of equal ones the earlier is first.
         features: Columns, each a mean over solids and moves; NaN for a row that is not a posture:
             `clearance` (n,), distance of the open hand from the object [m], negative inside, at
@@ -71,7 +76,8 @@ class Ranking:
             inward normal there;
             `opposition` (n,), how well the contacts' normals balance, 0 to 1;
             `arm` (n,), horizontal distance of the contacts' centre from the object's [m];
-            `robust` (n,), fraction in which the open hand is free and all required pads touch.
+            `robust` (n,), fraction in which the open hand is free and all required pads touch;
+            `held` (n,), only with a judge: the chance that the hand holds.
     """
 
     score: Array
@@ -85,6 +91,7 @@ def rank(
     hand: Hand | str | None = None,
     *,
     spread: float = 0.0,
+    judge: Judge | str | Path | None = None,
 ) -> Ranking:
     """Return the order in which to try proposals, by closing the hand on what a camera saw.
 
@@ -97,12 +104,42 @@ def rank(
         cloud: (n, 3), points of the object only, in {T} [m]; the table is z = 0.
         hand: A hand, or an argument of `load_hand`; None for the default hand.
         spread: Spread of palm poses [rad].
+        judge: Name or file of a judge of the hand, which then determines the scores; None for the
+            fixed weights, which any hand can use.
 
     Raises:
-        GraspError: If the cloud or the poses are invalid, or postures are in {O} without X_TO.
-        HandError: If the hand cannot be used, or several of its fingers move one link.
+        GraspError: If the cloud or the poses are invalid, postures are in {O} without X_TO, or
+            there is no such judge.
+        HandError: If the hand cannot be used, the judge is for another hand, or several of the
+            hand's fingers move one link.
     """
     points, hand = read_cloud(cloud), chosen_hand(hand)
+    judge = None if judge is None else load_judge(judge)
+    if judge is not None:
+        judge.refuse_other_hand(hand)
+    columns = measured(proposals, points, hand, spread=spread)
+    score = columns["score"]
+    if judge is not None:
+        columns["held"], score = judge.chances(columns).T
+    score = np.where(np.isnan(score), -1.0, score)
+    features = {name: columns[name] for name in (*COLUMNS, "held") if name in columns}
+    return Ranking(score=score, order=np.argsort(-score, kind="stable"), features=Table(features))
+
+
+def measured(
+    proposals: Attempts | npt.ArrayLike, points: Array, hand: Hand, *, spread: float = 0.0
+) -> dict[str, Array]:
+    """Return the score by fixed weights and all features (n, ...) of n proposals, by their names.
+
+    Among them are the features of a judge, see `judge.features_of`. A row that is not a posture is
+    NaN.
+
+    Args:
+        proposals: See `rank`.
+        points: (p, 3), see `read_cloud`.
+        hand: The hand.
+        spread: See `rank`.
+    """
     if not isinstance(proposals, Attempts):
         proposals = read_pose(proposals, "proposals").reshape(-1, 4, 4)
     starts = _starts(proposals, hand, spread)
@@ -113,15 +150,17 @@ def rank(
     for i, start in starts.items():
         near = round(start.spread / SPREAD_STEP) * SPREAD_STEP
         groups.setdefault((start.preshape, near), []).append(i)
-    count = len(proposals)
-    columns = {"score": np.full(count, -1.0)}
+    columns: dict[str, Array] = {}
     for (preshape, near), rows in groups.items():
         chosen = [starts[i] for i in rows]
-        for name, values in _closed(solids, hand.at(preshape), near, chosen).items():
-            nothing = np.full((count, *values.shape[1:]), np.nan)
+        closings = _closed(solids, hand.at(preshape), near, chosen)
+        found = {name: closings[name].mean(axis=(0, 2)) for name in ("score", *COLUMNS)}
+        X_TG = np.array([start.X_OG for start in chosen])
+        found |= features_of(closings, points, X_TG, near)
+        for name, values in found.items():
+            nothing = np.full((len(proposals), *values.shape[1:]), np.nan)
             columns.setdefault(name, nothing)[rows] = values
-    score = columns.pop("score")
-    return Ranking(score=score, order=np.argsort(-score, kind="stable"), features=Table(columns))
+    return columns
 
 
 def chosen_hand(hand: Hand | str | None) -> Hand:
@@ -172,7 +211,7 @@ def _starts(proposals: Attempts | Array, hand: Hand, spread: float) -> dict[int,
 def _closed(
     solids: Sequence[Solid], hand: Hand, spread: float, starts: Sequence[Attempt]
 ) -> dict[str, Array]:
-    """Return score and features (n, ...) of starts at a spread, averaged over solids and moves."""
+    """Return score and features (s, n, m, ...) of n starts on s solids, with m moves of each."""
     # Apply each move to each start.
     X_TG = np.array([start.X_OG for start in starts])
     moved = np.repeat(X_TG, len(MOVES), axis=0)
@@ -183,12 +222,11 @@ def _closed(
 
     paths = _paths(hand, spread)
     found = [_features(solid, hand, paths, moved, closing) for solid in solids]
-    mean = {}
-    for name in found[0]:
-        values = np.stack([each[name] for each in found])
-        shape = len(solids), len(starts), len(MOVES), *values.shape[2:]
-        mean[name] = values.reshape(shape).mean(axis=(0, 2))
-    return mean
+    shape = len(solids), len(starts), len(MOVES)
+    return {
+        name: np.reshape([each[name] for each in found], (*shape, *values.shape[1:]))
+        for name, values in found[0].items()
+    }
 
 
 def _features(
@@ -224,6 +262,13 @@ def _features(
         "opposition": opposition,
         "arm": norm((middle - solid.middle)[:, :2]),
         "robust": free & touch[:, needed].all(axis=1),
+        "free": free,
+        "gaps": gaps,
+        "pushes": push,
+        "closed": places / [len(path.angles) - 1 for path in paths.fingers],
+        "heights": p_TQ[:, :, 2],
+        "above": (middle - solid.middle)[:, 2],
+        "width": norm(p_TQ - middle[:, None]).max(axis=1),
     }
     logit = CONSTANT + sum(weight * features[name] for name, weight in WEIGHTS.items())
     return {"score": free / (1.0 + np.exp(-logit)), **features}

@@ -95,9 +95,21 @@ def test_proposals_begin_across_the_narrow_side_and_are_distinct():
     np.testing.assert_allclose(first[:2, 3], 0.0, atol=1e-9)
     assert first[:3, 2] @ [0.0, 0.0, -1.0] == pytest.approx(1.0)
     for i, X in enumerate(found.X_FG):
-        for Y in found.X_FG[:i]:
+        # The open hand tells the spread.
+        same = (found.q_pregrasp[:i] == found.q_pregrasp[i]).all(axis=1)
+        for Y in found.X_FG[:i][same]:
             angle = np.arccos(np.clip((np.trace(X[:3, :3].T @ Y[:3, :3]) - 1) / 2, -1, 1))
             assert np.linalg.norm(X[:3, 3] - Y[:3, 3]) >= SAME[0] or angle >= SAME[1] - 1e-9
+
+
+def test_proposals_come_from_all_sides_and_stay_above_the_table():
+    found = dg.propose(seen(np.array([0.03, 0.03, 0.09])))
+    sides = found.X_FG[np.char.startswith(found.said, "from the side")]
+    headings = np.rad2deg(np.arctan2(*sides[:, [1, 0], 2].T)).round() % 360.0
+    assert len(set(headings.tolist())) == 8
+    np.testing.assert_allclose(sides[:, 2, 2], 0.0, atol=1e-9)
+    np.testing.assert_allclose(sides[:, 2, 1], 0.0, atol=1e-9)
+    assert dg.rank(found, seen(np.array([0.03, 0.03, 0.09]))).features["table"].min() > 0.0
 
 
 @pytest.mark.parametrize("hand", ["barrett", "franka", "allegro_four"])
@@ -122,7 +134,8 @@ def test_postures_of_the_object_are_ranked_with_its_pose():
     X_OG = invert_pose(X_TO) @ table.X_FG
     names, count = table.objects, len(table)
     given = make_attempts(dg.load_hand(), names, X_OG, X_TO=[X_TO] * count, **own)
-    np.testing.assert_allclose(dg.rank(given, cloud).score, dg.rank(table, cloud).score, atol=1e-3)
+    # Where a pad slides along an edge, the last bit of a pose decides what it meets.
+    np.testing.assert_allclose(dg.rank(given, cloud).score, dg.rank(table, cloud).score, atol=1e-2)
     with pytest.raises(dg.GraspError, match="must be in the frame table, or say X_TO, got object"):
         dg.rank(make_attempts(dg.load_hand(), names, X_OG, **own), cloud)
 

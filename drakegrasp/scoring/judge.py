@@ -1,0 +1,184 @@
+"""A judge: the chances that a grasp holds, learned from lifts of proposals for other objects.
+
+Input: what `ranking` measures while the hand closes on a cloud. Output: two calibrated chances of
+each proposal, that the hand holds the object and that the grasp would be a sample of a dataset. A
+judge is an ensemble of small networks in one NumPy file, and belongs to one hand.
+`pipelines/baseline/train_judge.py` makes such a file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drakegrasp.arithmetic import Array, dot, norm
+from drakegrasp.errors import GraspError, HandError
+from drakegrasp.hand.description import Hand
+from drakegrasp.hand.finger_sweep import closing_path, pad_points_at
+from drakegrasp.mesh.cloud import smallest_rectangle
+
+#: The answers of a judge: the hand holds the object; and it is a sample, by the usual filters.
+HEADS = ("held", "sample")
+#: Columns of a closing that have a value for each finger; a judge uses the smallest, the mean and
+#: the largest.
+BY_FINGER = ("gaps", "pushes", "closed", "heights", "touch")
+#: The other columns of a closing.
+OF_HAND = (
+    *("clearance", "table", "gap", "push", "opposition", "arm", "robust", "free", "above", "width"),
+    "score",
+)
+#: Steps of closing at which the fingerprint of a hand has its pad points, and its decimals.
+STEPS, DECIMALS = 5, 6
+#: Standardised features are cut to this.
+FARTHEST = 4.0
+#: Names of the arrays of a file.
+ARRAYS = ("mean", "scale", "inner", "bias", "outer", "offset", "slope", "shift")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Judge:
+    """An ensemble of e networks with one hidden layer of h units for f features, by `load_judge`.
+
+    Attributes:
+        name: Name of the judge.
+        about: What the file states: hand, command, seeds, hash of the data, versions, scores.
+        mean, scale: (f,), by which the features are standardised.
+        inner, bias: (e, f, h) and (e, h), of the hidden layer.
+        outer, offset: (e, h, 2) and (e, 2), of the answers.
+        slope, shift: (2,), of the calibration of the mean answers.
+    """
+
+    name: str
+    about: dict[str, Any]
+    mean: Array
+    scale: Array
+    inner: Array
+    bias: Array
+    outer: Array
+    offset: Array
+    slope: Array
+    shift: Array
+
+    def chances(self, features: Mapping[str, Array]) -> Array:
+        """Return the chances (n, 2) of `HEADS` for features (n,) by their names."""
+        return self.chances_of(np.column_stack([features[n] for n in self.about["features"]]))
+
+    def chances_of(self, values: Array) -> Array:
+        """Return the chances (n, 2) for features (n, f) in the order of the file."""
+        x = np.clip((values - self.mean) / self.scale, -FARTHEST, FARTHEST)
+        hidden = np.tanh(np.einsum("nf,efh->enh", x, self.inner) + self.bias[:, None])
+        logits = np.einsum("enh,eha->ena", hidden, self.outer) + self.offset[:, None]
+        mean = logits.mean(axis=0) * self.slope + self.shift
+        return np.asarray(1.0 / (1.0 + np.exp(-mean)))
+
+    def refuse_other_hand(self, hand: Hand) -> None:
+        """Reject a hand for which the judge was not trained.
+
+        Raises:
+            HandError: If it is another hand.
+        """
+        if self.about["fingerprint"] != fingerprint(hand):
+            raise HandError(
+                f"hand must be {self.about['hand']} for the judge {self.name}, as it was trained, "
+                f"got {'a changed ' if hand.name == self.about['hand'] else ''}{hand.name}"
+            )
+
+
+def judge_names() -> list[str]:
+    """Return the names of the judges of the package."""
+    files = resources.files("drakegrasp.scoring").iterdir()
+    return sorted(f.name.removesuffix(".npz") for f in files if f.name.endswith(".npz"))
+
+
+def load_judge(source: str | Path | Judge) -> Judge:
+    """Return a judge of the package by its name, or the judge of a file.
+
+    Raises:
+        GraspError: If there is no such judge, or the file is not a judge.
+    """
+    if isinstance(source, Judge):
+        return source
+    path = Path(source)
+    if str(source) in judge_names():
+        path = Path(str(resources.files("drakegrasp.scoring").joinpath(f"{source}.npz")))
+    elif not path.is_file():
+        raise GraspError(
+            f"judge must be one of {', '.join(judge_names())}, or a file, got {str(source)!r}"
+        )
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            about = json.loads(str(file["about"]))
+            arrays = {name: np.asarray(file[name], dtype=float) for name in ARRAYS}
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise GraspError(f"{path}: must be the file of a judge, got another: {error}") from None
+    return Judge(name=about["name"], about=about, **arrays)
+
+
+def features_of(
+    found: Mapping[str, Array], points: Array, X_TG: Array, spread: float
+) -> dict[str, Array]:
+    """Return the features (n,) from which a judge takes its own, by their names.
+
+    Args:
+        found: Columns (s, n, m, ...) of n closings on s solids, with m moves of each; the first is
+            no move.
+        points: (p, 3), the cloud in {T} [m].
+        X_TG: (n, 4, 4), the palm poses.
+        spread: Spread [rad].
+    """
+    top = float(points[:, 2].max())
+    columns: dict[str, Array] = {}
+    for name in OF_HAND:
+        columns[name] = np.asarray(found[name], dtype=float)
+    for name in BY_FINGER:
+        values = np.asarray(found[name], dtype=float)
+        columns[f"{name}, least"], columns[f"{name}, most"] = values.min(-1), values.max(-1)
+        columns[f"{name}, mean"] = values.mean(-1)
+    features: dict[str, Array] = {}
+    for name, values in columns.items():
+        features[name] = values.mean(axis=(0, 2))
+        features[f"{name}, lowest"] = values.min(axis=(0, 2))
+        features[f"{name}, highest"] = values.max(axis=(0, 2))
+        features[f"{name}, hull"] = values[0].mean(axis=1) - features[name]
+
+    # The palm, relative to what is seen.
+    count = len(X_TG)
+    axes, middle, half = smallest_rectangle(points)
+    R, p = X_TG[:, :3, :3], X_TG[:, :3, 3]
+    centre = np.array([*middle, top / 2.0])
+    seen = np.einsum("npa,nab->npb", points[None] - p[:, None], R)
+    aside = dot((centre - p)[:, None], R)
+    along = np.abs(np.einsum("na,ka->nk", R[:, :2, 1], axes))
+    features |= {
+        "down": -R[:, 2, 2],
+        "closes upwards": np.abs(R[:, 2, 1]),
+        "closes along": along[:, 0],
+        "closes across": along[:, 1],
+        "palm height": p[:, 2],
+        "palm over top": p[:, 2] - top,
+        "distance": norm(centre - p),
+        "aside x": np.abs(aside[:, 0]),
+        "aside y": np.abs(aside[:, 1]),
+        "ahead": aside[:, 2],
+        "front": seen[:, :, 2].min(axis=1),
+        **{f"extent {k}": np.ptp(seen[:, :, k], axis=1) for k in range(3)},
+        "spread": np.full(count, spread),
+        "top": np.full(count, top),
+        "long": np.full(count, half[0]),
+        "short": np.full(count, half[1]),
+    }
+    return features
+
+
+def fingerprint(hand: Hand) -> str:
+    """Return a hash (16 hex digits) of how a hand's pads move while it closes."""
+    paths = [pad_points_at(hand, closing) for closing in closing_path(hand, STEPS)]
+    rounded = np.round(np.array(paths), DECIMALS) + 0.0
+    return hashlib.sha256(rounded.tobytes()).hexdigest()[:16]

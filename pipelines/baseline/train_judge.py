@@ -1,0 +1,374 @@
+"""Make a judge for `drakegrasp.rank(..., judge=...)`: lift proposals, and learn what holds.
+
+\b
+    python pipelines/baseline/train_judge.py DATA JUDGE.npz
+
+First the data: built-in objects of another seed than the benchmark's and without its new classes,
+each with its own sizes, mass, friction and resting pose, and one view of it. Of the grasps that
+`drakegrasp.propose` returns for the view, some are drawn and lifted. DATA gets a file for each
+object; after an interruption, the same command continues. Then an ensemble of small networks learns
+the outcomes from the features of `drakegrasp.rank`. Its chances are calibrated by objects of
+classes that a copy of the ensemble did not see. With the same DATA and seed, JUDGE.npz has the same
+bytes on the same machine.
+"""  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
+
+from __future__ import annotations
+
+import os
+
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
+
+import hashlib
+import io
+import json
+import math
+import multiprocessing
+import zipfile
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+
+import drakegrasp as dg
+from drakegrasp.errors import MeshError
+from drakegrasp.filters import Removal
+from drakegrasp.frames import transform_points
+from drakegrasp.generation.attempts import judge_sample
+from drakegrasp.hand.description import load_hand
+from drakegrasp.mesh.cloud import read_cloud
+from drakegrasp.mesh.crossings import first_hits
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.files import write_atomic
+from drakegrasp.scoring.benchmark import FRICTIONS, MASSES, new_classes
+from drakegrasp.scoring.judge import FARTHEST, HEADS, Judge, fingerprint
+from drakegrasp.scoring.ranking import measured
+from drakegrasp.seeding import Stream, object_key
+from drakegrasp.shapes.catalog import CLASSES, LICENCE, BuiltinObject
+from drakegrasp.simulation.attempts import make_attempts
+from drakegrasp.simulation.placement import PlacedObject, place_object
+from drakegrasp.simulation.posture import start_of
+from drakegrasp.simulation.scene_cache import cached_scene
+from drakegrasp.simulation.settle import settle
+from drakegrasp.simulation.trial import has_only_scraped, lift_on, run_attempt
+
+Array = npt.NDArray[np.float64]
+#: Seed of the objects and of all other draws of the data.
+SEED = 4801
+#: The camera: distance [m], minimum elevation and range of elevations [degree], half the width of
+#: the image at a distance of 1 m [m/m], pixels along an edge.
+DISTANCE, ELEVATION, RANGE, HALF, PIXELS = 0.65, 35.0, 30.0, 0.2, 96
+#: The hand of the judge.
+HAND = "barrett"
+#: Networks of an ensemble, units of their hidden layer, penalty of their weights, steps of the
+#: search, and folds of the classes.
+NETWORKS, HIDDEN, DECAY, STEPS, FOLDS = 5, 16, 1e-3, 150, 6
+
+
+def draw(name: str, *place: int) -> Stream:
+    """Return the stream of an object's draws for a purpose."""
+    return Stream(SEED, object_key(name), *place)
+
+
+def placed_object(item: BuiltinObject) -> PlacedObject:
+    """Return an object at rest, with drawn mass and friction: upright, or as it fell."""
+    u = draw(item.name, 1).uniform(3)
+    friction = FRICTIONS[int(u[1] * len(FRICTIONS))]
+    values = {
+        "objects.mass": MASSES[int(u[0] * len(MASSES))],
+        "physics.friction_hand": friction,
+        "physics.friction_table": friction,
+        "lift.least_chance": 0,
+        "lift.least_depth_variance": 0,
+        "lift.stop_when": "never",
+    }
+    config = dg.load_config("fast", [f"{key}={value}" for key, value in values.items()])
+    placed = place_object(item.build(), config=config, X_TO=None)
+    if u[2] < 0.5:
+        return placed
+    quaternion = draw(item.name, 2).normal(4)
+    quaternion /= np.linalg.norm(quaternion)
+    try:
+        fallen = settle(placed.model, config, rotation(quaternion))
+    except MeshError:
+        return placed
+    return PlacedObject(model=placed.model, X_TO=fallen.X_TO, config=config)
+
+
+def rotation(quaternion: Array) -> Array:
+    """Return the rotation matrix of a unit quaternion w, x, y, z."""
+    w, v = quaternion[0], quaternion[1:]
+    K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    return np.asarray(np.eye(3) + 2.0 * w * K + 2.0 * K @ K)
+
+
+def seen(triangles: Array, stream: Stream) -> Array:
+    """Return the points (n, 3) in {T} [m] at which rays of a camera first meet triangles."""
+    drawn = stream.uniform(2)
+    azimuth, elevation = 2 * np.pi * drawn[0], math.radians(ELEVATION + RANGE * drawn[1])
+    target = np.array([0.0, 0.0, triangles[..., 2].max() / 2.0])
+    level = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+    back = math.cos(elevation) * level + [0.0, 0.0, math.sin(elevation)]
+    right = np.array([level[1], -level[0], 0.0])
+    u, v = np.meshgrid(*[np.linspace(-HALF, HALF, PIXELS)] * 2)
+    rays = u.reshape(-1, 1) * right + v.reshape(-1, 1) * np.cross(-back, right) - back
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    eye = target + DISTANCE * back
+    distance = first_hits(triangles, np.tile(eye, (len(rays), 1)), rays)
+    hit = np.isfinite(distance)
+    return np.asarray(eye + distance[hit, None] * rays[hit])
+
+
+def tried(placed: PlacedObject, posture: dg.Posture) -> list[bool]:
+    """Return whether a grasp holds and is a sample, and whether the hand scraped the table."""
+    config = placed.config
+    start = start_of(posture, load_hand(config.hand_source))
+    scene = cached_scene(placed.model, config.physics, config.hand_source, start.preshape)
+    trial = run_attempt(scene, placed.X_TO_simulated, start, config)
+    scraped = has_only_scraped(trial)
+    if scraped:
+        trial = lift_on(scene, trial, start, config)
+    removal = judge_sample(placed.model, trial, config)
+    return [trial.outcome is Outcome.SUCCESS, removal is Removal.KEPT, scraped]
+
+
+def make_data(item: BuiltinObject, folder: Path, lifts: int) -> str:
+    """Write the file of an object, unless it exists, and return a line about it."""
+    path = folder / f"{item.name}.npz"
+    if path.exists():
+        return ""
+    try:
+        placed = placed_object(item)
+    except MeshError as error:
+        return f"{item.name}: {error}"
+    model, hand = placed.model, load_hand(placed.config.hand_source)
+    triangles = transform_points(placed.X_TO_simulated, model.visual_vertices)[model.visual_faces]
+    cloud = seen(triangles, draw(item.name, 3))
+    try:
+        grasps = dg.propose(cloud, hand)
+    except dg.GraspError as error:
+        return f"{item.name}: {error}"
+
+    # Lift the plainest grasp, and others at random.
+    drawn = draw(item.name, 4).permutation(len(grasps)).tolist()
+    chosen = [0, *(i for i in drawn if i)][:lifts]
+    ends = [tried(placed, grasps.posture(i, placed.X_TO_simulated)) for i in chosen]
+    kept = grasps.at(chosen)
+    arrays = {
+        "cloud": cloud.astype(np.float32),
+        "X_TG": kept.X_FG,
+        "q_grasp": kept.q_grasp,
+        "q_pregrasp": kept.q_pregrasp,
+        "said": kept.said,
+        "ends": np.array(ends),
+    }
+    write_atomic(path, packed(arrays))
+    counts = np.sum(ends, axis=0)
+    return f"{item.name}: {len(ends)} of {len(grasps)} grasps; held, sample, scraped: {counts}"
+
+
+def packed(arrays: dict[str, Any]) -> bytes:
+    """Return an NPZ file of arrays, with the same bytes every time."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, array in arrays.items():
+            one = io.BytesIO()
+            np.save(one, np.asarray(array), allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), one.getvalue())
+    return content.getvalue()
+
+
+def objects(per_class: int) -> list[BuiltinObject]:
+    """Return the objects, first one of each class, without the new classes of the benchmark."""
+    known = [each for each in CLASSES if each.name not in new_classes()]
+    return [
+        BuiltinObject(object_class=each, index=index, seed=SEED)
+        for index in range(1, per_class + 1)
+        for each in known
+    ]
+
+
+# Learning
+
+
+def read_data(folder: Path, chosen: list[BuiltinObject]) -> dict[str, Any]:
+    """Return features, outcomes and objects of all lifts, and a hash of the files."""
+    hand, digest, rows = load_hand(HAND), hashlib.sha256(), list[dict[str, Array]]()
+    ends, owner = list[Array](), list[Array]()
+    for number, item in enumerate(chosen):
+        path = folder / f"{item.name}.npz"
+        if not path.exists():
+            continue
+        digest.update(path.read_bytes())
+        with np.load(path) as file:
+            cloud, X_TG, q = file["cloud"].astype(float), file["X_TG"], file["q_pregrasp"]
+            grasps = make_attempts(
+                hand, [item.name] * len(X_TG), X_TG, file["q_grasp"], q_pregrasp=q, frame="table"
+            )
+            ends.append(file["ends"])
+        found = measured(grasps, read_cloud(cloud), hand)
+        rows.append({name: values for name, values in found.items() if values.ndim == 1})
+        owner.append(np.full(len(X_TG), number))
+    if not rows:
+        raise click.ClickException(f"{folder}: must have files of objects, got none")
+    names = list(rows[0])
+    return {
+        "names": names,
+        "features": np.column_stack([np.concatenate([r[name] for r in rows]) for name in names]),
+        "ends": np.concatenate(ends),
+        "object": np.concatenate(owner),
+        "sha256": digest.hexdigest(),
+    }
+
+
+def fit(x: Array, y: Array, seed: int) -> dict[str, Array]:
+    """Return an ensemble for features (n, f) and outcomes (n, 2), without its calibration."""
+    mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-6)
+    z = np.clip((x - mean) / scale, -FARTHEST, FARTHEST)
+    parts = [fit_network(z, y, Stream(SEED, seed, number)) for number in range(NETWORKS)]
+    names = ("inner", "bias", "outer", "offset")
+    stacked = {n: np.stack(each) for n, each in zip(names, zip(*parts, strict=True), strict=True)}
+    return {"mean": mean, "scale": scale, **stacked, "slope": np.ones(2), "shift": np.zeros(2)}
+
+
+def fit_network(z: Array, y: Array, stream: Stream) -> tuple[Array, ...]:
+    """Return the weights of one network: cross entropy and a penalty on the weights' squares."""
+    (n, f), answers = z.shape, y.shape[1]
+    shapes = ((f, HIDDEN), (HIDDEN,), (HIDDEN, answers), (answers,))
+    ends = np.cumsum([math.prod(shape) for shape in shapes])
+
+    def unpacked(w: Array) -> list[Array]:
+        parts = np.split(w, ends[:-1])
+        return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+
+    def loss(w: Array) -> tuple[float, Array]:
+        inner, bias, outer, offset = unpacked(w)
+        hidden = np.tanh(z @ inner + bias)
+        logits = hidden @ outer + offset
+        value = float((np.logaddexp(0.0, logits) - y * logits).mean())
+        back = (1.0 / (1.0 + np.exp(-logits)) - y) / (n * answers)
+        through = (back @ outer.T) * (1.0 - hidden**2)
+        penalty = 0.5 * DECAY * float((inner**2).sum() + (outer**2).sum())
+        inner, outer = z.T @ through + DECAY * inner, hidden.T @ back + DECAY * outer
+        gradients = (inner, through.sum(axis=0), outer, back.sum(axis=0))
+        return value + penalty, np.concatenate([g.ravel() for g in gradients])
+
+    start = stream.normal(int(ends[-1]))
+    start[: ends[0]] /= math.sqrt(f)
+    start[ends[0] :] /= math.sqrt(HIDDEN)
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", options={"maxiter": STEPS})
+    return tuple(unpacked(found.x))
+
+
+def calibrated(logits: Array, y: Array) -> tuple[Array, Array]:
+    """Return slope and shift (2,) with which logits (n, 2) fit outcomes best (Platt 1999)."""
+
+    def loss(w: Array, logit: Array, end: Array) -> float:
+        value = w[0] * logit + w[1]
+        return float((np.logaddexp(0.0, value) - end * value).mean())
+
+    pairs = [minimize(loss, [1.0, 0.0], args=pair).x for pair in zip(logits.T, y.T, strict=True)]
+    slope, shift = np.array(pairs).T
+    return slope, shift
+
+
+def crossed(x: Array, y: Array, groups: npt.NDArray[np.int64], seed: int) -> Array:
+    """Return logits (n, 2) of ensembles that did not see the row's class."""
+    logits = np.zeros(y.shape)
+    for fold in range(FOLDS):
+        held = groups % FOLDS == fold
+        if held.any() and not held.all():
+            logits[held] = logits_of(fit(x[~held], y[~held], seed), x[held])
+    return logits
+
+
+def logits_of(arrays: dict[str, Array], x: Array) -> Array:
+    """Return the logits (n, 2) of an ensemble that is not calibrated."""
+    chances = Judge(name="", about={}, **arrays).chances_of(x)
+    return np.log(chances) - np.log1p(-chances)
+
+
+def auc(score: Array, ends: Array, owner: Array) -> float:
+    """Return the mean over objects of the area under the ROC curve."""
+    found = []
+    for one in np.unique(owner):
+        own = owner == one
+        good, bad = score[own & (ends > 0)], score[own & (ends == 0)]
+        if len(good) and len(bad):
+            found.append(((good[:, None] > bad) + 0.5 * (good[:, None] == bad)).mean())
+    return float(np.mean(found)) if found else math.nan
+
+
+def first(score: Array, ends: Array, owner: Array) -> float:
+    """Return the fraction of objects whose first grasp by a score is good."""
+    rows = [np.flatnonzero(owner == one) for one in np.unique(owner)]
+    return float(np.mean([ends[own[np.argmax(score[own])]] for own in rows]))
+
+
+def learn(folder: Path, chosen: list[BuiltinObject], seed: int, name: str) -> bytes:
+    """Return the file of a judge, and print how well it judges objects of unseen classes."""
+    data = read_data(folder, chosen)
+    x, y, owner = data["features"], data["ends"][:, :2].astype(float), data["object"]
+    number = np.array([item.object_class.number for item in chosen])
+    logits = crossed(x, y, number[owner], seed)
+    slope, shift = calibrated(logits, y)
+    arrays = fit(x, y, seed) | {"slope": slope, "shift": shift}
+    sample, plain = logits[:, 1], -np.arange(len(owner), dtype=float)
+    formula = x[:, data["names"].index("score")]
+    choices = {"plainest": plain, "closing": formula, "judge": sample, "oracle": y[:, 1]}
+    about = {
+        "name": name,
+        "hand": HAND,
+        "fingerprint": fingerprint(load_hand(HAND)),
+        "features": data["names"],
+        "answers": list(HEADS),
+        "objects": len(np.unique(owner)),
+        "lifts": len(owner),
+        "data_sha256": data["sha256"],
+        "seeds": {"objects": SEED, "training": seed},
+        "unseen classes": {
+            **{f"{key}, sample": round(first(s, y[:, 1], owner), 3) for key, s in choices.items()},
+            **{
+                f"AUC {head}": round(auc(logits[:, k], y[:, k], owner), 3)
+                for k, head in enumerate(HEADS)
+            },
+        },
+        "command": f"python pipelines/baseline/train_judge.py DATA {name}.npz --seed {seed}",
+        "licence": LICENCE,
+        "versions": {"drakegrasp": dg.__version__, "numpy": np.__version__},
+    }
+    click.echo(json.dumps(about["unseen classes"], indent=1))
+    return packed_judge(about, arrays)
+
+
+def packed_judge(about: dict[str, Any], arrays: dict[str, Array]) -> bytes:
+    """Return the file of a judge, see `drakegrasp.scoring.judge.Judge`."""
+    stored = {key: values.astype(np.float32) for key, values in arrays.items()}
+    return packed({"about": json.dumps(about), **stored})
+
+
+@click.command(help=__doc__)
+@click.argument("data", type=click.Path(path_type=Path))
+@click.argument("judge", type=click.Path(path_type=Path))
+@click.option("--per-class", default=5, help="Objects of each of the 48 classes.")
+@click.option("--lifts", default=18, help="Lifts of each object.")
+@click.option("--workers", default=1, help="Processes that lift.")
+@click.option("--seed", default=0, help="Seed of the training.")
+def main(data: Path, judge: Path, per_class: int, lifts: int, workers: int, seed: int) -> None:
+    """Run the script."""
+    data.mkdir(parents=True, exist_ok=True)
+    chosen = objects(per_class)
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        work = partial(make_data, folder=data, lifts=lifts)
+        for done, line in enumerate(pool.imap(work, chosen), start=1):
+            if line:
+                click.echo(f"{done}/{len(chosen)} {line}", err=True)
+    write_atomic(judge, learn(data, chosen, seed, judge.stem))
+    click.echo(f"wrote {judge}")
+
+
+if __name__ == "__main__":
+    main()

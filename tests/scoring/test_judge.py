@@ -1,0 +1,125 @@
+"""A judge gives the chances of proposals; the package's judge is for one hand."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import drakegrasp as dg
+from drakegrasp.scoring.judge import fingerprint, judge_names, load_judge
+from drakegrasp.scoring.ranking import measured
+from drakegrasp.shapes.catalog import CLASSES, BuiltinObject
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "pipelines" / "baseline"))
+import train_judge
+
+NAME = "barrett-1"
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    box = trimesh.creation.box([0.12, 0.05, 0.08])
+    points = trimesh.sample.sample_surface(box, 1500, seed=0)[0] + np.array([0, 0, 0.04])
+    return points[points @ [1, 1, 1] > 0.06]
+
+
+@pytest.fixture(scope="module")
+def grasps(cloud):
+    return dg.propose(cloud).at(list(range(0, 40, 4)))
+
+
+def write(path, *, features=("gap",), hand="barrett", **changed):
+    """Write a judge of one network with one hidden unit."""
+    count = len(features)
+    arrays = {
+        "mean": np.zeros(count),
+        "scale": np.full(count, 0.01),
+        "inner": np.ones((1, count, 1)),
+        "bias": np.zeros((1, 1)),
+        "outer": np.array([[[-2.0, -3.0]]]),
+        "offset": np.array([[0.5, 0.0]]),
+        "slope": np.array([1.0, 2.0]),
+        "shift": np.array([0.0, 0.1]),
+    }
+    about = {"name": "toy", "hand": hand, "features": list(features)}
+    about["fingerprint"] = fingerprint(dg.load_hand(hand))
+    path.write_bytes(train_judge.packed_judge(about, arrays | changed))
+    return path
+
+
+def test_chances_are_those_of_the_network_and_order_the_proposals(tmp_path, cloud, grasps):
+    ranked = dg.rank(grasps, cloud, judge=write(tmp_path / "toy.npz"))
+    gap = measured(grasps, cloud, dg.load_hand())["gap"]
+    hidden = np.tanh(gap / 0.01)
+    np.testing.assert_allclose(
+        ranked.features["held"], 1 / (1 + np.exp(2 * hidden - 0.5)), rtol=1e-6
+    )
+    np.testing.assert_allclose(ranked.score, 1 / (1 + np.exp(6 * hidden - 0.1)), rtol=1e-6)
+    assert ranked.order.tolist() == np.argsort(-ranked.score, kind="stable").tolist()
+    assert "held" not in dg.rank(grasps, cloud).features.names
+
+
+def test_a_row_that_is_no_posture_is_last_for_a_judge_also(cloud, grasps):
+    spoilt = grasps.refuse(["bad", *[""] * (len(grasps) - 1)])
+    ranked = dg.rank(spoilt, cloud, judge=NAME)
+    assert ranked.score[0] == -1.0
+    assert ranked.order[-1] == 0
+
+
+def test_the_judge_of_the_package_prefers_what_the_hand_can_close_on(cloud, grasps):
+    judge = load_judge(NAME)
+    assert judge_names() == [NAME]
+    assert (judge.name, judge.about["hand"]) == (NAME, "barrett")
+    assert judge.about["data_sha256"]
+    above = grasps.X_FG[:1].copy()
+    above[0, 2, 3] += 0.15  # too high to touch
+    ranked = dg.rank(np.concatenate([above, grasps.X_FG[:1]]), cloud, judge=judge)
+    assert ranked.order.tolist() == [1, 0]
+    assert ranked.score[0] < 0.1
+    assert ranked.score[1] > 0.3
+
+
+@pytest.mark.parametrize(
+    ("judge", "message"),
+    [
+        ("barrett-9", f"judge must be one of {NAME}, or a file, got 'barrett-9'"),
+        (__file__, "must be the file of a judge, got another"),
+    ],
+)
+def test_what_is_no_judge_is_refused(cloud, grasps, judge, message):
+    with pytest.raises(dg.GraspError, match=message):
+        dg.rank(grasps, cloud, judge=judge)
+
+
+def test_a_judge_is_refused_for_another_hand(tmp_path, cloud):
+    with pytest.raises(dg.HandError, match=f"must be barrett for the judge {NAME}.*got franka"):
+        dg.rank(dg.propose(cloud, "franka"), cloud, "franka", judge=NAME)
+
+
+def test_training_gives_the_same_bytes_and_learns(tmp_path, cloud, monkeypatch):
+    for name, value in {"NETWORKS": 2, "STEPS": 60, "FOLDS": 2}.items():
+        monkeypatch.setattr(train_judge, name, value)
+    # A grasp holds if its palm is low; heights differ between objects.
+    items = [BuiltinObject(object_class=each, index=1) for each in CLASSES[:4]]
+    found = dg.propose(cloud)
+    for k, item in enumerate(items):
+        rows = found.at(list(range(k, len(found), 8)))
+        low = rows.X_FG[:, 2, 3] < np.median(rows.X_FG[:, 2, 3])
+        arrays = {
+            "cloud": cloud,
+            "X_TG": rows.X_FG,
+            "q_grasp": rows.q_grasp,
+            "q_pregrasp": rows.q_pregrasp,
+            "ends": np.column_stack([low, low, ~low]),
+        }
+        (tmp_path / f"{item.name}.npz").write_bytes(train_judge.packed(arrays))
+    files = [train_judge.learn(tmp_path, items, 0, "toy") for _ in range(2)]
+    assert files[0] == files[1]
+    (tmp_path / "toy.npz").write_bytes(files[0])
+    ranked = dg.rank(found, cloud, judge=tmp_path / "toy.npz")
+    heights = found.X_FG[ranked.order, 2, 3]
+    assert heights[:5].max() < heights[-5:].min()
