@@ -34,12 +34,14 @@ LEAST_SHARE = 0.15
 #: Planes through three random pixels that are tried, and number of pixels that judge them.
 PLANES, JUDGES = 1000, 4000
 #: The object stands on a plane if almost none of its points is deeper than this below it, and its
-#: lowest point is not higher than this above it [m].
-BELOW, ABOVE = 0.02, 0.08
+#: lowest point is not higher than this above it; the second limit is for planes if none is within
+#: the first [m].
+BELOW, ABOVE = 0.02, (0.025, 0.3)
 #: Fraction of the object's points that may be outliers.
 OUTLIERS = 0.02
-#: Rounds of least squares after the choice of a plane.
-ROUNDS = 5
+#: Rounds of least squares after the choice of a plane. They use the pixels that are closer to the
+#: plane than this multiple of the median distance (three standard deviations), or than this [m].
+ROUNDS, SIGMAS, CLOSE = 5, 4.45, 1e-4
 
 
 def cloud_from_depth(
@@ -79,8 +81,9 @@ def fit_table(
         mask: (h, w), not 0 on the object.
 
     Returns:
-        X_TC (4, 4); the root mean square of the distances from the plane, of the pixels on it [m];
-        and the fraction of the pixels beside the object that are on it.
+        X_TC (4, 4); the root mean square of the distances from the plane, of the pixels to which it
+        was fitted [m]; and the fraction of the pixels beside the object that are on it, within 1 %
+        of their depth.
 
     Raises:
         GraspError: See `cloud_from_depth`; or if fewer than 15 % of the pixels beside the object
@@ -92,20 +95,21 @@ def fit_table(
         raise GraspError(f"depth must show the table beside the object, got none of it: {few}")
     normal, offset = _table_plane(own, others)
 
-    # Least squares on the pixels that are on the plane.
+    # Least squares on the pixels that are on the plane, without those of what lies on the table.
     for _ in range(ROUNDS):
-        near = _on_plane(others, normal, offset)
-        if near.mean() < LEAST_SHARE:
+        on_plane = others[_on_plane(others, normal, offset)]
+        if (share := len(on_plane) / len(others)) < LEAST_SHARE:
             raise GraspError(
                 f"depth must show the table on at least {LEAST_SHARE:.0%} of the pixels beside the "
-                f"object, got {near.mean():.0%} on the best plane below it: {few}"
+                f"object, got {share:.0%} on the best plane below it: {few}"
             )
-        middle = others[near].mean(axis=0)
-        centred = others[near] - middle
-        normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]  # of the smallest variance
+        apart = np.abs(dot(on_plane, normal) - offset)
+        inner = on_plane[apart <= max(CLOSE, SIGMAS * float(np.median(apart)))]
+        middle = inner.mean(axis=0)
+        normal = np.linalg.eigh((inner - middle).T @ (inner - middle))[1][:, 0]
         normal *= -np.sign(dot(normal, middle))
         offset = float(dot(normal, middle))
-    residual = float(np.sqrt(((dot(others[near], normal) - offset) ** 2).mean()))
+    residual = float(np.sqrt(((dot(inner, normal) - offset) ** 2).mean()))
 
     # +Tx is the right of the image, or its top if the image's right is along +Tz.
     right = next(axis for axis in ([1.0, 0, 0], [0, -1.0, 0]) if abs(dot(axis, normal)) < 0.9)
@@ -114,7 +118,7 @@ def fit_table(
     below = own.mean(axis=0)
     below = below - (dot(below, normal) - offset) * normal
     X_CT = make_pose(np.column_stack([x, np.cross(normal, x), normal]), below)
-    return invert_pose(X_CT), residual, float(near.mean())
+    return invert_pose(X_CT), residual, share
 
 
 def _points(depth: npt.ArrayLike, K: npt.ArrayLike, mask: npt.ArrayLike) -> tuple[Array, Array]:
@@ -162,18 +166,21 @@ def _table_plane(own: Array, others: Array) -> tuple[Array, float]:
     normals *= -np.sign(dot(normals, a))[:, None]
     offsets = dot(normals, a)
 
-    # The object stands on a plane if it is above it, and not far.
+    # An object that is seen from the side touches the table, and not the wall behind it. Seen from
+    # above it shows only its top.
     heights = multiply(own[:: -(-len(own) // JUDGES)], normals.T) - offsets
     low = np.quantile(heights, OUTLIERS, axis=0)
-    stands = (low > -BELOW) & (low < ABOVE)
+    planes = zip(normals, offsets, strict=True)
+    counts = np.array([np.count_nonzero(_on_plane(judges, *plane)) for plane in planes])
+    for above in ABOVE:
+        stands = (low > -BELOW) & (low < above)
+        if (counts[stands] >= LEAST_SHARE * len(judges)).any():
+            break
     if not stands.any():
         raise GraspError(
             "depth must show the table on which the object stands, got no plane below the object: "
             "give the pose of the camera (X_TC)"
         )
-    counts = np.array(
-        [_on_plane(judges, n, d).sum() for n, d in zip(normals, offsets, strict=True)]
-    )
     best = int(np.argmax(np.where(stands, counts, -1)))
     return normals[best], float(offsets[best])
 
@@ -184,13 +191,14 @@ def _on_plane(points: Array, normal: Array, offset: float) -> npt.NDArray[np.boo
 
 
 def read_lens(K: npt.ArrayLike) -> Array:
-    """Return a camera matrix (3, 3) [px], after checking it.
+    """Return a camera matrix (3, 3) [px], given as (3, 3) or (9,), after checking it.
 
     Raises:
         GraspError: If it is not the matrix of a camera.
     """
     must = "camera must be a matrix (3, 3) with fx 0 cx, 0 fy cy, 0 0 1 in pixels"
     lens = as_numbers(K, must)
+    lens = lens.reshape(3, 3) if lens.shape == (9,) else lens
     if lens.shape != (3, 3):
         raise GraspError(f"{must}, got an array of shape {lens.shape}")
     zeros = lens[[0, 1, 2, 2], [1, 0, 0, 1]]
@@ -240,8 +248,8 @@ def read_camera(text: str) -> Array:
         else:
             content = next((content[k] for k in ("K", "k", "camera_matrix") if k in content), None)
     try:
-        return read_lens(np.reshape(as_numbers(content, must), (3, 3)))
-    except ValueError as error:  # also another number of values
+        return read_lens(as_numbers(content, must))
+    except GraspError as error:
         raise GraspError(f"{path}: {one_line(error)}") from None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import h5py
@@ -9,12 +10,15 @@ import numpy as np
 import pytest
 from helpers.commands import error_line, run
 from helpers.datasets import make_dataset
+from PIL import Image
 
 from drakegrasp.dataset.scenes import SceneDataset, SceneRows
+from drakegrasp.dataset.schema import DEPTH_UNIT
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.hand.description import load_hand
 from drakegrasp.scoring.network import load_network
+from drakegrasp.simulation.attempts import Attempts
 from drakegrasp.vision.depth_image import cloud_from_depth
 
 pytestmark = pytest.mark.sim
@@ -42,6 +46,12 @@ def cloud(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def own(cloud: Path) -> Attempts:
+    """The grasps for that cloud."""
+    return load_network().predict(np.load(cloud))
+
+
+@pytest.fixture(scope="module")
 def predicted(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("predicted") / "predicted.h5"
     result = run("predict", scenes, "--out", path, *FEW, "--workers", 1)
@@ -51,7 +61,7 @@ def predicted(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_grasps_of_scenes_are_those_of_their_views(
-    scenes: Path, predicted: Path, cloud: Path
+    scenes: Path, predicted: Path, own: Attempts
 ) -> None:
     """Each row has its best grasps, in the frame of its object."""
     rows = SceneRows(scenes, split="train")
@@ -61,11 +71,10 @@ def test_grasps_of_scenes_are_those_of_their_views(
     assert table.resting.tolist() == rows.column("grasp_props/resting")[table.of_row].tolist()
     assert set(table.said) == {"from above"}
 
-    own = load_network().predict(np.load(cloud), count=2)
     data = SceneDataset(scenes, points=None, negatives="none", balance="view")
     X_TG = data[0]["X_AO"].astype(float) @ table.X_FG[:2]
-    np.testing.assert_allclose(X_TG, own.X_FG, atol=1e-5)
-    np.testing.assert_allclose(table.confidence[:2], own.confidence, atol=1e-3)
+    np.testing.assert_allclose(X_TG, own.X_FG[:2], atol=1e-5)
+    np.testing.assert_allclose(table.confidence[:2], own.confidence[:2], atol=1e-3)
 
 
 @pytest.mark.slow
@@ -114,22 +123,50 @@ def test_workers_change_nothing(scenes: Path, predicted: Path, tmp_path: Path) -
     assert (tmp_path / "by 2.h5").read_bytes() == predicted.read_bytes()
 
 
-def test_a_cloud_may_be_in_any_unit(cloud: Path, tmp_path: Path) -> None:
-    out, points = tmp_path / "grasps.h5", np.load(cloud)
-    result = run("predict", cloud, "--out", out)
-    assert result.exit_code == 0, result.output
-    assert result.stdout.split()[0] == str(out) and "The best grasps" in result.stdout
+def test_a_cloud_may_be_in_any_unit(cloud: Path, own: Attempts, tmp_path: Path) -> None:
+    points, path, out = np.load(cloud), tmp_path / "cloud.ply", tmp_path / "grasps.h5"
     lines = "\n".join(" ".join(f"{1e3 * x:.6f}" for x in point) for point in points)
-    (tmp_path / "cloud.ply").write_text(
+    path.write_text(
         f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
         "property float x\nproperty float y\nproperty float z\nend_header\n" + lines
     )
-    again = tmp_path / "again.h5"
-    result = run("predict", tmp_path / "cloud.ply", "--units", "mm", "--out", again, "--count", 3)
+    result = run("predict", path, "--units", "mm", "--out", out, "--count", 3)
     assert result.exit_code == 0, result.output
-    one, other = (read_attempts(path, load_hand(), of="seen") for path in (out, again))
-    assert one.frame == "table" and len(other) == 3
-    np.testing.assert_allclose(other.X_FG, one.X_FG[:3], atol=1e-6)
+    assert result.stdout.split()[0] == str(out) and "The best grasps" in result.stdout
+    found = read_attempts(out, load_hand(), of="mug")
+    assert found.frame == "table" and len(found) == 3
+    np.testing.assert_allclose(found.X_FG, own.X_FG[:3], atol=1e-6)
+
+
+def test_grasps_of_a_depth_image_are_in_the_frame_of_its_camera(
+    scenes: Path, tmp_path: Path
+) -> None:
+    """The table is fitted, and close to the true one; a pose that is given is used."""
+    data = SceneDataset(scenes, points=None, negatives="none", balance="view")
+    (_, stored, own), X_TC = data.stored_images(data.views[0]), data[0]["X_TC"].astype(float)
+    Image.fromarray(stored).save(tmp_path / "depth.png")
+    Image.fromarray(own).save(tmp_path / "mask.png")
+    camera = tmp_path / "camera.json"
+    camera.write_text(json.dumps({"K": data.images(data.views[0])["K"].tolist()}))
+    given = ("predict", tmp_path / "depth.png", "--depth-scale", DEPTH_UNIT, "--camera", camera)
+    given += ("--mask", tmp_path / "mask.png", "--count", 3)
+    result = run(*given, "--out", tmp_path / "fitted.h5")
+    assert result.exit_code == 0, result.output
+    assert "table: " in result.stderr and "palm in" in result.stdout
+    with h5py.File(tmp_path / "fitted.h5") as file:
+        assert file["frame"].asstr()[()] == "camera"
+        X_TC_fitted, X_CG = file["X_TC"][0], file["X_FG"][:]
+
+    # {T} is elsewhere on the table; the palms are over the object.
+    angle = np.rad2deg(np.arccos(min(1.0, X_TC_fitted[2, :3] @ X_TC[2, :3])))
+    assert abs(X_TC_fitted[2, 3] - X_TC[2, 3]) < 1e-3 and angle < 0.5
+    palms = (X_TC @ X_CG)[:, :3, 3] - data[0]["X_AO"][:3, 3]
+    assert np.abs(palms[:, :2]).max() < 0.06 and palms[:, 2].min() > 0.04
+
+    # A pose that is given is used: here the camera is a metre lower.
+    np.save(tmp_path / "X_TC.npy", X_TC - np.eye(4, k=1) * [[0], [0], [1], [0]])
+    result = run(*given, "--camera-pose", tmp_path / "X_TC.npy", "--out", tmp_path / "known.h5")
+    assert "above the table" in error_line(result)
 
 
 @pytest.mark.parametrize(
@@ -144,6 +181,8 @@ def test_a_cloud_may_be_in_any_unit(cloud: Path, tmp_path: Path) -> None:
         ("{image} --units m", "must be a cloud (n, 3), got (4, 5): a depth image needs --camera"),
         ("{image} --camera 9,9,2,2", "--mask must be given with a depth image, got none"),
         ("{image} --camera 9,9,2 --mask {image}", "must be fx,fy,cx,cy in pixels, or a JSON file"),
+        ("{image} --camera 9,9,2,2 --mask {image}", "the table beside the object, got none"),
+        ("{image} --camera 9,9,2,2 --mask {image} --depth-scale 2", "with a .png only"),
         ("{scenes} --split valid", "in valid"),
         ("{text}", "INPUT must be .hdf5, .npy, .ply or .png"),
     ],

@@ -1,0 +1,170 @@
+"""Depth images of a user's own camera: the object's points, the table below it, and bad images."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import drakegrasp as dg
+from drakegrasp.frames import invert_pose, make_pose, rotation_about, transform_points
+from drakegrasp.vision.camera import look_at
+from drakegrasp.vision.depth_image import read_camera, read_depth_png, read_mask
+
+#: A camera of 160 x 120 pixels, which looks at a box on a table, with a wall behind the table.
+K = np.array([[150.0, 0.0, 80.0], [0.0, 152.0, 58.0], [0.0, 0.0, 1.0]])
+HIGH, WIDE = 120, 160
+X_TC = look_at(np.array([0.0, 0.0, 0.05]), 0.6, 0.4, np.sin(0.38), 0.3)
+#: Half extents of the box, and its height [m].
+BOX = np.array([0.04, 0.03, 0.1])
+#: The wall, in {T}: the plane of these normals and this offset [m].
+WALL, BEHIND = np.array([np.cos(0.4), np.sin(0.4), 0.0]), -0.1
+
+
+def image(noise=0.0, table=True, offset=BEHIND):
+    """Return depth (h, w) [m] and mask of the box, by casting rays; unknown far away."""
+    v, u = np.mgrid[:HIGH, :WIDE].reshape(2, -1)
+    rays = np.linalg.inv(K) @ np.stack([u, v, np.ones(len(u))])
+    way, eye = X_TC[:3, :3] @ rays, X_TC[:3, 3:]
+    low, high = np.array([-BOX[0], -BOX[1], 0.0])[:, None], np.array([*BOX])[:, None]
+    ends = np.sort([(low - eye) / way, (high - eye) / way], axis=0)
+    enters, leaves = ends[0].max(axis=0), ends[1].min(axis=0)
+    box = np.where(enters <= leaves, enters, np.inf)
+    floor = np.where(way[2] < 0.0, -eye[2] / way[2], np.inf) if table else np.full(len(u), np.inf)
+    behind = WALL @ way
+    wall = np.where(behind < 0.0, (offset - WALL @ eye) / behind, np.inf)
+    depth = np.minimum(np.minimum(box, floor), wall)
+    mask = (box <= depth) & np.isfinite(box)
+    depth *= 1.0 + noise * np.random.default_rng(0).normal(size=len(depth))
+    depth[::17] = np.nan
+    depth[5::19] = 0.0
+    return depth.reshape(HIGH, WIDE), mask.reshape(HIGH, WIDE)
+
+
+def off(fitted):
+    """Return how far a fitted table is from the true one: distance [m] and angle [degree]."""
+    normal = X_TC[:3, :3].T[:, 2]
+    angle = np.rad2deg(np.arccos(np.clip(fitted[:3, :3].T[:, 2] @ normal, -1.0, 1.0)))
+    # Of the points of the true table around the object.
+    points = np.array([[x, y, 0.0] for x in (-0.1, 0.1) for y in (-0.1, 0.1)])
+    heights = transform_points(fitted, transform_points(invert_pose(X_TC), points))[:, 2]
+    return np.abs(heights).max(), angle
+
+
+@pytest.mark.parametrize(("noise", "near"), [(0.0, 2e-5), (0.002, 1e-3)])
+def test_the_table_is_the_plane_on_which_the_object_stands(noise, near):
+    """Not the wall behind it, which has more pixels."""
+    depth, mask = image(noise)
+    fitted, residual, share = dg.fit_table(depth, K, mask)
+    distance, angle = off(fitted)
+    assert distance < near and angle < 0.5
+    assert residual < 2.0 * noise + 2e-5 and 0.15 < share < 0.55
+
+    # +z is up, x is horizontal in the image, and the origin is below what is seen of the object.
+    cloud = dg.cloud_from_depth(depth, K, mask, fitted)
+    np.testing.assert_allclose(cloud[:, :2].mean(axis=0), 0.0, atol=1e-6)
+    assert np.median(cloud[:, 2]) > 0.02 and cloud[:, 2].max() == pytest.approx(0.1, abs=5e-3)
+    assert fitted[:3, :3].T[0, 0] > 0.5 and np.linalg.det(fitted[:3, :3]) == pytest.approx(1.0)
+    again = dg.fit_table(depth, K, mask)
+    assert fitted.tobytes() == again[0].tobytes()
+
+
+def test_points_of_the_object_are_on_it():
+    depth, mask = image()
+    cloud = dg.cloud_from_depth(depth, K, mask, X_TC)
+    assert len(cloud) == (mask & np.isfinite(depth) & (depth > 0.0)).sum()
+    outward = np.maximum(np.abs(cloud[:, :2]) - BOX[:2], 0.0)
+    assert outward.max() < 1e-9 and cloud[:, 2].min() > -1e-9 and cloud[:, 2].max() < 0.1 + 1e-9
+    # At least one coordinate of each is that of a face.
+    faces = np.abs(np.column_stack([np.abs(cloud[:, :2]) - BOX[:2], cloud[:, 2] - 0.1]))
+    assert faces.min(axis=1).max() < 1e-9
+
+
+def scattered(depth, mask):
+    """Return an image without a plane."""
+    drawn = np.random.default_rng(0).uniform(0.7, 1.2, depth.shape)
+    return np.where(mask, depth, depth * drawn)
+
+
+def bad(**changes):
+    depth, mask = image()
+    return {"depth": depth, "K": K, "mask": mask} | {k: f(depth, mask) for k, f in changes.items()}
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (bad(depth=lambda z, m: 1000.0 * z), "depth must be in metres.*another unit"),
+        (bad(depth=lambda z, m: 0.001 * z), "depth must be in metres.*another unit"),
+        (bad(depth=lambda z, m: np.stack([z, z])), r"an image \(h, w\), got an array of shape"),
+        (bad(mask=lambda z, m: np.zeros_like(m)), "at least 10 pixels with a depth, got 0 of 0"),
+        (bad(depth=lambda z, m: np.where(m, np.nan, z)), "with a depth, got 0 of "),
+        (bad(mask=lambda z, m: m[:-1]), r"mask must be \(120, 160\), as the depth .*\(119, 160\)"),
+        (bad(K=lambda z, m: K[:2]), r"camera must be a matrix \(3, 3\)"),
+        (bad(K=lambda z, m: K * [[1], [-1], [1]]), "camera must be a matrix"),
+        (bad(mask=lambda z, m: np.ones_like(m)), "the table beside the object, got none"),
+        (bad(depth=lambda z, m: image(table=False, offset=-1.0)[0]), "no plane below the object"),
+        (bad(depth=scattered), "at least 15%"),
+    ],
+)
+def test_bad_images_are_refused_with_one_line(changed, said):
+    with pytest.raises(dg.GraspError, match=f"^[^\n]*{said}[^\n]*$"):
+        dg.fit_table(**changed)
+
+
+def test_files_of_a_camera(tmp_path):
+    depth, mask = image()
+    units = np.rint(np.nan_to_num(depth) / 0.00025).astype(np.uint16)
+    Image.fromarray(units).save(tmp_path / "depth.png")
+    np.testing.assert_array_equal(read_depth_png(tmp_path / "depth.png", 0.00025), units * 0.00025)
+
+    # A mask in any form.
+    Image.fromarray(mask).save(tmp_path / "bits.png")
+    Image.fromarray(200 * mask.astype(np.uint8)).save(tmp_path / "grey.png")
+    colours = np.dstack([0 * mask, 9 * mask, 0 * mask, 255 + 0 * mask]).astype(np.uint8)
+    Image.fromarray(colours).save(tmp_path / "colours.png")
+    np.save(tmp_path / "mask.npy", mask)
+    for name in ("bits.png", "grey.png", "colours.png", "mask.npy"):
+        np.testing.assert_array_equal(read_mask(tmp_path / name), mask)
+
+    # A camera in any form.
+    path = tmp_path / "K.json"
+    flat = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "width": WIDE}
+    for content in (K.tolist(), {"K": K.ravel().tolist()}, {"camera_matrix": K.tolist()}, flat):
+        path.write_text(json.dumps(content))
+        np.testing.assert_array_equal(read_camera(str(path)), K)
+    np.testing.assert_array_equal(read_camera("150,152, 80 58"), K)
+
+
+@pytest.mark.parametrize(
+    ("read", "content", "said"),
+    [
+        (read_mask, b"no image", "must be an image, got: "),
+        (lambda path: read_depth_png(path, 0.001), 8, "16 bits and one channel, got uint8"),
+        (lambda path: read_camera(str(path)), b"[1, 2]", r"camera must be .*got an array of shape"),
+        (lambda path: read_camera(str(path)), b'{"f": 1}', r"camera must be .*got None"),
+        (lambda path: read_camera(str(path)), b"{", "a JSON file with K, got: "),
+    ],
+)
+def test_bad_files_are_refused_with_their_name(tmp_path, read, content, said):
+    path = tmp_path / "file.png"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        Image.fromarray(np.full((4, 4), content, np.uint8)).save(path)
+    with pytest.raises(dg.GraspError, match=f"^{path}: .*{said}[^\n]*$"):
+        read(path)
+
+
+def test_a_camera_that_lies_on_its_side_has_a_table():
+    """The image's right may be up."""
+    depth, mask = image()
+    turned, mask = np.rot90(depth), np.rot90(mask)
+    # A turn by 90 degrees: u' = v, v' = w - 1 - u.
+    lens = np.array([[K[1, 1], 0, K[1, 2]], [0, K[0, 0], WIDE - 1 - K[0, 2]], [0, 0, 1]])
+    fitted, _, _ = dg.fit_table(turned, lens, mask)
+    X_CD = make_pose(rotation_about([0.0, 0.0, 1.0], np.pi / 2), np.zeros(3))
+    distance, angle = off(fitted @ invert_pose(X_CD))
+    assert distance < 2e-5 and angle < 0.01
