@@ -51,8 +51,10 @@ def test_options(golden: Golden) -> None:
         ("stats", ["stats", "OUT"]),
         ("stats_json", ["stats", "OUT", "--json"]),
         ("check", ["check", "OUT"]),
-        ("assemble", ["assemble", "OUT", "--set", "split.test_fraction=0.4"]),
-        ("assemble_rejected", ["assemble", "OUT", "--reject", "REJECT"]),
+        (
+            "assemble",
+            ["assemble", "OUT", "--set", "split.test_fraction=0.4", "--reject", "REJECT"],
+        ),
         ("audit", ["audit", "MESHES"]),
         ("hands", ["hand", "list"]),
         ("objects", ["objects", "list"]),

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from helpers.golden import Golden
 from helpers.hands import write_tongs
 from helpers.tiers import in_second_tier
 
@@ -131,23 +132,27 @@ def no_simulation(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureReques
         monkeypatch.setattr("drakegrasp.commissioning.trial_grasps.GRASPS", ())
 
 
-def refuse(path: Path, check: str, message: str) -> None:
-    """Check that one check of a hand fails, with a message of a line."""
-    (failed,) = (finding for finding in check_hand(path) if not finding.ok)
+def refuse(path: Path, check: str, message: str) -> str:
+    """Check that one check of a hand fails, with a message of a line; return all findings."""
+    findings = check_hand(path)
+    (failed,) = (finding for finding in findings if not finding.ok)
     assert failed.name == check
     assert re.search(message, failed.text), failed.text
     assert "\n" not in failed.text
+    said = "\n".join(f"{finding.ok} {finding.name}: {finding.text}" for finding in findings)
+    return said.replace(str(path.parent), "FOLDER")
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_spoilt_hand_fails_with_a_message_that_names_the_fault(
-    tmp_path: Path, fault: str
+    tmp_path: Path, fault: str, golden: Golden
 ) -> None:
     """No other check fails, and none of these needs a simulation to be seen."""
     name, suffix, old, new, *found = FAULTS[fault]
     path = copied(tmp_path, name)
     change(path, suffix, old, new)
-    refuse(path, *found)
+    text = refuse(path, *found)
+    golden(f"faults/{re.sub('[^a-z0-9]+', '_', fault.lower())}", text)
 
 
 def test_a_mirrored_order_of_fingers_is_refused(tmp_path: Path) -> None:
@@ -198,6 +203,12 @@ def test_the_hand_of_the_example_plugin_passes() -> None:
     """Its pads have no region, so they are the whole surface of the fingertips."""
     path = Path(__file__).parents[2] / "docs/examples/plugin/example_plugin/jaw_hand.yaml"
     assert [finding.text for finding in check_hand(path) if not finding.ok] == []
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett", "franka"])
+def test_findings_of_a_hand_of_the_package(name: str, golden: Golden) -> None:
+    findings = check_hand(name)
+    golden(f"hands/{name}", "\n".join(f"{f.ok} {f.name}: {f.text}" for f in findings))
 
 
 @pytest.mark.sim

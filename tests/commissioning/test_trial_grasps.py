@@ -6,10 +6,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.golden import Golden, points, short
 from helpers.hands import write_slider
 from helpers.tiers import in_second_tier
 
-from drakegrasp.commissioning.trial_grasps import check_grasp, trial_grasps
+from drakegrasp.commissioning.trial_grasps import GRASPS, check_grasp, trial_grasps
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.finger_sweep import find_opposition, find_pinch, reach
 from drakegrasp.hand.settings import load_config
@@ -82,3 +83,16 @@ def test_trial_grasps_are_lifted_to_their_end(monkeypatch) -> None:
     assert check_grasp(load_hand("allegro"), config, "box").ok
     assert [each.lift.drive for each in configs] == ["locked", "torque"]
     assert {each.lift.stop_when for each in configs} == {"never"}
+
+
+@pytest.mark.parametrize("name", ["barrett", "franka"])
+def test_trial_grasps_of_a_hand(name: str, golden: Golden) -> None:
+    """The objects, how they hang, and where the hand starts."""
+    hand, lines = load_hand(name), []
+    for shape, line in GRASPS:
+        for model, X_TO, start, width in trial_grasps(hand, shape, line):
+            size = points([model.half_extents])
+            lines.append(f"{shape} {line} {short(width)} m, {short(model.mass)} kg {size}")
+            lines += [points(X[:3]) for X in (X_TO, start.X_OG)]
+            lines.append(f"{short(start.spread)} {points([start.closing])}")
+    golden(f"grasps/{name}", "\n".join(lines))
