@@ -10,10 +10,11 @@ from pathlib import Path
 
 import dask
 import pytest
+from helpers.golden import Golden
 
 from drakegrasp.cluster.certificates import security_of
 from drakegrasp.cluster.connect import dask_settings
-from drakegrasp.cluster.kinds import cluster_of
+from drakegrasp.cluster.kinds import cluster_of, describe
 from drakegrasp.errors import ConfigError, MachineError
 
 pytest.importorskip("dask_jobqueue")
@@ -106,9 +107,10 @@ ASKED = {
 
 @pytest.mark.parametrize("kind", ASKED)
 def test_each_scheduler_is_asked_in_its_own_words(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, golden: Golden
 ) -> None:
-    monkeypatch.delenv("LSF_ENVDIR", raising=False)
+    for name in ("LSF_ENVDIR", "OPENBLAS_CORETYPE"):
+        monkeypatch.delenv(name, raising=False)
     site = {
         "jobqueue.sge.job-extra-directives": ["-pe smp 3"],
         "jobqueue.oar.memory-per-core-property-name": "mem",
@@ -128,6 +130,14 @@ def test_each_scheduler_is_asked_in_its_own_words(
     assert (
         f"6 workers in 2 {type(cluster).title} jobs (3 in each), 2GB per worker" in cluster.line()
     )
+
+    # The whole script, and that of one job of one worker, without encryption.
+    with dask.config.set(site):
+        more = {"workers": 1, "memory": "500MB", "walltime": "2-03:04:05", "host": "127.0.0.1"}
+        other = cluster_of(kind, tls=False, **more)
+        both = [script, *describe(cluster), other.script(tmp_path), *describe(other)]
+    text = "\n".join(both).replace(str(tmp_path), "OUT").replace(sys.executable, "PYTHON")
+    golden(f"jobs/{kind}", text)
 
 
 def test_times_of_the_users_file_are_read_as_its_scheduler_does() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import yaml
 from click.testing import CliRunner
+from helpers.golden import Golden
 
 from drakegrasp.cli.main import main
 from drakegrasp.cluster.kinds import cluster_of
@@ -49,8 +50,12 @@ def manifest(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("tls", [True, False])
-def test_manifest_is_what_the_operator_takes(tls: bool) -> None:
+def test_manifest_is_what_the_operator_takes(
+    tls: bool, golden: Golden, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OPENBLAS_CORETYPE", raising=False)
     document = manifest(tls=tls)
+    golden(f"jobs/kubernetes_{'tls' if tls else 'open'}", yaml.safe_dump(document))
     assert document.pop("apiVersion") == "kubernetes.dask.org/v1"
     assert document.pop("kind") == "DaskCluster"
     assert document.pop("metadata") == {"name": "drakegrasp", "namespace": "default"}
