@@ -34,9 +34,12 @@ LEAST_SHARE = 0.15
 #: Planes through three random pixels that are tried, and number of pixels that judge them.
 PLANES, JUDGES = 1000, 4000
 #: The object stands on a plane if almost none of its points is deeper than this below it, and its
-#: lowest point is not higher than this above it; the second limit is for planes if none is within
-#: the first [m].
+#: lowest point is not higher than the second limit above it; it touches the plane if this is not
+#: higher than the first limit [m].
 BELOW, ABOVE = 0.02, (0.025, 0.3)
+#: A plane that the object touches is preferred if it has at least this fraction of the pixels of
+#: the best plane.
+TOUCHED = 0.35
 #: Fraction of the object's points that may be outliers.
 OUTLIERS = 0.02
 #: Rounds of least squares after the choice of a plane. They use the pixels that are closer to the
@@ -172,10 +175,9 @@ def _table_plane(own: Array, others: Array) -> tuple[Array, float]:
     low = np.quantile(heights, OUTLIERS, axis=0)
     planes = zip(normals, offsets, strict=True)
     counts = np.array([np.count_nonzero(_on_plane(judges, *plane)) for plane in planes])
-    for above in ABOVE:
-        stands = (low > -BELOW) & (low < above)
-        if (counts[stands] >= LEAST_SHARE * len(judges)).any():
-            break
+    touches, stands = ((low > -BELOW) & (low < above) for above in ABOVE)
+    if counts[touches].max(initial=0) >= TOUCHED * counts[stands].max(initial=1):
+        stands = touches
     if not stands.any():
         raise GraspError(
             "depth must show the table on which the object stands, got no plane below the object: "

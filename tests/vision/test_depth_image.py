@@ -71,6 +71,16 @@ def test_the_table_is_the_plane_on_which_the_object_stands(noise, near):
     assert fitted.tobytes() == again[0].tobytes()
 
 
+def test_an_object_on_another_is_over_the_table():
+    """What lies below it has few pixels; its top, alone in the mask, is still over the table."""
+    depth, mask = image()
+    cloud = dg.cloud_from_depth(depth, K, mask, X_TC)
+    top = mask.copy()
+    top[mask & (depth > 0.0)] = cloud[:, 2] > 0.06
+    distance, angle = off(dg.fit_table(depth, K, top)[0])
+    assert distance < 2e-4 and angle < 0.05
+
+
 def test_points_of_the_object_are_on_it():
     depth, mask = image()
     cloud = dg.cloud_from_depth(depth, K, mask, X_TC)
