@@ -3,7 +3,7 @@
 Input: an object's visible points in {T}, where the table is z = 0, or the views of scenes. Output:
 `Attempts` with a confidence, which `exchange.attempts.write_attempts` writes, a robot executes, a
 build tries and a score judges. A network proposes grasps (`scoring.proposals`) and orders them
-(`scoring.ranking`) by its judge. It needs NumPy only, no torch.
+(`scoring.ranking`) by its judge (`scoring.judge`). It needs NumPy only, no torch.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,7 @@ from drakegrasp.frames import invert_pose, unpack_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.progress import Report, silent
+from drakegrasp.scoring.judge import Judge, judge_names, load_judge
 from drakegrasp.scoring.proposals import propose
 from drakegrasp.scoring.ranking import rank
 from drakegrasp.simulation.attempts import Attempts, join_attempts
@@ -31,6 +33,13 @@ from drakegrasp.vision.depth_image import cloud_from_depth
 
 #: The network that is used if none is named.
 DEFAULT = "barrett-1"
+#: What no network of this kind knows.
+LIMITS = (
+    "it sees one object alone on a table, from one side; it knows neither friction nor mass, nor "
+    "other objects, nor the arm; it was trained in simulation and never tried on a robot"
+)
+#: What the file of a judge states for programs only.
+_FOR_PROGRAMS = ("features", "answers", "fingerprint")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,12 +49,19 @@ class GraspNetwork:
     Attributes:
         name: Its name.
         hand: The hand that it is for.
-        card: What it was trained on, its limits and its licence, in words.
+        judge: Its judge, which orders the proposals.
     """
 
     name: str
     hand: Hand
-    card: str
+    judge: Judge
+
+    @property
+    def card(self) -> str:
+        """What it was trained on, the hash of the data, its scores, its limits and its licence."""
+        stated = {k: v for k, v in self.judge.about.items() if k not in _FOR_PROGRAMS}
+        stated["limits"] = LIMITS
+        return "\n".join(f"{name}: {_words(value)}" for name, value in stated.items())
 
     def predict(
         self, cloud: npt.ArrayLike, name: str = "seen", count: int | None = None
@@ -59,7 +75,8 @@ class GraspNetwork:
             count: Maximum number of grasps; None for all that were proposed.
 
         Returns:
-            Postures in the frame "table", with their `confidence`, 0 to 1.
+            Postures in the frame "table", with their `confidence`: the chance that the grasp would
+            be a sample of a dataset.
 
         Raises:
             GraspError: If the cloud is invalid, or `count` is less than 1.
@@ -67,7 +84,7 @@ class GraspNetwork:
         if count is not None and count < 1:
             raise GraspError(f"count must be 1 or more, got {count}")
         proposals = propose(cloud, self.hand, name=name)
-        ranking = rank(proposals, cloud, self.hand)
+        ranking = rank(proposals, cloud, self.hand, judge=self.judge)
         order = ranking.order[:count]
         chosen = proposals.at(order.tolist())
         return replace(chosen, confidence=ranking.score[order], row=np.arange(len(order)))
@@ -80,11 +97,25 @@ def load_network(name_or_path: str | Path = DEFAULT) -> GraspNetwork:
         name_or_path: A name, e.g. "barrett-1", or the path of a file of weights (.npz).
 
     Raises:
-        GraspError: If there is no such network.
+        GraspError: If there is no such network, or the file is not one.
+        HandError: If the hand has changed since the network was trained.
     """
-    if name_or_path != DEFAULT:
-        raise GraspError(f"network must be {DEFAULT}, got {str(name_or_path)!r}")
-    return GraspNetwork(name=DEFAULT, hand=load_hand(), card="")
+    if str(name_or_path) not in (names := judge_names()) and not Path(name_or_path).is_file():
+        raise GraspError(
+            f"network must be one of {', '.join(names)}, or a file of weights (.npz), "
+            f"got {str(name_or_path)!r}"
+        )
+    judge = load_judge(name_or_path)
+    hand = load_hand(judge.about["hand"])
+    judge.refuse_other_hand(hand)
+    return GraspNetwork(name=judge.name, hand=hand, judge=judge)
+
+
+def _words(value: Any) -> str:
+    """Return a value of a card as text."""
+    if isinstance(value, dict):
+        return "; ".join(f"{name} {_words(each)}" for name, each in value.items())
+    return str(value)
 
 
 def predict_scenes(

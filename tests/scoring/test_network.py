@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.resources import files
+
 import numpy as np
 import pytest
 
@@ -25,15 +27,15 @@ def network():
 def test_grasps_come_with_the_best_first(network, cloud):
     found = network.predict(cloud, "mug")
     assert found.frame == "table" and set(found.objects) == {"mug"} and not any(found.invalid)
-    assert (np.diff(found.confidence) <= 0.0).all() and 0.5 < found.confidence[0] <= 1.0
+    assert (np.diff(found.confidence) <= 0.0).all() and 0.0 < found.confidence[0] <= 1.0
     assert found.row.tolist() == list(range(len(found)))
 
-    # They are those that `propose` returns, in the order of their confidence.
+    # They are those that `propose` returns, in the order of the network's judge.
     proposed = dg.propose(cloud, network.hand)
-    known = {X.tobytes(): q for X, q in zip(proposed.X_FG, proposed.q_grasp, strict=True)}
-    for X, q in zip(found.X_FG, found.q_grasp, strict=True):
-        np.testing.assert_array_equal(known.pop(X.tobytes()), q)
-    assert not known
+    ranked = dg.rank(proposed, cloud, network.hand, judge=DEFAULT)
+    np.testing.assert_array_equal(found.confidence, ranked.score[ranked.order])
+    for name in ("X_FG", "q_grasp", "q_pregrasp"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(proposed, name)[ranked.order])
 
     few = network.predict(cloud, count=2)
     np.testing.assert_array_equal(few.X_FG, found.X_FG[:2])
@@ -44,6 +46,22 @@ def test_a_network_is_known_by_its_name(network):
     assert network.name == DEFAULT and network.hand.name == "barrett"
     with pytest.raises(dg.GraspError, match=r"barrett-1.*got 'magic'"):
         dg.load_network("magic")
+
+
+def test_a_network_states_what_it_was_trained_on(network):
+    about = dict(line.split(": ", 1) for line in network.card.splitlines())
+    assert about["hand"] == "barrett" and about["licence"] == "BSD-3-Clause"
+    assert len(about["data_sha256"]) == 64 and "from one side" in about["limits"]
+    assert "features" not in about
+
+
+def test_a_file_of_weights_is_a_network(network, cloud, tmp_path):
+    path = tmp_path / "own.npz"
+    path.write_bytes(files("drakegrasp.scoring").joinpath(f"{DEFAULT}.npz").read_bytes())
+    assert dg.load_network(path).card == network.card
+    path.write_bytes(b"weights")
+    with pytest.raises(dg.GraspError, match=r"own\.npz: must be the file of a judge"):
+        dg.load_network(path)
 
 
 def test_the_number_of_grasps_is_positive(network, cloud):
