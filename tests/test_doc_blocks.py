@@ -58,6 +58,7 @@ NOT_RUN = {
     "drakegrasp hand new ": "a model that may not be shipped; tests/commissioning/test_new_hand.py",
     "drakegrasp hand check ": "tests/commissioning/test_tutorial_hand.py runs it",
     "drakegrasp export OUT FOLDER --to lerobot ": "simulates again; tests/exchange/test_lerobot.py",
+    "drakegrasp export OUT POSES ": "wants the package of the page; tests/test_plugin.py",
     "drakegrasp verify FILE ": "wants a file of postures; tests/cli/test_verify_request.py",
     "drakegrasp verify GRASPS --protocol ": "wants an MJCF; tests/protocols",
 }
@@ -81,6 +82,7 @@ NO_CODE = {
 PY_NOT_RUN = {
     "dg.fit_table(": "wants a depth image; tests/vision/test_depth_image.py",
     "dg.build_dataset(": "simulates for hours; tests/test_api.py",
+    "read_closed_grasps(out)": "an exporter of the reader; tests/test_plugin.py",
     "datasets.load_dataset(": "tests/exchange/hub/test_hub.py reads a folder so",
     "lerobot.datasets": "wants LeRobot; tests/exchange/test_lerobot.py",
     "dg.SceneDataset(": "wants scenes and torch; tests/dataset/test_scene_reader.py",

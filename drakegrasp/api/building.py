@@ -71,7 +71,7 @@ def build_dataset(
         out: Directory of the dataset. Files travel over the network if a worker does not see it.
         config: All the rules; None for the defaults.
         units: Unit of length of the meshes: m, cm or mm.
-        manifest: YAML file with units and classes per mesh, if it is not beside the meshes.
+        manifest: YAML file with units and classes per mesh, if it is not in their folder.
         only: Names of the objects to build; all if empty.
         postures: A file or a table of postures that replace drawn palm poses. Only the objects that
             it names are built; invalid rows are reported and left out.

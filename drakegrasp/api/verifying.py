@@ -169,7 +169,7 @@ def verify_grasps(
         X_TC: Only for an object, with frame "camera": pose of the camera in {T}, (4, 4), or one
             per grasp (n, 4, 4). Rows have their own cameras.
         units: Only for a mesh: unit of its lengths, m, cm or mm; metres if None. An `objects.yaml`
-            beside a file wins. Grasps are always in metres.
+            in the folder of the mesh overrides it. Grasps are always in metres.
         X_TO: Only for an object: its pose on the table, (4, 4).
         hand: Name or YAML file of the hand; None for the hand of the configuration or the dataset.
         method: "hand" closes a simulated hand on the contacts and lifts. "forces" computes whether
@@ -277,8 +277,8 @@ def place_object(
     Args:
         mesh: Path of a mesh file, a mesh, or a placed object. The origin of {O} is the centre of
             the bounding box, not the origin of the file.
-        units: Unit of the mesh's lengths: m, cm or mm; metres if None. An `objects.yaml` beside
-            a file wins. Grasps are always in metres.
+        units: Unit of the mesh's lengths: m, cm or mm; metres if None. An `objects.yaml` in
+            the folder of the mesh overrides it. Grasps are always in metres.
         X_TO: Pose of the object on the table, (4, 4); if None, the object is dropped as in a build.
         hand: Name or YAML file of the hand; None for the configuration's ("barrett").
         config: Hand, physics, lift and rules; None for those of a placed object, or else the

@@ -1,4 +1,4 @@
-"""A process beside a Dask worker that calls functions, so that a crash does not kill the worker.
+"""A separate process that calls functions for a Dask worker: a crash does not kill the worker.
 
 Input: a pickled pair of a function and the `FileTask` to call it with. Output: the pickled result.
 If workers do not see the files of the dataset, the journal of a task (`drakegrasp.runtime.journal`)

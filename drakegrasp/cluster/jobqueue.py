@@ -254,7 +254,7 @@ class Sge(Jobs):
 
 
 class Htcondor(Jobs):
-    """HTCondor: memory and disk of a job in its ClassAd, and no time limit but ours."""
+    """HTCondor: a job states its memory and disk in its ClassAd; only our time limit ends it."""
 
     of, title = dask_jobqueue.HTCondorCluster, "HTCondor"
 

@@ -53,7 +53,8 @@ class Local:
 
     Attributes:
         starts: Whether `connected` starts or finds workers; otherwise there is only a `script`.
-        follow: Minimum and maximum number of words after the kind, and their description.
+        follow: How many words follow the name of the kind on the command line (minimum, maximum),
+            and what they are.
         options: Names of the options that the kind has.
         kind: Name of the kind in the registry.
         where: Names of hosts, the address of a scheduler, or the path of a scheduler's file.

@@ -5,7 +5,7 @@ Output: the results, and the written files, which the client writes to the datas
 
 The client sends the content of a file to the scheduler once, and the scheduler keeps it while tasks
 in flight need it. A worker gets missing files from the scheduler, and keeps the files of its last
-tasks in its own directory. A task runs in a process beside the worker, in a folder with copies of
+tasks in its own directory. A task runs in a separate process, in a folder with copies of
 the files. If the process dies, the worker survives and starts another process. The journal of the
 task is in this folder, so a step that kills its process is identified in the same way as on workers
 that see the dataset. If a worker is lost, another worker runs its task from the beginning. If the

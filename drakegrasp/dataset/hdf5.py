@@ -46,7 +46,7 @@ def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
 
     Raises:
         OSError: If the file cannot be read.
-        DataError: If a process died while it replaced the files beside it, or if the file has
+        DataError: If a process died while it replaced the files of this folder, or if the file has
             links, values stored outside of it, or more rows than it can hold.
     """
     refuse_half_replaced(path.parent)

@@ -152,10 +152,10 @@ class Suspicion:
 
     Attributes:
         score: (n,), root of the sum of the squared parts; NaN if nothing was simulated.
-        values: By the names of PARTS, (n,), the quantity itself in its unit; NaN if the attempt
-            ended before its stage, or if a contact has no normal.
-        shares: By the names of PARTS, (n,), value divided by scale, at most CAP; NaN if the attempt
-            ended before its stage.
+        values: For each name of PARTS the measured quantity (n,) in its unit; NaN if the attempt
+            ended before it could be measured, or if a contact has no normal.
+        shares: For each name of PARTS the value divided by the scale of the part (n,), at most CAP;
+            NaN if the attempt ended before the value could be measured.
     """
 
     score: Array

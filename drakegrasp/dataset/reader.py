@@ -362,7 +362,7 @@ def _group(values: dict[str, Any], prefix: str) -> dict[str, Any]:
     return {k.removeprefix(prefix): v for k, v in values.items() if k.startswith(prefix)}
 
 
-#: Group of a file of results, beside the group of the verdicts.
+#: Group of the rows in a file of results, which also has a group of verdicts.
 ROWS_GROUP = "rows"
 
 

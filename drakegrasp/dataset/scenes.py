@@ -584,7 +584,7 @@ class SceneRows(GraspDataset):
     trials, so the camera (`frame_work2cam_view`) is turned and moved back with the object.
 
     Args:
-        path: OUT/scenes.hdf5; OUT/trials.hdf5 must be beside it.
+        path: OUT/scenes.hdf5; OUT/trials.hdf5 must be in the same folder.
         split: `train`, `valid` or `test`.
 
     Attributes:
@@ -694,6 +694,6 @@ def refuse_other_state(path: Path, trials: Trials) -> None:
         for key in ("shards", "signature"):
             if str(file.attrs.get(key)) != str(trials.attributes.get(key)):
                 raise DataError(
-                    f"{path}: must be of the trials beside it, got one of others; run "
+                    f"{path}: must be of the trials in its folder, got other scenes; run "
                     "`drakegrasp scenes` again"
                 )

@@ -36,8 +36,8 @@ def read_contacts(path: Path, *, split: str | None = None, axes: int = 2) -> dic
     Args:
         path: A `.npy` file, (n, m) or (m,); a `.csv` file with a line per grasp and optionally a
             header; an HDF5 file (`.h5`, `.hdf5`) with an array `grasps`, and optionally `rows` and
-            `confidence` beside it, at the root or in a group; or a Parquet file with a line per
-            entry and these as columns, `grasps` of lists.
+            `confidence`, all at the root or all in one group; or a Parquet file with a line per
+            grasp and columns of the same names, in which `grasps` are lists.
         split: Name of the group to read in an HDF5 file. If it is None or there is no such group,
             the root is read. If it is None and the root has no grasps, the only group with grasps
             is read.

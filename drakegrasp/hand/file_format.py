@@ -120,7 +120,7 @@ class Finger:
             raise ValueError(fault)
 
     def _faults(self) -> Iterator[str]:
-        """Yield the faults of the finger alone, without the rest of the file."""
+        """Yield the faults that can be found in this finger without the rest of the file."""
         # A finger either turns or slides; a driven finger does what its driver does.
         limits = self.torque_limit, self.force_limit
         if limits.count(None) != 1 and not (self.driven_by and limits.count(None) == 2):
@@ -132,7 +132,7 @@ class Finger:
         # The worm's key fits the kind of joint, and the worm is no weaker than the motor.
         key, wrong = ("force", "torque") if self.slides else ("torque", "force")
         if getattr(self, f"holding_{wrong}") is not None:
-            yield f"holding_{wrong} must be holding_{key} beside {key}_limit"
+            yield f"holding_{wrong} must be holding_{key} together with {key}_limit"
         holding = self.holding_effort
         if holding is not None and holding < self.effort_limit:
             yield (
@@ -291,8 +291,8 @@ class HandFile(BaseModel):
             for key, none in _OF_MOTOR.items():
                 if getattr(self.fingers[i], key) != none:
                     yield (
-                        f"fingers.{i}.{key} must be left out beside driven_by: the motor is that "
-                        f"of finger {driver!r}"
+                        f"fingers.{i}.{key} must be left out with driven_by: the motor is that of "
+                        f"finger {driver!r}"
                     )
 
     def _faults(self) -> Iterator[str]:

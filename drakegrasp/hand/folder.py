@@ -91,7 +91,7 @@ def hand_folder(source: HandSource, name: str | None = None) -> HandFolder:
         HandError: If there is no such hand, its files are too large, or a dataset's hand names
             files outside its folder.
     """
-    # The hand file; a model outside its folder is put beside it.
+    # The hand file; a model outside its folder is copied into this folder.
     path = hand_file(source)
     found = HandFolder(within=path.parent if isinstance(source, CarriedHand) else None)
     found.has(path)

@@ -190,7 +190,7 @@ def flat_limits(hand: Hand) -> tuple[float, float]:
 def _reach(hand: Hand) -> tuple[float, float, Array]:
     """Return how far ahead of the palm a hand reaches while it closes, and in which posture.
 
-    All fingers close together in `REACH_STEPS` postures, at both limits of the spread.
+    At both limits of the spread, all fingers close together in `REACH_STEPS` steps.
 
     Returns:
         The distance along +Gz [m], the spread [rad] and the closing positions (k,) [rad or m].

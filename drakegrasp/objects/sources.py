@@ -6,9 +6,9 @@
 File names and `objects.yaml`: a mesh called `<number>_<class>_<rest>.ext` belongs to `<class>`,
 which may itself contain underscores: the number is dropped, and so is the last part if at least two
 parts remain (24_mug_final and 1_mug are mugs, 30_fruit_juicer_final is a fruit_juicer). A name
-without a number is its own class. A file `objects.yaml` beside the meshes overrides these for
-single meshes, and the unit for all. It also states the licence of the meshes and what a file of
-triangles cannot specify:
+without a number is its own class. A file `objects.yaml` in the folder of the meshes overrides
+the class of single meshes, and the unit of single or all meshes. It also states the
+licence of the meshes, and properties that a file of triangles cannot specify:
 
     units: cm
     licence: CC-BY-4.0

@@ -80,7 +80,7 @@ def verify_postures(
 
 
 def prepare_trials(name: str, hand: Path, objects: Path) -> PostureTrials:
-    """Return the trials of a protocol; everything except the files is checked here.
+    """Return the trials of a protocol. The arguments are checked here, and the files later.
 
     Args:
         name: Name of a protocol in the registry, or `FILE.py:NAME`.

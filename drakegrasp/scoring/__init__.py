@@ -1,1 +1,1 @@
-"""Scores of predicted grasps beside reference rows: cards, and the frozen benchmark."""
+"""Scores of predicted grasps and of reference rows: cards, and the frozen benchmark."""

@@ -133,7 +133,7 @@ def read_benchmark(out: Path, config: Config, versions: Mapping[str, str]) -> di
             versions are returned, because simulated values may then differ.
 
     Raises:
-        DataError: If the file of the benchmark, or the data file beside it, is damaged.
+        DataError: If the file of the benchmark, or the data file in the same folder, is damaged.
     """
     path = out / BUILTIN_FOLDER / BENCHMARK_FILE
     if not path.is_file():

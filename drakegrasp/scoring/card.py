@@ -241,7 +241,7 @@ def card_text(card: Mapping[str, Any]) -> str:
 
 
 def _more(card: Mapping[str, Any]) -> list[str]:
-    """Return the lines on measures beside the headline."""
+    """Return the lines on all measures except the headline."""
     # The curve, and measures of the predictions that count.
     sets, lines = card["sets"], list[str]()
     if "protocol" not in card["settings"]:

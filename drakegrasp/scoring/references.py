@@ -1,4 +1,4 @@
-"""Reference rows: predictions that the program makes itself, to be scored beside a network's.
+"""Reference rows: predictions of the program itself, with which a network is compared.
 
 Input: the rows to score, and training rows. Output: a grasp per row, as contacts in the camera's
 frame or postures in {T}. `constant` and `random` never look at the image. The camera is at a fixed

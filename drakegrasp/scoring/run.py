@@ -40,7 +40,7 @@ CARD_JSON, CARD_TEXT, CARD_PICTURE, VERDICTS = "card.json", "card.md", "card.png
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Score:
-    """A score of predictions beside reference rows.
+    """A score of predictions and of reference rows, with which they are compared.
 
     Attributes:
         card: Plain JSON types, see docs/how-to/score.md.

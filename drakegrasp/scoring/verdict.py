@@ -287,7 +287,7 @@ def verdict_key(settings: Mapping[str, Any], signature: str, row: int, grasp: Ar
     """Return the key (32 hex digits) of a prediction that is tried on a row of a dataset.
 
     Args:
-        settings: All that decides the verdict beside the row: rules and versions.
+        settings: All that decides the verdict apart from the row: rules and versions.
         signature: Hash of the dataset's content, with the camera in whose frame the grasps are.
         row: Row of the split.
         grasp: (6k,), or the numbers of a posture.

@@ -713,7 +713,7 @@ def misfits(table: Attempts, name: str, scale: float, poses: Array) -> list[str]
     return found
 
 
-#: Columns of postures that a plan has beside their palm poses.
+#: Columns of postures that a plan has in addition to their palm poses.
 _IN_PLAN = ("q_grasp", "q_pregrasp", "q_squeeze", "row", "said", "preshape")
 
 

@@ -85,8 +85,8 @@ def place_object(
     Args:
         mesh: Path of a mesh file, a mesh, or a placed object. The origin of {O} is the centre of
             the bounding box, not the origin of the file.
-        units: Unit of the mesh's lengths: m, cm or mm; metres if None. An `objects.yaml` beside
-            a file wins.
+        units: Unit of the mesh's lengths: m, cm or mm; metres if None. An `objects.yaml` in
+            the folder of the mesh overrides it.
         X_TO: Pose of the object on the table; if None, the object is dropped as in a build.
         config: Mass, friction and settling; if None, the configuration of a placed object, or else
             the defaults.

@@ -43,7 +43,7 @@ SQUEEZED = np.deg2rad(20.0)
 #: A rotation with a smaller error is exact except for rounding.
 EXACT = 1e-12
 #: Requirement for a pregrasp or a squeeze, in messages.
-BESIDE_GRASP = "given beside q_grasp, got it alone"
+BESIDE_GRASP = "given together with q_grasp, got it alone"
 #: A closing joint this close to zero is open [rad or m].
 OPEN = 1e-6
 

@@ -1,11 +1,15 @@
 """How much disturbance a grasp tolerates: repeats with noise, and with less friction.
 
-Input: an attempt that was lifted. Output: three results. First, how many repeats with noise on palm
-pose, friction and mass hold, and how many of them would be samples. Second, whether the attempt
-without noise would be a sample at half the time step. Third, the smallest friction at which it
-holds without noise, also at half the step. The repeats use the trial's own step, because the error
-of the step is numerical and reported separately. The stored lift is not counted. The noise depends
-only on the attempt's seed.
+Input: an attempt that was lifted. Output: three results.
+
+1. The number of repeats, with noise on palm pose, friction and mass, that hold, and the number of
+   them that would be samples. The repeats use the time step of the trial. The stored lift is not a
+   repeat.
+2. Whether the attempt without noise would be a sample at half the time step. This is the error of
+   the step, which is numerical and therefore reported separately.
+3. The smallest friction at which the attempt holds without noise, also at half the time step.
+
+The noise depends only on the attempt's seed.
 """
 
 from __future__ import annotations

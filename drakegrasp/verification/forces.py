@@ -470,11 +470,11 @@ def surface_contacts(model: ObjectModel, p_OQ: npt.ArrayLike, nhat_Q_O: npt.Arra
 def patch_points(model: ObjectModel, contacts: Table) -> tuple[Array, Array]:
     """Return points (k, m, 3) [m] of the patches around k contacts, and normals (k, m, 3) there.
 
-    A patch is its contact and a ring of `RING_POINTS` points around it, each with the normal of its
-    face. The ring consists of the surface points that are closest to a circle with the radius
-    `TORSION_RADIUS` in the contact's tangent plane. Of equally close faces, the one that is most
-    parallel to the contact's face is used. So a patch ends at an edge of 90 degrees or more, and
-    bends around a blunter edge.
+    A patch consists of the contact and `RING_POINTS` points in a ring around it; each point has the
+    normal of the face on which it lies. The ring consists of the surface points that are closest to
+    a circle with the radius `TORSION_RADIUS` in the contact's tangent plane. Of equally close
+    faces, the one that is most parallel to the contact's face is used. So a patch ends at an edge
+    of 90 degrees or more, and bends around a blunter edge.
 
     Args:
         model: The object.

@@ -381,7 +381,7 @@ def test_a_palm_pose_in_each_preshape_has_no_joints(tmp_path):
 def test_joints_before_a_grasp_without_joints_are_refused(tmp_path):
     np.savez(tmp_path / "p.npz", object=OBJECTS, X_FG=POSES, q_pregrasp=PREGRASP)
     reasons = read_attempts(tmp_path / "p.npz", HAND).invalid
-    assert all("q_pregrasp must be given beside q_grasp" in reason for reason in reasons)
+    assert all("q_pregrasp must be given together with q_grasp" in reason for reason in reasons)
 
 
 # Rows that are no postures

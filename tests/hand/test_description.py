@@ -296,7 +296,7 @@ REFUSALS = {
                     r"fingers\.0: torque_limit must be .* got both"),
     "holding force of a turning joint": (
         {"fingers": changed_finger(holding_force=9.0)},
-        r"fingers\.0: holding_force must be holding_torque beside torque_limit"),
+        r"fingers\.0: holding_force must be holding_torque together with torque_limit"),
     "force of a turning joint": (
         {"fingers": [SLIDING, PINCER["fingers"][1]], "closing_speed": 0.1},
         r"fingers\.0\.torque_limit: must be given, as joint 'left_hinge' turns"),

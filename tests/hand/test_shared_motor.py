@@ -30,7 +30,7 @@ REFUSALS = {
         r"fingers.0.driven_by.finger must be .* \(there is none\), got 'right'"),
     "a motor of its own as well": (
         [OWN, {**DRIVEN, "force_limit": 3.0}],
-        "fingers.1.force_limit must be left out beside driven_by: the motor is that of finger"),
+        "fingers.1.force_limit must be left out with driven_by: the motor is that of finger"),
     "a rotor of its own": ([OWN, {**DRIVEN, "rotor_inertia": 1e-6}],
                            "fingers.1.rotor_inertia must be left out"),
     "it opens while the other closes": (

@@ -262,7 +262,7 @@ def test_a_palm_pose_alone_closes_from_the_open_hand(tmp_path):
     assert (start.preshape, start.unused) == (0, hand.unused_in(0)) and start.unused
     assert start.spread == pytest.approx(np.deg2rad(10.0))
     np.testing.assert_array_equal(start.X_OG, X)
-    assert "q_squeeze must be given beside q_grasp" in refused(
+    assert "q_squeeze must be given together with q_grasp" in refused(
         make_posture, hand, X, q_squeeze=np.zeros(8)
     )
 

@@ -1,6 +1,6 @@
 """MJCF as MuJoCo compiles it and as Drake reads it.
 
-Input: the XML of an MJCF file, with meshes beside it. Output: the same hand without the parts of
+Input: the XML of an MJCF file, and its meshes. Output: the same hand without the parts of
 the language that Drake drops (bodies and joints without names, frames, classes within classes), and
 the joints, couplings, efforts and inertias as MuJoCo compiles them; Drake reads only a part of
 these.

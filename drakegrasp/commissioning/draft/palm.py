@@ -1,7 +1,8 @@
 """The palm frame G of a grip: where the palm's surface is, and which direction it faces.
 
 Input: a model and a `Grip`. Output: poses X_BG, the best first. Gz is perpendicular to the line
-along which the fingers close, and its ray from the palm to the pinch is free. Gy points to the
+along which the fingers close, and no link is on the line from the palm along Gz to the place where
+the fingers pinch. Gy points to the
 finger that opposes the others.
 """
 

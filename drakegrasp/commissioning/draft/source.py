@@ -105,7 +105,7 @@ def read_source(path: Path, packages: Mapping[str, Path], given: Sequence[Path] 
 
     Args:
         path: A URDF, SDFormat or MJCF file.
-        packages: Folders of package:// URIs, beside those in which the model lies.
+        packages: Folders of package:// URIs, in addition to those that contain the model.
         given: Folders outside the model's folder that it may use.
 
     Raises:

@@ -154,7 +154,8 @@ def unpack_rows(
 
     Args:
         task: The task.
-        files: The files by camera, with room for all rows; the trials are under "".
+        files: For each camera its open data file, which has space for all rows; for the key "" the
+            file of the trials.
         texts: See `sample_texts`.
     """
     with h5py.File(task.part) as part:

@@ -142,6 +142,6 @@ def test_scenes_of_other_trials_are_refused(made: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(made, tmp_path / "out"))
     with h5py.File(out / "scenes.hdf5", "r+") as file:
         file.attrs["shards"] = "others"
-    with pytest.raises(DataError, match="must be of the trials beside it, got one of others"):
+    with pytest.raises(DataError, match="must be of the trials in its folder, got other scenes"):
         export_dataset(out, tmp_path / "to", "hf")
     assert not (tmp_path / "to").exists()

@@ -1,6 +1,6 @@
-"""A package that adds one of each kind that drakegrasp finds by name.
+"""A package that adds one extension of each kind.
 
-pyproject.toml beside this folder names them; docs/how-to/extend.md says what each must be.
+pyproject.toml in the folder above names them; docs/how-to/extend.md defines what each must be.
 """
 
 import json
@@ -18,10 +18,10 @@ from drakegrasp.protocols.protocol import DexGraspBench
 
 #: A hand is the path of its hand file.
 HAND = Path(__file__).with_name("jaw_hand.yaml")
-#: What `drakegrasp export --help` says of the exporter.
+#: The text of the exporter in `drakegrasp export --help`.
 HELP = "a line of JSON per sample: object, palm pose, joints"
 
-#: A rule says which rows of a table it refuses: here objects that turned in the hand.
+#: A rule decides which rows of a table are removed: here objects that turned in the hand.
 CALM = Rule(
     removal=Removal.OWN,
     needs=("turn",),
