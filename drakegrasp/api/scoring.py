@@ -82,7 +82,7 @@ def score(
         protocol: The rule of a verdict, by name or as `FILE.py:NAME`. All protocols but "lift" try
             the first wrist pose of a prediction in MuJoCo, on this machine.
         out: Folder that stores verdicts, so that the same call can continue, and the card.
-        again: The card's statement on how to create it again.
+        again: Text of the card on how to create the card again.
         client: A Dask client whose workers do the work, e.g. from `connect`.
         show: Whether to show progress on standard error.
         workers: The arguments of `connect`, instead of a client; one process per core if neither

@@ -153,7 +153,7 @@ def verify_grasps(
     | `on` | the grasps are on | default frame | friction and mass |
     |---|---|---|---|
     | path of a mesh, `trimesh.Trimesh` | this object, dropped on the table | object | of `config` |
-    | `PlacedObject` | this object in its pose | object | as it was placed with |
+    | `PlacedObject` | this object in its pose | object | as given to `place_object` |
     | `Sample` | the object and pose of its row, for all grasps | camera | drawn for its row |
     | `GraspDataset` | the objects and poses of `rows` | camera | drawn for each row |
 
@@ -185,8 +185,8 @@ def verify_grasps(
 
     Raises:
         GraspError: If the array does not hold grasps, `on` is not a valid target, an argument does
-            not apply to the target, rows do not exist or are not one per grasp, or a frame, pose or
-            method is invalid.
+            not apply to the target, a row does not exist, the number of rows is not that of the
+            grasps, or a frame, pose or method is invalid.
         MeshError: If a mesh cannot be simulated or does not come to rest.
         ConfigError: If config is not a `Config`, or the object was prepared with other values.
         HandError: If the hand cannot be used.

@@ -39,8 +39,8 @@ def build(times: Path | None, plan: bool = False, part: str | None = None, **opt
 
     Options:
         BUILD, CONNECTION
-        --part I/N: Only run every Nth work unit, starting with the Ith; `merge` joins the OUT of
-            all N.
+        --part I/N: Only run every Nth work unit, starting with the Ith; `merge` joins the datasets
+            of all N parts.
         --plan: Only print the hours and bytes that the build would need.
         --times
     """

@@ -74,7 +74,7 @@ def audit(
 
 @click.group()
 def objects() -> None:
-    """List or export the built-in objects, or create morphs of meshes."""
+    """List or export the built-in objects, or make morphs of meshes."""
 
 
 @objects.command("list")

@@ -298,7 +298,7 @@ def score(
     quiet: bool = False,
     **options: Any,
 ) -> None:
-    """Score predicted grasps against reference rows, and write a card.
+    """Score predicted grasps against reference rows; write a card.
 
     Each of PREDICTIONS is a .npy, HDF5 or Parquet file of (n, 6k) numbers, one grasp per row of the
     split, or (n, m, 6k), m grasps per row, in the camera's frame. It may also be a file of postures

@@ -62,14 +62,14 @@ def submit(
         --cluster KIND (kind): Where the work runs: local, ssh, slurm, pbs, lsf, sge, htcondor, oar,
             kubernetes, scheduler, scheduler-file, or a kind of another package. Hosts follow ssh,
             an address follows scheduler, and a path follows scheduler-file.
-        --scheduler ADDRESS: Use the running Dask scheduler at this address, instead.
+        --scheduler ADDRESS: In place of --cluster: use the running Dask scheduler at this address.
         BUILD
         --workers N: Total number of processes. [default with local: one per core]
         --cores N: Number of cores of each SSH host or job, with a worker on each core.
         --memory SIZE: Memory of each worker, e.g. 2GB.
         --walltime TIME: Time limit of each job, [D-]HH:MM:SS.
         --interface NAME: Network interface on which scheduler and workers listen.
-        --host ADDRESS: Address on which the scheduler listens, instead.
+        --host ADDRESS: In place of --interface: address on which the scheduler listens.
         --with KEY=VALUE (own): A setting that only this kind of cluster has, e.g. image for
             kubernetes; may be given several times.
         TLS, --times

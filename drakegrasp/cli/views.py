@@ -149,8 +149,8 @@ def export(
         --to (form): The format.
         --licence --license ID: Licence that the card of format hf names, e.g. cc-by-4.0.
         --about YAML: For format hf: name, version, url, creators, published, licence, citation.
-        --attempts WHICH: Of format lerobot: samples, failed (closed, and not held) or all of which
-            it is known whether they hold.  [default: samples]
+        --attempts WHICH: Attempts of format lerobot: samples; failed: the hand closed, but does
+            not hold the object; all: samples, failed and held attempts.  [default: samples]
         --fps N: Frames per second of format lerobot.  [default: 10]
         --quiet
     """

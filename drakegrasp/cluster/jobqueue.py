@@ -1,6 +1,7 @@
 """Workers in jobs of a batch scheduler, with the user's jobqueue.yaml; needs extra `[jobqueue]`.
 
-A kind is a short class that states the class of dask-jobqueue and the differences of its scheduler.
+Each kind of scheduler is a short class here. It names the class of dask-jobqueue that submits the
+jobs, and overrides what differs from SLURM.
 Paths in a job's script are quoted here. dask-jobqueue (0.9) writes them without quotes, so the
 shell would split a path at a blank and run a command in `$(...)`.
 """

@@ -168,8 +168,8 @@ def read_rows(
         group: The group of the field.
         field: The field.
         rows: The rows.
-        fields: Fields of the group; the shapes of existing ones define the lengths of the letters
-            in the shape of a field without values.
+        fields: Other fields of the group. A missing field without values gets its shape, such as
+            (n, k), from those of them that exist.
 
     Raises:
         DataError: If the field is required and missing.

@@ -262,7 +262,7 @@ def load_plain_hand(source: HandSource, where: str) -> Hand:
         where: Description of the caller, for the message.
 
     Raises:
-        HandError: If the hand has preshapes, or as `load_hand`.
+        HandError: If the hand has preshapes, or if `load_hand` raises one.
     """
     hand = load_hand(source)
     if hand.preshapes:

@@ -1,7 +1,8 @@
 """What a protocol is: numbers, their source, and a trial from which a verdict follows.
 
-Input: the numbers of a benchmark of the field. Output: `MujocoProtocol`, the base class of
-protocols that run in MuJoCo, including user-defined ones; the protocols by name. A trial moves the
+Input: the mass, friction, disturbances and limits of a published benchmark. Output:
+`MujocoProtocol`, the base class of protocols that run in MuJoCo, including user-defined ones; the
+protocols by name. A trial moves the
 hand through three postures (pregrasp, grasp, squeeze), which form a `GraspMotion` in the joint
 order of the hand's MJCF, and then pushes the object or lifts it. MuJoCo is loaded only with the
 scene; a `scene` here is a `protocols.scene.ProtocolScene`. The docstring of each class describes

@@ -3,8 +3,9 @@
 While a unit runs, a small file in the folder of its shard names the current step: building the
 scene, an attempt, rendering its images. Each step overwrites one record of fixed size. A native
 crash and a step that exceeds its time limit leave a mark after the record, which Python's
-`faulthandler` writes without the interpreter; SIGKILL leaves no mark. The file is removed when the unit is done. A file that
-exists when a unit starts shows that an earlier run died, and in which step:
+`faulthandler` writes without the interpreter; SIGKILL leaves no mark. The file is removed when
+the unit is done. A file that exists when a unit starts shows that an earlier run died, and in which
+step:
 
 * a step that exceeded its time limit `HUNG_DEATHS` times in a row is not tried again;
 * a step in which the process crashed `NATIVE_DEATHS` times in a row is not tried again;

@@ -633,7 +633,7 @@ def hand_contacts(
 ) -> GraspContacts:
     """Return the contacts on the surface that a prediction selects for the configuration's hand.
 
-    They are points, or patches for a hand with two fingertips.
+    Contacts are modelled as points, or as patches for a hand with two fingertips.
 
     Args:
         model: The object.

@@ -71,7 +71,7 @@ class Draft:
         reasons: Reason for a value, by the path of its key, as in "palm.p_BG".
         changed: Lines for the comment at the top of the model; they name the joints whose positions
             differ from the vendor's.
-        grip: The fingers, in the vendor's positions.
+        grip: The fingers that grasp; joint positions are those of the vendor's model.
     """
 
     model: VendorModel

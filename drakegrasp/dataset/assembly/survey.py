@@ -537,7 +537,8 @@ def judge_successes(
         successes: The n successes, with the columns of `dataset.assembly.survey`.
         config: Limits of the filters.
         rejected: Ids of trials that an inspection rejects.
-        removed_by_own: (n,), successes that user-defined filters remove; if None, these are run.
+        removed_by_own: (n,), successes that user-defined filters remove; if None, the filters are
+            run here.
 
     Raises:
         ConfigError: If a user-defined filter cannot be run, or returns something else than bools.

@@ -591,7 +591,7 @@ class Check:
 
     Attributes:
         execute: Executor of the tasks.
-        report: Called with the number of finished rows and shards, and the number of all.
+        report: Called with two numbers: the finished rows and shards, and all of them.
         total: Number of all rows and shards.
         done: Number of finished rows and shards.
         findings: The violations.

@@ -101,7 +101,7 @@ def check_dataset(
         path: Directory of a dataset, or one of its HDF5 files. For a single file, all rules that
             need no other file are checked.
         execute: Executor of the tasks; the result does not depend on it.
-        progress: Called with the number of finished rows and shards, and the number of all.
+        progress: Called with two numbers: the finished rows and shards, and all of them.
 
     Raises:
         DataError: If the path is neither, cannot be read, or has another schema. In a directory, a
