@@ -96,10 +96,14 @@ class Funnel:
 
 @dataclass(frozen=True)
 class PreshapeCount:
-    """Numbers of a preshape: attempts, successes, stable grasps of the first round; all samples.
+    """How the attempts of a preshape ended.
 
-    `preshape` is its name, or `NO_NAME` for postures without a preshape. `refined` is the number of
-    refined samples, which `samples` includes.
+    Attributes:
+        preshape: Name of the preshape, or `NO_NAME` for postures without a preshape.
+        attempts, held, stable: Number of attempts of the first round, and how many of them are
+            held and stable.
+        refined: Number of refined samples.
+        samples: Number of all samples, including the refined ones.
     """
 
     preshape: str

@@ -473,7 +473,7 @@ def _stored(
 
     Args:
         name: Name of the column.
-        trials: The group of the part.
+        trials: Group of the file that contains the column.
         rows: Rows in rising order.
         codes: Valid codes of the column, see `refuse_other_codes`; None for measured values.
     """

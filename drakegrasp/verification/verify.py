@@ -3,7 +3,7 @@
 Input: `PlacedGrasp`s. Output: a `Verification` for each, in the caller's order. A posture is tried
 as given. For contacts, method `hand` finds palm poses that bring the fingertips to the points, and
 runs a trial from the best pose, as a build does. If that does not hold, it also tries the others.
-Method `forces` computes whether forces at the surface's own contacts can lift the object. Every row
+Method `forces` computes whether forces at points of the surface can lift the object. Every row
 with contacts is tried, even if the numbers look wrong, and faults are judged afterwards from the
 measurements. A wrong prediction, a failed solver and a lost object are outcomes, not exceptions.
 """
@@ -278,7 +278,7 @@ def _run(
 
 
 def _lift_by_forces(base: Verification) -> Verification:
-    """Compute whether forces at the surface's own contacts can lift the object, without a hand."""
+    """Compute whether forces at points of the surface can lift the object, without a hand."""
     placed = base.placed
     with timed(base.seconds, "forces"):
         forces = judge_forces(

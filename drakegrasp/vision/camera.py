@@ -228,9 +228,9 @@ def visible_contacts(
     the camera meets the object or the table first. A contact is the centre of a pressed patch, so
     it may lie a little inside the object, and the depth of a slanted surface changes much from one
     pixel to the next. The test therefore uses the farthest of the four pixels around the contact,
-    and allows `BEFORE`. The patch of a grasp that is not a sample may span an edge. A centre that
-    is farther than `BESIDE` from the object in the image is therefore also hidden: no image shows
-    it.
+    and allows `BEFORE`. If a patch spans an edge, which is possible for grasps that are not
+    samples, its centre may be off the object. So a centre that is farther than `BESIDE` from the
+    object in the image is also hidden.
 
     Args:
         p_TQ: Contact points (..., 3) [m].
