@@ -23,6 +23,7 @@ def bench(
     out: Annotated[Path, NEW_FILE] = Path("bench.json"),
     objects: str = BUILTIN,
     only: tuple[str, ...] = (),
+    draw: Annotated[int | None, click.IntRange(min=1)] = None,
     candidates: int = 100,
     *,
     units: str,
@@ -40,6 +41,7 @@ def bench(
         --objects MESH_DIR|builtin: The meshes.
         --per-class, --objects-seed
         --only NAME: Only objects whose names begin with NAME; may be given several times.
+        --draw N: Only N of the objects, drawn by the seed of the configuration.
         --config YAML|PRESET: Configuration. [default: paper]
         --set
         --candidates N: Palm poses per object.
@@ -55,6 +57,7 @@ def bench(
     from drakegrasp.cli import tables
     from drakegrasp.hand.settings import load_config
     from drakegrasp.objects.sources import find_meshes
+    from drakegrasp.seeding import Stream, object_key
     from drakegrasp.shapes.catalog import builtin_sources
 
     # Unusable options are rejected before the measurement, which takes a while.
@@ -77,6 +80,9 @@ def bench(
         sources = [s for s in every if not only or s.name.startswith(only)]
         if not sources:
             raise click.UsageError(f"--only must name objects of {objects}, got {', '.join(only)}")
+        if draw is not None:
+            order = Stream(rules.seed, object_key("bench")).permutation(len(sources))
+            sources = [sources[i] for i in sorted(order[:draw])]
         with progress_bar("bench", "attempts", show=not quiet) as progress:
             measured = measuring.measure(sources, rules, mujoco=mujoco, progress=progress)
             report = measuring.summarize(list(measured), rules)

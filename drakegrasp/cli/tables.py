@@ -345,7 +345,7 @@ _VERDICTS = {
 
 def bench_table(report: Mapping[str, Any]) -> Table:
     """Return a report of `measure.summarize` as a table: rates, and CPU seconds by stage."""
-    stages = ("scene", "field", "screen", "try", "look")
+    stages = ("prepare", "scene", "field", "screen", "try", "look")
     with_mujoco = "peer" in report["all"]
     heads = ["object", "faces", "attempts", "grasps", "attempts\nper s", "grasps\nper h"]
     heads += [f"{stage}\n[s]" for stage in stages] + ["MuJoCo\ngrasps/h", "ratio"] * with_mujoco
@@ -371,11 +371,21 @@ def bench_table(report: Mapping[str, Any]) -> Table:
 
 
 def bench_lines(report: Mapping[str, Any]) -> list[str]:
-    """Return the funnel, the memory and the machine of a report as lines."""
-    outcomes = Counter(report["all"]["outcomes"])
+    """Return the rates with preparing, the funnel, the memory and the machine of a report."""
+    every = report["all"]
+    runs = {"here": every} | ({"MuJoCo": every["peer"]} if "peer" in every else {})
+    poses = sum(each["candidates"] for each in report["objects"]) // len(report["objects"])
+    paid = [
+        f"grasps per h with preparing, {int(times) * poses:,} palm poses per object"
+        f"{'' if times == '1' else ' (estimate)'}: "
+        + ", ".join(f"{name} {run['with_preparing'][times]:,.0f}" for name, run in runs.items())
+        for times in every["with_preparing"]
+    ]
+    outcomes = Counter(every["outcomes"])
     funnel = ", ".join(f"{outcomes[o.label]:,} {o.label}" for o in _FUNNEL if outcomes[o.label])
     versions = ", ".join(f"{name} {version}" for name, version in report["versions"].items())
     return [
+        *paid,
         f"outcomes: {funnel}",
         f"peak memory: {report['peak_memory'] / 1e6:,.0f} MB",
         f"on {report['cpu']}; {versions}",

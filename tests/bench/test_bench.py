@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from helpers.commands import run
 
+import drakegrasp as dg
 from drakegrasp.bench import measure
 from drakegrasp.errors import DataError
 
@@ -36,6 +37,10 @@ def test_report_says_what_attempts_cost(meshes, tmp_path):
     assert report["versions"]["drake"]
     assert "MuJoCo" in first.stdout
     assert "peak memory" in first.stdout
+    assert (
+        f"preparing, 4 palm poses per object: here {report['all']['with_preparing']['1']:,.0f}"
+        in (first.stdout)
+    )
     for outcome, count in report["all"]["outcomes"].items():
         assert f"{count} {outcome}" in first.stdout
     again = run(*arguments, "--out", str(other), "--compare", str(path))
@@ -56,6 +61,34 @@ def test_name_that_no_mesh_has_is_wrong_usage(meshes):
     result = run("bench", "--objects", str(meshes), "--only", "9_cup")
     assert result.exit_code == 2
     assert "--only must name objects" in result.output
+
+
+def test_objects_are_drawn_by_the_seed(meshes, tmp_path, monkeypatch):
+    for name in "abcdef":
+        trimesh.creation.box([0.05, 0.07, 0.15]).export(tmp_path / f"{name}.obj")
+    drawn = []
+
+    def only_named(sources, *_, **__):
+        drawn.append(sources)
+        raise DataError("not measured")
+
+    monkeypatch.setattr(measure, "measure", only_named)
+    arguments = ["bench", "--objects", str(tmp_path), "--draw", "3", "--out", str(tmp_path / "r")]
+    for seed in (0, 0, 1):
+        run(*arguments, "--quiet", "--set", f"seed={seed}")
+    names = [[source.name for source in sources] for sources in drawn]
+    assert names[0] == names[1] != names[2]
+    assert len(set(names[0])) == len(set(names[2])) == 3
+
+
+def test_preparing_is_paid_once_for_any_number_of_palm_poses():
+    def report(**seconds):
+        return {"outcomes": {"success": 2}, "seconds": seconds}
+
+    one, other = report(**{"prepare": 5.0, "try": 2.0}), report(**{"prepare": 15.0, "try": 6.0})
+    every = measure.summarize([one, other], dg.load_config())["all"]
+    assert every["grasps_per_core_hour"] == pytest.approx(4 * 3600 / 8)
+    assert every["with_preparing"] == pytest.approx({"1": 4 * 3600 / 28, "10": 4 * 3600 / 10})
 
 
 def test_only_the_same_attempts_are_compared():
