@@ -174,13 +174,14 @@ def predict_attempts(setup: TrialSetup, attempts: Sequence[Attempt]) -> list[Pre
     config, prepared = setup.config, setup.prepared
     hand = load_hand(config.hand_source)
 
-    # `predict` takes attempts of one resting pose and one preshape.
-    groups: dict[tuple[int, int | None], list[int]] = {}
+    # `predict` takes attempts of one preshape.
+    groups: dict[int | None, list[int]] = {}
     for row, attempt in enumerate(attempts):
-        groups.setdefault((attempt.resting, attempt.preshape), []).append(row)
+        groups.setdefault(attempt.preshape, []).append(row)
     found: list[Prediction | None] = [None] * len(attempts)
-    for (resting, preshape), rows in groups.items():
-        own, X_TO = [attempts[row] for row in rows], prepared.resting_poses[resting]
+    for preshape, rows in groups.items():
+        own = [attempts[row] for row in rows]
+        X_TO = prepared.resting_poses[[attempt.resting for attempt in own]]
         said = predict(prepared.model, hand.at(preshape), X_TO, own, config.screen)
         for row, prediction in zip(rows, said, strict=True):
             found[row] = prediction

@@ -84,8 +84,9 @@ def predict(
     Args:
         model: The object.
         hand: The hand.
-        X_TO: Resting pose of the object in the table-top frame, (4, 4).
-        attempts: Attempts at the object.
+        X_TO: Resting pose of the object in the table-top frame, (4, 4), or that of each attempt,
+            (n, 4, 4). One call for all attempts is much faster than one for each pose.
+        attempts: Attempts at the object, n.
         config: The margins.
     """
     predictions: list[Prediction | None] = [None] * len(attempts)
@@ -97,12 +98,13 @@ def predict(
     for row, attempt in enumerate(attempts):
         if attempt.ray_hits and attempt.closing is None:
             rows_by_spread.setdefault(attempt.spread, []).append(row)
+    each_X_TO = np.broadcast_to(np.asarray(X_TO, dtype=float), (len(attempts), 4, 4))
     for spread, rows in rows_by_spread.items():
         paths = hand_paths(hand, spread)
         if paths is None:
             continue
         X_OG = np.stack([attempts[row].X_OG for row in rows])
-        lookup = PointLookup(model.field, np.asarray(X_TO, dtype=float), X_OG)
+        lookup = PointLookup(model.field, each_X_TO[rows], X_OG)
         screened = _screen(lookup, paths, _widened(config, model.field))
         for row, found in zip(rows, screened, strict=True):
             # Fingers that share a motor start together.

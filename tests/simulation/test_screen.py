@@ -117,13 +117,16 @@ def test_attempt_that_says_where_its_fingers_start_is_never_screened(cube, confi
 
 
 def test_prediction_depends_on_the_attempt_alone(cube, hand, config):
+    """The poses of the object differ, and the higher one blocks no finger at the table."""
     drawn, made, together = drawn_attempts(cube, standing(cube), config, 0), [], []
+    lifted = make_pose(np.eye(3), [0.0, 0.0, 0.02]) @ standing(cube)
     while sum(found is not None and found.outcome is None for found in together) < 3:
         assert len(made) < 2000, "three of the attempts must be simulated"
         made += islice(drawn, 100)
-        together = predict(cube, hand, standing(cube), made, config.screen)
+        X_TO = np.array([(standing(cube), lifted)[row % 2] for row in range(len(made))])
+        together = predict(cube, hand, X_TO, made, config.screen)
     for row, attempt in enumerate(made):
-        alone = ask(cube, hand, attempt)
+        (alone,) = predict(cube, hand, X_TO[row], [attempt], config.screen)
         found = together[row]
         assert (alone is None) == (found is None)
         if found is not None:
