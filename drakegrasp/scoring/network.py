@@ -163,7 +163,8 @@ def predict_scenes(
         report(row + 1, len(data))
     if not tables:
         raise GraspError(
-            f"{path}: must have views in {split} that show their object, got {len(data)} without"
+            f"{path}: must have views with a sample in {split} that show their object, got "
+            f"{len(data)} views"
         )
     return join_attempts(tables), len(data) - len(tables)
 
