@@ -66,7 +66,10 @@ def cloud_from_depth(
             than 10 pixels with a depth.
     """
     own, _ = _points(depth, K, mask)
-    return transform_points(read_pose(X_TC, "X_TC"), own)
+    pose = read_pose(X_TC, "X_TC")
+    if pose.ndim != 2:
+        raise GraspError(f"X_TC must be one pose (4, 4), got {len(pose)} poses")
+    return transform_points(pose, own)
 
 
 def fit_table(
