@@ -48,7 +48,7 @@ def predict(
     workers: int | None = None,
     quiet: bool = False,
 ) -> None:
-    """Write grasps of a network for what a camera saw, the best first.
+    """Write a network's grasps for what a camera saw, best first.
 
     INPUT is the file scenes.hdf5 of a dataset, for all views of a split, in the rows of
     `drakegrasp score`; or a cloud of one object (.npy of shape (n, 3), or .ply), over a table that

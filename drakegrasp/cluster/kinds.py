@@ -196,7 +196,7 @@ class Remote(Local):
             return {}
         raise AddressMissingError(
             "--interface NAME or --host ADDRESS must be given for workers on other machines: "
-            "without, the scheduler listens to this machine only"
+            "without them, the scheduler listens on this machine only"
         )
 
     def workers_listening(self) -> dict[str, str]:

@@ -274,16 +274,16 @@ def check_palm(hand: Hand) -> Finding:
             f"+Gz must point to where the fingertips close, got them {-1e3 * height:.0f} mm behind "
             "the palm: check palm.rpy_deg"
         )
-    text = f"its ray is free; half-closed fingertips {1e3 * height:.0f} mm ahead"
+    text = f"the ray along +Gz is free; half-closed fingertips {1e3 * height:.0f} mm ahead"
     pinch = None if faults else find_pinch(hand, WIDTH)
     if pinch is not None:
         # Links beyond the pinch would meet the table before the fingertips meet the object.
         beyond = reach(hand, np.array([0.0, 0.0, 1.0])) - float(pinch.p_GM[2])
-        text += f"; it reaches {1e3 * beyond:.0f} mm beyond what it pinches"
+        text += f"; the hand reaches {1e3 * beyond:.0f} mm beyond the pinch"
         if beyond > BEYOND_PINCH:
             faults.append(
                 "the palm must be able to face a table, but the hand reaches "
-                f"{1e3 * beyond:.0f} mm beyond what it pinches along +Gz: turn "
+                f"{1e3 * beyond:.0f} mm beyond the pinch along +Gz: turn "
                 "palm.rpy_deg, or keep fingers that do not grasp away with preshape"
             )
     return judge("palm", faults, text)

@@ -309,8 +309,8 @@ def held_note(funnel: Funnel) -> str:
         found += [counted(samples, "sample")] if funnel.removals.any() else []
         reasons.append(
             f"{counted(left, 'closed hand')} did not lift (not_lifted), because a sample was "
-            f"improbable or the image too flat; {counted(lifts, 'lift')} of the audit: "
-            f"{', '.join(found)}"
+            "improbable or the image too flat"
+            + (f"; {counted(lifts, 'lift')} of the audit: {', '.join(found)}" if lifts else "")
         )
     return f"the number of held grasps is a lower bound: {'; '.join(reasons)}" if reasons else ""
 
@@ -488,9 +488,9 @@ def split_shortfall(counts: Sequence[SplitCount], rule: str, config: SplitConfig
         return ""
     told = ", ".join(f"{name} {samples[name] / total:.0%} ({asked[name]:.0%})" for name in samples)
     objects = sum(count.objects for count in counts)
-    verb = "is" if objects == 1 else "are"
+    verb = "has" if objects == 1 else "have"
     return (
         f"the fractions of the split differ from the requested ones (in brackets): {told}. Whole "
-        f"objects are drawn, and {counted(objects, 'object')} with samples {verb} too few. What "
-        "would help: more objects, or equally many samples of each (--samples-per-object)"
+        f"objects are drawn, and {counted(objects, 'object')} {verb} samples. What would help: "
+        "more objects, or equally many samples of each (--samples-per-object)"
     )
