@@ -361,8 +361,8 @@ class PrivateCluster(SpecCluster):
 def _undisturbed_loop() -> Iterator[IOLoop]:
     """Run an event loop in a thread that Ctrl-C does not interrupt, nor the processes it starts.
 
-    At a terminal, Ctrl-C goes to every process. The client then stops its workers itself; a worker
-    that has just begun to start would print a traceback instead.
+    At a terminal, Ctrl-C goes to every process, and a worker that has just begun to start would
+    print a traceback. So workers ignore it, and the client stops them.
     """
     # Start the resource tracker here. Otherwise the first process that the thread starts would
     # start it, which clears the thread's signal mask.

@@ -232,7 +232,7 @@ class Lsf(Jobs):
 
 
 class Sge(Jobs):
-    """Grid Engine: memory of each slot by mem_free, unless jobqueue.yaml has a resource-spec."""
+    """Grid Engine: `mem_free` is the memory of a slot; a resource-spec of jobqueue.yaml replaces it."""
 
     of, title = dask_jobqueue.SGECluster, "Grid Engine"
 

@@ -499,7 +499,7 @@ def _least_gap(hand: Hand, group: npt.NDArray[np.bool_]) -> float:
 
 
 def _shortfall(hand: Hand, opposition: Opposition) -> Array:
-    """Return by how much each pad (k,) fails to reach those opposite, along their line [m]."""
+    """Return the gap (k,) between each pad and the pads opposite, along their line [m]."""
     (axis, group), (_, front) = opposition, pad_fronts(hand, opposition)
     reached = (front @ axis * np.where(group, 1.0, -1.0)).max(axis=0)
     opposite = [-reached[group != own].max() for own in group]

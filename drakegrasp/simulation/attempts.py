@@ -341,8 +341,8 @@ def make_attempts(
         objects: (n,), names of the objects.
         X_FG: (n, 4, 4), poses of the palm, or of the link, in the frame.
         q_grasp: (n, m), joint positions; None if every row is a palm pose alone.
-        q_pregrasp: (n, m), joint positions; rows of NaN are not given.
-        q_squeeze: (n, m), joint positions; rows of NaN are not given.
+        q_pregrasp: (n, m), joint positions; a row of NaN means that none are given.
+        q_squeeze: (n, m), joint positions; a row of NaN means that none are given.
         joints: (m,), names of the joints; None for all joints in the plant's order. Joints that the
             hand file couples, or that the preshapes of all rows keep, may be missing.
         link: Name of the palm link, or of one of the hand's `frames`, if the poses are poses of it;
