@@ -232,7 +232,7 @@ class Lsf(Jobs):
 
 
 class Sge(Jobs):
-    """Grid Engine: `mem_free` is the memory of a slot; a resource-spec of jobqueue.yaml replaces it."""
+    """Grid Engine: `mem_free` of a slot, unless jobqueue.yaml has a resource-spec."""
 
     of, title = dask_jobqueue.SGECluster, "Grid Engine"
 
