@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from drakegrasp.errors import counted
 from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
 from drakegrasp.outcomes import Outcome
@@ -236,7 +237,7 @@ def _draw_curves(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, str]
     axes.set_xlim(0.0, max(float(d) for d in curve))
     axes.set_ylim(-2.0, 102.0)
     axes.grid(color="#E3E6EA")
-    axes.set_xlabel("d: farthest contact from the one asked for [mm]")
+    axes.set_xlabel("d: largest distance from a requested contact [mm]")
     axes.set_title("held(d) [%]")
 
 
@@ -253,7 +254,7 @@ def _draw_calibration(
     axes.set_ylim(-2.0, 102.0)
     axes.grid(color="#E3E6EA")
     axes.set_xlabel("stated confidence, five groups")
-    axes.set_title("share that counts [%]")
+    axes.set_title("fraction that counts [%]")
 
 
 def _caption(figure: Figure, card: Mapping[str, Any]) -> None:
@@ -263,7 +264,8 @@ def _caption(figure: Figure, card: Mapping[str, Any]) -> None:
     if protocol is not None:
         simulator = f"MuJoCo {protocol['versions']['mujoco']}"
     text = (
-        f"{card['rows']} rows, {card['objects']} objects, {card['classes']} classes of "
+        f"{counted(card['rows'], 'row')}, {counted(card['objects'], 'object')}, "
+        f"{counted(card['classes'], 'class', 'classes')} of "
         f"{where['file']} ({where['split']}, {where['rows_sha256'][:8]}); "
         f"drakegrasp {card['settings']['versions']['drakegrasp']}, {simulator}"
     )

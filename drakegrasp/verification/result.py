@@ -197,7 +197,7 @@ class Verification:
             return f"fails: {self.outcome.label.replace('_', ' ')}"
         names = ("held", "precision", "stable", "sample")
         words = [name for name in names if getattr(self, name)]
-        return ", ".join([*words, *([] if self.success else ["not as asked"])])
+        return ", ".join([*words, *([] if self.success else ["not as requested"])])
 
     @property
     def first(self) -> PoseTrial | None:

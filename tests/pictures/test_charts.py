@@ -83,7 +83,7 @@ def test_panels_of_a_card_state_what_they_draw(monkeypatch: pytest.MonkeyPatch) 
     figure: Any = card_picture(card)
     headline, curves, calibration = figure.axes
     assert headline.get_xlabel() == "per cent of rows, mean over objects"
-    assert curves.get_xlabel() == "d: farthest contact from the one asked for [mm]"
+    assert curves.get_xlabel() == "d: largest distance from a requested contact [mm]"
     assert calibration.get_xlabel() == "stated confidence, five groups"
     assert [line.get_xdata().tolist() for line in headline.lines] == [[25.0, 75.0], [50.0], [60.0]]
     assert curves.lines[0].get_xydata().tolist() == [[0.0, 0.0], [20.0, 50.0], [40.0, 60.0]]

@@ -127,7 +127,7 @@ def test_dots_are_on_the_object_and_its_hand_is_shown(verified, held, config):
     assert texts_of(figure)[0] == f"1_box_a  {result.words}"
     assert result.words.startswith("held")
     line = texts_of(figure)[1].splitlines()[1]
-    assert line == "contacts within 3.0 mm of those asked for (success: 20 mm)"
+    assert line == "contacts within 3.0 mm of the requested ones (success: 20 mm)"
     line = texts_of(figure)[1].splitlines()[2]
     assert f"slip {1e3 * held.lift.slip:.1f} mm, turn {np.rad2deg(held.lift.turn):.1f}°" in line
     assert line.endswith(f"other links at the end: {held.lift.contacts.other_links}")

@@ -146,5 +146,5 @@ def test_held_within_a_distance_follows_from_the_farthest_contact():
     near = replace(verdict, tries=(replace(verdict.tries[0], contact_error=error),))
     assert near.farthest_contact == 0.019 and near.success
     far = replace(verdict, tries=(replace(verdict.tries[0], contact_error=error + 0.002),))
-    assert far.held and not far.success and far.words.endswith("not as asked")
+    assert far.held and not far.success and far.words.endswith("not as requested")
     assert "fingertip 3 is more than 20.0 mm from its point" in far.explain()

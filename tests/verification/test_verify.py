@@ -111,7 +111,7 @@ def test_contacts_in_the_air_are_tried_and_told(cube, grasp):
     np.testing.assert_allclose(found.surface_distance, 0.03, atol=1e-4)
     assert found.held and not found.success
     assert found.farthest_contact == pytest.approx(0.03, abs=1e-3)
-    assert found.words.endswith("not as asked")
+    assert found.words.endswith("not as requested")
     assert "It is not a success: fingertip" in found.explain()
 
 
