@@ -273,8 +273,8 @@ def _contact_line(verified: Verification) -> str:
     words = []
     if np.isfinite(verified.farthest_contact):
         limit = verified.config.verify.max_contact_error
-        words.append(f"contacts within {1e3 * verified.farthest_contact:.1f} mm of the requested ones"
-                     f" (success: {1e3 * limit:g} mm)")  # fmt: skip
+        words.append(f"contacts within {1e3 * verified.farthest_contact:.1f} mm of the requested "
+                     f"ones (success: {1e3 * limit:g} mm)")  # fmt: skip
     if verified.num_tries > 1:
         by = "none" if verified.held_by is None else f"number {verified.held_by + 1}"
         words.append(f"of {verified.num_tries} wrist poses {by} holds")
