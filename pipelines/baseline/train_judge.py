@@ -40,7 +40,7 @@ from drakegrasp.frames import transform_points
 from drakegrasp.generation.attempts import judge_sample
 from drakegrasp.hand.description import load_hand
 from drakegrasp.mesh.cloud import read_cloud
-from drakegrasp.mesh.crossings import first_hits
+from drakegrasp.mesh.crossings import seen_points
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.scoring.benchmark import FRICTIONS, MASSES, new_classes
@@ -106,20 +106,10 @@ def rotation(quaternion: Array) -> Array:
 
 
 def seen(triangles: Array, stream: Stream) -> Array:
-    """Return the points (n, 3) in {T} [m] at which rays of a camera first meet triangles."""
+    """Return the points (n, 3) in {T} [m] that a camera sees from a drawn direction."""
     drawn = stream.uniform(2)
     azimuth, elevation = 2 * np.pi * drawn[0], math.radians(ELEVATION + RANGE * drawn[1])
-    target = np.array([0.0, 0.0, triangles[..., 2].max() / 2.0])
-    level = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
-    back = math.cos(elevation) * level + [0.0, 0.0, math.sin(elevation)]
-    right = np.array([level[1], -level[0], 0.0])
-    u, v = np.meshgrid(*[np.linspace(-HALF, HALF, PIXELS)] * 2)
-    rays = u.reshape(-1, 1) * right + v.reshape(-1, 1) * np.cross(-back, right) - back
-    rays /= np.linalg.norm(rays, axis=1)[:, None]
-    eye = target + DISTANCE * back
-    distance = first_hits(triangles, np.tile(eye, (len(rays), 1)), rays)
-    hit = np.isfinite(distance)
-    return np.asarray(eye + distance[hit, None] * rays[hit])
+    return seen_points(triangles, azimuth, elevation, distance=DISTANCE, half=HALF, pixels=PIXELS)
 
 
 def tried(placed: PlacedObject, posture: dg.Posture) -> list[bool]:

@@ -2,14 +2,20 @@
 
 \b
     python pipelines/measurements/grasp_choice.py [--object NAME ...] [--set KEY=VALUE ...]
+    python pipelines/measurements/grasp_choice.py --judge barrett-1 --prepared BENCH --lifts 3
+    python pipelines/measurements/grasp_choice.py --judge barrett-1 --meshes DIR --units cm
 
-One view of each object is taken from a drawn direction, by rays that meet its mesh. All grasps that
-`drakegrasp.propose` returns for it are tried, each once, on the object at rest. The script prints a
-line per object, then JSON: for several choices the fractions of objects that are held, and that are
-held in a stable precision grasp, each with the 95 % bootstrap interval over the objects; the area
-under the ROC curve of the score within objects; and the CPU milliseconds per view. Without
-`--object` it uses the first built-in objects of 40 classes; the weights of the score were fitted to
-second objects of the other 24 classes.
+One view of each object is taken from a drawn direction, by rays that meet its mesh, and
+`drakegrasp.propose` returns grasps for it. The script tries all of them, each once, on the object
+at rest, or with `--lifts` only the first ones of each choice. It prints a line per object, then
+JSON: for several choices the fractions of objects that are held, and that are held in a grasp that
+would be a sample, each with the 95 % bootstrap interval over the objects, also for the differences;
+the area under the ROC curve of the scores within objects; and the CPU milliseconds per view.
+
+Without other options it uses the first built-in objects of 40 classes; the fixed weights of the
+score were fitted to second objects of the other 24 classes. `--prepared` uses the objects of a
+dataset or a benchmark, each with its own mass and friction, in its first resting pose. With
+`--results`, a line for each object is kept, and the same command continues.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -17,6 +23,8 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import click
@@ -24,10 +32,21 @@ import numpy as np
 import numpy.typing as npt
 
 import drakegrasp as dg
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.errors import GraspError, MeshError
+from drakegrasp.filters import Removal
 from drakegrasp.frames import transform_points
+from drakegrasp.generation.attempts import judge_sample
 from drakegrasp.hand.description import load_hand
-from drakegrasp.mesh.crossings import first_hits
+from drakegrasp.hand.settings import override_config
+from drakegrasp.mesh.cloud import read_cloud
+from drakegrasp.mesh.crossings import seen_points
 from drakegrasp.mesh.surfaces import even_points, on_faces
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.scoring.benchmark import new_classes
+from drakegrasp.scoring.judge import load_judge
+from drakegrasp.scoring.ranking import measured
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.shapes.catalog import builtin_object, draw_builtin
 from drakegrasp.simulation.attempts import Attempts
@@ -47,89 +66,184 @@ DRAWS = 10_000
 
 @click.command(help=__doc__)
 @click.option("--object", "names", multiple=True, help="Name of a built-in object.")
+@click.option("--prepared", type=click.Path(path_type=Path), help="A dataset or a benchmark.")
+@click.option("--meshes", type=click.Path(path_type=Path), help="A folder of meshes.")
+@click.option("--units", default="m", help="Unit of the meshes.")
+@click.option("--count", type=int, help="Number of objects, evenly spread; all if left out.")
+@click.option("--judge", help="Name or file of a judge, besides the fixed weights.")
+@click.option(
+    "--lifts",
+    type=int,
+    help="Number of first grasps to lift, of the judge if there is one; all if left out.",
+)
+@click.option("--results", type=click.Path(path_type=Path), help="File with a line per object.")
 @click.option(
     "--set", "overrides", multiple=True, help="Change one setting of preset fast, KEY=VALUE."
 )
-def main(names: tuple[str, ...], overrides: tuple[str, ...]) -> None:
+def main(
+    names: tuple[str, ...],
+    prepared: Path | None,
+    meshes: Path | None,
+    units: str,
+    count: int | None,
+    judge: str | None,
+    lifts: int | None,
+    results: Path | None,
+    overrides: tuple[str, ...],
+) -> None:
     """Run the script."""
-    kept = [each for each in draw_builtin() if each.object_class.number % OF >= FITTED]
-    names = names or tuple(each.name for each in kept if each.index == 1)
     config = dg.load_config("fast", list(overrides))
-    found = [measure(name, config) for name in names]
-    click.echo(json.dumps(summary(found), indent=1))
+    items: Iterator[tuple[str, Any]]
+    if prepared:
+        items = prepared_objects(prepared, overrides)
+    elif meshes:
+        items = ((source.name, source) for source in find_meshes(meshes, units=units))
+    else:
+        kept = [each for each in draw_builtin() if each.object_class.number % OF >= FITTED]
+        names = names or tuple(each.name for each in kept if each.index == 1)
+        items = ((name, builtin_object(name).build()) for name in names)
+    chosen = list(items)
+    if count:
+        chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, count).round().astype(int)]
+
+    found = {}
+    if results and results.exists():
+        found = {row["name"]: row for row in map(json.loads, results.read_text().splitlines())}
+    for name, item in chosen:
+        if name in found:
+            continue
+        try:
+            placed = item if isinstance(item, PlacedObject) else placed_at(item, config)
+            found[name] = measure(name, placed, judge, lifts)
+        except (MeshError, GraspError) as error:
+            click.echo(f"{name}: {error}", err=True)
+            continue
+        if results:
+            with results.open("a") as file:
+                file.write(json.dumps(found[name]) + "\n")
+    rows = list(found.values())
+    new = [row for row in rows if name_of_class(row["name"]) in new_classes()]
+    click.echo(json.dumps(summary(rows), indent=1))
+    if prepared and new:
+        click.echo(json.dumps({"new classes": summary(new)}, indent=1))
 
 
-def measure(name: str, config: dg.Config) -> dict[str, Any]:
-    """Return for each choice of a grasp of an object whether it holds and whether it is stable."""
-    hand = load_hand(config.hand_source)
-    placed = dg.place_object(builtin_object(name).build(), config=config)
+def placed_at(item: Any, config: dg.Config) -> PlacedObject:
+    """Return a mesh or a mesh file on the table."""
+    path, units = getattr(item, "path", item), getattr(item, "units", None)
+    return dg.place_object(path, units=units, config=config)
+
+
+def prepared_objects(out: Path, overrides: tuple[str, ...]) -> Iterator[tuple[str, PlacedObject]]:
+    """Yield the names and the objects of a dataset, at rest, with their own configurations."""
+    manifest = read_manifest(out)
+    for entry in manifest.objects:
+        config = manifest.config_of(entry.name)
+        thing = load_prepared(out, entry.name, config)
+        changed = override_config(config, list(overrides))
+        yield entry.name, PlacedObject(model=thing.model, X_TO=thing.X_TO, config=changed)
+
+
+def name_of_class(name: str) -> str:
+    """Return the class of a built-in object."""
+    return name.partition("_")[2].rpartition("_")[0]
+
+
+def measure(
+    name: str, placed: PlacedObject, judge: str | None, lifts: int | None
+) -> dict[str, Any]:
+    """Return for each choice of a grasp of an object whether it holds and whether it is a sample.
+
+    Args:
+        name: Name of the object.
+        placed: The object.
+        judge: Name or file of a judge.
+        lifts: Number of first grasps to lift; None for all grasps.
+    """
+    hand = load_hand(placed.config.hand_source)
     triangles = transform_points(placed.X_TO_simulated, placed.model.visual_vertices)[
         placed.model.visual_faces
     ]
     cloud = seen(triangles, name)
     begin = time.process_time()
     grasps = dg.propose(cloud, hand)
-    ranking = dg.rank(grasps, cloud, hand)
+    columns = measured(grasps, read_cloud(cloud), hand)
     cpu = time.process_time() - begin
+    scores = {"closing": columns["score"]}
+    aside = ~np.char.startswith(grasps.said, "from above")
+    if judge:
+        scores["judge"] = load_judge(judge).chances(columns)[:, 1]
+    for key in list(scores):
+        scores[f"{key}, from above"] = np.where(aside, -1.0, scores[key])
+    if lifts is None:
+        faces = np.arange(3 * len(triangles)).reshape(-1, 3)
+        whole, _ = on_faces(triangles.reshape(-1, 3), faces, even_points(WHOLE))
+        scores["closing, whole surface"] = dg.rank(grasps, whole, hand).score
+    orders = {key: np.argsort(-each, kind="stable") for key, each in scores.items()}
 
-    # Try all grasps.
-    ends = np.array([tried(placed, grasps, i, config) for i in range(len(grasps))])
-    faces = np.arange(3 * len(triangles)).reshape(-1, 3)
-    whole, _ = on_faces(triangles.reshape(-1, 3), faces, even_points(WHOLE))
-    order, known = ranking.order, dg.rank(grasps, whole, hand).order
-    choices = {
-        "plainest": ends[0],
-        "random": ends.mean(axis=0),
-        "closing": ends[order[0]],
-        "closing, best of 3": ends[order[:3]].max(axis=0),
-        "closing, whole surface": ends[known[0]],
-        "oracle": ends.max(axis=0),
-        "auc": [auc(ranking.score, each) for each in ends.T],
+    # Try the grasps that a choice needs.
+    ends = np.full((len(grasps), 2), np.nan)
+    last = list(scores)[1 if judge else 0]
+    wanted = {0, *(int(order[0]) for order in orders.values()), *orders[last][:lifts].tolist()}
+    for i in sorted(wanted) if lifts else range(len(grasps)):
+        ends[i] = tried(placed, grasps, i)
+    choices = {"plainest": ends[0]}
+    for key, order in orders.items():
+        choices[key] = ends[order[0]]
+        choices[f"{key}, best of 3"] = ends[order[:3]].max(axis=0)
+        choices[f"{key}, best of 5"] = ends[order[:5]].max(axis=0)
+        choices[f"{key}, auc"] = np.array([auc(scores[key], end) for end in ends.T])
+    choices["random"], choices["oracle"] = ends.mean(axis=0), ends.max(axis=0)
+    told = ", ".join(f"{key} {value[1]:.2f}" for key, value in choices.items())
+    click.echo(f"{name}: {len(grasps)} grasps; samples: {told}", err=True)
+    listed = {key: value.tolist() for key, value in choices.items() if np.isfinite(value).any()}
+    best = int(orders[last][0])
+    return {
+        "name": name,
+        "choices": listed,
+        "ms": 1e3 * cpu,
+        "said": grasps.said[best],
+        "friction": placed.config.physics.friction_hand,
+        "mass": placed.model.mass,
+        "score": float(scores[last][best]),
     }
-    told = ", ".join(f"{key} {float(value[0]):.2f}" for key, value in choices.items())
-    click.echo(f"{name}: {len(grasps)} grasps; held: {told}", err=True)
-    return {"choices": choices, "ms": 1e3 * cpu, "score": float(ranking.score[order[0]])}
 
 
-def tried(placed: PlacedObject, grasps: Attempts, i: int, config: dg.Config) -> list[float]:
-    """Return whether a grasp holds, and whether it is stable."""
-    trial = dg.run_trial(placed, grasps.posture(i, placed.X_TO_simulated), config)
-    return [float(trial.outcome == dg.Outcome.SUCCESS), float(trial.stable)]
+def tried(placed: PlacedObject, grasps: Attempts, i: int) -> list[float]:
+    """Return whether a grasp holds, and whether it is a sample."""
+    trial = dg.run_trial(placed, grasps.posture(i, placed.X_TO_simulated))
+    removal = judge_sample(placed.model, trial, placed.config)
+    return [float(trial.outcome == dg.Outcome.SUCCESS), float(removal is Removal.KEPT)]
 
 
 def seen(triangles: Array, name: str) -> Array:
-    """Return the points (n, 3) in {T} [m] at which rays of a camera first meet triangles."""
+    """Return the points (n, 3) in {T} [m] that a camera sees from a drawn direction."""
     drawn = Stream(7, object_key(name)).uniform(2)
     azimuth, elevation = 2 * np.pi * drawn[0], math.radians(ELEVATION + RANGE * drawn[1])
-    target = np.array([0.0, 0.0, triangles[..., 2].max() / 2.0])
-    level = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
-    back = math.cos(elevation) * level + [0.0, 0.0, math.sin(elevation)]
-    right = np.array([level[1], -level[0], 0.0])
-    u, v = np.meshgrid(*[np.linspace(-HALF, HALF, PIXELS)] * 2)
-    rays = u.reshape(-1, 1) * right + v.reshape(-1, 1) * np.cross(-back, right) - back
-    rays /= np.linalg.norm(rays, axis=1)[:, None]
-    eye = target + DISTANCE * back
-    distance = first_hits(triangles, np.tile(eye, (len(rays), 1)), rays)
-    hit = np.isfinite(distance)
-    return np.asarray(eye + distance[hit, None] * rays[hit])
+    return seen_points(triangles, azimuth, elevation, distance=DISTANCE, half=HALF, pixels=PIXELS)
 
 
 def auc(score: Array, ends: Array) -> float:
-    """Return the area under the ROC curve; NaN if all results are the same."""
+    """Return the area under the ROC curve; NaN if all results are the same or some are unknown."""
     good, bad = score[ends > 0], score[ends == 0]
-    if not len(good) or not len(bad):
+    if not len(good) or not len(bad) or np.isnan(ends).any():
         return math.nan
     return float(((good[:, None] > bad) + 0.5 * (good[:, None] == bad)).mean())
 
 
 def summary(found: list[dict[str, Any]]) -> dict[str, Any]:
     """Return means over objects with their intervals."""
-    names = list(found[0]["choices"])
-    table = np.array([[each["choices"][name] for name in names] for each in found])
+    names = list(dict.fromkeys(key for each in found for key in each["choices"]))
+    nothing = [math.nan, math.nan]
+    table = np.array([[each["choices"].get(name, nothing) for name in names] for each in found])
     result: dict[str, Any] = {"objects": len(found)}
-    for k, end in enumerate(("held", "stable")):
+    for k, end in enumerate(("held", "sample")):
         columns = dict(zip(names, table[:, :, k].T, strict=True))
-        columns["closing above plainest"] = columns["closing"] - columns["plainest"]
+        for name in ("closing", "closing, from above", "judge", "judge, from above"):
+            if name in columns:
+                columns[f"{name} minus plainest"] = columns[name] - columns["plainest"]
+        if "judge" in columns:
+            columns["judge minus closing"] = columns["judge"] - columns["closing"]
         result[end] = {name: interval(values) for name, values in columns.items()}
     result["ms_per_view"] = round(float(np.median([each["ms"] for each in found])))
     return result
@@ -138,6 +252,8 @@ def summary(found: list[dict[str, Any]]) -> dict[str, Any]:
 def interval(values: Array) -> list[float]:
     """Return the mean and the 95 % interval of values of objects, without unknown values."""
     known = values[np.isfinite(values)]
+    if not len(known):
+        return [math.nan] * 3
     drawn = np.random.default_rng(0).integers(len(known), size=(DRAWS, len(known)))
     low, high = np.quantile(known[drawn].mean(axis=1), [0.025, 0.975])
     return [round(float(each), 3) for each in (known.mean(), low, high)]
