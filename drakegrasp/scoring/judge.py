@@ -2,7 +2,7 @@
 
 Input: what `ranking` measures while the hand closes on a cloud. Output: two calibrated chances of
 each proposal, that the hand holds the object and that the grasp would be a sample of a dataset. A
-judge is an ensemble of small networks in one NumPy file, and belongs to one hand.
+judge is a logistic regression in one NumPy file, and belongs to one hand.
 `pipelines/baseline/train_judge.py` makes such a file.
 """
 
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from drakegrasp.arithmetic import Array, dot, norm
+from drakegrasp.arithmetic import Array, dot, multiply, norm
 from drakegrasp.errors import GraspError, HandError
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.finger_sweep import closing_path, pad_points_at
@@ -39,44 +39,39 @@ STEPS, DECIMALS = 5, 6
 #: Standardised features are cut to this.
 FARTHEST = 4.0
 #: Names of the arrays of a file.
-ARRAYS = ("mean", "scale", "inner", "bias", "outer", "offset", "slope", "shift")
+ARRAYS = ("mean", "scale", "weights", "offset")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Judge:
-    """An ensemble of e networks with one hidden layer of h units for f features, by `load_judge`.
+    """A logistic regression with f features for each of `HEADS`, read by `load_judge`.
 
     Attributes:
         name: Name of the judge.
-        about: What the file states: hand, command, seeds, hash of the data, versions, scores.
-        mean, scale: (f,), by which the features are standardised.
-        inner, bias: (e, f, h) and (e, h), of the hidden layer.
-        outer, offset: (e, h, 2) and (e, 2), of the answers.
-        slope, shift: (2,), of the calibration of the mean answers.
+        about: What the file states: hand, features, command, hash of the data, versions, scores.
+        mean: (f,), mean of each feature.
+        scale: (f,), standard deviation of each feature.
+        weights: (f, 2), of the standardised features.
+        offset: (2,), added to the weighted sums.
     """
 
     name: str
     about: dict[str, Any]
     mean: Array
     scale: Array
-    inner: Array
-    bias: Array
-    outer: Array
+    weights: Array
     offset: Array
-    slope: Array
-    shift: Array
 
     def chances(self, features: Mapping[str, Array]) -> Array:
         """Return the chances (n, 2) of `HEADS` for features (n,) by their names."""
-        return self.chances_of(np.column_stack([features[n] for n in self.about["features"]]))
+        values = np.column_stack([features[name] for name in self.about["features"]])
+        logits = self.logits(values)
+        return np.asarray(1.0 / (1.0 + np.exp(-logits)))
 
-    def chances_of(self, values: Array) -> Array:
-        """Return the chances (n, 2) for features (n, f) in the order of the file."""
+    def logits(self, values: Array) -> Array:
+        """Return the logits (n, 2) of the chances for features (n, f) in the judge's order."""
         x = np.clip((values - self.mean) / self.scale, -FARTHEST, FARTHEST)
-        hidden = np.tanh(np.einsum("nf,efh->enh", x, self.inner) + self.bias[:, None])
-        logits = np.einsum("enh,eha->ena", hidden, self.outer) + self.offset[:, None]
-        mean = logits.mean(axis=0) * self.slope + self.shift
-        return np.asarray(1.0 / (1.0 + np.exp(-mean)))
+        return multiply(x, self.weights) + self.offset
 
     def refuse_other_hand(self, hand: Hand) -> None:
         """Reject a hand for which the judge was not trained.

@@ -6,10 +6,9 @@
 First the data: built-in objects of another seed than the benchmark's and without its new classes,
 each with its own sizes, mass, friction and resting pose, and one view of it. Of the grasps that
 `drakegrasp.propose` returns for the view, some are drawn and lifted. DATA gets a file for each
-object; after an interruption, the same command continues. Then an ensemble of small networks learns
-the outcomes from the features of `drakegrasp.rank`. Its chances are calibrated by objects of
-classes that a copy of the ensemble did not see. With the same DATA and seed, JUDGE.npz has the same
-bytes on the same machine.
+object; after an interruption, the same command continues. Then a logistic regression learns the
+outcomes from the features of `drakegrasp.rank`. Its chances are calibrated on classes that another
+regression did not see. The same command writes the same bytes on the same machine.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -24,6 +23,7 @@ import json
 import math
 import multiprocessing
 import zipfile
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ from drakegrasp.mesh.crossings import seen_points
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.scoring.benchmark import FRICTIONS, MASSES, new_classes
-from drakegrasp.scoring.judge import FARTHEST, HEADS, Judge, fingerprint
+from drakegrasp.scoring.judge import ARRAYS, FARTHEST, HEADS, Judge, fingerprint
 from drakegrasp.scoring.ranking import measured
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.shapes.catalog import CLASSES, LICENCE, BuiltinObject
@@ -63,9 +63,8 @@ SEED = 4801
 DISTANCE, ELEVATION, RANGE, HALF, PIXELS = 0.65, 35.0, 30.0, 0.2, 96
 #: The hand of the judge.
 HAND = "barrett"
-#: Networks of an ensemble, units of their hidden layer, penalty of their weights, steps of the
-#: search, and folds of the classes.
-NETWORKS, HIDDEN, DECAY, STEPS, FOLDS = 5, 16, 1e-3, 150, 6
+#: Penalty of the weights' squares, steps of the search, and folds of the classes.
+DECAY, STEPS, FOLDS = 0.01, {"maxiter": 300}, 6
 
 
 def draw(name: str, *place: int) -> Stream:
@@ -214,43 +213,21 @@ def read_data(folder: Path, chosen: list[BuiltinObject]) -> dict[str, Any]:
     }
 
 
-def fit(x: Array, y: Array, seed: int) -> dict[str, Array]:
-    """Return an ensemble for features (n, f) and outcomes (n, 2), without its calibration."""
-    mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-6)
+def fit(x: Array, y: Array) -> Judge:
+    """Return a logistic regression for features (n, f) and outcomes (n, 2), not calibrated."""
+    (n, f), mean, scale = x.shape, x.mean(axis=0), np.maximum(x.std(axis=0), 1e-6)
     z = np.clip((x - mean) / scale, -FARTHEST, FARTHEST)
-    parts = [fit_network(z, y, Stream(SEED, seed, number)) for number in range(NETWORKS)]
-    names = ("inner", "bias", "outer", "offset")
-    stacked = {n: np.stack(each) for n, each in zip(names, zip(*parts, strict=True), strict=True)}
-    return {"mean": mean, "scale": scale, **stacked, "slope": np.ones(2), "shift": np.zeros(2)}
 
+    def loss(w: Array, end: Array) -> tuple[float, Array]:
+        logit = z @ w[:-1] + w[-1]
+        value = np.logaddexp(0.0, logit) - end * logit
+        back = (1.0 / (1.0 + np.exp(-logit)) - end) / n
+        penalty = 0.5 * DECAY * float(w[:-1] @ w[:-1])
+        return float(value.mean()) + penalty, np.append(z.T @ back + DECAY * w[:-1], back.sum())
 
-def fit_network(z: Array, y: Array, stream: Stream) -> tuple[Array, ...]:
-    """Return the weights of one network: cross entropy and a penalty on the weights' squares."""
-    (n, f), answers = z.shape, y.shape[1]
-    shapes = ((f, HIDDEN), (HIDDEN,), (HIDDEN, answers), (answers,))
-    ends = np.cumsum([math.prod(shape) for shape in shapes])
-
-    def unpacked(w: Array) -> list[Array]:
-        parts = np.split(w, ends[:-1])
-        return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
-
-    def loss(w: Array) -> tuple[float, Array]:
-        inner, bias, outer, offset = unpacked(w)
-        hidden = np.tanh(z @ inner + bias)
-        logits = hidden @ outer + offset
-        value = float((np.logaddexp(0.0, logits) - y * logits).mean())
-        back = (1.0 / (1.0 + np.exp(-logits)) - y) / (n * answers)
-        through = (back @ outer.T) * (1.0 - hidden**2)
-        penalty = 0.5 * DECAY * float((inner**2).sum() + (outer**2).sum())
-        inner, outer = z.T @ through + DECAY * inner, hidden.T @ back + DECAY * outer
-        gradients = (inner, through.sum(axis=0), outer, back.sum(axis=0))
-        return value + penalty, np.concatenate([g.ravel() for g in gradients])
-
-    start = stream.normal(int(ends[-1]))
-    start[: ends[0]] /= math.sqrt(f)
-    start[ends[0] :] /= math.sqrt(HIDDEN)
-    found = minimize(loss, start, jac=True, method="L-BFGS-B", options={"maxiter": STEPS})
-    return tuple(unpacked(found.x))
+    found = [minimize(loss, np.zeros(f + 1), args=(end,), jac=True, options=STEPS).x for end in y.T]
+    w = np.array(found).T
+    return Judge(name="", about={}, mean=mean, scale=scale, weights=w[:-1], offset=w[-1])
 
 
 def calibrated(logits: Array, y: Array) -> tuple[Array, Array]:
@@ -265,20 +242,14 @@ def calibrated(logits: Array, y: Array) -> tuple[Array, Array]:
     return slope, shift
 
 
-def crossed(x: Array, y: Array, groups: npt.NDArray[np.int64], seed: int) -> Array:
-    """Return logits (n, 2) of ensembles that did not see the row's class."""
-    logits = np.zeros(y.shape)
+def crossed(x: Array, y: Array, groups: npt.NDArray[np.int64]) -> Array:
+    """Return logits (n, 2) of regressions that did not see the row's class."""
+    logits, folds = np.zeros(y.shape), np.unique(groups, return_inverse=True)[1] % FOLDS
     for fold in range(FOLDS):
-        held = groups % FOLDS == fold
+        held = folds == fold
         if held.any() and not held.all():
-            logits[held] = logits_of(fit(x[~held], y[~held], seed), x[held])
+            logits[held] = fit(x[~held], y[~held]).logits(x[held])
     return logits
-
-
-def logits_of(arrays: dict[str, Array], x: Array) -> Array:
-    """Return the logits (n, 2) of an ensemble that is not calibrated."""
-    chances = Judge(name="", about={}, **arrays).chances_of(x)
-    return np.log(chances) - np.log1p(-chances)
 
 
 def auc(score: Array, ends: Array, owner: Array) -> float:
@@ -298,14 +269,15 @@ def first(score: Array, ends: Array, owner: Array) -> float:
     return float(np.mean([ends[own[np.argmax(score[own])]] for own in rows]))
 
 
-def learn(folder: Path, chosen: list[BuiltinObject], seed: int, name: str) -> bytes:
+def learn(folder: Path, chosen: list[BuiltinObject], name: str) -> bytes:
     """Return the file of a judge, and print how well it judges objects of unseen classes."""
     data = read_data(folder, chosen)
     x, y, owner = data["features"], data["ends"][:, :2].astype(float), data["object"]
     number = np.array([item.object_class.number for item in chosen])
-    logits = crossed(x, y, number[owner], seed)
+    logits = crossed(x, y, number[owner])
     slope, shift = calibrated(logits, y)
-    arrays = fit(x, y, seed) | {"slope": slope, "shift": shift}
+    judge = fit(x, y)
+    judge = replace(judge, weights=judge.weights * slope, offset=judge.offset * slope + shift)
     sample, plain = logits[:, 1], -np.arange(len(owner), dtype=float)
     formula = x[:, data["names"].index("score")]
     choices = {"plainest": plain, "closing": formula, "judge": sample, "oracle": y[:, 1]}
@@ -314,11 +286,10 @@ def learn(folder: Path, chosen: list[BuiltinObject], seed: int, name: str) -> by
         "hand": HAND,
         "fingerprint": fingerprint(load_hand(HAND)),
         "features": data["names"],
-        "answers": list(HEADS),
         "objects": len(np.unique(owner)),
         "lifts": len(owner),
         "data_sha256": data["sha256"],
-        "seeds": {"objects": SEED, "training": seed},
+        "seed": SEED,
         "unseen classes": {
             **{f"{key}, sample": round(first(s, y[:, 1], owner), 3) for key, s in choices.items()},
             **{
@@ -326,18 +297,13 @@ def learn(folder: Path, chosen: list[BuiltinObject], seed: int, name: str) -> by
                 for k, head in enumerate(HEADS)
             },
         },
-        "command": f"python pipelines/baseline/train_judge.py DATA {name}.npz --seed {seed}",
+        "command": f"python pipelines/baseline/train_judge.py DATA {name}.npz",
         "licence": LICENCE,
         "versions": {"drakegrasp": dg.__version__, "numpy": np.__version__},
     }
     click.echo(json.dumps(about["unseen classes"], indent=1))
-    return packed_judge(about, arrays)
-
-
-def packed_judge(about: dict[str, Any], arrays: dict[str, Array]) -> bytes:
-    """Return the file of a judge, see `drakegrasp.scoring.judge.Judge`."""
-    stored = {key: values.astype(np.float32) for key, values in arrays.items()}
-    return packed({"about": json.dumps(about), **stored})
+    arrays = {key: getattr(judge, key).astype(np.float32) for key in ARRAYS}
+    return packed({"about": json.dumps(about), **arrays})
 
 
 @click.command(help=__doc__)
@@ -346,8 +312,7 @@ def packed_judge(about: dict[str, Any], arrays: dict[str, Array]) -> bytes:
 @click.option("--per-class", default=5, help="Objects of each of the 48 classes.")
 @click.option("--lifts", default=18, help="Lifts of each object.")
 @click.option("--workers", default=1, help="Processes that lift.")
-@click.option("--seed", default=0, help="Seed of the training.")
-def main(data: Path, judge: Path, per_class: int, lifts: int, workers: int, seed: int) -> None:
+def main(data: Path, judge: Path, per_class: int, lifts: int, workers: int) -> None:
     """Run the script."""
     data.mkdir(parents=True, exist_ok=True)
     chosen = objects(per_class)
@@ -356,7 +321,7 @@ def main(data: Path, judge: Path, per_class: int, lifts: int, workers: int, seed
         for done, line in enumerate(pool.imap(work, chosen), start=1):
             if line:
                 click.echo(f"{done}/{len(chosen)} {line}", err=True)
-    write_atomic(judge, learn(data, chosen, seed, judge.stem))
+    write_atomic(judge, learn(data, chosen, judge.stem))
     click.echo(f"wrote {judge}")
 
 
