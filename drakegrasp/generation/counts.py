@@ -33,8 +33,8 @@ class Counts:
     """Counts of completed work; their memory does not grow with the number of work units.
 
     For `max_grasps` it stores, for each object, the candidate up to which all units are done and
-    the grasps of these units. It also stores the grasps of the units beyond this first gap; they
-    are few, because other units are only ahead of those that are still running.
+    the grasps of these units. It also stores the grasps of later units that are done; these are
+    few, because they only wait for units that are still running.
 
     Attributes:
         simulated: Work units that were run now.

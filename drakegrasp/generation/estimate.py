@@ -84,8 +84,8 @@ MOST_WORKERS = 1_000_000
 def plan_build(objects: int, config: Config, workers: int, times: StageTimes) -> Plan:
     """Return the expected size and duration of building objects from the beginning.
 
-    Every object is taken to have as many candidates as it may have, and none to be cut short by
-    `max_grasps`: this is never less than what will be done.
+    The estimate is an upper limit: it assumes that each object has the largest number of candidates,
+    and that `max_grasps` stops no object early.
 
     Raises:
         ConfigError: If there is no object or no worker.

@@ -189,7 +189,7 @@ def refuse_part(part: Part | None, config: Config) -> None:
     """Reject a part of a build that ends when there are enough samples.
 
     Raises:
-        ConfigError: If it is such a part. The units that it needs depend on the results of all.
+        ConfigError: If it is such a part: which units it needs depends on the results of all parts.
     """
     if part is not None and config.has_target:
         raise ConfigError(
