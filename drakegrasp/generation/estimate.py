@@ -84,8 +84,8 @@ MOST_WORKERS = 1_000_000
 def plan_build(objects: int, config: Config, workers: int, times: StageTimes) -> Plan:
     """Return the expected size and duration of building objects from the beginning.
 
-    The estimate is an upper limit: it assumes that each object has the largest number of candidates,
-    and that `max_grasps` stops no object early.
+    The work is never more than estimated: each object is assumed to have the largest number of
+    candidates, and `max_grasps` to stop no object early.
 
     Raises:
         ConfigError: If there is no object or no worker.
