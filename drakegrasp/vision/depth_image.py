@@ -39,7 +39,7 @@ PLANES, JUDGES = 1000, 4000
 BELOW, ABOVE = 0.02, (0.025, 0.3)
 #: A plane that the object touches is preferred if it has at least this fraction of the pixels of
 #: the best plane.
-TOUCHED = 0.35
+TOUCHED = 0.6
 #: Fraction of the object's points that may be outliers.
 OUTLIERS = 0.02
 #: Rounds of least squares after the choice of a plane. They use the pixels that are closer to the
