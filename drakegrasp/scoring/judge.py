@@ -9,12 +9,14 @@ judge is a logistic regression in one NumPy file, and belongs to one hand.
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -108,12 +110,15 @@ def load_judge(source: str | Path | Judge) -> Judge:
             f"judge must be one of {', '.join(judge_names())}, or a file, got {str(source)!r}"
         )
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             about = json.loads(str(file["about"]))
             arrays = {name: np.asarray(file[name], dtype=float) for name in ARRAYS}
-    except (OSError, ValueError, KeyError, EOFError) as error:
+        size = len(about["features"])
+        if arrays["weights"].shape != (size, len(HEADS)) or arrays["mean"].shape != (size,):
+            raise ValueError(f"its weights are not of {size} features")
+        return Judge(name=about["name"], about=about, **arrays)
+    except (OSError, ValueError, KeyError, EOFError, TypeError, BadZipFile) as error:
         raise GraspError(f"{path}: must be the file of a judge, got another: {error}") from None
-    return Judge(name=about["name"], about=about, **arrays)
 
 
 def features_of(

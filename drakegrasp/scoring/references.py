@@ -300,7 +300,7 @@ REFERENCES = {
         make=top_down, words="from above, across the minor axis of what is seen", trained=False
     ),
     "closing": Reference(
-        make=closing, words="from above, chosen by closing on what is seen", trained=False
+        make=closing, words="proposed and chosen by closing on what is seen", trained=False
     ),
     "palm normals": Reference(make=palm_normals, words="rays about the palm's direction"),
     "surface": Reference(make=surface_points, words="random visible points", trained=False),

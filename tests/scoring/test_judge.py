@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 import drakegrasp as dg
-from drakegrasp.scoring.judge import fingerprint, judge_names, load_judge
+from drakegrasp.scoring.judge import ARRAYS, fingerprint, judge_names, load_judge
 from drakegrasp.scoring.ranking import measured
 from drakegrasp.shapes.catalog import CLASSES, BuiltinObject
 
@@ -72,16 +72,28 @@ def test_the_judge_of_the_package_prefers_what_the_hand_can_close_on(cloud, gras
     assert ranked.score[1] > 0.3
 
 
-@pytest.mark.parametrize(
-    ("judge", "message"),
-    [
-        ("barrett-9", f"judge must be one of {NAME}, or a file, got 'barrett-9'"),
-        (__file__, "must be the file of a judge, got another"),
-    ],
-)
-def test_what_is_no_judge_is_refused(cloud, grasps, judge, message):
-    with pytest.raises(dg.GraspError, match=message):
-        dg.rank(grasps, cloud, judge=judge)
+def test_an_unknown_judge_is_refused(cloud, grasps):
+    with pytest.raises(dg.GraspError, match=f"judge must be one of {NAME}, or a file, got 'b'"):
+        dg.rank(grasps, cloud, judge="b")
+
+
+@pytest.mark.parametrize("damage", ["text", "truncated", "array", "features"])
+def test_a_file_that_is_no_judge_is_refused(tmp_path, damage):
+    path = write(tmp_path / "toy.npz")
+    if damage == "text":
+        path.write_text("judge")
+    elif damage == "truncated":
+        path.write_bytes(path.read_bytes()[:-40])
+    elif damage == "array":
+        with path.open("wb") as file:
+            np.save(file, np.zeros(3))
+    else:
+        about = {"name": "toy", "features": ["gap", "push"]}
+        with np.load(path) as file:
+            arrays = {name: file[name] for name in ARRAYS}
+        path.write_bytes(train_judge.packed({"about": json.dumps(about), **arrays}))
+    with pytest.raises(dg.GraspError, match="must be the file of a judge, got another"):
+        load_judge(path)
 
 
 def test_a_judge_is_refused_for_another_hand(tmp_path, cloud):
