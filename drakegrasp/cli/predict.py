@@ -81,6 +81,8 @@ def predict(
     # All input is checked before anything is predicted.
     if out.suffix.lower() not in HDF5:
         raise click.UsageError(f"--out must be a file {' or '.join(HDF5)}, got {str(out)!r}")
+    if out.exists() and out.samefile(source):
+        raise click.UsageError(f"--out must be another file than INPUT, got {str(out)!r}")
     refuse_unwritable(out)
     given: dict[str, Any] = {"split": split, "workers": workers, "units": units}
     given |= {"camera": camera, "mask": mask, "camera_pose": camera_pose}

@@ -205,3 +205,6 @@ def test_a_file_that_cannot_be_written_is_refused_before_any_work(scenes: Path) 
     assert "--out must be a file .h5 or .hdf5" in error_line(
         run("predict", scenes, "--out", "out.npz")
     )
+    before = scenes.read_bytes()
+    assert "another file than INPUT" in error_line(run("predict", scenes, "--out", scenes))
+    assert scenes.read_bytes() == before
