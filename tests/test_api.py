@@ -376,6 +376,19 @@ def test_one_worker_is_this_process(cube: PlacedObject, monkeypatch: pytest.Monk
     assert run_verification(grasps, workers=1, show=False) == [run_here]
 
 
+def test_few_grasps_are_verified_in_this_process(
+    cube: PlacedObject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four are few, and five are not."""
+    module = "drakegrasp.api.verifying"
+    monkeypatch.setattr(f"{module}.verify_batch", lambda grasps, execute, *_, **__: [execute])
+    monkeypatch.setattr(f"{module}.joined", lambda *_: _none())
+    four, five = (place([GRASP.ravel()] * count, cube) for count in (4, 5))
+    assert run_verification(four, show=False) == [run_here]
+    with pytest.raises(MachineError, match="no workers"):
+        run_verification(five, show=False)
+
+
 def test_workers_are_asked_whether_they_see_the_meshes_of_a_build(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,3 +25,19 @@ def test_large_file_is_read_in_parts_unless_it_consists_of_holes(
     refuse_irregular(solid)
     with pytest.raises(OSError, match="1,048,576 byte, more than 1,024"):
         refuse_irregular(solid, 2**10)
+
+
+def test_share_of_a_file_that_is_on_the_disk_decides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half of it must be: 300 kB of 1 MB are too few, 900 kB are enough."""
+    monkeypatch.setattr(foreign_files, "LARGE", 2**10)
+    monkeypatch.setattr(foreign_files, "SOLID", 0.5)
+    path = tmp_path / "file"
+    path.write_bytes(b"x" * 300_000)
+    os.truncate(path, 1_000_000)
+    with pytest.raises(OSError, match=r"1,000,000 byte, of which only 3\d\d,\d{3} are on"):
+        refuse_irregular(path)
+    path.write_bytes(b"x" * 900_000)
+    os.truncate(path, 1_000_000)
+    refuse_irregular(path)

@@ -62,6 +62,9 @@ FAULTS = {
     "joint without limit": (
         "barrett", ".sdf", "<lower>0</lower><upper>2.443460953</upper>", "", "limits",
         r"joint 'finger1_proximal_joint' must have limits, got -inf\.\.inf"),
+    "spread half a degree before its joints": (
+        "barrett", ".yaml", "spreads_deg: [0.0,", "spreads_deg: [-0.5,", "limits",
+        r"spreads_deg must be 0\.\.180, got -0\.5$"),
     "zero mass": (
         "barrett", ".sdf", "<mass>0.04166</mass>", "<mass>0</mass>", "masses",
         r"link 'finger1_distal' must have a mass above 0 kg, got 0"),

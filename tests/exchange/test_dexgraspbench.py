@@ -114,6 +114,13 @@ def test_motors_of_fingers_that_slide_work_in_metres() -> None:
     np.testing.assert_allclose(model.actuator_forcerange, [[-30.0, 30.0]])
 
 
+def test_hand_has_the_friction_of_mujocos_defaults() -> None:
+    """A coefficient of 1, and that which is asked for."""
+    hand = load_hand("franka")
+    for model, friction in ((make_hand_model(hand), 1.0), (make_hand_model(hand, 0.6), 0.6)):
+        assert set(model.compile().geom_friction[:, 0]) == {friction}
+
+
 def test_settings_name_links_of_the_model(folder: Path, settings: dict[str, Any]) -> None:
     model = mujoco.MjModel.from_xml_path(str(folder / settings["xml_path"]))
     bodies = {model.body(i).name for i in range(model.nbody)}

@@ -194,3 +194,12 @@ def test_storage_adds_up_to_the_directory(small_dataset: Path, small_config: Con
     plan = plan_build(3, small_config, 1, replace(MEASURED, **shares, **sizes))
     whole = sum(p.stat().st_size for p in small_dataset.rglob("*") if p.is_file())
     assert plan.bytes == pytest.approx(whole, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [(1.5e12, "1.5 TB"), (2e9, "2.0 GB"), (999e6, "999.0 MB"), (1e6, "1.0 MB"), (12e3, "12 kB")],
+)
+def test_sizes_are_in_the_largest_unit_that_they_fill(size: float, words: str) -> None:
+    plan = replace(plan_build(1, SMALL, 1, EVEN), bytes=size)
+    assert f", {words} on disk" in plan_lines(plan)[-2]

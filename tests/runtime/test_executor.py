@@ -19,7 +19,7 @@ from helpers.tiers import few
 from drakegrasp.cluster.connect import connect
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.runtime import executor
-from drakegrasp.runtime.executor import in_order, processes
+from drakegrasp.runtime.executor import MOST_PROCESSES, count_workers, in_order, processes
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -59,6 +59,12 @@ def test_processes_start_by_default_only_where_the_work_is_long(
         assert list(execute(pid_later, [0.0] * 3)) == [os.getpid()] * 3
         assert next(execute(pid_later, [0.6])) == os.getpid()
         assert os.getpid() not in list(execute(pid_later, [0.0] * 3))
+
+
+def test_number_of_processes_may_be_the_largest() -> None:
+    assert [count_workers(n) for n in (1, MOST_PROCESSES)] == [1, 10_000]
+    with pytest.raises(ConfigError, match="workers must be at most 10,000, got 10001"):
+        count_workers(MOST_PROCESSES + 1)
 
 
 @pytest.mark.parametrize("workers", [0, -1, 10**6])

@@ -109,6 +109,7 @@ def test_some_rows_of_each_object_are_the_same_for_all_sets(data):
     card = scored(data, per_object=1).card
     assert card["rows"] == card["objects"] == 2
     assert f"2 of the {len(data)} rows of the split were scored" in card["warnings"]
+    assert "of the split were scored" not in " ".join(scored(data).card["warnings"])
 
 
 def test_files_of_several_training_seeds_are_one_set(data, tmp_path):

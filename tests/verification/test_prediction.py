@@ -125,6 +125,16 @@ def test_other_sizes_are_refused(shape):
     assert "a grasp must be 12 numbers (2 points" in refused(read_grasps, one_grasp(), 2)
 
 
+def test_rows_of_one_wrong_length_are_refused_as_an_array_is():
+    """Rows of different lengths are judged one by one; these cannot be grasps of this hand."""
+    message = refused(read_grasps, [[0.0] * 17, [0.0] * 17], 3)
+    assert message.endswith("got an array of shape (2, 17)")
+    assert read_grasps([[0.0] * 17, [1.0] * 18], 3).invalid == (
+        "the row has 17 numbers, not 18",
+        "",
+    )
+
+
 @pytest.mark.parametrize(
     ("value", "got"),
     [
