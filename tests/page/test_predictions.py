@@ -49,14 +49,6 @@ def test_the_worst_come_first(client: TestClient) -> None:
     assert shown(client, "sort=contact_error") == ["1", "3", "0", "2"]
 
 
-def test_results_that_are_written_again_are_sorted_again(client: TestClient, results: Path) -> None:
-    """The dataset is as it was, so nothing else says that a selection is an old one."""
-    assert shown(client) == ["2", "3", "1", "0"]
-    with h5py.File(results, "r+") as file:
-        file["grasps/contact_error"][1] = [0.001, 0.0, 0.0]
-    assert shown(client) == ["2", "3", "0", "1"]
-
-
 @pytest.mark.parametrize(
     ("query", "numbers"),
     [
