@@ -295,9 +295,10 @@ def test_each_view_shows_the_contacts_of_a_sample_of_its_scene(out: Path) -> Non
         dots = {line.get_gid(): line for line in axes.lines if line.get_gid()}
         hollow = [dots[f"contact {i}"].get_markerfacecolor() == "white" for i in range(3)]
         assert hollow == (~grasps["visible"][row]).tolist()
-        # Only the image is in the picture, also if a contact is outside of it.
+        # Only the image is in the picture, without ticks and a frame.
         height, width = data.images(told["view"])["mask"].shape
         assert axes.get_xlim() == (-0.5, width - 0.5) and axes.get_ylim() == (height - 0.5, -0.5)
+        assert not axes.get_xticks().size and not axes.spines["left"].get_visible()
     assert any(not data.grasps_in(told["view"])["visible"].all() for told in drawn)
 
 
