@@ -23,7 +23,9 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +52,7 @@ from drakegrasp.scoring.ranking import measured
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.shapes.catalog import builtin_object, draw_builtin
 from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.conditions import usual_materials
 from drakegrasp.simulation.placement import PlacedObject
 
 Array = npt.NDArray[np.float64]
@@ -76,6 +79,7 @@ DRAWS = 10_000
     type=int,
     help="Number of first grasps to lift, of the judge if there is one; all if left out.",
 )
+@click.option("--friction", default=1.0, help="Factor of the friction of all objects.")
 @click.option("--results", type=click.Path(path_type=Path), help="File with a line per object.")
 @click.option(
     "--set", "overrides", multiple=True, help="Change one setting of preset fast, KEY=VALUE."
@@ -88,20 +92,22 @@ def main(
     count: int | None,
     judge: str | None,
     lifts: int | None,
+    friction: float,
     results: Path | None,
     overrides: tuple[str, ...],
 ) -> None:
     """Run the script."""
     config = dg.load_config("fast", list(overrides))
-    items: Iterator[tuple[str, Any]]
+    items: Iterator[tuple[str, Callable[[], PlacedObject]]]
     if prepared:
         items = prepared_objects(prepared, overrides)
     elif meshes:
-        items = ((source.name, source) for source in find_meshes(meshes, units=units))
+        found_meshes = find_meshes(meshes)
+        items = ((m.name, partial(mesh_at_rest, m.path, units, config)) for m in found_meshes)
     else:
         kept = [each for each in draw_builtin() if each.object_class.number % OF >= FITTED]
         names = names or tuple(each.name for each in kept if each.index == 1)
-        items = ((name, builtin_object(name).build()) for name in names)
+        items = ((name, partial(builtin_at_rest, name, config)) for name in names)
     chosen = list(items)
     if count:
         chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, count).round().astype(int)]
@@ -109,12 +115,11 @@ def main(
     found = {}
     if results and results.exists():
         found = {row["name"]: row for row in map(json.loads, results.read_text().splitlines())}
-    for name, item in chosen:
+    for name, place in chosen:
         if name in found:
             continue
         try:
-            placed = item if isinstance(item, PlacedObject) else placed_at(item, config)
-            found[name] = measure(name, placed, judge, lifts)
+            found[name] = measure(name, with_friction(place(), friction), judge, lifts)
         except (MeshError, GraspError) as error:
             click.echo(f"{name}: {error}", err=True)
             continue
@@ -128,20 +133,36 @@ def main(
         click.echo(json.dumps({"new classes": summary(new)}, indent=1))
 
 
-def placed_at(item: Any, config: dg.Config) -> PlacedObject:
-    """Return a mesh or a mesh file on the table."""
-    path, units = getattr(item, "path", item), getattr(item, "units", None)
+def with_friction(placed: PlacedObject, factor: float) -> PlacedObject:
+    """Return an object whose friction with hand and table is multiplied by a factor."""
+    usual = usual_materials(placed.model, placed.config.physics).friction_hand
+    return replace(placed, model=replace(placed.model, friction=factor * usual))
+
+
+def mesh_at_rest(path: Path, units: str, config: dg.Config) -> PlacedObject:
+    """Return the object of a mesh file on the table."""
     return dg.place_object(path, units=units, config=config)
 
 
-def prepared_objects(out: Path, overrides: tuple[str, ...]) -> Iterator[tuple[str, PlacedObject]]:
-    """Yield the names and the objects of a dataset, at rest, with their own configurations."""
+def builtin_at_rest(name: str, config: dg.Config) -> PlacedObject:
+    """Return a built-in object on the table."""
+    return dg.place_object(builtin_object(name).build(), config=config)
+
+
+def prepared_objects(
+    out: Path, overrides: tuple[str, ...]
+) -> Iterator[tuple[str, Callable[[], PlacedObject]]]:
+    """Yield the names of a dataset's objects, and functions that return them at rest."""
     manifest = read_manifest(out)
-    for entry in manifest.objects:
-        config = manifest.config_of(entry.name)
-        thing = load_prepared(out, entry.name, config)
+
+    def at_rest(name: str) -> PlacedObject:
+        config = manifest.config_of(name)
+        thing = load_prepared(out, name, config)
         changed = override_config(config, list(overrides))
-        yield entry.name, PlacedObject(model=thing.model, X_TO=thing.X_TO, config=changed)
+        return PlacedObject(model=thing.model, X_TO=thing.X_TO, config=changed)
+
+    for entry in manifest.objects:
+        yield entry.name, partial(at_rest, entry.name)
 
 
 def name_of_class(name: str) -> str:
@@ -203,7 +224,7 @@ def measure(
         "choices": listed,
         "ms": 1e3 * cpu,
         "said": grasps.said[best],
-        "friction": placed.config.physics.friction_hand,
+        "friction": usual_materials(placed.model, placed.config.physics).friction_hand,
         "mass": placed.model.mass,
         "score": float(scores[last][best]),
     }
