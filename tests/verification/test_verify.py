@@ -175,7 +175,7 @@ def test_misplaced_points_are_told_first_with_where_they_would_fit(
     assert f"{distance.max():.1f} mm off the object" in text.split(". ")[0]
     assert "friction" not in text  # of points in the air nothing is said that reassures
     if hint is None:
-        assert found.hints == () and "They fit in no other frame or unit" in text
+        assert found.hints == () and "They fit in no other known frame or unit" in text
     else:
         assert found.hints == (hint,)
         assert f". This would fit much better: {hint}. The grasp of" in text
