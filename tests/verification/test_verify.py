@@ -188,7 +188,7 @@ def test_one_point_in_the_air_is_told(cube, grasp):
     assert found.held and found.misplaced and found.hints == ()
     text = found.explain()
     assert text.startswith("1 of 3 points lies 12.0 mm off the object, so the requested grasp")
-    assert "After closing, they touch" in text
+    assert "After closing, the fingertips touch" in text
     assert not any(word in text for word in ("Before closing", "friction", "In a dataset"))
 
 
