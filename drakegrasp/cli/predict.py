@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -215,6 +216,7 @@ def _of_depth(
         read_camera,
         read_depth_png,
         read_mask,
+        table_share,
     )
 
     assert camera is not None and mask is not None
@@ -227,14 +229,17 @@ def _of_depth(
     K, own = read_camera(camera), read_mask(mask)
     if camera_pose is not None:
         pose = read_pose(read_numbers(camera_pose), "X_TC")
+        share = table_share(depth, K, own, pose)
+        off = ""
     else:
         pose, residual, share = fit_table(depth, K, own)
-        if show:
-            say(
-                f"table: {share:.0%} of the pixels beside the object, {1e3 * residual:.1f} mm off "
-                f"its plane (rms); the camera is {1e3 * pose[2, 3]:.0f} mm above it",
-                err=True,
-            )
+        off = f", {1e3 * residual:.1f} mm off its plane (rms)"
+    if show and not math.isnan(share):
+        say(
+            f"table: {share:.0%} of the pixels beside the object{off}; the camera is "
+            f"{1e3 * pose[2, 3]:.0f} mm above it",
+            err=True,
+        )
     return cloud_from_depth(depth, K, own, pose), pose
 
 

@@ -26,6 +26,9 @@ FEWEST, MOST, LARGEST = 10, 4096, 1.0
 #: The highest point must be at least this far above the table [m]: a solid cannot show thinner
 #: objects.
 LEAST_HEIGHT = 0.004
+#: The lowest points, except this fraction of outliers, are not farther than this below the table,
+#: nor above it [m].
+OUTLIERS, BELOW, ABOVE = 0.02, 0.02, 0.3
 #: Approximate number of cells of a grid, its smallest spacing [m], and empty cells around it.
 CELLS, FINEST, PADDING = 150_000, 0.002, 6
 #: A normal is the slope between points this many cells to both sides, since columns have steps of
@@ -71,6 +74,11 @@ def read_cloud(cloud: npt.ArrayLike) -> Array:
         raise GraspError(f"{must}, {FEWEST} or more, got {len(points)}")
     if (size := float(np.ptp(points, axis=0).max())) > LARGEST:
         raise GraspError(f"{must}, got points {size:.3g} m apart")
+    low = float(np.quantile(points[:, 2], OUTLIERS))
+    if not -BELOW <= low <= ABOVE:
+        raise GraspError(
+            f"{must}: the table must be z = 0, got the lowest points at z = {low:.3g} m"
+        )
     if (top := float(points[:, 2].max())) < LEAST_HEIGHT:
         raise GraspError(f"{must}, got none higher than {1e3 * top:.3g} mm above the table")
     points = points[:: -(-len(points) // MOST)].copy()

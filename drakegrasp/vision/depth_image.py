@@ -31,6 +31,11 @@ FEWEST = 10
 ON_PLANE = 0.01
 #: Fraction of the pixels beside the object that must be on the table's plane.
 LEAST_SHARE = 0.15
+#: The same for a pose that is known, since less of the table may be visible then.
+LEAST_KNOWN_SHARE = LEAST_SHARE / 3.0
+#: Maximum fraction of an image that is on the object, and the part of an image, along either side,
+#: in which its principal point is.
+LARGEST_MASK, CENTRAL = 0.99, (0.35, 0.65)
 #: Planes through three random pixels that are tried, and number of pixels that judge them.
 PLANES, JUDGES = 1000, 4000
 #: The object stands on a plane if almost none of its points is deeper than this below it, and its
@@ -62,14 +67,42 @@ def cloud_from_depth(
         X_TC: Pose of the camera over the table (4, 4), known or from `fit_table`.
 
     Raises:
-        GraspError: If an argument is invalid, the depth is not in metres, or the mask has fewer
-            than 10 pixels with a depth.
+        GraspError: If an argument is invalid, the depth is not in metres, the mask has fewer than
+            10 pixels with a depth, or the camera matrix is of another resolution.
     """
     own, _ = _points(depth, K, mask)
+    return transform_points(_one_pose(X_TC), own)
+
+
+def table_share(
+    depth: npt.ArrayLike, K: npt.ArrayLike, mask: npt.ArrayLike, X_TC: npt.ArrayLike
+) -> float:
+    """Return the fraction of the pixels beside an object that are on the table.
+
+    A pixel is on the table if its distance from z = 0 is less than 1 % of its depth. The arguments
+    are those of `cloud_from_depth`; an image without pixels beside the object has NaN.
+
+    Raises:
+        GraspError: See `cloud_from_depth`; or if fewer than 5 % are on the table.
+    """
+    _, others = _points(depth, K, mask)
+    pose = _one_pose(X_TC)
+    if not len(others):
+        return np.nan
+    share = float(np.mean(_on_plane(others, pose[2, :3], -pose[2, 3])))
+    if share < LEAST_KNOWN_SHARE:
+        raise GraspError(
+            f"X_TC must place {LEAST_KNOWN_SHARE:.0%} of the pixels beside the object on the table "
+            f"(z = 0), got {share:.1%}: is it inverted (X_CT), or in another unit?"
+        )
+    return share
+
+
+def _one_pose(X_TC: npt.ArrayLike) -> Array:
     pose = read_pose(X_TC, "X_TC")
     if pose.ndim != 2:
         raise GraspError(f"X_TC must be one pose (4, 4), got {len(pose)} poses")
-    return transform_points(pose, own)
+    return pose
 
 
 def fit_table(
@@ -136,7 +169,7 @@ def _points(depth: npt.ArrayLike, K: npt.ArrayLike, mask: npt.ArrayLike) -> tupl
     z = as_numbers(depth, "depth must be an image (h, w) in metres")
     if z.ndim != 2:
         raise GraspError(f"depth must be an image (h, w), got an array of shape {z.shape}")
-    own = np.asarray(mask) != 0
+    own = _chosen(mask)
     if own.shape != z.shape:
         raise GraspError(f"mask must be {z.shape}, as the depth image, got {own.shape}")
     known = np.isfinite(z) & (z > 0.0)
@@ -144,6 +177,10 @@ def _points(depth: npt.ArrayLike, K: npt.ArrayLike, mask: npt.ArrayLike) -> tupl
         raise GraspError(
             f"mask must have at least {FEWEST} pixels with a depth, got {count} "
             f"of {int(own.sum()):,} pixels"
+        )
+    if own.mean() > LARGEST_MASK:
+        raise GraspError(
+            f"mask must be 0 beside the object, got {own.mean():.1%} of the image on the object"
         )
     median = float(np.median(z[known]))
     if not DEPTHS[0] <= median <= DEPTHS[1]:
@@ -153,9 +190,30 @@ def _points(depth: npt.ArrayLike, K: npt.ArrayLike, mask: npt.ArrayLike) -> tupl
         )
 
     lens = read_lens(K)
+    middle, size = lens[:2, 2], np.array(z.shape[::-1])
+    if not ((middle > CENTRAL[0] * size) & (middle < CENTRAL[1] * size)).all():
+        raise GraspError(
+            f"camera must have (cx, cy) near the centre of the image of {size[0]} x {size[1]} "
+            f"pixels, got ({middle[0]:g}, {middle[1]:g}): is it for another resolution?"
+        )
     parts = (np.nonzero(known & chosen) for chosen in (own, ~own))
     own_points, others = (unproject(lens, np.column_stack([u, v]), z[v, u]) for v, u in parts)
     return own_points, others
+
+
+def _chosen(mask: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """Return where a mask is not 0.
+
+    Raises:
+        GraspError: If it is no array of numbers or truth values, or has NaN.
+    """
+    must = "mask must be numbers (h, w), not 0 on the object"
+    if getattr(mask, "dtype", None) == np.bool_:
+        return np.asarray(mask)
+    values = as_numbers(mask, must)
+    if unknown := np.count_nonzero(np.isnan(values)):
+        raise GraspError(f"{must}, got {unknown:,} that are NaN")
+    return values != 0
 
 
 def _table_plane(own: Array, others: Array) -> tuple[Array, float]:
@@ -281,15 +339,20 @@ def read_mask(path: Path) -> npt.NDArray[np.bool_]:
     """Return the mask (h, w) of an image file or a .npy file: where any channel is not 0.
 
     Raises:
-        GraspError: If the file is neither.
+        GraspError: If the file is neither, or has NaN.
     """
     pixels = _pixels(path)
-    if pixels.ndim == 3:
-        # A fourth channel is the opacity.
-        pixels = np.asarray(pixels[:, :, :3].any(axis=2))
-    if pixels.ndim != 2:
+    try:
+        own = _chosen(pixels)
+    except GraspError as error:
+        raise GraspError(f"{path}: {one_line(error)}") from None
+    if own.ndim == 3:
+        # The last of two or four channels is the opacity.
+        channels = own.shape[2] - (own.shape[2] in (2, 4))
+        own = np.asarray(own[:, :, :channels].any(axis=2))
+    if own.ndim != 2:
         raise GraspError(f"{path}: must be an image, got an array of shape {pixels.shape}")
-    return np.asarray(pixels != 0)
+    return own
 
 
 def _pixels(path: Path) -> npt.NDArray[Any]:

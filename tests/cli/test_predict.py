@@ -1,210 +1,79 @@
-"""`drakegrasp predict`: scenes, clouds and depth images to files of postures."""
+"""`drakegrasp predict` of clouds and depth images: the grasps, and what is refused."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from helpers.commands import error_line, run
-from helpers.datasets import make_dataset
+from helpers.depth_images import X_TC, K, image
 from PIL import Image
 
-from drakegrasp.dataset.scenes import SceneDataset, SceneRows
-from drakegrasp.dataset.schema import DEPTH_UNIT
-from drakegrasp.exchange.attempts import read_attempts
-from drakegrasp.generation.scenes import make_scenes
-from drakegrasp.hand.description import load_hand
-from drakegrasp.outcomes import Outcome
-from drakegrasp.scoring.network import load_network
-from drakegrasp.simulation.attempts import Attempts
-from drakegrasp.vision.depth_image import cloud_from_depth
-
-pytestmark = pytest.mark.sim
-#: The views of the training split, of which there are few.
-FEW = ("--split", "train", "--count", 2, "--quiet")
+from drakegrasp.frames import invert_pose
 
 
-@pytest.fixture(scope="module")
-def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Small scenes of boxes."""
-    folder = tmp_path_factory.mktemp("scenes")
-    out = make_dataset(folder / "out", folder / "meshes", overrides=["split.by=class"])
-    make_scenes(out, overrides=["scenes.views=1"])
-    return out / "scenes.hdf5"
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    """A folder with a depth image, a mask, poses of the camera and clouds."""
+    depth, mask = image()
+    np.save(tmp_path / "depth.npy", depth)
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    Image.fromarray(~mask | mask).save(tmp_path / "all.png")
+    np.save(tmp_path / "one.npy", np.ones((4, 5)))
+    millimetres = X_TC.copy()
+    millimetres[:3, 3] *= 1e3
+    poses = {"X_TC": X_TC, "X_CT": invert_pose(X_TC), "mm": millimetres}
+    for name, pose in poses.items():
+        np.save(tmp_path / f"{name}.npy", pose)
+    corners = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 3)) * [0.04, 0.03, 0.05]
+    for name, z in {"cloud": 0.05, "centred": 0.0, "below": -0.2, "camera": 0.6}.items():
+        np.save(tmp_path / f"{name}.npy", corners + np.array([0.0, 0.0, z]))
+    (tmp_path / "a.txt").write_text("points")
+    return tmp_path
 
 
-@pytest.fixture(scope="module")
-def cloud(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the first view of the training scenes shows of its object."""
-    data = SceneDataset(scenes, points=None, negatives="none", balance="view")
-    seen, X_TC = data.images(data.views[0]), data[0]["X_TC"]
-    path = tmp_path_factory.mktemp("cloud") / "cloud.npy"
-    np.save(path, cloud_from_depth(seen["depth"], seen["K"], seen["mask"], X_TC))
-    return path
+#: The depth image, its camera and its mask.
+SEEN = f"depth.npy --camera {K[0, 0]},{K[1, 1]},{K[0, 2]},{K[1, 2]} --mask mask.png"
+NINE = "one.npy --camera 9,9,2,1.5"
 
 
-@pytest.fixture(scope="module")
-def own(cloud: Path) -> Attempts:
-    """The grasps for that cloud."""
-    return load_network().predict(np.load(cloud))
-
-
-@pytest.fixture(scope="module")
-def predicted(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("predicted") / "predicted.h5"
-    result = run("predict", scenes, "--out", path, *FEW, "--workers", 1)
-    assert result.exit_code == 0, result.output
-    assert result.stdout.split() == [str(path)]
-    return path
-
-
-def test_grasps_of_scenes_are_those_of_their_views(
-    scenes: Path, predicted: Path, own: Attempts
-) -> None:
-    """Each row has its best grasps, in the frame of its object."""
-    rows = SceneRows(scenes, split="train")
-    table = read_attempts(predicted, load_hand(), of=rows)
-    assert table.of_row.tolist() == np.repeat(np.arange(len(rows)), 2).tolist()
-    assert not any(table.invalid) and table.frame == "object"
-    assert table.resting.tolist() == rows.column("grasp_props/resting")[table.of_row].tolist()
-    assert set(table.said) == {"from above"}
-
-    data = SceneDataset(scenes, points=None, negatives="none", balance="view")
-    X_TG = data[0]["X_AO"].astype(float) @ table.X_FG[:2]
-    np.testing.assert_allclose(X_TG, own.X_FG[:2], atol=1e-5)
-    np.testing.assert_allclose(table.confidence[:2], own.confidence[:2], atol=1e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.nightly
-def test_grasps_of_scenes_are_scored(scenes: Path, predicted: Path, tmp_path: Path) -> None:
-    given = (
-        "--dataset",
-        scenes,
-        "--split",
-        "train",
-        "--reference",
-        "own",
-        "--out",
-        tmp_path / "card",
-        "--quiet",
-    )
-    result = run("score", predicted, *given, "--workers", 1)
-    assert result.exit_code == 0, result.output
-    assert float(result.stdout.split()[1]) > 50.0
-
-
-@pytest.mark.slow
-@pytest.mark.nightly
-def test_grasps_of_scenes_become_a_dataset(
-    small_dataset: Path, small_meshes: Path, tmp_path: Path
-) -> None:
-    """The loop: a build, its scenes, grasps for them, and a build of these grasps."""
-    out = tmp_path / "out"
-    out.symlink_to(small_dataset)
-    make_scenes(out, overrides=["scenes.views=1"])
-    path, tried = tmp_path / "predicted.h5", tmp_path / "tried"
-    result = run("predict", out / "scenes.hdf5", "--split", "train", "--out", path, "--count", 1)
-    assert result.exit_code == 0, result.output
-    given = ("--objects", small_meshes, "--out", tried, "--postures", path, "--quiet")
-    result = run("build", *given, "--workers", 1)
-    assert result.exit_code == 0, result.output
-    with h5py.File(tried / "trials.hdf5") as file, h5py.File(path) as postures:
-        outcomes = file["trials/outcome"][:]
-        assert len(outcomes) == len(postures["row"]) and Outcome.SUCCESS in outcomes
-
-
-@pytest.mark.slow
-@pytest.mark.nightly
-def test_workers_change_nothing(scenes: Path, predicted: Path, tmp_path: Path) -> None:
-    result = run("predict", scenes, "--out", tmp_path / "by 2.h5", *FEW, "--workers", 2)
-    assert result.exit_code == 0, result.output
-    assert (tmp_path / "by 2.h5").read_bytes() == predicted.read_bytes()
-
-
-def test_a_cloud_may_be_in_any_unit(cloud: Path, own: Attempts, tmp_path: Path) -> None:
-    points, path, out = np.load(cloud), tmp_path / "cloud.ply", tmp_path / "grasps.h5"
-    lines = "\n".join(" ".join(f"{1e3 * x:.6f}" for x in point) for point in points)
-    path.write_text(
-        f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
-        "property float x\nproperty float y\nproperty float z\nend_header\n" + lines
-    )
-    result = run("predict", path, "--units", "mm", "--out", out, "--count", 3)
-    assert result.exit_code == 0, result.output
-    assert result.stdout.split()[0] == str(out) and "The best grasps" in result.stdout
-    found = read_attempts(out, load_hand(), of="mug")
-    assert found.frame == "table" and len(found) == 3
-    np.testing.assert_allclose(found.X_FG, own.X_FG[:3], atol=1e-6)
-
-
-def test_grasps_of_a_depth_image_are_in_the_frame_of_its_camera(
-    scenes: Path, tmp_path: Path
-) -> None:
-    """The table is fitted, and close to the true one; a pose that is given is used."""
-    data = SceneDataset(scenes, points=None, negatives="none", balance="view")
-    (_, stored, own), X_TC = data.stored_images(data.views[0]), data[0]["X_TC"].astype(float)
-    Image.fromarray(stored).save(tmp_path / "depth.png")
-    Image.fromarray(own).save(tmp_path / "mask.png")
-    camera = tmp_path / "camera.json"
-    camera.write_text(json.dumps({"K": data.images(data.views[0])["K"].tolist()}))
-    given = ("predict", tmp_path / "depth.png", "--depth-scale", DEPTH_UNIT, "--camera", camera)
-    given += ("--mask", tmp_path / "mask.png", "--count", 3)
-    result = run(*given, "--out", tmp_path / "fitted.h5")
-    assert result.exit_code == 0, result.output
-    assert "table: " in result.stderr and "palm in" in result.stdout
-    with h5py.File(tmp_path / "fitted.h5") as file:
-        assert file["frame"].asstr()[()] == "camera"
-        X_TC_fitted, X_CG = file["X_TC"][0], file["X_FG"][:]
-
-    # {T} is elsewhere on the table; the palms are over the object.
-    angle = np.rad2deg(np.arccos(min(1.0, X_TC_fitted[2, :3] @ X_TC[2, :3])))
-    assert abs(X_TC_fitted[2, 3] - X_TC[2, 3]) < 1e-3 and angle < 0.5
-    palms = (X_TC @ X_CG)[:, :3, 3] - data[0]["X_AO"][:3, 3]
-    assert np.abs(palms[:, :2]).max() < 0.06 and palms[:, 2].min() > 0.04
-
-    # A pose that is given is used: here the camera is a metre lower.
-    np.save(tmp_path / "X_TC.npy", X_TC - np.eye(4, k=1) * [[0], [0], [1], [0]])
-    result = run(*given, "--camera-pose", tmp_path / "X_TC.npy", "--out", tmp_path / "known.h5")
-    assert "above the table" in error_line(result)
+def predict(files: Path, words: str):
+    """Run the command on files of a folder."""
+    given = [str(files / word) if (files / word).exists() else word for word in words.split()]
+    return run("predict", *given, "--out", files / "out.h5")
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("{cloud} --units cm", "must be points (n, 3) of one object"),
-        ("{cloud} --mask {cloud}", "--mask must be given with a depth image only, got a cloud"),
-        ("{cloud} --split test", "--split must be given with scenes only, got a cloud"),
-        ("{scenes} --units mm", "--units must be given with a cloud only, got scenes"),
-        ("{cloud} --network magic", "got 'magic'"),
-        ("{cloud} --count 0", "0 is not in the range"),
-        ("{image} --units m", "must be a cloud (n, 3), got (4, 5): a depth image needs --camera"),
-        ("{image} --camera 9,9,2,2", "--mask must be given with a depth image, got none"),
-        ("{image} --camera 9,9,2 --mask {image}", "must be fx,fy,cx,cy in pixels, or a JSON file"),
-        ("{image} --camera 9,9,2,2 --mask {image}", "the table beside the object, got none"),
-        ("{image} --camera 9,9,2,2 --mask {image} --depth-scale 2", "with a .png only"),
-        ("{scenes} --split valid", "in valid that show their object, got 0 views"),
-        ("{text}", "INPUT must be .hdf5, .npy, .ply or .png"),
+        (f"{SEEN} --camera-pose X_CT.npy", "is it inverted (X_CT), or in another unit?"),
+        (f"{SEEN} --camera-pose mm.npy", "is it inverted (X_CT), or in another unit?"),
+        ("cloud.npy --units cm", "must be points (n, 3) of one object"),
+        ("cloud.npy --mask cloud.npy", "--mask must be given with a depth image only, got a cloud"),
+        ("cloud.npy --split test", "--split must be given with scenes only, got a cloud"),
+        ("cloud.npy --network magic", "got 'magic'"),
+        ("cloud.npy --count 0", "0 is not in the range"),
+        ("one.npy --units m", "must be a cloud (n, 3), got (4, 5): a depth image needs --camera"),
+        (NINE, "--mask must be given with a depth image, got none"),
+        ("one.npy --camera 9,9,2 --mask one.npy", "must be fx,fy,cx,cy in pixels, or a JSON file"),
+        (f"{NINE} --mask one.npy", "mask must be 0 beside the object"),
+        (f"{NINE} --mask one.npy --depth-scale 2", "with a .png only"),
+        ("a.txt", "INPUT must be .hdf5, .npy, .ply or .png"),
+        ("centred.npy", "the table must be z = 0"),
+        ("below.npy", "the table must be z = 0"),
+        ("camera.npy", "the table must be z = 0"),
+        (SEEN.replace("mask.png", "all.png"), "must be 0 beside the object"),
+        (SEEN.replace("80.0", "160.0"), "for another resolution?"),
     ],
 )
-def test_bad_input_is_refused_with_one_line(
-    scenes: Path, cloud: Path, tmp_path: Path, words: str, said: str
-) -> None:
-    image, text = tmp_path / "image.npy", tmp_path / "a.txt"
-    np.save(image, np.ones((4, 5)))
-    text.write_text("points")
-    given = words.format(scenes=scenes, cloud=cloud, image=image, text=text).split()
-    result = run("predict", *given, "--out", tmp_path / "out.h5")
+def test_bad_input_is_refused_with_one_line(files: Path, words: str, said: str) -> None:
+    result = predict(files, words)
     assert result.exit_code == 2 and said in error_line(result)
-    assert not (tmp_path / "out.h5").exists()
+    assert not (files / "out.h5").exists()
 
 
-def test_a_file_that_cannot_be_written_is_refused_before_any_work(scenes: Path) -> None:
-    assert "--out must be a file .h5 or .hdf5" in error_line(
-        run("predict", scenes, "--out", "out.npz")
-    )
-    before = scenes.read_bytes()
-    assert "another file than INPUT" in error_line(run("predict", scenes, "--out", scenes))
-    assert scenes.read_bytes() == before
+def test_a_pose_that_is_given_is_checked_with_the_image(files: Path) -> None:
+    result = predict(files, f"{SEEN} --camera-pose X_TC.npy --count 1")
+    assert result.exit_code == 0, result.output
+    assert "% of the pixels beside the object; the camera is" in result.stderr

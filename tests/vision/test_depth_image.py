@@ -6,41 +6,12 @@ import json
 
 import numpy as np
 import pytest
+from helpers.depth_images import BOX, WIDE, X_TC, K, image
 from PIL import Image
 
 import drakegrasp as dg
 from drakegrasp.frames import invert_pose, make_pose, rotation_about, transform_points
-from drakegrasp.vision.camera import look_at
 from drakegrasp.vision.depth_image import read_camera, read_depth_png, read_mask
-
-#: A camera of 160 x 120 pixels, which looks at a box on a table, with a wall behind the table.
-K = np.array([[150.0, 0.0, 80.0], [0.0, 152.0, 58.0], [0.0, 0.0, 1.0]])
-HIGH, WIDE = 120, 160
-X_TC = look_at(np.array([0.0, 0.0, 0.05]), 0.6, 0.4, np.sin(0.26), 0.3)
-#: Half extents of the box, and its height [m].
-BOX = np.array([0.04, 0.03, 0.1])
-#: The wall, in {T}: the plane of these normals and this offset [m].
-WALL, BEHIND = np.array([np.cos(0.4), np.sin(0.4), 0.0]), -0.1
-
-
-def image(noise=0.0, table=True, offset=BEHIND):
-    """Return depth (h, w) [m] and mask of the box, by casting rays; unknown far away."""
-    v, u = np.mgrid[:HIGH, :WIDE].reshape(2, -1)
-    rays = np.linalg.inv(K) @ np.stack([u, v, np.ones(len(u))])
-    way, eye = X_TC[:3, :3] @ rays, X_TC[:3, 3:]
-    low, high = np.array([-BOX[0], -BOX[1], 0.0])[:, None], np.array([*BOX])[:, None]
-    ends = np.sort([(low - eye) / way, (high - eye) / way], axis=0)
-    enters, leaves = ends[0].max(axis=0), ends[1].min(axis=0)
-    box = np.where(enters <= leaves, enters, np.inf)
-    floor = np.where(way[2] < 0.0, -eye[2] / way[2], np.inf) if table else np.full(len(u), np.inf)
-    behind = WALL @ way
-    wall = np.where(behind < 0.0, (offset - WALL @ eye) / behind, np.inf)
-    depth = np.minimum(np.minimum(box, floor), wall)
-    mask = (box <= depth) & np.isfinite(box)
-    depth *= 1.0 + noise * np.random.default_rng(0).normal(size=len(depth))
-    depth[::17] = np.nan
-    depth[5::19] = 0.0
-    return depth.reshape(HIGH, WIDE), mask.reshape(HIGH, WIDE)
 
 
 def off(fitted):
@@ -114,7 +85,12 @@ def bad(**changes):
         (bad(mask=lambda z, m: m[:-1]), r"mask must be \(120, 160\), as the depth .*\(119, 160\)"),
         (bad(K=lambda z, m: K[:2]), r"camera must be a matrix \(3, 3\)"),
         (bad(K=lambda z, m: K * [[1], [-1], [1]]), "camera must be a matrix"),
-        (bad(mask=lambda z, m: np.ones_like(m)), "the table beside the object, got none"),
+        (bad(mask=lambda z, m: np.ones_like(m)), "mask must be 0 beside the object, got 100.0%"),
+        (bad(depth=lambda z, m: np.where(m, z, 0.0)), "the table beside the object, got none"),
+        (bad(mask=lambda z, m: np.where(m, 1.0, np.nan)), "mask must be numbers .* that are NaN"),
+        (bad(mask=lambda z, m: [[1], [1, 2]]), "mask must be numbers .* cannot be read"),
+        (bad(K=lambda z, m: K * [[0.5], [0.5], [1.0]]), "for another resolution"),
+        (bad(K=lambda z, m: K * [[2.0], [2.0], [1.0]]), "for another resolution"),
         (bad(depth=lambda z, m: image(table=False, offset=-1.0)[0]), "no plane below the object"),
         (bad(depth=scattered), "at least 15%"),
     ],
@@ -146,7 +122,9 @@ def test_files_of_a_camera(tmp_path):
     colours = np.dstack([0 * mask, 9 * mask, 0 * mask, 255 + 0 * mask]).astype(np.uint8)
     Image.fromarray(colours).save(tmp_path / "colours.png")
     np.save(tmp_path / "mask.npy", mask)
-    for name in ("bits.png", "grey.png", "colours.png", "mask.npy"):
+    grey = np.dstack([9 * mask, 255 + 0 * mask]).astype(np.uint8)
+    Image.fromarray(grey).save(tmp_path / "opaque.png")
+    for name in ("bits.png", "grey.png", "colours.png", "opaque.png", "mask.npy"):
         np.testing.assert_array_equal(read_mask(tmp_path / name), mask)
 
     # A camera in any form.
