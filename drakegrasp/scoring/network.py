@@ -39,7 +39,7 @@ LIMITS = (
     "other objects, nor the arm; it was trained in simulation and never tried on a robot"
 )
 #: What the file of a judge states for programs only.
-_FOR_PROGRAMS = ("features", "answers", "fingerprint")
+_FOR_PROGRAMS = ("features", "fingerprint")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -4,6 +4,7 @@
     python pipelines/measurements/grasp_choice.py [--object NAME ...] [--set KEY=VALUE ...]
     python pipelines/measurements/grasp_choice.py --judge barrett-1 --prepared BENCH --lifts 3
     python pipelines/measurements/grasp_choice.py --judge barrett-1 --meshes DIR --units cm
+    python pipelines/measurements/grasp_choice.py --prepared BENCH --protocol dexgraspbench
 
 One view of each object is taken from a drawn direction, by rays that meet its mesh, and
 `drakegrasp.propose` returns grasps for it. The script tries all of them, each once, on the object
@@ -15,7 +16,8 @@ the area under the ROC curve of the scores within objects; and the CPU milliseco
 Without other options it uses the first built-in objects of 40 classes; the fixed weights of the
 score were fitted to second objects of the other 24 classes. `--prepared` uses the objects of a
 dataset or a benchmark, each with its own mass and friction, in its first resting pose. With
-`--results`, a line for each object is kept, and the same command continues.
+`--protocol`, the rule of another benchmark decides in MuJoCo, and both numbers are its successes.
+With `--results`, a line for each object is kept, and the same command continues.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -23,10 +25,11 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import click
@@ -37,6 +40,7 @@ import drakegrasp as dg
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.errors import GraspError, MeshError
+from drakegrasp.exchange.dexgraspbench import write_grasps
 from drakegrasp.filters import Removal
 from drakegrasp.frames import transform_points
 from drakegrasp.generation.attempts import judge_sample
@@ -46,6 +50,7 @@ from drakegrasp.mesh.cloud import read_cloud
 from drakegrasp.mesh.crossings import seen_points
 from drakegrasp.mesh.surfaces import even_points, on_faces
 from drakegrasp.objects.sources import find_meshes
+from drakegrasp.protocols.postures import prepare_trials, verify_postures
 from drakegrasp.scoring.benchmark import new_classes
 from drakegrasp.scoring.judge import load_judge
 from drakegrasp.scoring.ranking import measured
@@ -63,6 +68,8 @@ DISTANCE, ELEVATION, RANGE, HALF, PIXELS = 0.65, 35.0, 30.0, 0.2, 96
 WHOLE = 4096
 #: Classes whose number modulo OF is less than FITTED served to fit the weights.
 FITTED, OF = 3, 8
+#: Numbers of first grasps of which the best is told.
+FIRST = (3, 5, 24)
 #: Number of bootstrap resamplings.
 DRAWS = 10_000
 
@@ -79,6 +86,7 @@ DRAWS = 10_000
     type=int,
     help="Number of first grasps to lift, of the judge if there is one; all if left out.",
 )
+@click.option("--protocol", help="Protocol in MuJoCo that decides in place of the lift.")
 @click.option("--friction", default=1.0, help="Factor of the friction of all objects.")
 @click.option("--results", type=click.Path(path_type=Path), help="File with a line per object.")
 @click.option(
@@ -92,6 +100,7 @@ def main(
     count: int | None,
     judge: str | None,
     lifts: int | None,
+    protocol: str | None,
     friction: float,
     results: Path | None,
     overrides: tuple[str, ...],
@@ -119,7 +128,7 @@ def main(
         if name in found:
             continue
         try:
-            found[name] = measure(name, with_friction(place(), friction), judge, lifts)
+            found[name] = measure(name, with_friction(place(), friction), judge, lifts, protocol)
         except (MeshError, GraspError) as error:
             click.echo(f"{name}: {error}", err=True)
             continue
@@ -171,7 +180,7 @@ def name_of_class(name: str) -> str:
 
 
 def measure(
-    name: str, placed: PlacedObject, judge: str | None, lifts: int | None
+    name: str, placed: PlacedObject, judge: str | None, lifts: int | None, protocol: str | None
 ) -> dict[str, Any]:
     """Return for each choice of a grasp of an object whether it holds and whether it is a sample.
 
@@ -180,6 +189,7 @@ def measure(
         placed: The object.
         judge: Name or file of a judge.
         lifts: Number of first grasps to lift; None for all grasps.
+        protocol: Name of a protocol in MuJoCo; None for the lift.
     """
     hand = load_hand(placed.config.hand_source)
     triangles = transform_points(placed.X_TO_simulated, placed.model.visual_vertices)[
@@ -206,13 +216,16 @@ def measure(
     ends = np.full((len(grasps), 2), np.nan)
     last = list(scores)[1 if judge else 0]
     wanted = {0, *(int(order[0]) for order in orders.values()), *orders[last][:lifts].tolist()}
-    for i in sorted(wanted) if lifts else range(len(grasps)):
-        ends[i] = tried(placed, grasps, i)
+    rows = sorted(wanted) if lifts else list(range(len(grasps)))
+    if protocol is None:
+        ends[rows] = [tried(placed, grasps, i) for i in rows]
+    else:
+        ends[rows] = np.array(tried_by(protocol, placed, grasps, rows))[:, None]
     choices = {"plainest": ends[0]}
     for key, order in orders.items():
         choices[key] = ends[order[0]]
-        choices[f"{key}, best of 3"] = ends[order[:3]].max(axis=0)
-        choices[f"{key}, best of 5"] = ends[order[:5]].max(axis=0)
+        for first in FIRST:
+            choices[f"{key}, best of {first}"] = ends[order[:first]].max(axis=0)
         choices[f"{key}, auc"] = np.array([auc(scores[key], end) for end in ends.T])
     choices["random"], choices["oracle"] = ends.mean(axis=0), ends.max(axis=0)
     told = ", ".join(f"{key} {value[1]:.2f}" for key, value in choices.items())
@@ -235,6 +248,18 @@ def tried(placed: PlacedObject, grasps: Attempts, i: int) -> list[float]:
     trial = dg.run_trial(placed, grasps.posture(i, placed.X_TO_simulated))
     removal = judge_sample(placed.model, trial, placed.config)
     return [float(trial.outcome == dg.Outcome.SUCCESS), float(removal is Removal.KEPT)]
+
+
+def tried_by(
+    protocol: str, placed: PlacedObject, grasps: Attempts, rows: Sequence[int]
+) -> list[bool]:
+    """Return whether grasps are successes by a protocol in MuJoCo."""
+    hand = load_hand(placed.config.hand_source)
+    postures = [(placed, grasps.posture(i, placed.X_TO_simulated)) for i in rows]
+    with TemporaryDirectory() as name:
+        mjcf, files = write_grasps(postures, hand, Path(name))
+        trials = prepare_trials(protocol, mjcf, Path(name))
+        return [verdict.success for verdict, _ in verify_postures(files, trials)]
 
 
 def seen(triangles: Array, name: str) -> Array:
