@@ -12,16 +12,15 @@ import hashlib
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
 from drakegrasp.arithmetic import Array, dot, multiply, norm
-from drakegrasp.errors import GraspError, HandError
+from drakegrasp.errors import GraspError, HandError, listed, one_line
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.finger_sweep import closing_path, pad_points_at
 from drakegrasp.mesh.cloud import smallest_rectangle
@@ -65,7 +64,15 @@ class Judge:
     offset: Array
 
     def chances(self, features: Mapping[str, Array]) -> Array:
-        """Return the chances (n, 2) of `HEADS` for features (n,) by their names."""
+        """Return the chances (n, 2) of `HEADS` for features (n,) by their names.
+
+        Raises:
+            GraspError: If the judge uses a feature that is not among them.
+        """
+        if unknown := [name for name in self.about["features"] if name not in features]:
+            raise GraspError(
+                f"judge {self.name} must use features of this version, got {listed(unknown)}"
+            )
         values = np.column_stack([features[name] for name in self.about["features"]])
         logits = self.logits(values)
         return np.asarray(1.0 / (1.0 + np.exp(-logits)))
@@ -102,6 +109,8 @@ def load_judge(source: str | Path | Judge) -> Judge:
     """
     if isinstance(source, Judge):
         return source
+    if not isinstance(source, str | Path):
+        raise GraspError(f"judge must be a name or a file, got {type(source).__name__}")
     path = Path(source)
     if str(source) in judge_names():
         path = Path(str(resources.files("drakegrasp.scoring").joinpath(f"{source}.npz")))
@@ -113,12 +122,25 @@ def load_judge(source: str | Path | Judge) -> Judge:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             about = json.loads(str(file["about"]))
             arrays = {name: np.asarray(file[name], dtype=float) for name in ARRAYS}
-        size = len(about["features"])
-        if arrays["weights"].shape != (size, len(HEADS)) or arrays["mean"].shape != (size,):
-            raise ValueError(f"its weights are not of {size} features")
-        return Judge(name=about["name"], about=about, **arrays)
-    except (OSError, ValueError, KeyError, EOFError, TypeError, BadZipFile) as error:
-        raise GraspError(f"{path}: must be the file of a judge, got another: {error}") from None
+        fault = _fault(about, arrays)
+    except Exception as error:  # a damaged file raises all kinds
+        fault = one_line(error)
+    if fault:
+        raise GraspError(f"{path}: must be the file of a judge (.npz), got another: {fault}")
+    return Judge(name=about["name"], about=about, **arrays)
+
+
+def _fault(about: Any, arrays: Mapping[str, Array]) -> str:
+    """Return what is wrong with the content of a file; empty if nothing is."""
+    for key in ("name", "hand", "fingerprint"):
+        if not isinstance(about[key], str):
+            return f"its {key} is {about[key]!r}"
+    count, heads = len(about["features"]), len(HEADS)
+    shapes = {"mean": (count,), "scale": (count,), "weights": (count, heads), "offset": (heads,)}
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
+            return f"its {name} must be finite numbers of shape {shape}"
+    return "" if (arrays["scale"] > 0.0).all() else "its scale must be positive"
 
 
 def features_of(
@@ -178,7 +200,13 @@ def features_of(
 
 
 def fingerprint(hand: Hand) -> str:
-    """Return a hash (16 hex digits) of how a hand's pads move while it closes."""
+    """Return a hash (16 hex digits) of a hand's fingers and preshapes.
+
+    It includes everything that the hand file says of the fingers, and how the pads move while the
+    hand closes.
+    """
     paths = [pad_points_at(hand, closing) for closing in closing_path(hand, STEPS)]
     rounded = np.round(np.array(paths), DECIMALS) + 0.0
-    return hashlib.sha256(rounded.tobytes()).hexdigest()[:16]
+    described = [*map(asdict, hand.fingers), hand.spread.joints, hand.preshape_names]
+    text = json.dumps(described, sort_keys=True, default=vars).encode()
+    return hashlib.sha256(text + rounded.tobytes()).hexdigest()[:16]

@@ -19,8 +19,10 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import Array, dot, multiply, norm
 from drakegrasp.errors import GraspError, HandError
 from drakegrasp.frames import read_pose
+from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.finger_sweep import FingerPath, HandPaths, hand_paths
+from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.mesh.cloud import Solid, column_solid, hull_solid, read_cloud
 from drakegrasp.scoring.judge import Judge, features_of, load_judge
 from drakegrasp.simulation.attempt import Attempt
@@ -48,9 +50,11 @@ LEVER = 0.05
 #: Rounds and rate of the search for the fractions of force of the fingers.
 ROUNDS, RATE = 100, 1.0
 #: Logistic weights of `push`, `opposition`, `arm` [1/m] and `gap` [1/m], and the constant. They
-#: were fitted to lifts of the Barrett Hand, see docs/results/choice.md.
+#: were fitted to lifts of the Barrett Hand at 24 built-in objects.
 WEIGHTS = {"push": 4.0, "opposition": 2.0, "arm": -20.0, "gap": -50.0}
 CONSTANT = -3.0
+#: Scores that are equal to this number of decimals keep the order of their rows.
+DECIMALS = 9
 #: Columns of a ranking, see `Ranking`.
 COLUMNS = ("clearance", "table", "touch", "gap", "push", "opposition", "arm", "robust")
 
@@ -60,16 +64,16 @@ class Ranking:
     """The scores of n proposals, and the features that determine them.
 
     Attributes:
-        score: (n,), 0 to 1, greater is better: an estimate of the probability that the hand holds,
-            or with a judge the chance that the grasp is a sample; -1 for a row that is not a
-            posture.
+        score: (n,), 0 to 1, greater is better: by the fixed weights a mere order, with a judge the
+            chance that the grasp is a sample; -1 for a row that is not a posture.
         order: (n,), indices of the proposals, best first; of equal ones the earlier is first.
         features: Columns, each a mean over solids and moves; NaN for a row that is not a posture:
             `clearance` (n,), distance of the open hand from the object [m], negative inside, at
             most 20 mm;
             `table` (n,), distance of the open hand from the table [m], negative inside, at most
             20 mm;
-            `touch` (n, k), whether each finger's pad is at the object when the finger stops;
+            `touch` (n, k), whether each finger's pad is at the object when the finger stops; NaN
+            for a finger that the preshape does not use;
             `gap` (n,), distance of the farthest required pad from the object then [m], at most
             20 mm;
             `push` (n,), smallest cosine between the motion of a required pad and the surface's
@@ -108,8 +112,8 @@ def rank(
             fixed weights, which any hand can use.
 
     Raises:
-        GraspError: If the cloud or the poses are invalid, postures are in {O} without X_TO, or
-            there is no such judge.
+        GraspError: If the cloud, the poses or the spread are invalid, postures are in {O} without
+            X_TO or have other joints than the hand, or there is no such judge.
         HandError: If the hand cannot be used, the judge is for another hand, or several of the
             hand's fingers move one link.
     """
@@ -118,12 +122,16 @@ def rank(
     if judge is not None:
         judge.refuse_other_hand(hand)
     columns = measured(proposals, points, hand, spread=spread)
-    score = columns["score"]
+    score, known = columns["score"], ~np.isnan(columns["score"])
     if judge is not None:
-        columns["held"], score = judge.chances(columns).T
-    score = np.where(np.isnan(score), -1.0, score)
+        columns["held"], score = np.full((2, len(score)), np.nan)
+        if known.any():
+            columns["held"], score = judge.chances(columns).T
+    score = np.where(known, score, -1.0)
     features = {name: columns[name] for name in (*COLUMNS, "held") if name in columns}
-    return Ranking(score=score, order=np.argsort(-score, kind="stable"), features=Table(features))
+    # The last bits of a score depend on the other rows, and must not decide.
+    order = np.argsort(-np.round(score, DECIMALS), kind="stable")
+    return Ranking(score=score, order=order, features=Table(features))
 
 
 def measured(
@@ -131,8 +139,8 @@ def measured(
 ) -> dict[str, Array]:
     """Return the score by fixed weights and all features (n, ...) of n proposals, by their names.
 
-    Among them are the features of a judge, see `judge.features_of`. A row that is not a posture is
-    NaN.
+    Among them are the features of a judge, see `judge.features_of`, unless no row is a posture. A
+    row that is not a posture is NaN.
 
     Args:
         proposals: See `rank`.
@@ -140,8 +148,20 @@ def measured(
         hand: The hand.
         spread: See `rank`.
     """
-    if not isinstance(proposals, Attempts):
+    if isinstance(proposals, Attempts):
+        joints, expected = proposals.q_grasp.shape[1], len(hand.joint_names)
+        if joints != expected:
+            raise GraspError(
+                f"proposals must be of the hand {hand.name} with {expected} joints, got {joints}"
+            )
+    else:
         proposals = read_pose(proposals, "proposals").reshape(-1, 4, 4)
+        low, high = coordinate_limits(hand)[0]
+        if not low <= spread <= high:
+            raise GraspError(
+                f"spread must be {low:.3g} to {high:.3g} rad for the hand {hand.name}, "
+                f"got {spread:g}"
+            )
     starts = _starts(proposals, hand, spread)
     solids = hull_solid(points), column_solid(points)
 
@@ -150,16 +170,19 @@ def measured(
     for i, start in starts.items():
         near = round(start.spread / SPREAD_STEP) * SPREAD_STEP
         groups.setdefault((start.preshape, near), []).append(i)
-    columns: dict[str, Array] = {}
+    count = len(proposals)
+    columns = {name: np.full(count, np.nan) for name in ("score", *COLUMNS)}
+    columns["touch"] = np.full((count, hand.num_fingers), np.nan)
     for (preshape, near), rows in groups.items():
         chosen = [starts[i] for i in rows]
         closings = _closed(solids, hand.at(preshape), near, chosen)
         found = {name: closings[name].mean(axis=(0, 2)) for name in ("score", *COLUMNS)}
         X_TG = np.array([start.X_OG for start in chosen])
         found |= features_of(closings, points, X_TG, near)
+        used = ~unused_fingers(hand.unused_in(preshape), hand.num_fingers)
+        columns["touch"][np.array(rows)[:, None], np.flatnonzero(used)] = found.pop("touch")
         for name, values in found.items():
-            nothing = np.full((len(proposals), *values.shape[1:]), np.nan)
-            columns.setdefault(name, nothing)[rows] = values
+            columns.setdefault(name, np.full(count, np.nan))[rows] = values
     return columns
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -77,23 +78,75 @@ def test_an_unknown_judge_is_refused(cloud, grasps):
         dg.rank(grasps, cloud, judge="b")
 
 
-@pytest.mark.parametrize("damage", ["text", "truncated", "array", "features"])
+def spoil(path, about=None, **arrays):
+    """Write a judge again with other content."""
+    with np.load(path) as file:
+        known = {name: file[name] for name in ARRAYS}
+        said = json.loads(str(file["about"]))
+    said = {key: value for key, value in (said | (about or {})).items() if value is not None}
+    path.write_bytes(train_judge.packed({"about": json.dumps(said), **known, **arrays}))
+
+
+@pytest.mark.parametrize("damage", ["text", "truncated", "array"])
 def test_a_file_that_is_no_judge_is_refused(tmp_path, damage):
     path = write(tmp_path / "toy.npz")
     if damage == "text":
         path.write_text("judge")
     elif damage == "truncated":
         path.write_bytes(path.read_bytes()[:-40])
-    elif damage == "array":
+    else:
         with path.open("wb") as file:
             np.save(file, np.zeros(3))
-    else:
-        about = {"name": "toy", "features": ["gap", "push"]}
-        with np.load(path) as file:
-            arrays = {name: file[name] for name in ARRAYS}
-        path.write_bytes(train_judge.packed({"about": json.dumps(about), **arrays}))
-    with pytest.raises(dg.GraspError, match="must be the file of a judge, got another"):
+    with pytest.raises(dg.GraspError, match="must be the file of a judge"):
         load_judge(path)
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "said"),
+    [
+        ({"about": {"features": ["gap", "push"]}}, "its mean must be finite numbers of shape"),
+        ({"about": {"fingerprint": None}}, "'fingerprint'"),
+        ({"about": {"hand": 7}}, "its hand is 7"),
+        ({"offset": [0.0, 0.0, 0.0]}, "its offset must be finite numbers of shape"),
+        ({"weights": [[np.nan, 0.0]]}, "its weights must be finite numbers"),
+        ({"scale": [0.0]}, "its scale must be positive"),
+    ],
+)
+def test_a_judge_that_is_spoilt_says_what_is_wrong(tmp_path, spoilt, said):
+    path = write(tmp_path / "toy.npz")
+    spoil(path, **spoilt)
+    with pytest.raises(dg.GraspError, match=f"must be the file of a judge .*{said}"):
+        load_judge(path)
+
+
+def test_a_feature_that_nobody_measures_is_refused(tmp_path, cloud, grasps):
+    path = write(tmp_path / "toy.npz")
+    spoil(path, about={"features": ["colour"]})
+    with pytest.raises(dg.GraspError, match="must use features of this version, got colour"):
+        dg.rank(grasps, cloud, judge=path)
+
+
+@pytest.mark.parametrize("judge", [None, NAME])
+def test_nothing_to_rank_is_ranked(cloud, grasps, judge):
+    none = dg.rank(np.zeros((0, 4, 4)), cloud, judge=judge)
+    assert none.score.shape == none.order.shape == (0,)
+    bad = dg.rank(grasps.refuse(["bad"] * len(grasps)), cloud, judge=judge)
+    assert (bad.score == -1.0).all()
+    assert bad.order.tolist() == list(range(len(grasps)))
+    assert np.isnan(bad.features["touch"]).all()
+
+
+@pytest.mark.parametrize("change", ["required", "pad", "torque"])
+def test_a_hand_with_other_fingers_is_another_hand(change):
+    hand = dg.load_hand()
+    changed = {
+        "required": {"required": False},
+        "pad": {"pad_region": hand.fingers[0].pad_region[1:]},
+        "torque": {"torque_limit": 0.2},
+    }[change]
+    other = replace(hand, fingers=(replace(hand.fingers[0], **changed), *hand.fingers[1:]))
+    assert fingerprint(other) != fingerprint(hand)
+    assert fingerprint(replace(hand, preshape_names=("pinch",))) != fingerprint(hand)
 
 
 def test_a_judge_is_refused_for_another_hand(tmp_path, cloud):

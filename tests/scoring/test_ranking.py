@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
+from helpers.hands import write_with_preshapes
 
 import drakegrasp as dg
 from drakegrasp.frames import invert_pose, make_pose, rotation_about
@@ -188,3 +191,30 @@ def test_a_cloud_that_is_none_is_refused(cloud, words):
         dg.rank([DOWN], cloud)
     with pytest.raises(dg.GraspError, match=words):
         dg.propose(cloud)
+
+
+@pytest.mark.parametrize("spread", [-1.0, 30.0, np.nan])
+def test_a_spread_that_the_hand_cannot_have_is_refused(spread):
+    with pytest.raises(dg.GraspError, match=r"spread must be 0 to 3.14 rad for the hand barrett"):
+        dg.rank(np.eye(4), seen(), spread=spread)
+
+
+def test_proposals_of_another_hand_are_refused():
+    grasps = dg.propose(seen(), "franka")
+    with pytest.raises(dg.GraspError, match="proposals must be of the hand barrett with 8 joints"):
+        dg.rank(grasps, seen())
+
+
+def test_a_row_does_not_depend_on_the_others():
+    grasps = dg.propose(seen())
+    together = dg.rank(grasps, seen())
+    alone = [dg.rank(grasps.at([i]), seen()).score[0] for i in (0, 7, 30)]
+    np.testing.assert_allclose(together.score[[0, 7, 30]], alone, rtol=0, atol=1e-12)
+
+
+def test_a_finger_that_a_preshape_leaves_out_touches_nothing(tmp_path):
+    hand = dg.load_hand(write_with_preshapes(tmp_path, pinch="F1 F3", all="F1 F2 F3"))
+    found = dg.propose(seen(), hand).at([0, 0])
+    ranked = dg.rank(replace(found, preshape=("pinch", "all")), seen(), hand)
+    assert np.isnan(ranked.features["touch"]).tolist() == [[False, True, False], [False] * 3]
+    assert (ranked.score >= 0.0).all()
