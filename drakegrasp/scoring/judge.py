@@ -118,6 +118,8 @@ def load_judge(source: str | Path | Judge) -> Judge:
         raise GraspError(
             f"judge must be one of {', '.join(judge_names())}, or a file, got {str(source)!r}"
         )
+
+    # Read the file, and look for faults.
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             about = json.loads(str(file["about"]))

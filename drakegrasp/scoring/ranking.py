@@ -148,20 +148,7 @@ def measured(
         hand: The hand.
         spread: See `rank`.
     """
-    if isinstance(proposals, Attempts):
-        joints, expected = proposals.q_grasp.shape[1], len(hand.joint_names)
-        if joints != expected:
-            raise GraspError(
-                f"proposals must be of the hand {hand.name} with {expected} joints, got {joints}"
-            )
-    else:
-        proposals = read_pose(proposals, "proposals").reshape(-1, 4, 4)
-        low, high = coordinate_limits(hand)[0]
-        if not low <= spread <= high:
-            raise GraspError(
-                f"spread must be {low:.3g} to {high:.3g} rad for the hand {hand.name}, "
-                f"got {spread:g}"
-            )
+    proposals = _read_proposals(proposals, hand, spread)
     starts = _starts(proposals, hand, spread)
     solids = hull_solid(points), column_solid(points)
 
@@ -184,6 +171,29 @@ def measured(
         for name, values in found.items():
             columns.setdefault(name, np.full(count, np.nan))[rows] = values
     return columns
+
+
+def _read_proposals(
+    proposals: Attempts | npt.ArrayLike, hand: Hand, spread: float
+) -> Attempts | Array:
+    """Return postures, or palm poses (n, 4, 4), that fit a hand.
+
+    Raises:
+        GraspError: If they or the spread do not.
+    """
+    if isinstance(proposals, Attempts):
+        joints, expected = proposals.q_grasp.shape[1], len(hand.joint_names)
+        if joints != expected:
+            raise GraspError(
+                f"proposals must be of the hand {hand.name} with {expected} joints, got {joints}"
+            )
+        return proposals
+    low, high = coordinate_limits(hand)[0]
+    if not low <= spread <= high:
+        raise GraspError(
+            f"spread must be {low:.3g} to {high:.3g} rad for the hand {hand.name}, got {spread:g}"
+        )
+    return read_pose(proposals, "proposals").reshape(-1, 4, 4)
 
 
 def chosen_hand(hand: Hand | str | None) -> Hand:
