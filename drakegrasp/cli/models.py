@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -284,11 +285,12 @@ def check_hand_file(hand_file: str, picture: Annotated[Path | None, NEW_FILE] = 
 def _draw(hand_file: str | Path, picture: Path) -> None:
     """Draw a hand."""
     from drakegrasp.hand.description import load_hand
-    from drakegrasp.hand.finger_sweep import across_angle
+    from drakegrasp.hand.finger_sweep import across
     from drakegrasp.pictures.rendered import picture_hand
 
     loaded = load_hand(hand_file)
-    picture_hand(loaded, picture, across=across_angle(loaded))
+    x, y, _ = across(loaded)
+    picture_hand(loaded, picture, across=math.atan2(y, x))
 
 
 def _print(finding: Finding) -> None:

@@ -263,6 +263,8 @@ STEPS = 60
 UNEVEN = 1.0
 #: Points at most this far behind the foremost point are treated as equally far in front [m].
 FLAT = 2e-4
+#: Fingers whose motions differ between directions by at most this fraction have no main axis.
+ROUND = 1e-9
 #: Largest allowed difference between the width of a pinch and the requested width [m].
 WIDTH_ERROR = 0.004
 
@@ -296,11 +298,16 @@ def find_opposition(hand: Hand) -> Opposition:
     # Motion of each pad point across Gz, from the open hand to the limits.
     paths = _pad_point_paths(hand)
     motion = np.diff(paths, axis=0)[:, :, :2].reshape(-1, 2)
-    _, vectors = np.linalg.eigh(motion.T @ motion)
-    axis = np.array([*vectors[:, 1], 0.0])
+    (xx, xy), (_, yy) = multiply(motion.T, motion)
+
+    # The main axis of the motion; Gy if it has none.
+    apart = (xx - yy) / 2.0
+    radius = np.sqrt(apart * apart + xy * xy)
+    axis = np.array([xy, radius - apart, 0.0] if apart < 0.0 else [radius + apart, xy, 0.0])
+    axis = axis / norm(axis) if radius > ROUND * (xx + yy) else np.array([0.0, 1.0, 0.0])
 
     # The last finger, often a thumb, closes against the axis.
-    moved = (paths[-1] - paths[0]) @ axis
+    moved = multiply(paths[-1] - paths[0], axis)
     if moved[-1] > 0.0:
         axis, moved = -axis, -moved
     return axis, moved > 0.0
@@ -358,8 +365,8 @@ def reach(hand: Hand, direction: Array) -> float:
         if not len(surfaces[link]):
             continue
         X_GL = link_poses(hand, link, spread=0.0, closing=closing)
-        along = np.einsum("nab,b->na", np.swapaxes(X_GL[:, :3, :3], -1, -2), direction)
-        heights = along @ surfaces[link].T + (X_GL[:, :3, 3] @ direction)[:, None]
+        along = multiply(np.swapaxes(X_GL[:, :3, :3], -1, -2), direction)
+        heights = multiply(along, surfaces[link].T) + multiply(X_GL[:, :3, 3], direction)[:, None]
         farthest = max(farthest, float(heights.max()))
     return farthest
 
@@ -380,7 +387,7 @@ def _pad_point_paths(hand: Hand) -> Array:
     """Return the pad points (steps, k, 3) in {G} from the open hand to the limits [m]."""
     X_GF = fingertip_poses(hand, spread=0.0, closing=closing_path(hand, STEPS))
     points = np.array([finger.p_FiP for finger in hand.fingers])
-    return np.einsum("nkab,kb->nka", X_GF[..., :3, :3], points) + X_GF[..., :3, 3]
+    return multiply(X_GF[..., :3, :3], points[:, :, None])[..., 0] + X_GF[..., :3, 3]
 
 
 def pad_fronts(hand: Hand, opposition: Opposition) -> tuple[Array, Array]:
@@ -401,7 +408,7 @@ def pad_fronts(hand: Hand, opposition: Opposition) -> tuple[Array, Array]:
     return closing, front
 
 
-def across_angle(hand: Hand) -> float:
-    """Return the direction across the opposition, as an angle about Gz from Gx [rad]."""
+def across(hand: Hand) -> Array:
+    """Return the unit direction (3,) across the opposition in {G}, across Gz."""
     axis, _ = find_opposition(hand)
-    return float(np.arctan2(-axis[0], axis[1]))
+    return np.array([axis[1], -axis[0], 0.0])

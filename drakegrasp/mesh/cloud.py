@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.ndimage import binary_closing, distance_transform_edt
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from drakegrasp.arithmetic import Array, norm
+from drakegrasp.arithmetic import Array, dot, multiply, norm
 from drakegrasp.errors import GraspError
 from drakegrasp.frames import as_numbers
 from drakegrasp.mesh.distance_field import DistanceField
@@ -37,6 +37,11 @@ SLOPE = 2.0
 #: Gaps between columns are filled up to this multiple of the distance between neighbouring points,
 #: with this minimum and maximum number of cells.
 CLOSED, LEAST_CLOSED, MOST_CLOSED = 2.0, 3, 2 * PADDING - 1
+#: Number of cells along the longest side of a large cloud, from which the edge of smaller cells
+#: follows; and the factor by which this edge grows until there are few enough cells.
+COARSE, GROWTH = 15, 1.1
+#: Relative difference of two lengths or areas that rounding can make.
+TIE = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,9 +86,31 @@ def read_cloud(cloud: npt.ArrayLike) -> Array:
         )
     if (top := float(points[:, 2].max())) < LEAST_HEIGHT:
         raise GraspError(f"{must}, got none higher than {1e3 * top:.3g} mm above the table")
-    points = points[:: -(-len(points) // MOST)].copy()
-    points[:, 2] = np.maximum(points[:, 2], 0.0)
-    return points
+    points = np.maximum(points, [-np.inf, -np.inf, 0.0])
+    return points if len(points) <= MOST else _thinned(points)
+
+
+def _thinned(points: Array) -> Array:
+    """Return at most `MOST` points, one per cell of a grid; the order of the points is ignored.
+
+    The point of a cell is the outermost, so that the outline stays.
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    away = points - (low + high) / 2.0
+    points = points[np.lexsort([*points.T, -dot(away, away)])]
+
+    def kept(edge: float) -> npt.NDArray[np.int64]:
+        """Return the first point of each cell with an edge [m]."""
+        cells = np.floor((points - low) / edge).astype(np.int64)
+        number = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))
+        return np.unique(number, return_index=True)[1]
+
+    # A surface has four times as many cells of half the edge.
+    edge = max(float((high - low).max()), LEAST_HEIGHT) / COARSE
+    edge *= float(np.sqrt(len(kept(edge)) / MOST))
+    while len(found := kept(edge)) > MOST:
+        edge *= GROWTH
+    return points[found]
 
 
 def hull_solid(points: Array) -> Solid:
@@ -126,6 +153,8 @@ def column_solid(points: Array) -> Solid:
 def smallest_rectangle(points: Array) -> tuple[Array, Array, Array]:
     """Return the smallest rectangle around points (n, 3), seen from above.
 
+    Of rectangles or sides that only rounding distinguishes, the long side is the one nearest to Tx.
+
     Returns:
         Unit axes (2, 2) as rows, the long side first; the centre (2,) and the half sides (2,) [m].
 
@@ -136,13 +165,19 @@ def smallest_rectangle(points: Array) -> tuple[Array, Array, Array]:
     edges = np.roll(corners, -1, axis=0) - corners
     u = edges / norm(edges)[:, None]
     axes = np.stack([u, np.column_stack([-u[:, 1], u[:, 0]])], axis=1)
-    along = axes @ corners.T
+    along = multiply(axes, corners.T)
     low, high = along.min(axis=2), along.max(axis=2)
-    best = int(np.argmin(np.prod(high - low, axis=1)))
-    middle = axes[best].T @ (low[best] + high[best]) / 2.0
-    half = (high[best] - low[best]) / 2.0
-    order = np.argsort(-half)
-    return axes[best][order], middle, half[order]
+    middles = multiply(np.swapaxes(axes, 1, 2), (low + high)[:, :, None])[..., 0] / 2.0
+    halves = (high - low) / 2.0
+
+    # The long side of each rectangle along an edge; in a square that is the edge.
+    upright = halves[:, 1] > halves[:, 0] * (1.0 + TIE)
+    axes[upright], halves[upright] = axes[upright, ::-1], halves[upright, ::-1]
+    areas = halves.prod(axis=1)
+    tied = np.flatnonzero(areas <= areas.min() * (1.0 + TIE))
+    x, y = np.rint(axes[tied, 0] / TIE).T
+    best = tied[np.lexsort((y, x))[-1]]
+    return axes[best], middles[best], halves[best]
 
 
 def _hull(points: Array) -> ConvexHull:

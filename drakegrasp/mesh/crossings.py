@@ -7,12 +7,10 @@ CPU.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import dot, norm
+from drakegrasp.arithmetic import dot, norm, sin_cos
 from drakegrasp.frames import Array
 from drakegrasp.mesh.surfaces import Faces, diagonal, pair_blocks, unit_normals
 
@@ -94,12 +92,13 @@ def seen_points(
         pixels: Number of pixels along an edge.
     """
     target = np.array([0.0, 0.0, triangles[..., 2].max() / 2.0])
-    level = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
-    back = math.cos(elevation) * level + [0.0, 0.0, math.sin(elevation)]
+    sine, cosine = sin_cos([azimuth, elevation])
+    level = np.array([cosine[0], sine[0], 0.0])
+    back = cosine[1] * level + [0.0, 0.0, sine[1]]
     right = np.array([level[1], -level[0], 0.0])
     u, v = np.meshgrid(*[np.linspace(-half, half, pixels)] * 2)
     rays = u.reshape(-1, 1) * right + v.reshape(-1, 1) * np.cross(-back, right) - back
-    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    rays /= norm(rays)[:, None]
     eye = target + distance * back
     found = first_hits(triangles, np.tile(eye, (len(rays), 1)), rays)
     hit = np.isfinite(found)

@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import Array, dot, multiply, norm
+from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import Hand
-from drakegrasp.hand.finger_sweep import across_angle, reach
+from drakegrasp.hand.finger_sweep import across, reach
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.mesh.cloud import read_cloud, smallest_rectangle
 from drakegrasp.scoring.ranking import chosen_hand, closed_on
@@ -119,17 +119,17 @@ def _spreads(hand: Hand) -> tuple[float, ...]:
 def _from_above(points: Array, hand: Hand) -> Iterator[Palm]:
     """Yield the palms that look down on the object."""
     axes, middle, half = smallest_rectangle(points)
-    heading = np.rad2deg(np.arctan2(axes[0, 1], axes[0, 0]) - across_angle(hand))
+    ahead = multiply(_rotation_to(axes[0]), _rotation_to(across(hand)).T)
     top, least = float(points[:, 2].max()), min(hand.standoffs)
     standoff = max(least, reach(hand, np.array([0.0, 0.0, 1.0])) + TABLE_GAP - top)
 
     def palm(turn: float, higher: float, aside: float = 0.0, tilt: float | None = None) -> Array:
         """Return X_TG turned [degree], higher [m], aside [fraction] and tilted about an axis."""
         # All poses look at the point at half the height, so they are relative to it.
-        R = multiply(_rotation_z(heading + turn), np.diag([1.0, -1.0, -1.0]))
+        R = multiply(multiply(ahead, _rotation_z(turn)), np.diag([1.0, -1.0, -1.0]))
         X = make_pose(R, [0.0, 0.0, top / 2.0 + standoff + higher])
         if tilt is not None:
-            about = multiply(_rotation_z(heading + tilt), [1.0, 0.0, 0.0])
+            about = multiply(ahead, _rotation_z(tilt)[:, 0])
             X = multiply(make_pose(rotation_about(about, np.deg2rad(TILT)), np.zeros(3)), X)
         target = middle + aside * half[0] * axes[0]
         return multiply(make_pose(np.eye(3), [*target, top / 2.0]), X)
@@ -156,15 +156,15 @@ def _from_above(points: Array, hand: Hand) -> Iterator[Palm]:
 def _from_the_side(points: Array, hand: Hand) -> Iterator[Palm]:
     """Yield the palms that come from the side, slanted or horizontal, and close across Tz."""
     axes, middle, _ = smallest_rectangle(points)
-    heading, top = np.arctan2(axes[0, 1], axes[0, 0]), float(points[:, 2].max())
-    target, turned = np.array([*middle, top / 2.0]), _rotation_z(-np.rad2deg(across_angle(hand)))
+    top, turned = float(points[:, 2].max()), _rotation_to(across(hand)).T
+    target = np.array([*middle, top / 2.0])
     palms = [(SLANTED, each, "slanted") for each in SLANTED_FROM]
     palms += [(90.0, each, "from the side") for each in BESIDE]
     down_to: dict[tuple[float, ...], float] = {}
     for slant, where, said in palms:
-        azimuth, polar = heading + np.deg2rad(where), np.deg2rad(slant)
-        outward = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        approach = -np.sin(polar) * outward - np.cos(polar) * np.array([0.0, 0.0, 1.0])
+        outward = multiply(_rotation_to(axes[0]), _rotation_z(where)[:, 0])
+        sine, cosine = sin_cos_deg(slant)
+        approach = -sine * outward - cosine * np.array([0.0, 0.0, 1.0])
         front = float(dot(points - target, -approach).max())
         origin = target - (front + min(hand.standoffs)) * approach
         for sign in (1.0, -1.0):
@@ -182,6 +182,12 @@ def _from_the_side(points: Array, hand: Hand) -> Iterator[Palm]:
 
 def _rotation_z(degrees: float) -> Array:
     return rotation_about([0.0, 0.0, 1.0], np.deg2rad(degrees))
+
+
+def _rotation_to(direction: Array) -> Array:
+    """Return the rotation about Tz that turns Tx to a horizontal unit direction (2,) or (3,)."""
+    x, y = direction[:2]
+    return np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
 
 
 def distinct(palms: list[Palm]) -> list[Palm]:
