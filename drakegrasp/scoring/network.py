@@ -3,7 +3,7 @@
 Input: an object's visible points in {T}, where the table is z = 0, or the views of scenes. Output:
 `Attempts` with a confidence, which `exchange.attempts.write_attempts` writes, a robot executes, a
 build tries and a score judges. A network proposes grasps (`scoring.proposals`) and orders them
-(`scoring.ranking`) by its judge (`scoring.judge`). It needs NumPy only, no torch.
+(`scoring.ranking`) by its judge (`scoring.judge`). It needs no torch.
 """
 
 from __future__ import annotations

@@ -6,21 +6,23 @@
 First the data: built-in objects of another seed than the benchmark's and without its new classes,
 each with its own sizes, mass, friction and resting pose, and one view of it. Of the grasps that
 `drakegrasp.propose` returns for the view, some are drawn and lifted. DATA gets a file for each
-object; after an interruption, the same command continues. Then a logistic regression learns the
-outcomes from the features of `drakegrasp.rank`. Its chances are calibrated on classes that another
-regression did not see. The same command writes the same bytes on the same machine.
+object, and the settings; after an interruption, the same command continues, and DATA of other
+settings is refused. Hand and seed are constants of this script, and the camera is that of
+`pipelines/measurements/grasp_choice.py`. Then a logistic regression learns the outcomes from the
+features of `drakegrasp.rank`. Its chances are calibrated on classes that another regression did not
+see. The same command writes the same bytes on the same machine.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
 
 import os
+import sys
 
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
 
 import hashlib
 import io
 import json
-import math
 import multiprocessing
 import zipfile
 from dataclasses import replace
@@ -33,6 +35,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 
+# The camera and the ROC curve have one home.
+sys.path.append(str(Path(__file__).parents[1] / "measurements"))
+import grasp_choice
+
 import drakegrasp as dg
 from drakegrasp.errors import MeshError
 from drakegrasp.filters import Removal
@@ -40,7 +46,6 @@ from drakegrasp.frames import transform_points
 from drakegrasp.generation.attempts import judge_sample
 from drakegrasp.hand.description import load_hand
 from drakegrasp.mesh.cloud import read_cloud
-from drakegrasp.mesh.crossings import seen_points
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.scoring.benchmark import FRICTIONS, MASSES, new_classes
@@ -58,13 +63,14 @@ from drakegrasp.simulation.trial import has_only_scraped, lift_on, run_attempt
 Array = npt.NDArray[np.float64]
 #: Seed of the objects and of all other draws of the data.
 SEED = 4801
-#: The camera: distance [m], minimum elevation and range of elevations [degree], half the width of
-#: the image at a distance of 1 m [m/m], pixels along an edge.
-DISTANCE, ELEVATION, RANGE, HALF, PIXELS = 0.65, 35.0, 30.0, 0.2, 96
-#: The hand of the judge.
+#: The hand of the judge: an argument of `load_hand`.
 HAND = "barrett"
+#: Usual numbers of objects of each class, and of lifts of each object.
+PER_CLASS, LIFTS = 5, 18
 #: Penalty of the weights' squares, steps of the search, and folds of the classes.
 DECAY, STEPS, FOLDS = 0.01, {"maxiter": 300}, 6
+#: What the options of the command may be.
+POSITIVE = click.IntRange(min=1)
 
 
 def draw(name: str, *place: int) -> Stream:
@@ -77,6 +83,7 @@ def placed_object(item: BuiltinObject) -> PlacedObject:
     u = draw(item.name, 1).uniform(3)
     friction = FRICTIONS[int(u[1] * len(FRICTIONS))]
     values = {
+        "hand": HAND,
         "objects.mass": MASSES[int(u[0] * len(MASSES))],
         "physics.friction_hand": friction,
         "physics.friction_table": friction,
@@ -104,13 +111,6 @@ def rotation(quaternion: Array) -> Array:
     return np.asarray(np.eye(3) + 2.0 * w * K + 2.0 * K @ K)
 
 
-def seen(triangles: Array, stream: Stream) -> Array:
-    """Return the points (n, 3) in {T} [m] that a camera sees from a drawn direction."""
-    drawn = stream.uniform(2)
-    azimuth, elevation = 2 * np.pi * drawn[0], math.radians(ELEVATION + RANGE * drawn[1])
-    return seen_points(triangles, azimuth, elevation, distance=DISTANCE, half=HALF, pixels=PIXELS)
-
-
 def tried(placed: PlacedObject, posture: dg.Posture) -> list[bool]:
     """Return whether a grasp holds and is a sample, and whether the hand scraped the table."""
     config = placed.config
@@ -135,7 +135,7 @@ def make_data(item: BuiltinObject, folder: Path, lifts: int) -> str:
         return f"{item.name}: {error}"
     model, hand = placed.model, load_hand(placed.config.hand_source)
     triangles = transform_points(placed.X_TO_simulated, model.visual_vertices)[model.visual_faces]
-    cloud = seen(triangles, draw(item.name, 3))
+    cloud = grasp_choice.seen(triangles, draw(item.name, 3))
     try:
         grasps = dg.propose(cloud, hand)
     except dg.GraspError as error:
@@ -154,9 +154,34 @@ def make_data(item: BuiltinObject, folder: Path, lifts: int) -> str:
         "said": kept.said,
         "ends": np.array(ends),
     }
+    if any(kept.preshape):
+        arrays["preshape"] = np.array(kept.preshape)
     write_atomic(path, packed(arrays))
     counts = np.sum(ends, axis=0)
     return f"{item.name}: {len(ends)} of {len(grasps)} grasps; held, sample, scraped: {counts}"
+
+
+def claim(folder: Path, lifts: int) -> None:
+    """Write the settings of a new folder of data.
+
+    Raises:
+        ClickException: If the folder has data of other settings.
+    """
+    camera = ("DISTANCE", "ELEVATION", "RANGE", "HALF", "PIXELS")
+    settings = {
+        "hand": HAND,
+        "fingerprint": fingerprint(load_hand(HAND)),
+        "seed": SEED,
+        "lifts": lifts,
+        "camera": {name: getattr(grasp_choice, name) for name in camera},
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "settings.json"
+    if not any(folder.iterdir()):
+        write_atomic(path, json.dumps(settings, indent=1).encode())
+    other = json.loads(path.read_text()) if path.exists() else None
+    if other != settings:
+        raise click.ClickException(f"{folder}: must have data of {settings}, got {other}")
 
 
 def packed(arrays: dict[str, Any]) -> bytes:
@@ -195,7 +220,13 @@ def read_data(folder: Path, chosen: list[BuiltinObject]) -> dict[str, Any]:
         with np.load(path) as file:
             cloud, X_TG, q = file["cloud"].astype(float), file["X_TG"], file["q_pregrasp"]
             grasps = make_attempts(
-                hand, [item.name] * len(X_TG), X_TG, file["q_grasp"], q_pregrasp=q, frame="table"
+                hand,
+                [item.name] * len(X_TG),
+                X_TG,
+                file["q_grasp"],
+                q_pregrasp=q,
+                frame="table",
+                preshape=file["preshape"].tolist() if "preshape" in file else None,
             )
             ends.append(file["ends"])
         found = measured(grasps, read_cloud(cloud), hand)
@@ -254,13 +285,8 @@ def crossed(x: Array, y: Array, groups: npt.NDArray[np.int64]) -> Array:
 
 def auc(score: Array, ends: Array, owner: Array) -> float:
     """Return the mean over objects of the area under the ROC curve."""
-    found = []
-    for one in np.unique(owner):
-        own = owner == one
-        good, bad = score[own & (ends > 0)], score[own & (ends == 0)]
-        if len(good) and len(bad):
-            found.append(((good[:, None] > bad) + 0.5 * (good[:, None] == bad)).mean())
-    return float(np.mean(found)) if found else math.nan
+    rows = [owner == one for one in np.unique(owner)]
+    return float(np.nanmean([grasp_choice.auc(score[own], ends[own]) for own in rows]))
 
 
 def first(score: Array, ends: Array, owner: Array) -> float:
@@ -269,8 +295,15 @@ def first(score: Array, ends: Array, owner: Array) -> float:
     return float(np.mean([ends[own[np.argmax(score[own])]] for own in rows]))
 
 
-def learn(folder: Path, chosen: list[BuiltinObject], name: str) -> bytes:
-    """Return the file of a judge, and print how well it judges objects of unseen classes."""
+def learn(folder: Path, chosen: list[BuiltinObject], name: str, options: str = "") -> bytes:
+    """Return the file of a judge, and print how well it judges objects of unseen classes.
+
+    Args:
+        folder: The data.
+        chosen: The objects.
+        name: Name of the judge.
+        options: Options of the command that are not the usual ones.
+    """
     data = read_data(folder, chosen)
     x, y, owner = data["features"], data["ends"][:, :2].astype(float), data["object"]
     number = np.array([item.object_class.number for item in chosen])
@@ -297,7 +330,7 @@ def learn(folder: Path, chosen: list[BuiltinObject], name: str) -> bytes:
                 for k, head in enumerate(HEADS)
             },
         },
-        "command": f"python pipelines/baseline/train_judge.py DATA {name}.npz",
+        "command": f"python pipelines/baseline/train_judge.py DATA {name}.npz{options}",
         "licence": LICENCE,
         "versions": {"drakegrasp": dg.__version__, "numpy": np.__version__},
     }
@@ -309,19 +342,21 @@ def learn(folder: Path, chosen: list[BuiltinObject], name: str) -> bytes:
 @click.command(help=__doc__)
 @click.argument("data", type=click.Path(path_type=Path))
 @click.argument("judge", type=click.Path(path_type=Path))
-@click.option("--per-class", default=5, help="Objects of each of the 48 classes.")
-@click.option("--lifts", default=18, help="Lifts of each object.")
-@click.option("--workers", default=1, help="Processes that lift.")
+@click.option("--per-class", default=PER_CLASS, type=POSITIVE, help="Objects of each class.")
+@click.option("--lifts", default=LIFTS, type=POSITIVE, help="Lifts of each object.")
+@click.option("--workers", default=1, type=POSITIVE, help="Processes that lift.")
 def main(data: Path, judge: Path, per_class: int, lifts: int, workers: int) -> None:
     """Run the script."""
-    data.mkdir(parents=True, exist_ok=True)
+    claim(data, lifts)
     chosen = objects(per_class)
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
         work = partial(make_data, folder=data, lifts=lifts)
         for done, line in enumerate(pool.imap(work, chosen), start=1):
             if line:
                 click.echo(f"{done}/{len(chosen)} {line}", err=True)
-    write_atomic(judge, learn(data, chosen, judge.stem))
+    options = f" --per-class {per_class}" if per_class != PER_CLASS else ""
+    options += f" --lifts {lifts}" if lifts != LIFTS else ""
+    write_atomic(judge, learn(data, chosen, judge.stem, options))
     click.echo(f"wrote {judge}")
 
 

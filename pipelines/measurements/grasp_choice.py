@@ -17,11 +17,13 @@ Without other options it uses the first built-in objects of 40 classes; the fixe
 score were fitted to second objects of the other 24 classes. `--prepared` uses the objects of a
 dataset or a benchmark, each with its own mass and friction, in its first resting pose. With
 `--protocol`, the rule of another benchmark decides in MuJoCo, and both numbers are its successes.
-With `--results`, a line for each object is kept, and the same command continues.
+With `--results`, the file gets the settings and a line for each object, and the same command
+continues; a file of other settings is refused.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import time
@@ -52,7 +54,7 @@ from drakegrasp.mesh.surfaces import even_points, on_faces
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.protocols.postures import prepare_trials, verify_postures
 from drakegrasp.scoring.benchmark import new_classes
-from drakegrasp.scoring.judge import load_judge
+from drakegrasp.scoring.judge import ARRAYS, load_judge
 from drakegrasp.scoring.ranking import measured
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.shapes.catalog import builtin_object, draw_builtin
@@ -79,11 +81,13 @@ DRAWS = 10_000
 @click.option("--prepared", type=click.Path(path_type=Path), help="A dataset or a benchmark.")
 @click.option("--meshes", type=click.Path(path_type=Path), help="A folder of meshes.")
 @click.option("--units", default="m", help="Unit of the meshes.")
-@click.option("--count", type=int, help="Number of objects, evenly spread; all if left out.")
+@click.option(
+    "--count", type=click.IntRange(min=1), help="Number of objects, evenly spread; all if left out."
+)
 @click.option("--judge", help="Name or file of a judge, besides the fixed weights.")
 @click.option(
     "--lifts",
-    type=int,
+    type=click.IntRange(min=1),
     help="Number of first grasps to lift, of the judge if there is one; all if left out.",
 )
 @click.option("--protocol", help="Protocol in MuJoCo that decides in place of the lift.")
@@ -121,9 +125,16 @@ def main(
     if count:
         chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, count).round().astype(int)]
 
-    found = {}
-    if results and results.exists():
-        found = {row["name"]: row for row in map(json.loads, results.read_text().splitlines())}
+    settings = {
+        "objects": str(prepared or meshes or "built-in"),
+        "units": units,
+        "judge": judge and judge_hash(judge),
+        "lifts": lifts,
+        "protocol": protocol,
+        "friction": friction,
+        "set": list(overrides),
+    }
+    found = stored(results, settings) if results else {}
     for name, place in chosen:
         if name in found:
             continue
@@ -135,11 +146,31 @@ def main(
         if results:
             with results.open("a") as file:
                 file.write(json.dumps(found[name]) + "\n")
-    rows = list(found.values())
+    rows = [found[name] for name, _ in chosen if name in found]
     new = [row for row in rows if name_of_class(row["name"]) in new_classes()]
     click.echo(json.dumps(summary(rows), indent=1))
     if prepared and new:
         click.echo(json.dumps({"new classes": summary(new)}, indent=1))
+
+
+def judge_hash(source: str) -> str:
+    """Return a hash of the numbers of a judge."""
+    judge = load_judge(source)
+    return hashlib.sha256(b"".join(getattr(judge, name).tobytes() for name in ARRAYS)).hexdigest()
+
+
+def stored(results: Path, settings: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the stored lines of objects by name; a new file gets the settings as its first line.
+
+    Raises:
+        ClickException: If the file has other settings, or none.
+    """
+    if not results.exists():
+        results.write_text(json.dumps({"settings": settings}) + "\n")
+    first, *rows = [json.loads(line) for line in results.read_text().splitlines()] or [{}]
+    if (other := first.get("settings")) != settings:
+        raise click.ClickException(f"{results}: must be of the settings {settings}, got {other}")
+    return {row["name"]: row for row in rows}
 
 
 def with_friction(placed: PlacedObject, factor: float) -> PlacedObject:
@@ -195,7 +226,7 @@ def measure(
     triangles = transform_points(placed.X_TO_simulated, placed.model.visual_vertices)[
         placed.model.visual_faces
     ]
-    cloud = seen(triangles, name)
+    cloud = seen(triangles, Stream(7, object_key(name)))
     begin = time.process_time()
     grasps = dg.propose(cloud, hand)
     columns = measured(grasps, read_cloud(cloud), hand)
@@ -216,7 +247,7 @@ def measure(
     ends = np.full((len(grasps), 2), np.nan)
     last = list(scores)[1 if judge else 0]
     wanted = {0, *(int(order[0]) for order in orders.values()), *orders[last][:lifts].tolist()}
-    rows = sorted(wanted) if lifts else list(range(len(grasps)))
+    rows = list(range(len(grasps))) if lifts is None else sorted(wanted)
     if protocol is None:
         ends[rows] = [tried(placed, grasps, i) for i in rows]
     else:
@@ -262,9 +293,9 @@ def tried_by(
         return [verdict.success for verdict, _ in verify_postures(files, trials)]
 
 
-def seen(triangles: Array, name: str) -> Array:
+def seen(triangles: Array, stream: Stream) -> Array:
     """Return the points (n, 3) in {T} [m] that a camera sees from a drawn direction."""
-    drawn = Stream(7, object_key(name)).uniform(2)
+    drawn = stream.uniform(2)
     azimuth, elevation = 2 * np.pi * drawn[0], math.radians(ELEVATION + RANGE * drawn[1])
     return seen_points(triangles, azimuth, elevation, distance=DISTANCE, half=HALF, pixels=PIXELS)
 

@@ -7,6 +7,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import click
+import grasp_choice
 import numpy as np
 import pytest
 import trimesh
@@ -175,3 +177,37 @@ def test_training_gives_the_same_bytes_and_learns(tmp_path, cloud):
     ranked = dg.rank(found, cloud, judge=tmp_path / "toy.npz")
     heights = found.X_FG[ranked.order, 2, 3]
     assert heights[:5].max() < heights[-5:].min()
+
+
+def test_data_of_other_settings_are_refused(tmp_path, monkeypatch):
+    for _ in range(2):
+        train_judge.claim(tmp_path / "data", lifts=3)
+    with pytest.raises(
+        click.ClickException, match=r"must have data of .*'lifts': 4.*got .*'lifts': 3"
+    ):
+        train_judge.claim(tmp_path / "data", lifts=4)
+    monkeypatch.setattr(train_judge, "HAND", "franka")
+    with pytest.raises(click.ClickException, match=r"franka.*got .*barrett"):
+        train_judge.claim(tmp_path / "data", lifts=3)
+    (tmp_path / "data" / "settings.json").rename(tmp_path / "data" / "1_mug_1.npz")
+    with pytest.raises(click.ClickException, match="got None"):
+        train_judge.claim(tmp_path / "data", lifts=3)
+
+
+def test_an_object_of_the_data_is_placed_for_the_hand_of_the_judge(monkeypatch):
+    monkeypatch.setattr(train_judge, "HAND", "franka")
+    placed = train_judge.placed_object(BuiltinObject(object_class=CLASSES[0], index=1))
+    assert placed.config.hand == "franka"
+
+
+def test_results_of_other_settings_are_refused(tmp_path):
+    path, row = tmp_path / "results.jsonl", {"name": "1_mug_1"}
+    assert grasp_choice.stored(path, {"lifts": 3}) == {}
+    with path.open("a") as file:
+        file.write(json.dumps(row) + "\n")
+    assert grasp_choice.stored(path, {"lifts": 3}) == {"1_mug_1": row}
+    with pytest.raises(click.ClickException, match=r"must be of the settings .*4.*got .*3"):
+        grasp_choice.stored(path, {"lifts": 4})
+    path.write_text(json.dumps(row) + "\n")
+    with pytest.raises(click.ClickException, match="got None"):
+        grasp_choice.stored(path, {"lifts": 3})
