@@ -51,6 +51,10 @@ class GraspError(DrakegraspError, ValueError):
     """A grasp vector, or its frame, that cannot be verified."""
 
 
+class TooLittleSeenError(GraspError):
+    """A cloud or a depth image that shows too little of its object for a grasp."""
+
+
 class MachineError(DrakegraspError, RuntimeError):
     """A resource that this machine lacks; the message states how to get it."""
 

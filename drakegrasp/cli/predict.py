@@ -16,6 +16,7 @@ from drakegrasp.runtime.executor import processes
 
 if TYPE_CHECKING:
     from drakegrasp.arithmetic import Array
+    from drakegrasp.hand.description import Hand
     from drakegrasp.scoring.network import GraspNetwork
     from drakegrasp.simulation.attempts import Attempts
 
@@ -77,14 +78,15 @@ def predict(
     """
     from drakegrasp.exchange.attempts import write_attempts
     from drakegrasp.scoring.network import load_network
-    from drakegrasp.verification.result_files import refuse_unwritable
+    from drakegrasp.verification.result_files import refuse_unwritable_files
 
     # All input is checked before anything is predicted.
     if out.suffix.lower() not in HDF5:
         raise click.UsageError(f"--out must be a file {' or '.join(HDF5)}, got {str(out)!r}")
     if out.exists() and out.samefile(source):
         raise click.UsageError(f"--out must be another file than INPUT, got {str(out)!r}")
-    refuse_unwritable(out)
+    refuse_unwritable_files(out)
+    _refuse_foreign(out)
     given: dict[str, Any] = {"split": split, "workers": workers, "units": units}
     given |= {"camera": camera, "mask": mask, "camera_pose": camera_pose}
     given["depth_scale"] = depth_scale
@@ -102,10 +104,27 @@ def predict(
         else:
             cloud, pose = _of_depth(source, camera, mask, camera_pose, depth_scale, show=not quiet)
         found = chosen.predict(cloud, count=count)
-    write_attempts(out, _seen_from(found, pose), chosen.hand)
+    write_attempts(out, _seen_from(found, pose), chosen.hand, network=chosen.name)
     say(str(out))
     if not quiet and kind != "scenes":
-        _print_best(found, pose)
+        _print_best(found, pose, chosen.hand)
+
+
+def _refuse_foreign(out: Path) -> None:
+    """Reject to replace a file that is not of postures, e.g. one of a dataset.
+
+    Raises:
+        click.UsageError: If it is another file.
+    """
+    from drakegrasp.errors import GraspError
+    from drakegrasp.exchange.attempts import holds_postures
+
+    try:
+        known = not out.exists() or holds_postures(out)
+    except GraspError:  # no HDF5 file
+        known = False
+    if not known:
+        raise click.UsageError(f"--out must be a new file or one of postures, got {str(out)!r}")
 
 
 def _kind_of(source: Path, camera: str | None) -> str:
@@ -133,7 +152,10 @@ def _refuse_others(kind: str, given: Mapping[str, Any]) -> None:
     for name, value in given.items():
         if value is not None and name not in KINDS[kind]:
             due = next(other for other, names in KINDS.items() if name in names)
-            raise click.UsageError(f"{_option(name)} must be given with {due} only, got {kind}")
+            hint = ": a depth image in a .npy file needs --camera" if due == "a depth image" else ""
+            raise click.UsageError(
+                f"{_option(name)} must be given with {due} only, got {kind}{hint}"
+            )
     if kind == "a depth image":
         for name in ("camera", "mask"):
             if given[name] is None:
@@ -193,9 +215,12 @@ def _read_cloud(path: Path, units: str) -> Array:
             )
         return UNITS[units] * points
     try:
-        return UNITS[units] * declared_ply(read_content(path)).vertices
+        surface = declared_ply(read_content(path))
     except (OSError, ValueError) as error:
         raise GraspError(f"{path}: must be a PLY file of points, got: {one_line(error)}") from None
+    if len(surface.faces):
+        raise GraspError(f"{path}: must be a PLY file of points, got a mesh: sample its surface")
+    return UNITS[units] * surface.vertices
 
 
 def _of_depth(
@@ -207,7 +232,13 @@ def _of_depth(
     *,
     show: bool,
 ) -> tuple[Array, Array]:
-    """Return the object's points (n, 3) in {T} [m], and the camera's pose X_TC (4, 4)."""
+    """Return the object's points (n, 3) in {T} [m], and the camera's pose X_TC (4, 4).
+
+    Raises:
+        GraspError: If a file is invalid; the message names it.
+    """
+    from drakegrasp.errors import GraspError
+    from drakegrasp.exchange.attempts import named
     from drakegrasp.exchange.contacts import read_numbers
     from drakegrasp.frames import read_pose
     from drakegrasp.vision.depth_image import (
@@ -226,13 +257,18 @@ def _of_depth(
         raise click.UsageError("--depth-scale must be given with a .png only, got a .npy in metres")
     else:
         depth = read_numbers(path)
-    K, own = read_camera(camera), read_mask(mask)
+    with named(path):
+        if depth.ndim != 2:
+            raise GraspError(f"must be a depth image (h, w), got an array of shape {depth.shape}")
+    K, own = read_camera(camera, depth.shape), read_mask(mask)
     if camera_pose is not None:
-        pose = read_pose(read_numbers(camera_pose), "X_TC")
-        share = table_share(depth, K, own, pose)
+        with named(camera_pose):
+            pose = read_pose(read_numbers(camera_pose), "X_TC")
+            share = table_share(depth, K, own, pose)
         off = ""
     else:
-        pose, residual, share = fit_table(depth, K, own)
+        with named(path):
+            pose, residual, share = fit_table(depth, K, own)
         off = f", {1e3 * residual:.1f} mm off its plane (rms)"
     if show and not math.isnan(share):
         say(
@@ -240,7 +276,8 @@ def _of_depth(
             f"{1e3 * pose[2, 3]:.0f} mm above it",
             err=True,
         )
-    return cloud_from_depth(depth, K, own, pose), pose
+    with named(path):
+        return cloud_from_depth(depth, K, own, pose), pose
 
 
 def _seen_from(found: Attempts, X_TC: Array | None) -> Attempts:
@@ -254,9 +291,12 @@ def _seen_from(found: Attempts, X_TC: Array | None) -> Attempts:
     return replace(found, X_FG=X_CG, frame="camera", X_TC=X_TC[None].repeat(len(found), axis=0))
 
 
-def _print_best(found: Attempts, X_TC: Array | None) -> None:
-    """Print the best grasps: their score, the direction of approach and the palm's position."""
+def _print_best(found: Attempts, X_TC: Array | None, hand: Hand) -> None:
+    """Print the best grasps: score, directions of approach and of closing, and palm's position."""
+    import numpy as np
+
     from drakegrasp.cli.tables import make_table, print_table
+    from drakegrasp.hand.finger_sweep import across_angle
 
     frames = (
         {"{T}": found.X_FG}
@@ -264,13 +304,16 @@ def _print_best(found: Attempts, X_TC: Array | None) -> None:
         else {"{T}": found.X_FG, "{C}": _seen_from(found, X_TC).X_FG}
     )
     heads = ["grasp", "score"]
+    angle = across_angle(hand) + np.pi / 2.0
+    along = np.array([np.cos(angle), np.sin(angle), 0.0])
     for frame in frames:
-        heads += [f"approach\nin {frame}", f"palm in\n{frame} [mm]"]
+        heads += [f"approach\nin {frame}", f"closes along\nin {frame}", f"palm in\n{frame} [mm]"]
     rows = []
     for i, score in enumerate(found.confidence[:SHOWN].tolist()):
         cells = [str(i), f"{score:.3f}"]
         for X_FG in frames.values():
-            cells += [_numbers(X_FG[i, :3, 2], "z.2f"), _numbers(1e3 * X_FG[i, :3, 3], "z.0f")]
+            cells += [_numbers(axis, "z.2f") for axis in (X_FG[i, :3, 2], X_FG[i, :3, :3] @ along)]
+            cells += [_numbers(1e3 * X_FG[i, :3, 3], "z.0f")]
         rows.append(cells)
     print_table(make_table("The best grasps", heads, rows))
 

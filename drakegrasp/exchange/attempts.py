@@ -24,7 +24,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp import registry
+from drakegrasp import __version__, registry
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import (
@@ -209,27 +209,42 @@ def read_columns(path: Path, hand: Hand, nameless: bool = False) -> dict[str, An
     return _of_columns(*_read_columns(path), nameless)
 
 
-def write_attempts(path: Path, table: Attempts, hand: Hand) -> None:
+def write_attempts(path: Path, table: Attempts, hand: Hand, *, network: str | None = None) -> None:
     """Write postures as an HDF5 file of arrays in our own layout, which `read_attempts` reads.
+
+    Attributes of the file state the hand, the network and the version of drakegrasp. `link` is not
+    written, since the poses are those of the palm frame.
 
     Args:
         path: The file; an older one is replaced.
         table: Postures with joints, in a frame whose poses do not need the mesh file.
         hand: The hand.
+        network: Name of the network that made them.
 
     Raises:
+        GraspError: If a row is not a valid posture.
         OSError: If the file cannot be written.
     """
+    if bad := table.refused:
+        raise GraspError(f"postures must be valid to be written: {bad}")
     texts = {
         "object": table.objects,
         "joints": joint_order(hand),
         "source": table.said,
         "preshape": table.preshape if any(table.preshape) else None,
     }
+    numbers = {
+        "q_pregrasp": table.q_pregrasp,
+        "q_squeeze": table.q_squeeze,
+        "X_TO": table.X_TO,
+        "scale": table.scale,
+        "log_density": table.log_density,
+        **dict(zip(CONDITIONS, table.conditions.T, strict=True)),
+    }
     arrays = {
         "X_FG": table.X_FG,
         "q_grasp": table.q_grasp,
-        "q_pregrasp": table.q_pregrasp,
+        **{name: values for name, values in numbers.items() if not np.isnan(values).all()},
         "X_TC": table.X_TC,
         "resting": None if (table.resting == UNTOLD).all() else table.resting,
         "row": table.of_row,
@@ -239,6 +254,8 @@ def write_attempts(path: Path, table: Attempts, hand: Hand) -> None:
     # Columns without values are left out.
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         file["frame"] = table.frame
+        told = {"hand": hand.name, "network": network, "drakegrasp": __version__}
+        file.attrs.update({name: value for name, value in told.items() if value is not None})
         for name, words in texts.items():
             if words is not None:
                 file[name] = np.array(words, dtype=h5py.string_dtype())

@@ -16,7 +16,7 @@ from scipy.ndimage import binary_closing, distance_transform_edt
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from drakegrasp.arithmetic import Array, dot, multiply, norm
-from drakegrasp.errors import GraspError
+from drakegrasp.errors import GraspError, TooLittleSeenError
 from drakegrasp.frames import as_numbers
 from drakegrasp.mesh.distance_field import DistanceField
 
@@ -73,19 +73,22 @@ def read_cloud(cloud: npt.ArrayLike) -> Array:
     points = as_numbers(cloud, must)
     if points.ndim != 2 or points.shape[1] != 3:
         raise GraspError(f"{must}, got an array of shape {points.shape}")
-    if not np.isfinite(points).all():
-        raise GraspError(f"{must}, got numbers that are not finite")
+    if wrong := np.count_nonzero(~np.isfinite(points)):
+        raise GraspError(f"{must}, got {wrong:,} of {points.size:,} numbers that are not finite")
     if len(points) < FEWEST:
-        raise GraspError(f"{must}, {FEWEST} or more, got {len(points)}")
+        raise TooLittleSeenError(f"{must}, {FEWEST} or more, got {len(points)}")
+
+    # One object that stands on the table.
     if (size := float(np.ptp(points, axis=0).max())) > LARGEST:
-        raise GraspError(f"{must}, got points {size:.3g} m apart")
+        raise GraspError(f"{must}, got points {size:.3g} m apart: is it in another unit?")
     low = float(np.quantile(points[:, 2], OUTLIERS))
     if not -BELOW <= low <= ABOVE:
         raise GraspError(
             f"{must}: the table must be z = 0, got the lowest points at z = {low:.3g} m"
         )
     if (top := float(points[:, 2].max())) < LEAST_HEIGHT:
-        raise GraspError(f"{must}, got none higher than {1e3 * top:.3g} mm above the table")
+        raise TooLittleSeenError(f"{must}, got none higher than {1e3 * top:.3g} mm above the table")
+
     points = np.maximum(points, [-np.inf, -np.inf, 0.0])
     return points if len(points) <= MOST else _thinned(points)
 
@@ -184,7 +187,9 @@ def _hull(points: Array) -> ConvexHull:
     try:
         return ConvexHull(points)
     except QhullError:
-        raise GraspError("cloud must show an object from above or aslant, got a flat one") from None
+        raise TooLittleSeenError(
+            "cloud must show an object from above or aslant, got a flat one"
+        ) from None
 
 
 def _grid(points: Array) -> tuple[Array, float, tuple[int, ...]]:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.scenes import SceneDataset
-from drakegrasp.errors import GraspError
+from drakegrasp.errors import GraspError, TooLittleSeenError
 from drakegrasp.frames import invert_pose, unpack_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.runtime.executor import Executor, in_order, run_here
@@ -145,7 +145,8 @@ def predict_scenes(
 
     Raises:
         DataError: If the file cannot be used.
-        GraspError: If the scenes are of another hand, or no view yields a posture.
+        GraspError: If the scenes are of another hand, or no view yields a posture, or a view is
+            invalid.
     """
     data = SceneDataset(path, points=None, split=split, negatives="none", balance="view", grasps=1)
     hand = load_hand(read_manifest(data.path.parent).config.hand_source)
@@ -199,12 +200,18 @@ def _views(data: SceneDataset) -> Iterator[_View]:
 
 
 def _predict_view(network: GraspNetwork, count: int | None, view: _View) -> Attempts | None:
-    """Return grasps for a view in {O}; None if it shows too little of its object."""
+    """Return grasps for a view in {O}; None if it shows too little of its object.
+
+    Raises:
+        GraspError: If the view is invalid.
+    """
     try:
         cloud = cloud_from_depth(view.depth, view.K, view.mask, view.X_TC)
         found = network.predict(cloud, view.name, count)
-    except GraspError:
+    except TooLittleSeenError:
         return None
+    except GraspError as error:
+        raise GraspError(f"a view of {view.name}: {error}") from None
     return replace(
         found,
         X_FG=multiply(invert_pose(view.X_TO), found.X_FG),

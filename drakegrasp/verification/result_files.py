@@ -48,19 +48,24 @@ def result_paths(out: Path) -> tuple[Path, Path]:
 
 
 def refuse_unwritable(out: Path) -> None:
-    """Reject a common name under which the files cannot be written; no file is left behind.
+    """Reject a common name under which the files cannot be written, see `result_paths`.
 
-    Args:
-        out: The name, see `result_paths`.
+    Raises:
+        DataError: See `refuse_unwritable_files`.
+    """
+    if out.is_dir():
+        raise DataError(f"{out}: must be a name for files, got a folder; choose another --out")
+    refuse_unwritable_files(out, *result_paths(out), part_path(out))
+
+
+def refuse_unwritable_files(out: Path, *others: Path) -> None:
+    """Reject a file that cannot be written, or others in its folder; no file is left behind.
 
     Raises:
         DataError: If a folder has the name of one of the files, or the folder of the files cannot
             be written (if it does not exist: the first existing folder above it).
     """
-    # Folders in the place of files.
-    if out.is_dir():
-        raise DataError(f"{out}: must be a name for files, got a folder; choose another --out")
-    for path in (*result_paths(out), part_path(out)):
+    for path in (out, *others):
         if path.is_dir():
             raise DataError(f"{path}: must be a file, got a folder; choose another --out")
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, dot, multiply, norm
-from drakegrasp.errors import GraspError, one_line
+from drakegrasp.errors import GraspError, TooLittleSeenError, one_line
 from drakegrasp.foreign_files import read_content, read_json
 from drakegrasp.frames import as_numbers, invert_pose, make_pose, read_pose, transform_points
 from drakegrasp.seeding import Stream
@@ -174,7 +174,7 @@ def _points(depth: npt.ArrayLike, K: npt.ArrayLike, mask: npt.ArrayLike) -> tupl
         raise GraspError(f"mask must be {z.shape}, as the depth image, got {own.shape}")
     known = np.isfinite(z) & (z > 0.0)
     if (count := int((own & known).sum())) < FEWEST:
-        raise GraspError(
+        raise TooLittleSeenError(
             f"mask must have at least {FEWEST} pixels with a depth, got {count} "
             f"of {int(own.sum()):,} pixels"
         )
@@ -278,14 +278,15 @@ def read_lens(K: npt.ArrayLike) -> Array:
 # Files
 
 
-def read_camera(text: str) -> Array:
+def read_camera(text: str, shape: tuple[int, ...]) -> Array:
     """Return the camera matrix (3, 3) [px] of the text "fx fy cx cy", or of a JSON file.
 
     The file has a matrix, or an object with `K`, `k` or `camera_matrix`, or with `fx`, `fy`, `cx`
-    and `cy`.
+    and `cy`. If it also states the `width` and `height` of its images, they must be those of the
+    depth image, whose shape is (h, w).
 
     Raises:
-        GraspError: If it is neither.
+        GraspError: If it is neither, or for images of another size.
     """
     # Four numbers.
     must = "camera must be fx,fy,cx,cy in pixels, or a JSON file with K"
@@ -305,6 +306,12 @@ def read_camera(text: str) -> Array:
     except (OSError, ValueError) as error:
         raise GraspError(f"{path}: {must}, got: {one_line(error)}") from None
     if isinstance(content, dict):
+        high, wide = (content.get(name) for name in ("height", "width"))
+        if (wide or shape[-1], high or shape[0]) != (shape[-1], shape[0]):
+            raise GraspError(
+                f"{path}: camera must be for {shape[-1]} x {shape[0]} pixels, as the depth image, "
+                f"got {wide} x {high}"
+            )
         if {"fx", "fy", "cx", "cy"} <= content.keys():
             f_u, f_v, c_u, c_v = (content[key] for key in ("fx", "fy", "cx", "cy"))
             content = [[f_u, 0.0, c_u], [0.0, f_v, c_v], [0.0, 0.0, 1.0]]
@@ -339,7 +346,7 @@ def read_mask(path: Path) -> npt.NDArray[np.bool_]:
     """Return the mask (h, w) of an image file or a .npy file: where any channel is not 0.
 
     Raises:
-        GraspError: If the file is neither, or has NaN.
+        GraspError: If the file is neither, is 0 everywhere, or has NaN.
     """
     pixels = _pixels(path)
     try:
@@ -352,12 +359,14 @@ def read_mask(path: Path) -> npt.NDArray[np.bool_]:
         own = np.asarray(own[:, :, :channels].any(axis=2))
     if own.ndim != 2:
         raise GraspError(f"{path}: must be an image, got an array of shape {pixels.shape}")
+    if not own.any():
+        raise GraspError(f"{path}: mask is 0 everywhere")
     return own
 
 
 def _pixels(path: Path) -> npt.NDArray[Any]:
     """Return the pixels of an image, (h, w) or (h, w, channels)."""
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     # Pillow raises all kinds of exceptions for damaged files.
     try:
@@ -366,5 +375,7 @@ def _pixels(path: Path) -> npt.NDArray[Any]:
             return np.asarray(np.lib.format.read_array(content, allow_pickle=False))
         with Image.open(content) as image:
             return np.asarray(image)
+    except UnidentifiedImageError:  # its message has the address of `content`
+        raise GraspError(f"{path}: must be an image, got no image file") from None
     except Exception as error:
         raise GraspError(f"{path}: must be an image, got: {one_line(error)}") from None

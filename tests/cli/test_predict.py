@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
+import trimesh
 from helpers.commands import error_line, run
 from helpers.depth_images import X_TC, K, image
 from PIL import Image
@@ -29,6 +32,14 @@ def files(tmp_path: Path) -> Path:
     corners = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 3)) * [0.04, 0.03, 0.05]
     for name, z in {"cloud": 0.05, "centred": 0.0, "below": -0.2, "camera": 0.6}.items():
         np.save(tmp_path / f"{name}.npy", corners + np.array([0.0, 0.0, z]))
+    np.save(tmp_path / "nan.npy", np.where(corners > 0.03, np.nan, corners))
+    np.save(tmp_path / "far.npy", 1e3 * corners)
+    np.save(tmp_path / "wide.npy", np.ones((4, 6)))
+    Image.fromarray(0 * mask.astype(np.uint8)).save(tmp_path / "zero.png")
+    (tmp_path / "bad.png").write_bytes(b"no image")
+    trimesh.creation.box([0.1, 0.1, 0.1]).export(tmp_path / "mesh.ply")
+    K_of = {"K": K.tolist(), "width": 1280, "height": 960}
+    (tmp_path / "K.json").write_text(json.dumps(K_of))
     (tmp_path / "a.txt").write_text("points")
     return tmp_path
 
@@ -65,12 +76,50 @@ def predict(files: Path, words: str):
         ("camera.npy", "the table must be z = 0"),
         (SEEN.replace("mask.png", "all.png"), "must be 0 beside the object"),
         (SEEN.replace("80.0", "160.0"), "for another resolution?"),
+        (
+            "depth.npy --camera K.json --mask mask.png",
+            "K.json: camera must be for 160 x 120 pixels",
+        ),
+        ("far.npy", "m apart: is it in another unit?"),
+        ("nan.npy", "of 180 numbers that are not finite"),
+        ("mesh.ply", "got a mesh: sample its surface"),
+        ("depth.npy --mask mask.png", "a depth image in a .npy file needs --camera"),
+        (SEEN.replace("mask.png", "zero.png"), "zero.png: mask is 0 everywhere"),
+        (SEEN.replace("mask.png", "bad.png"), "bad.png: must be an image, got no image file"),
+        (f"{SEEN} --camera-pose one.npy", "one.npy: X_TC must be a pose"),
+        (SEEN.replace("mask.png", "wide.npy"), "depth.npy: mask must be (120, 160)"),
     ],
 )
 def test_bad_input_is_refused_with_one_line(files: Path, words: str, said: str) -> None:
     result = predict(files, words)
     assert result.exit_code == 2 and said in error_line(result)
     assert not (files / "out.h5").exists()
+
+
+@pytest.mark.parametrize("old", ["dataset", "text"])
+def test_no_file_but_postures_is_replaced(files: Path, old: str) -> None:
+    if old == "text":
+        (files / "out.h5").write_text("notes")
+    else:
+        with h5py.File(files / "out.h5", "w") as file:
+            file["trials/outcome"] = [1, 2]
+    before = (files / "out.h5").read_bytes()
+    assert "must be a new file or one of postures" in error_line(predict(files, "cloud.npy"))
+    assert (files / "out.h5").read_bytes() == before
+
+
+def test_grasps_that_are_printed_differ(files: Path) -> None:
+    """Two turns of one palm close along different directions.
+
+    The second file replaces the first. A folder with a name that is not written does not matter.
+    """
+    (files / "out.jsonl").mkdir()
+    for _ in range(2):
+        result = predict(files, "cloud.npy --count 5")
+        assert result.exit_code == 0, result.output
+    lines = [line.split() for line in result.stdout.splitlines()]
+    turned = {tuple(line[5:8]) for line in lines if line and line[0] in "01234"}
+    assert "closes along" in result.stdout and len(turned) > 1
 
 
 def test_a_pose_that_is_given_is_checked_with_the_image(files: Path) -> None:

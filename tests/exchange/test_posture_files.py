@@ -13,13 +13,14 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+import drakegrasp
 from drakegrasp.errors import GraspError
 from drakegrasp.exchange import attempts as posture_files
-from drakegrasp.exchange.attempts import read_attempts
+from drakegrasp.exchange.attempts import read_attempts, write_attempts
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
-from drakegrasp.simulation.attempts import Attempts, quaternion_poses
+from drakegrasp.simulation.attempts import CONDITIONS, Attempts, quaternion_poses
 from drakegrasp.simulation.posture import joint_order
 
 HAND = load_hand("allegro")
@@ -156,6 +157,34 @@ def test_own_layouts_say_the_same(tmp_path, write):
     np.testing.assert_array_equal(table.q_pregrasp, PREGRASP)
     np.testing.assert_array_equal(table.q_squeeze, SQUEEZE)
     np.testing.assert_array_equal(table.log_density, [-1.0, np.nan])
+
+
+def test_all_that_is_known_is_written(tmp_path):
+    """What a reader knows of a row comes in again, and the file states its hand."""
+    hand = load_hand()
+    q = np.tile(joint_positions(hand, 0.0, [0.5] * hand.num_fingers), (3, 1))
+    known = {
+        **{f"q_{stage}": q + 0.01 * i for i, stage in enumerate(("grasp", "pregrasp", "squeeze"))},
+        "X_TO": np.tile(make_pose(np.eye(3), [0.0, 0.0, 0.1]), (3, 1, 1)),
+        "scale": np.array([1.0, np.nan, 0.01]),
+        "log_density": np.array([0.0, -1.0, np.nan]),
+        **{name: np.array([0.5, np.nan, 0.2]) for name in CONDITIONS},
+        "confidence": np.array([0.9, 0.5, 0.1]),
+    }
+    np.savez(tmp_path / "all.npz", X_FG=np.tile(np.eye(4), (3, 1, 1)), object=["mug"] * 3, **known)
+    table = read_attempts(tmp_path / "all.npz", hand)
+    assert not any(table.invalid)
+    write_attempts(tmp_path / "all.h5", table, hand, network="barrett-1")
+    again = dict(read_attempts(tmp_path / "all.h5", hand))
+    for name, values in table:
+        np.testing.assert_array_equal(again[name], values, err_msg=name)
+    with h5py.File(tmp_path / "all.h5") as file:
+        assert file.attrs["hand"] == hand.name and file.attrs["network"] == "barrett-1"
+        assert file.attrs["drakegrasp"] == drakegrasp.__version__
+
+    with pytest.raises(GraspError, match="row 1: of no use"):
+        write_attempts(tmp_path / "bad.h5", table.refuse(["", "of no use", ""]), hand)
+    assert not (tmp_path / "bad.h5").exists()
 
 
 def test_pose_of_the_palm_link_becomes_that_of_the_palm(tmp_path):

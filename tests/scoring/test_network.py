@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.resources import files
 
 import numpy as np
 import pytest
+from helpers.depth_images import X_TC, K, image
 
 import drakegrasp as dg
-from drakegrasp.scoring.network import DEFAULT
+from drakegrasp.scoring.network import DEFAULT, _predict_view, _View
 
 
 @pytest.fixture(scope="module")
@@ -67,3 +69,17 @@ def test_a_file_of_weights_is_a_network(network, cloud, tmp_path):
 def test_the_number_of_grasps_is_positive(network, cloud):
     with pytest.raises(dg.GraspError, match="count must be 1 or more, got 0"):
         network.predict(cloud, count=0)
+
+
+def test_a_view_without_its_object_is_told_from_a_bad_one(network):
+    """Too few points, none high enough, or a flat object yield no grasps; other mistakes raise."""
+    depth, mask = image()
+    view = _View(name="box", resting=0, X_TO=np.eye(4), depth=depth, K=K, mask=mask, X_TC=X_TC)
+    lower = X_TC - np.eye(4, k=1) * [[0.0], [0.0], [0.12], [0.0]]
+    beside = np.zeros_like(mask)
+    beside[-20:-10, 60:90] = True
+    for changes in ({"mask": 0 * mask}, {"mask": beside}):
+        assert _predict_view(network, 1, replace(view, **changes)) is None
+    for changes in ({"mask": mask[1:]}, {"K": 2 * K}, {"depth": 1e3 * depth}, {"X_TC": lower}):
+        with pytest.raises(dg.GraspError, match="view of box"):
+            _predict_view(network, 1, replace(view, **changes))

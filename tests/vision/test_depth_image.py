@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from helpers.depth_images import BOX, WIDE, X_TC, K, image
+from helpers.depth_images import BOX, HIGH, WIDE, X_TC, K, image
 from PIL import Image
 
 import drakegrasp as dg
@@ -132,18 +132,26 @@ def test_files_of_a_camera(tmp_path):
     flat = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "width": WIDE}
     for content in (K.tolist(), {"K": K.ravel().tolist()}, {"camera_matrix": K.tolist()}, flat):
         path.write_text(json.dumps(content))
-        np.testing.assert_array_equal(read_camera(str(path)), K)
-    np.testing.assert_array_equal(read_camera("150,152, 80 58"), K)
+        np.testing.assert_array_equal(read_camera(str(path), (HIGH, WIDE)), K)
+    np.testing.assert_array_equal(read_camera("150,152, 80 58", (HIGH, WIDE)), K)
 
 
 @pytest.mark.parametrize(
     ("read", "content", "said"),
     [
-        (read_mask, b"no image", "must be an image, got: "),
+        (read_mask, b"no image", "must be an image, got no image"),
         (lambda path: read_depth_png(path, 0.001), 8, "16 bits and one channel, got uint8"),
-        (lambda path: read_camera(str(path)), b"[1, 2]", r"camera must be .*got an array of shape"),
-        (lambda path: read_camera(str(path)), b'{"f": 1}', r"camera must be .*got None"),
-        (lambda path: read_camera(str(path)), b"{", "a JSON file with K, got: "),
+        (
+            lambda path: read_camera(str(path), (HIGH, WIDE)),
+            b"[1, 2]",
+            r"camera must be .*got an array of shape",
+        ),
+        (
+            lambda path: read_camera(str(path), (HIGH, WIDE)),
+            b'{"f": 1}',
+            r"camera must be .*got None",
+        ),
+        (lambda path: read_camera(str(path), (HIGH, WIDE)), b"{", "a JSON file with K, got: "),
     ],
 )
 def test_bad_files_are_refused_with_their_name(tmp_path, read, content, said):
