@@ -162,7 +162,8 @@ def test_own_layouts_say_the_same(tmp_path, write):
 def test_all_that_is_known_is_written(tmp_path):
     """What a reader knows of a row comes in again, and the file states its hand."""
     hand = load_hand()
-    q = np.tile(joint_positions(hand, 0.0, [0.5] * hand.num_fingers), (3, 1))
+    closed = joint_positions(hand, 0.0, [0.5] * hand.num_fingers)
+    q = np.tile([closed[name] for name in joint_order(hand)], (3, 1))
     known = {
         **{f"q_{stage}": q + 0.01 * i for i, stage in enumerate(("grasp", "pregrasp", "squeeze"))},
         "X_TO": np.tile(make_pose(np.eye(3), [0.0, 0.0, 0.1]), (3, 1, 1)),
