@@ -293,10 +293,8 @@ def _seen_from(found: Attempts, X_TC: Array | None) -> Attempts:
 
 def _print_best(found: Attempts, X_TC: Array | None, hand: Hand) -> None:
     """Print the best grasps: score, directions of approach and of closing, and palm's position."""
-    import numpy as np
-
     from drakegrasp.cli.tables import make_table, print_table
-    from drakegrasp.hand.finger_sweep import across_angle
+    from drakegrasp.hand.finger_sweep import find_opposition
 
     frames = (
         {"{T}": found.X_FG}
@@ -304,8 +302,7 @@ def _print_best(found: Attempts, X_TC: Array | None, hand: Hand) -> None:
         else {"{T}": found.X_FG, "{C}": _seen_from(found, X_TC).X_FG}
     )
     heads = ["grasp", "score"]
-    angle = across_angle(hand) + np.pi / 2.0
-    along = np.array([np.cos(angle), np.sin(angle), 0.0])
+    along, _ = find_opposition(hand)
     for frame in frames:
         heads += [f"approach\nin {frame}", f"closes along\nin {frame}", f"palm in\n{frame} [mm]"]
     rows = []
