@@ -50,7 +50,8 @@ LEVER = 0.05
 #: Rounds and rate of the search for the fractions of force of the fingers.
 ROUNDS, RATE = 100, 1.0
 #: Logistic weights of `push`, `opposition`, `arm` [1/m] and `gap` [1/m], and the constant. They
-#: were fitted to lifts of the Barrett Hand at 24 built-in objects.
+#: were fitted to lifts of the Barrett Hand at 24 built-in objects, see "The fixed weights" in
+#: docs/results/choice.md.
 WEIGHTS = {"push": 4.0, "opposition": 2.0, "arm": -20.0, "gap": -50.0}
 CONSTANT = -3.0
 #: Scores that are equal to this number of decimals keep the order of their rows.
@@ -64,8 +65,8 @@ class Ranking:
     """The scores of n proposals, and the features that determine them.
 
     Attributes:
-        score: (n,), 0 to 1, greater is better: by the fixed weights a mere order, with a judge the
-            chance that the grasp is a sample; -1 for a row that is not a posture.
+        score: (n,), 0 to 1, greater is better: by the fixed weights only an order, with a judge
+            the chance that the grasp is a sample; -1 for a row that is not a posture.
         order: (n,), indices of the proposals, best first; of equal ones the earlier is first.
         features: Columns, each a mean over solids and moves; NaN for a row that is not a posture:
             `clearance` (n,), distance of the open hand from the object [m], negative inside, at

@@ -43,6 +43,7 @@ PALM_SHAPE = (
     '    <collision><origin xyz="0 0 -0.015"/><geometry><box size="0.06 0.14 0.03"/></geometry>'
     "</collision>\n"
 )
+SPREAD_LIMIT = "<xyz>0 0 -1</xyz>\n        <limit><lower>0</lower>"
 SPREAD_AXIS = "<child>finger2_spread</child>\n      <axis>\n        <xyz>0 0 1</xyz>"
 MIMIC = "<mimic joint='{}'><multiplier>{}</multiplier></mimic>"
 INERTIA = '<inertia ixx="1.86e-3" iyy="3.0e-4" izz="1.74e-3" ixy="0" ixz="0" iyz="-2e-5"/>'
@@ -63,8 +64,8 @@ FAULTS = {
         "barrett", ".sdf", "<lower>0</lower><upper>2.443460953</upper>", "", "limits",
         r"joint 'finger1_proximal_joint' must have limits, got -inf\.\.inf"),
     "spread half a degree before its joints": (
-        "barrett", ".yaml", "spreads_deg: [0.0,", "spreads_deg: [-0.5,", "limits",
-        r"spreads_deg must be 0\.\.180, got -0\.5$"),
+        "barrett", ".sdf", SPREAD_LIMIT, SPREAD_LIMIT.replace(">0<", ">0.0087266463<"), "limits",
+        r"spreads_deg must be 0\.5\.\.180, got 0$"),
     "zero mass": (
         "barrett", ".sdf", "<mass>0.04166</mass>", "<mass>0</mass>", "masses",
         r"link 'finger1_distal' must have a mass above 0 kg, got 0"),

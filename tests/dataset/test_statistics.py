@@ -236,9 +236,9 @@ def counts(train: int, valid: int, test: int) -> list[SplitCount]:
 def test_split_that_is_not_as_asked_is_told() -> None:
     config = SplitConfig()
     told = split_shortfall(counts(24, 43, 8), "object", config)
-    assert "train 32% (asked 75%), valid 57% (asked 10%), test 11% (asked 15%)" in told
-    assert "3 have samples" in told
-    assert "valid 0% (asked 10%)" in split_shortfall(counts(60, 0, 15), "object", config)
+    assert "train 32% (75%), valid 57% (10%), test 11% (15%)" in told
+    assert "3 objects have samples" in told
+    assert "valid 0% (10%)" in split_shortfall(counts(60, 0, 15), "object", config)
     assert split_shortfall(counts(75, 10, 15), "object", config) == ""
     none = SplitConfig(valid_fraction=0.0)
     assert split_shortfall(counts(85, 0, 15), "object", none) == ""
