@@ -16,6 +16,9 @@ DEV    := $(VENV)/.installed-dev
 # Software OpenGL must not start threads beside the workers, and nothing needs the network.
 export LP_NUM_THREADS := 0
 export DRAKE_ALLOW_NETWORK := none
+# Each process is one worker, so a library of linear algebra must not start threads in it.
+export OPENBLAS_NUM_THREADS := 1
+export OMP_NUM_THREADS := 1
 # Containers often set this; each process of the tests would compile tests and package again.
 unexport PYTHONDONTWRITEBYTECODE
 
