@@ -63,7 +63,7 @@ def test_name_that_no_mesh_has_is_wrong_usage(meshes):
     assert "--only must name objects" in result.output
 
 
-def test_objects_are_drawn_by_the_seed(meshes, tmp_path, monkeypatch):
+def test_objects_are_drawn_by_the_seed(tmp_path, monkeypatch):
     for name in "abcdef":
         trimesh.creation.box([0.05, 0.07, 0.15]).export(tmp_path / f"{name}.obj")
     drawn = []
