@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -315,21 +315,30 @@ def differences(
 
         # Check each field by itself; the number of rows must be that of most datasets.
         meanings = {f.meaning: f.name for f in fields}
-        rows = _most_frequent([dataset.shape[0] for dataset in datasets.values() if dataset.shape])
+        rows = _most_frequent([each.shape[0] for each in datasets.values() if each.shape])
         for f in fields:
-            dataset = datasets.get(f.name)
-            if dataset is not None:
-                yield from _of_field(f"{place}/{f.name}", dataset, f, rows, lengths)
-                words = h5py.Dataset(dataset).attrs  # each attribute is read when it is used
-                yield from _of_words(f"{place}/{f.name}", words, f, meanings, thorough)
+            path, header = f"{place}/{f.name}", datasets.get(f.name)
+            if header is not None:
+                yield from _of_field(path, header, f, rows, lengths)
+                yield from _of_words(path, header.dataset, f, meanings, thorough)
             elif not f.optional or f.name in file[name]:
-                path = f"{place}/{f.name}"
                 yield Difference(path=path, what="the dataset must be there", got="none")
+
+
+class _Header(NamedTuple):
+    """A dataset, its type, and its shape, which is None without a dataspace.
+
+    HDF5 needs more time to return these than for all else that is done with them.
+    """
+
+    dataset: h5py.h5d.DatasetID
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...] | None
 
 
 def _datasets(
     file: h5py.File, name: str, fields: Iterable[Field]
-) -> dict[str, h5py.h5d.DatasetID] | None:
+) -> dict[str, _Header] | None:
     """Return the datasets of a group that are fields; None if the group does not exist."""
     group = file.get(name)
     if not isinstance(group, h5py.Group):
@@ -341,7 +350,7 @@ def _datasets(
         except KeyError:
             continue
         if isinstance(item, h5py.h5d.DatasetID):
-            datasets[f.name] = item
+            datasets[f.name] = _Header(item, item.dtype, item.shape)
     return datasets
 
 
@@ -363,7 +372,7 @@ def _extras(file: h5py.File, tables: Tables) -> Iterator[Difference]:
 
 
 def _lengths(
-    tables: Tables, headers: Mapping[str, dict[str, h5py.h5d.DatasetID] | None]
+    tables: Tables, headers: Mapping[str, dict[str, _Header] | None]
 ) -> dict[str, int]:
     """Return the lengths of the letters in shapes, as most datasets of a file have them."""
     votes: dict[str, list[int]] = {}
@@ -386,7 +395,7 @@ def _most_frequent(numbers: Sequence[int]) -> int:
 
 def _of_field(
     path: str,
-    dataset: h5py.h5d.DatasetID,
+    header: _Header,
     field: Field,
     rows: int,
     lengths: Mapping[str, int],
@@ -395,12 +404,12 @@ def _of_field(
 
     Args:
         path: Path of the dataset.
-        dataset: The dataset.
+        header: The dataset.
         field: The field.
         rows: Number of rows that the dataset must have.
         lengths: Lengths of the letters in the shapes, as far as they are known.
     """
-    dtype, stored = dataset.dtype, dataset.shape
+    _, dtype, stored = header
     text = h5py.check_string_dtype(dtype) is not None
     if text != (field.dtype == "str") or not (text or dtype == np.dtype(field.dtype)):
         yield Difference(path=path, what=f"type must be {field.dtype}", got=str(dtype))
@@ -414,19 +423,24 @@ def _of_field(
 
 
 def _of_words(
-    path: str, attrs: Mapping[str, Any], field: Field, meanings: Mapping[str, str], thorough: bool
+    path: str,
+    dataset: h5py.h5d.DatasetID,
+    field: Field,
+    meanings: Mapping[str, str],
+    thorough: bool,
 ) -> Iterator[Difference]:
     """Yield the differences between the attributes of a dataset and its field.
 
     Args:
         path: Path of the dataset.
-        attrs: Attributes of the dataset.
+        dataset: The dataset.
         field: The field.
         meanings: Names of the fields of the group by their meanings.
         thorough: Whether unit and frame must also match the field, and a meaning must exist.
     """
     # Wording may improve without a new version of the schema. Only the meaning of another field is
     # reported, because two fields were swapped then.
+    attrs = h5py.AttributeManager(h5py.Dataset(dataset))  # each is read when it is used
     said = attrs.get("meaning")
     if isinstance(said, str) and said != field.meaning and said in meanings:
         yield Difference(path=path, what=f"must be {field.name}", got=meanings[said])
