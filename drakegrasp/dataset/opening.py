@@ -336,9 +336,7 @@ class _Header(NamedTuple):
     shape: tuple[int, ...] | None
 
 
-def _datasets(
-    file: h5py.File, name: str, fields: Iterable[Field]
-) -> dict[str, _Header] | None:
+def _datasets(file: h5py.File, name: str, fields: Iterable[Field]) -> dict[str, _Header] | None:
     """Return the datasets of a group that are fields; None if the group does not exist."""
     group = file.get(name)
     if not isinstance(group, h5py.Group):
@@ -371,9 +369,7 @@ def _extras(file: h5py.File, tables: Tables) -> Iterator[Difference]:
             yield Difference(path=f"/{name}", what=what, got=f"{key} too")
 
 
-def _lengths(
-    tables: Tables, headers: Mapping[str, dict[str, _Header] | None]
-) -> dict[str, int]:
+def _lengths(tables: Tables, headers: Mapping[str, dict[str, _Header] | None]) -> dict[str, int]:
     """Return the lengths of the letters in shapes, as most datasets of a file have them."""
     votes: dict[str, list[int]] = {}
     for name, fields in tables.items():

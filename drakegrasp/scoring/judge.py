@@ -135,8 +135,10 @@ def load_judge(source: str | Path | Judge) -> Judge:
 def _fault(about: Any, arrays: Mapping[str, Array]) -> str:
     """Return what is wrong with the content of a file; empty if nothing is."""
     for key in ("name", "hand", "fingerprint"):
-        if not isinstance(about[key], str):
-            return f"its {key} is {about[key]!r}"
+        if not isinstance(about.get(key), str):
+            return f"its {key} is {about.get(key)!r}"
+    if "features" not in about:
+        return "its features are missing"
     count, heads = len(about["features"]), len(HEADS)
     shapes = {"mean": (count,), "scale": (count,), "weights": (count, heads), "offset": (heads,)}
     for name, shape in shapes.items():

@@ -259,9 +259,9 @@ def measure(
             choices[f"{key}, best of {first}"] = ends[order[:first]].max(axis=0)
         choices[f"{key}, auc"] = np.array([auc(scores[key], end) for end in ends.T])
     choices["random"], choices["oracle"] = ends.mean(axis=0), ends.max(axis=0)
-    told = ", ".join(f"{key} {value[1]:.2f}" for key, value in choices.items())
-    click.echo(f"{name}: {len(grasps)} grasps; samples: {told}", err=True)
     listed = {key: value.tolist() for key, value in choices.items() if np.isfinite(value).any()}
+    told = ", ".join(f"{key} {value[1]:.2f}" for key, value in listed.items())
+    click.echo(f"{name}: {len(grasps)} grasps; samples: {told}", err=True)
     best = int(orders[last][0])
     return {
         "name": name,

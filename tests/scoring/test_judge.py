@@ -107,7 +107,8 @@ def test_a_file_that_is_no_judge_is_refused(tmp_path, damage):
     ("spoilt", "said"),
     [
         ({"about": {"features": ["gap", "push"]}}, "its mean must be finite numbers of shape"),
-        ({"about": {"fingerprint": None}}, "'fingerprint'"),
+        ({"about": {"fingerprint": None}}, "its fingerprint is None"),
+        ({"about": {"features": None}}, "its features are missing"),
         ({"about": {"hand": 7}}, "its hand is 7"),
         ({"offset": [0.0, 0.0, 0.0]}, "its offset must be finite numbers of shape"),
         ({"weights": [[np.nan, 0.0]]}, "its weights must be finite numbers"),
