@@ -54,7 +54,7 @@ TEMPLATES = Environment(
 )
 #: Colours of fingers, and of kinds of contacts in the order in which they are drawn.
 TEMPLATES.globals["colours"] = FINGER_COLOURS
-TEMPLATES.globals["kinds"] = {"true": TRUE, "asked": PREDICTED, "reached": REACHED}
+TEMPLATES.globals["kinds"] = {"true": TRUE, "requested": PREDICTED, "reached": REACHED}
 TEMPLATES.globals["counted"] = counted
 
 

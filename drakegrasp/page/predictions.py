@@ -62,7 +62,7 @@ _BOTH = {field.name for field in TRIAL_FIELDS if field.shown == NUMBERS.get(fiel
 QUANTITIES = {
     "contact_error": NUMBERS["contact_error"],
     "normal_error": NUMBERS["normal_error"],
-    "true_error": Shown("asked to true", "mm"),
+    "true_error": Shown("requested to true", "mm"),
     **{
         name: NUMBERS[name]
         for name in ("surface_distance", "slip", "turn", "confidence", "smallest_friction")
@@ -74,7 +74,7 @@ _CARD = ("contact_error", "true_error", "slip", "turn", "confidence")
 WORDS = ("held", "success", "precision", "stable", "sample")
 VERDICTS = ("fails", *WORDS, "held_any")
 #: Kinds of contacts, and the columns of a verdict that contain them.
-_CONTACTS = {"asked": ("p_OQ", "nhat_Q_O"), "reached": ("closed_p_OQ", "closed_nhat_Q_O")}
+_CONTACTS = {"requested": ("p_OQ", "nhat_Q_O"), "reached": ("closed_p_OQ", "closed_nhat_Q_O")}
 #: Fields of a verdict that its card needs.
 ON_CARDS = ("reason", *(name for names in _CONTACTS.values() for name in names))
 #: Width of the shown part of an image over that of its marks, and the smallest shown fraction.
@@ -287,7 +287,7 @@ class Predictions(Gallery):
         X_TO = unpack_pose(row["X_TO"])
         marks = [
             *contacts_of(row, "closed_", X_TO, "true"),
-            *contacts_of(verdict, "", X_TO, "asked"),
+            *contacts_of(verdict, "", X_TO, "requested"),
             *contacts_of(verdict, "closed_", X_TO, "reached"),
         ]
 

@@ -65,16 +65,16 @@ def test_filters_choose(client: TestClient, query: str, numbers: list[str]) -> N
     assert shown(client, query) == numbers
 
 
-def test_asked_reached_and_true_contacts_are_marked(client: TestClient) -> None:
+def test_requested_reached_and_true_contacts_are_marked(client: TestClient) -> None:
     cards = client.get("/predictions?sort=row&order=up").text.split("</li>")
     card = next(c for c in cards if 'data-label="0"' in c)
-    kinds = {kind: card.count(f'class="{kind}"') for kind in ("asked", "reached", "true")}
+    kinds = {kind: card.count(f'class="{kind}"') for kind in ("requested", "reached", "true")}
     # Three fingers, in colour and depth.
-    assert kinds == {"asked": 6, "reached": 6, "true": 6}
+    assert kinds == {"requested": 6, "reached": 6, "true": 6}
     assert "4.0 mm" in card and "it &lt;success&gt;" in card
     never_closed = next(c for c in cards if 'data-label="2"' in c)
     assert 'class="reached"' not in never_closed
-    assert never_closed.count('class="asked"') == 6
+    assert never_closed.count('class="requested"') == 6
 
 
 def test_page_of_a_prediction_has_both_hands_and_all_contacts(client: TestClient) -> None:
@@ -83,9 +83,11 @@ def test_page_of_a_prediction_has_both_hands_and_all_contacts(client: TestClient
     scene = _scene(page)
     assert set(scene["states"]) == {"closed", "dataset's grasp"}
     contacts = scene["states"]["closed"]["contacts"]
-    points = {kind: [c["p"] for c in contacts if c["kind"] == kind] for kind in ("asked", "true")}
+    points = {
+        kind: [c["p"] for c in contacts if c["kind"] == kind] for kind in ("requested", "true")
+    }
     # The first was asked 7 mm from the true one along z of {O}, which lies in the table's plane.
-    apart = np.subtract(points["asked"], points["true"])
+    apart = np.subtract(points["requested"], points["true"])
     z_T = np.array([0.5, -np.sqrt(0.75), 0.0])
     np.testing.assert_allclose(apart, [0.007 * z_T, [0, 0, 0], [0, 0, 0]], atol=1e-9)
     assert set(_scene(client.get("/prediction/2").text)["states"]) == {"dataset's grasp"}

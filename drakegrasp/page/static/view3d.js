@@ -97,7 +97,7 @@
 
   // As on the images: a ring that lies on the surface, a dot, a square.
   function shape(kind) {
-    if (kind === "asked") return new THREE.TorusGeometry(1.6 * DOT, 0.3 * DOT, 12, 32);
+    if (kind === "requested") return new THREE.TorusGeometry(1.6 * DOT, 0.3 * DOT, 12, 32);
     if (kind === "true") return new THREE.BoxGeometry(1.9 * DOT, 1.9 * DOT, 0.6 * DOT);
     return new THREE.SphereGeometry(DOT, 24, 16);
   }
