@@ -328,7 +328,7 @@ def _add_visual(plant: MultibodyPlant, body: RigidBody, model: ObjectModel) -> N
 
 
 def _add_table(plant: MultibodyPlant, scene_graph: SceneGraph, physics: PhysicsConfig) -> RigidBody:
-    (instance,) = make_parser(plant).AddModels(MODELS / "table.sdf")
+    (instance,) = make_parser(plant).AddModels(MODELS / "table.urdf")
     body = plant.GetBodyByName("table", instance)
     plant.WeldFrames(plant.world_frame(), body.body_frame(), RigidTransform(X_WT))
     properties = ProximityProperties()

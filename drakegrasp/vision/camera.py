@@ -33,7 +33,7 @@ BESIDE = 2.0
 RING = tuple((azimuth, 45.0, 0.65) for azimuth in (0.0, 90.0, 180.0, 270.0))
 SINGLE = (45.0, 60.0, 0.7)
 FIXED_AIM = np.array([0.0, 0.0, 0.05])
-#: Colour of the table (models/table.sdf).
+#: Colour of the table (models/table.urdf).
 TABLE_COLOUR = (0.55, 0.50, 0.44)
 #: Direction and intensity of the light from above. It is slanted, because a table is black if
 #: camera and light look along it.

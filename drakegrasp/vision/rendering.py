@@ -135,7 +135,7 @@ def build_renderer(model: ObjectModel, config: CameraConfig, hand: Hand | None =
     plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
     scene_graph.AddRenderer(ENGINE, MakeRenderEngineVtk(_engine_parameters(appearance)))
     body = add_drawn_object(plant, model)
-    (instance,) = make_parser(plant).AddModels(MODELS / "table.sdf")
+    (instance,) = make_parser(plant).AddModels(MODELS / "table.urdf")
     table = plant.GetBodyByName("table", instance)
     plant.WeldFrames(plant.world_frame(), table.body_frame(), RigidTransform(X_WT))
     drawn = None if hand is None else add_posed_hand(plant, hand)
