@@ -239,5 +239,5 @@ def test_weights_of_a_hand_are_copied_and_counted(tmp_path: Path) -> None:
     copy = carried_source(tmp_path / "out", load_config())
     known = read_lift_chance("barrett")
     assert known is not None and read_lift_chance(copy) == known
-    chance = replace(folder, files=folder.files | {"barrett_chance.yaml": MODELS / "table.sdf"})
+    chance = replace(folder, files=folder.files | {"barrett_chance.yaml": MODELS / "table.urdf"})
     assert chance.digest != folder.digest

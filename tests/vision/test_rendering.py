@@ -233,8 +233,8 @@ def painted(box: ObjectModel) -> Renderer:
 
 def test_table_looks_as_its_model_says(box: ObjectModel) -> None:
     """The constant is what the checks compare with; the model is what is drawn."""
-    text = (MODELS / "table.sdf").read_text()
-    assert f"<diffuse>{' '.join(f'{c:.2f}' for c in TABLE_COLOUR)} 1.0</diffuse>" in text
+    text = (MODELS / "table.urdf").read_text()
+    assert f'<color rgba="{" ".join(f"{c:.2f}" for c in TABLE_COLOUR)} 1.0"/>' in text
 
 
 def brightness(renderer: Renderer) -> tuple[Array, Array]:

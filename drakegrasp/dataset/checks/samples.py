@@ -70,7 +70,7 @@ BEFORE_SURFACE = 5e-3  # [m]
 CENTROID_TOLERANCE = 0.05  # [px]
 #: Mask pixels per image whose distance from the mesh is measured; all are tested against the box.
 MEASURED_PIXELS = 16
-#: The table's slab (models/table.sdf): half edges and centre in {T} [m].
+#: The table's slab (models/table.urdf): half edges and centre in {T} [m].
 TABLE_HALF = np.array([0.8, 0.8, 0.05])
 P_TTABLE = np.array([0.0, 0.0, -0.05])
 
