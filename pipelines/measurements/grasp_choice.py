@@ -223,10 +223,7 @@ def measure(
         protocol: Name of a protocol in MuJoCo; None for the lift.
     """
     hand = load_hand(placed.config.hand_source)
-    triangles = transform_points(placed.X_TO_simulated, placed.model.visual_vertices)[
-        placed.model.visual_faces
-    ]
-    cloud = seen(triangles, Stream(7, object_key(name)))
+    triangles, cloud = view_of(name, placed)
     begin = time.process_time()
     grasps = dg.propose(cloud, hand)
     columns = measured(grasps, read_cloud(cloud), hand)
@@ -291,6 +288,13 @@ def tried_by(
         mjcf, files = write_grasps(postures, hand, Path(name))
         trials = prepare_trials(protocol, mjcf, Path(name))
         return [verdict.success for verdict, _ in verify_postures(files, trials)]
+
+
+def view_of(name: str, placed: PlacedObject) -> tuple[Array, Array]:
+    """Return an object's triangles (n, 3, 3), and the points (m, 3) of its view, in {T} [m]."""
+    vertices = transform_points(placed.X_TO_simulated, placed.model.visual_vertices)
+    triangles = vertices[placed.model.visual_faces]
+    return triangles, seen(triangles, Stream(7, object_key(name)))
 
 
 def seen(triangles: Array, stream: Stream) -> Array:
