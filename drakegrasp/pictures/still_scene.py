@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -55,7 +54,7 @@ from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.runtime.environment import require_render_memory
+from drakegrasp.runtime.environment import prepare_rendering
 from drakegrasp.vision.camera import Picture, object_colour
 from drakegrasp.vision.rendering import BLANK, GREY, add_drawn_object, add_posed_hand
 
@@ -312,9 +311,7 @@ class StillScene:
         # Engines are added when needed: a scene that is not drawn does not start OpenGL.
         context = self._graph.GetMyMutableContextFromRoot(self._root)
         if not self._graph.HasRenderer(context, lighting.name):
-            # Software OpenGL would otherwise start its own threads.
-            os.environ.setdefault("LP_NUM_THREADS", "0")
-            require_render_memory()
+            prepare_rendering()
             parameters = RenderEngineVtkParams(
                 default_clear_color=BACKGROUND,
                 default_diffuse=GREY,

@@ -22,9 +22,10 @@ import resource
 import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, wraps
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -139,18 +140,26 @@ def require_mujoco(*modules: str) -> None:
             raise MachineError(f"{module} must be installed: pip install 'drakegrasp[peer]'")
 
 
-def require_render_memory() -> None:
-    """Raise an error if the limit of memory is so small that OpenGL would crash.
+def prepare_rendering() -> None:
+    """Prepare this process for OpenGL; called before each renderer is made.
 
     Raises:
-        MachineError: If it is.
+        MachineError: If the limit of memory is so small that OpenGL would crash.
     """
+    # Software OpenGL would start its own threads beside the one process per core.
+    os.environ.setdefault("LP_NUM_THREADS", "0")
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY and limit < RENDER_MEMORY:
         raise MachineError(
             f"the limit of memory must be at least {RENDER_MEMORY / 1e9:g} GB to render, got "
             f"{limit / 1e9:.2g} GB: raise `ulimit -v`"
         )
+
+    # torch's optimizers import Triton. Triton and software OpenGL each have their own LLVM, and
+    # Triton ends in a segmentation fault if it is loaded second.
+    if find_spec("triton") is not None:
+        with suppress(Exception):  # what is broken may not be needed
+            import_module("triton")
 
 
 def release_memory() -> None:

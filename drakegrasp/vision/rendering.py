@@ -10,7 +10,6 @@ context, and any other thread silently gets a blank image. A blank image is an e
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -53,7 +52,7 @@ from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.parsing import add_model, make_parser
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.runtime.environment import require_render_memory
+from drakegrasp.runtime.environment import prepare_rendering
 from drakegrasp.vision.camera import Appearance, Lens, object_colour, unproject, usual_appearance
 
 #: Colour of pixels beyond the table.
@@ -126,9 +125,7 @@ class Renderer:
 
 def build_renderer(model: ObjectModel, config: CameraConfig, hand: Hand | None = None) -> Renderer:
     """Return a renderer of an object's full mesh on the table, and of a hand if there is one."""
-    # Software OpenGL would start its own threads beside the one process per core.
-    os.environ.setdefault("LP_NUM_THREADS", "0")
-    require_render_memory()
+    prepare_rendering()
 
     # The object, and the table of the simulation.
     builder, appearance = DiagramBuilder(), usual_appearance(model.name)

@@ -34,11 +34,10 @@ from drakegrasp.pictures.style import add_axes, new_page, save_figure, show_imag
 from drakegrasp.scoring.judge import load_judge
 from drakegrasp.scoring.ranking import measured
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.posture import start_of
 
 #: Pictures side by side; edge of a picture and its distance from the next, height of its text, and
-#: margin [inch]; edge [px].
-ACROSS, EDGE, GAP, TEXT, MARGIN, PIXELS = 5, 1.5, 0.08, 0.34, 0.1, 220
+#: margin [inch]; resolution [px/inch].
+ACROSS, EDGE, GAP, TEXT, MARGIN, DPI = 5, 1.5, 0.08, 0.34, 0.1, 150
 
 
 @click.command(help=__doc__)
@@ -72,11 +71,11 @@ def picture(name: str, placed: PlacedObject, judge: str) -> tuple[np.ndarray, st
     posture = grasps.posture(int(np.argmax(chances)), placed.X_TO_simulated)
     trial = dg.run_trial(placed, posture)
 
-    start = start_of(posture, hand)
+    assert posture.q_pregrasp is not None  # proposals have one
     scene = StillScene(hand, placed.model)
     poses = Poses(
         X_WG=multiply(X_WT, multiply(trial.X_TO, trial.X_OG)),
-        q=start.path[0] if trial.closed is None else trial.closed.q,
+        q=posture.q_pregrasp if trial.closed is None else trial.closed.q,
         X_WO=multiply(X_WT, trial.X_TO),
     )
     X_WC = scene.choose_view(scene.outline(poses), fill=1.25)
@@ -84,7 +83,7 @@ def picture(name: str, placed: PlacedObject, judge: str) -> tuple[np.ndarray, st
     end = trial.outcome.label if removal is None else f"held, {removal.label}"
     end = "sample" if removal is Removal.KEPT else end.replace("_", " ")
     click.echo(f"{name}: {end}", err=True)
-    return scene.picture(X_WC, (PIXELS, PIXELS)).image, end
+    return scene.picture(X_WC, 2 * (round(EDGE * DPI),)).image, end
 
 
 def draw(images: Sequence[np.ndarray], texts: Sequence[str], png: Path) -> None:
@@ -98,7 +97,7 @@ def draw(images: Sequence[np.ndarray], texts: Sequence[str], png: Path) -> None:
         axes = add_axes(figure, left, top, EDGE, EDGE)
         show_image(axes, image)
         write_beside(axes, 0.0, 1.02, text, 6.5, va="bottom")
-    save_figure(figure, png, dpi=PIXELS / EDGE)
+    save_figure(figure, png, dpi=DPI)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import pickle
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -168,3 +170,18 @@ def test_a_pickle_holds_neither_file_nor_columns(data: GraspDataset) -> None:
     copied = pickle.loads(pickle.dumps(row))
     assert type(copied) is dict  # of a batch, too
     assert torch.equal(copied["grasps"], row["grasps"])
+
+
+def test_a_process_that_has_rendered_can_train() -> None:
+    code = """
+import numpy as np, torch
+from drakegrasp.hand.description import load_hand
+from drakegrasp.pictures.still_scene import Poses, StillScene, camera_pose
+
+scene = StillScene(load_hand())
+p_WA = scene.outline(Poses(X_WG=np.eye(4), q=scene.positions(0.0)))
+scene.picture(camera_pose(p_WA, 0.3, 0.4), (60, 60))
+torch.optim.Adam(torch.nn.Linear(2, 1).parameters())
+"""
+    # In a process of its own, because the fault would be a segmentation fault.
+    subprocess.run([sys.executable, "-c", code], check=True)
