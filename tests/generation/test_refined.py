@@ -15,7 +15,7 @@ import trimesh
 from cross_check import cross_check
 from helpers.assertions import assert_same_arrays, assert_same_dataset
 from helpers.meshes import write_fixed
-from helpers.objects import CUBE
+from helpers.objects import CUBE, write_above
 
 from drakegrasp.config import CloseConfig, Config
 from drakegrasp.dataset.assemble import assemble
@@ -61,6 +61,7 @@ def config() -> Config:
             *(f"refine.children={CHILDREN}", "refine.generations=2", "objects.resting_poses=3"),
             *("filters.outlier_sigma=0", "split.by=object", "objects.mass=0.2"),
             *("physics.friction_hand=1.5", "lift.max_speed=2", "lift.max_acceleration=20"),
+            *("lift.hold_time=0.1", "camera.size=32"),
         ]
     )
 
@@ -374,22 +375,13 @@ def test_palm_poses_about_one_that_only_scrapes_the_table_are_tried(tmp_path: Pa
     (tmp_path / "meshes").mkdir()
     can = trimesh.creation.cylinder(CUBE / 2, CUBE, sections=64)
     can.export(tmp_path / "meshes" / "1_can.obj")
-    (tmp_path / "above.py").write_text(
-        "import numpy as np\n"
-        "from drakegrasp.frames import make_pose\n"
-        "from drakegrasp.simulation.samplers import R_OG0\n"
-        "class Above:\n"
-        "  def __init__(self, model, X_TO, stream):\n"
-        "    self.height = float(model.half_extents[2]) + 0.042\n"
-        "  def poses(self):\n"
-        "    yield make_pose(R_OG0, [0.0, 0.0, self.height])\n"
-    )
-    rules = [f"candidates.method={tmp_path}/above.py:Above", "candidates.standoffs=[0.042]"]
-    rules += ["refine.children=3", "candidates.max=1"]
+    rules = [f"candidates.method={write_above(tmp_path, 0.042)}", "candidates.standoffs=[0.042]"]
+    rules += ["refine.children=2", "candidates.max=1", "objects.resting_poses=1"]
+    rules += ["lift.max_speed=2", "lift.max_acceleration=20", "lift.hold_time=0.1"]
     out = tmp_path / "out"
     build(find_meshes(tmp_path / "meshes"), out, load_config(overrides=rules), run_here, show=False)
     trials = Trials(out)
     scraped = trials["outcome"][0], trials["clearance_close"][0] < -0.5e-3
     assert scraped == (Outcome.TABLE_CONTACT, True)
-    assert trials["child"].tolist() == [0, 1, 2, 3]
+    assert trials["child"].tolist() == [0, 1, 2]
     assert check_dataset(out) == []

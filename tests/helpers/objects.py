@@ -65,3 +65,22 @@ def from_above(model: ObjectModel, standoff: float, *, spread: float = 0.0) -> A
         ray_hits=True,
         seed=0,
     )
+
+
+def write_above(folder: Path, standoff: float, x: float = 0.0) -> str:
+    """Write a sampler of one palm pose over an object's top, moved along Ox [m].
+
+    Returns:
+        Its value of `candidates.method`.
+    """
+    path = folder / "above.py"
+    path.write_text(
+        "from drakegrasp.frames import make_pose\n"
+        "from drakegrasp.simulation.samplers import R_OG0\n"
+        "class Above:\n"
+        "  def __init__(self, model, X_TO, stream):\n"
+        f"    self.height = float(model.half_extents[2]) + {standoff}\n"
+        "  def poses(self):\n"
+        f"    yield make_pose(R_OG0, [{x}, 0.0, self.height])\n"
+    )
+    return f"{path}:Above"
