@@ -32,8 +32,11 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> BuildReport:
     config = load_config(
         hand=str(write_with_optional_fingers(folder, 0, 1)),
         overrides=[
-            *(*SMALL, "lift.max_speed=2", "lift.max_acceleration=20", "lift.hold_time=0.1"),
-            *("candidates.max=1", f"candidates.method={write_above(folder, 0.06, x=0.013)}"),
+            *(
+                *SMALL,
+                "candidates.max=1",
+                f"candidates.method={write_above(folder, 0.06, x=0.013)}",
+            ),
             *("candidates.standoffs=[0.06]", "camera.size=32"),
         ],
     )

@@ -106,5 +106,5 @@ def assert_sound(model: ObjectModel) -> None:
 SMALL = [
     *("candidates.max=16", "unit_candidates=4", "split.train_classes=[wineglass]"),
     *("filters.outlier_sigma=0", "filters.require=held", "filters.max_normal_angle_deg=null"),
-    *("lift.max_speed=1", "lift.max_acceleration=10"),
+    *("lift.max_speed=2", "lift.max_acceleration=20", "lift.hold_time=0.1"),
 ]
