@@ -7,8 +7,11 @@ import gc
 import os
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import trimesh
@@ -79,10 +82,12 @@ def small_config() -> Config:
 def builds_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let `drakegrasp build` do the work in this process, and start no others."""
 
-    def build_here(objects: Path, out: Path, *, config: Config, show: bool, **_: object) -> object:
-        return build(find_meshes(objects), out, config, run_here, show=show)
-
-    monkeypatch.setattr("drakegrasp.api.building.build_dataset", build_here)
+    no_cluster = nullcontext(SimpleNamespace(dashboard_link=""))
+    building = "drakegrasp.api.building"
+    monkeypatch.setattr(f"{building}.joined", lambda *_: no_cluster)
+    monkeypatch.setattr(f"{building}.admitted_workers", lambda *_: nullcontext(False))
+    execute = Mock(side_effect=run_here, pool=None)
+    monkeypatch.setattr(f"{building}.DaskExecutor", lambda *_, **__: execute)
 
 
 @pytest.fixture(scope="session")

@@ -95,6 +95,7 @@ def test_the_caller_says_the_preshape_of_rows_that_name_none(tmp_path):
 
 
 @pytest.mark.sim
+@pytest.mark.usefixtures("builds_here")
 def test_palm_poses_are_built_in_each_preshape_and_a_third_resting_pose(tmp_path, monkeypatch):
     import h5py
 

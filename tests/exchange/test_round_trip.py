@@ -78,7 +78,7 @@ def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def out(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset, all of whose samples train."""
     folder = tmp_path_factory.mktemp("built") / "out"
-    few = ("candidates.method=normals", "candidates.max=110")
+    few = ("candidates.method=normals", "candidates.max=60")
     config = load_config("fast", [*RULES, *OBJECTS, *SAMPLES, *few])
     build(find_meshes(meshes, units="cm"), folder, config, run_here, show=False)
     return folder
