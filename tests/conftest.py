@@ -81,7 +81,6 @@ def small_config() -> Config:
 @pytest.fixture
 def builds_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let `drakegrasp build` do the work in this process, and start no others."""
-
     no_cluster = nullcontext(SimpleNamespace(dashboard_link=""))
     building = "drakegrasp.api.building"
     monkeypatch.setattr(f"{building}.joined", lambda *_: no_cluster)

@@ -272,6 +272,7 @@ def test_build_reports_and_says_when_nothing_is_left_to_do(
     shutil.copy(small_meshes / "11_box_slim.obj", tmp_path / "meshes")
     command = ["build", "--objects", tmp_path / "meshes", "--out", tmp_path / "out"]
     command += ["--workers", "1", "--candidates", "1", "--quiet", "--config", "fast"]
+    command += ["--set", "candidates.method=normals"]
     first = run(*command)
     assert first.exit_code == 0, first.output
     assert "1 work unit simulated" in first.stdout

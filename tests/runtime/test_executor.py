@@ -54,10 +54,10 @@ def test_processes_start_by_default_only_where_the_work_is_long(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(executor, "available_cores", lambda: 2)
-    monkeypatch.setattr(executor, "ALONE_SECONDS", 0.5)
+    monkeypatch.setattr(executor, "ALONE_SECONDS", 0.2)
     with processes() as execute:
         assert list(execute(pid_later, [0.0] * 3)) == [os.getpid()] * 3
-        assert next(execute(pid_later, [0.6])) == os.getpid()
+        assert next(execute(pid_later, [0.3])) == os.getpid()
         assert os.getpid() not in list(execute(pid_later, [0.0] * 3))
 
 

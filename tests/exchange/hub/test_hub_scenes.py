@@ -49,7 +49,7 @@ print(json.dumps({
 def made(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset with scenes."""
     out = Path(shutil.copytree(dataset, tmp_path_factory.mktemp("scenes") / "out"))
-    make_scenes(out, overrides=["scenes.views=3", "scenes.width=160", "scenes.height=120"])
+    make_scenes(out, overrides=["scenes.views=2", "scenes.width=64", "scenes.height=48"])
     return out
 
 
