@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.assertions import assert_same_dataset
+from helpers.tiers import few
 
 from drakegrasp.api.building import build_dataset
 from drakegrasp.config import Config
@@ -97,8 +98,9 @@ def test_dataset_keeps_every_invariant(small_dataset: Path) -> None:
 
 
 @pytest.mark.cluster
+@pytest.mark.parametrize("workers", few([1, 2], 1))
 def test_number_of_workers_changes_nothing(
-    small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path
+    small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path, workers: int
 ) -> None:
     """One of three objects is left for the workers to prepare, and two of its units to try."""
     out, ignore = tmp_path / "out", shutil.ignore_patterns("11_box_slim.*")
@@ -106,7 +108,7 @@ def test_number_of_workers_changes_nothing(
         shutil.copytree(small_dataset / name, out / name, ignore=ignore)
     for shard in out.glob("shards/11_box_slim/000000[48]*.h5"):
         shard.unlink()
-    report = build_dataset(small_meshes, out, config=small_config, workers=2, show=False)
+    report = build_dataset(small_meshes, out, config=small_config, workers=workers, show=False)
     assert report.simulated == 2
     assert_same_dataset(small_dataset, out)
 
