@@ -174,8 +174,12 @@ def test_file_that_cannot_be_shown_is_a_line(
         assert 'href="/scenes"' in client.get("/").text
 
 
-def test_files_without_a_server_say_what_cannot_be_shown(spoiled: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("without_plots")
+def test_files_without_a_server_say_what_cannot_be_shown(
+    spoiled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """And hold all else."""
+    monkeypatch.setattr(site_module, "MAX_GRASPS", 1)
     damage(spoiled / "scenes.hdf5")
     write_site(spoiled, tmp_path / "site")
     index = Tags((tmp_path / "site" / "index.html").read_text(encoding="utf-8")).text
@@ -189,6 +193,7 @@ def test_without_scenes_there_is_no_link(boxes: Path, tmp_path: Path) -> None:
         assert client.get("/scenes").status_code == 404
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_every_address_of_the_files_is_there(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -74,6 +74,7 @@ def test_cards_carry_what_filters_need(site: Path, first: str) -> None:
     assert "2 of 4" in (site / "prediction" / "3.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_files_cannot_decide_but_show_decisions(out: Path, tmp_path: Path) -> None:
     key = AttemptKey("1_box_a", 0, 0)
     write_decisions(out / "reject.json", Decisions(rejected=frozenset([key])))
@@ -85,6 +86,7 @@ def test_files_cannot_decide_but_show_decisions(out: Path, tmp_path: Path) -> No
         assert not re.search("<button data-(decide|undo|record)", text)
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_what_is_left_out_is_told(
     boxes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -100,6 +102,7 @@ def test_what_is_left_out_is_told(
     assert 'name="outcome"' not in index
 
 
+@pytest.mark.usefixtures("without_plots")
 @pytest.mark.parametrize("how", [KeyboardInterrupt, DataError])
 def test_a_run_that_ends_early_leaves_nothing(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: type[BaseException]
