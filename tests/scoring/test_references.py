@@ -98,8 +98,9 @@ def test_closing_gives_the_posture_that_is_ranked_first_for_what_is_seen(scene):
     for i, row in enumerate(scene.rows):
         cloud = transform_points(unpack_pose(poses[row]), scene.visible(row)[1])
         found = dg.propose(cloud)
-        best = found.X_FG[dg.rank(found, cloud).order[0]]
-        np.testing.assert_array_equal(table.X_FG[i], best)
+        best = dg.rank(found, cloud).order[0]
+        for name in ("X_FG", "q_grasp", "q_pregrasp"):
+            np.testing.assert_array_equal(getattr(table, name)[i], getattr(found, name)[best])
 
 
 def test_a_row_of_which_nothing_is_seen_is_no_grasp(scene, monkeypatch):
