@@ -51,4 +51,4 @@ def client(inspection: Inspection) -> Iterator[TestClient]:
 @pytest.fixture
 def without_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw no plots, whose drawing takes most of the time of the pages of a few grasps."""
-    monkeypatch.setattr("drakegrasp.page.app.plot_svg", lambda *_: b"<svg/>")
+    monkeypatch.setitem(make_app.__globals__, "plot_svg", lambda *_: b"<svg/>")
