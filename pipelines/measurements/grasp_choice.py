@@ -252,8 +252,10 @@ def measure(
     choices = {"plainest": ends[0]}
     for key, order in orders.items():
         choices[key] = ends[order[0]]
+        # Where not all are tried, the first ones of other orders are tried only by chance.
         for first in FIRST:
-            choices[f"{key}, best of {first}"] = ends[order[:first]].max(axis=0)
+            if lifts is None or (key == last and first <= lifts):
+                choices[f"{key}, best of {first}"] = ends[order[:first]].max(axis=0)
         choices[f"{key}, auc"] = np.array([auc(scores[key], end) for end in ends.T])
     choices["random"], choices["oracle"] = ends.mean(axis=0), ends.max(axis=0)
     listed = {key: value.tolist() for key, value in choices.items() if np.isfinite(value).any()}
