@@ -326,10 +326,7 @@ def differences(
 
 
 class _Header(NamedTuple):
-    """A dataset, its type, and its shape, which is None without a dataspace.
-
-    HDF5 needs more time to return these than for all else that is done with them.
-    """
+    """A dataset, its type, and its shape, which is None without a dataspace."""
 
     dataset: h5py.h5d.DatasetID
     dtype: np.dtype[Any]
