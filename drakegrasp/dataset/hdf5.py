@@ -88,12 +88,14 @@ def _find_elsewhere(file: h5py.File) -> str | None:
         group, path = groups.pop()
         for key in group:
             name = f"{path}/{key.decode(errors='replace')}"
-            if group.links.get_info(key).type != h5py.h5l.TYPE_HARD:
+            link = group.links.get_info(key)
+            if link.type != h5py.h5l.TYPE_HARD:
                 return f"a link at {name}"
 
-            # An object may have several names, and a group may contain itself.
+            # An object may have several names, and a group may contain itself. A hard link has the
+            # object's address; to ask the object, HDF5 would read the index of all its chunks.
             item = h5py.h5o.open(group, key)
-            address = h5py.h5o.get_info(item).addr
+            address = link.u
             if isinstance(item, h5py.h5g.GroupID) and address not in seen:
                 groups.append((item, name))
             elif isinstance(item, h5py.h5d.DatasetID):

@@ -68,10 +68,13 @@ def cloud_from_depth(
 
     Raises:
         GraspError: If an argument is invalid, the depth is not in metres, the mask has fewer than
-            10 pixels with a depth, or the camera matrix is of another resolution.
+            10 pixels with a depth, the camera matrix is of another resolution, or less than 5 % of
+            what the image shows beside the object is on the table.
     """
-    own, _ = _points(depth, K, mask)
-    return transform_points(_one_pose(X_TC), own)
+    own, others = _points(depth, K, mask)
+    pose = _one_pose(X_TC)
+    _share_on_table(others, pose)
+    return transform_points(pose, own)
 
 
 def table_share(
@@ -83,10 +86,14 @@ def table_share(
     are those of `cloud_from_depth`; an image without pixels beside the object has NaN.
 
     Raises:
-        GraspError: See `cloud_from_depth`; or if fewer than 5 % are on the table.
+        GraspError: See `cloud_from_depth`.
     """
     _, others = _points(depth, K, mask)
-    pose = _one_pose(X_TC)
+    return _share_on_table(others, _one_pose(X_TC))
+
+
+def _share_on_table(others: Array, pose: Array) -> float:
+    """Return the fraction of points (n, 3) in {C} that are on the table, see `table_share`."""
     if not len(others):
         return np.nan
     share = float(np.mean(_on_plane(others, pose[2, :3], -pose[2, 3])))

@@ -102,9 +102,14 @@ def test_bad_images_are_refused_with_one_line(changed, said):
 
 @pytest.mark.parametrize(
     ("pose", "said"),
-    [(np.stack([X_TC, X_TC]), "one pose .*got 2 poses"), (2.0 * X_TC, "X_TC must have 0 0 0 1")],
+    [
+        (np.stack([X_TC, X_TC]), "one pose .*got 2 poses"),
+        (2.0 * X_TC, "X_TC must have 0 0 0 1"),
+        (invert_pose(X_TC), "on the table .*got 0.0%: is it inverted"),
+        (make_pose(X_TC[:3, :3], 1000.0 * X_TC[:3, 3]), "on the table .*got 0.0%: is it inverted"),
+    ],
 )
-def test_a_camera_has_one_pose(pose, said):
+def test_a_camera_has_one_pose_over_the_table(pose, said):
     depth, mask = image()
     with pytest.raises(dg.GraspError, match=said):
         dg.cloud_from_depth(depth, K, mask, pose)
