@@ -84,6 +84,7 @@ def test_files_cannot_decide_but_show_decisions(out: Path, tmp_path: Path) -> No
     for page in (tmp_path / "site").rglob("*.html"):
         text = page.read_text(encoding="utf-8")
         assert not re.search("<button data-(decide|undo|record)", text)
+        assert '<meta name="token" content="">' in text  # that of a run would differ
 
 
 @pytest.mark.usefixtures("without_plots")
@@ -107,13 +108,13 @@ def test_what_is_left_out_is_told(
 def test_a_run_that_ends_early_leaves_nothing(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: type[BaseException]
 ) -> None:
-    """After Ctrl-C, and where the dataset was assembled anew: the next run can begin."""
+    """After Ctrl-C, and where the dataset was assembled anew, even after its last row was read."""
     monkeypatch.setattr(site_module, "MAX_GRASPS", 2)
 
     def end(done: int, total: int) -> None:
         if how is KeyboardInterrupt:
             raise KeyboardInterrupt
-        if done == 1:
+        if done == total:
             assemble(out, rejected=[0])
 
     with pytest.raises(how):
