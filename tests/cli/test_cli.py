@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -23,6 +24,7 @@ from helpers.datasets import make_dataset
 from helpers.tiers import few
 from matplotlib.image import imread
 
+from drakegrasp.cli import main as cli
 from drakegrasp.cli.main import main
 from drakegrasp.cli.options import parse_request
 from drakegrasp.dataset.assemble import assemble
@@ -295,6 +297,18 @@ def test_check_stats_and_replay_speak_of_a_dataset(small_dataset: Path, tmp_path
     assert page.read_text(encoding="utf-8").lstrip().startswith("<!DOCTYPE html>")
     assert "trial 0 of 10_box_tall: was" in again.stdout
     assert run("replay", small_dataset, "--trial", "100000").exit_code == 1
+
+
+def test_a_terminal_with_another_encoding_shows_question_marks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In this process; in a terminal, and by whole commands, in the second tier."""
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="latin-1"))
+    monkeypatch.setattr("drakegrasp.cli.main.restart_with_utf8", lambda: None)
+    monkeypatch.setattr("drakegrasp.cli.main.main", lambda: click.echo("\u7897 \u00fc"))
+    cli.run()
+    assert written.getvalue() == b"? \xfc\n"
 
 
 def test_stats_and_check_print_one_document_of_json(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TypeVar
 
 import pytest
@@ -45,8 +46,7 @@ def test_what_is_begun_ends_before_the_executor_does(tmp_path: Path) -> None:
         assert set(tmp_path.iterdir()) == there
 
 
-def pid_later(seconds: float) -> int:
-    time.sleep(seconds)
+def pid(_: object) -> int:
     return os.getpid()
 
 
@@ -54,11 +54,13 @@ def test_processes_start_by_default_only_where_the_work_is_long(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(executor, "available_cores", lambda: 2)
-    monkeypatch.setattr(executor, "ALONE_SECONDS", 0.2)
+    now = 10.0
+    monkeypatch.setattr(executor, "time", SimpleNamespace(monotonic=lambda: now))
     with processes() as execute:
-        assert list(execute(pid_later, [0.0] * 3)) == [os.getpid()] * 3
-        assert next(execute(pid_later, [0.3])) == os.getpid()
-        assert os.getpid() not in list(execute(pid_later, [0.0] * 3))
+        now += 0.99 * executor.ALONE_SECONDS
+        assert list(execute(pid, range(3))) == [os.getpid()] * 3
+        now += 0.02 * executor.ALONE_SECONDS
+        assert os.getpid() not in list(execute(pid, range(3)))
 
 
 def test_number_of_processes_may_be_the_largest() -> None:
