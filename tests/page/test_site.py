@@ -89,7 +89,7 @@ def test_files_cannot_decide_but_show_decisions(out: Path, tmp_path: Path) -> No
 
 @pytest.mark.usefixtures("without_plots")
 def test_what_is_left_out_is_told(
-    boxes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    boxes: Path, site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(site_module, "MAX_GRASPS", 2)
     result = CliRunner().invoke(main, ["inspect", str(boxes), "--static", str(tmp_path / "site")])
@@ -98,7 +98,11 @@ def test_what_is_left_out_is_told(
     assert "the most suspicious of 9" in result.stdout
     index = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
     assert "Only the 2 most suspicious of 9 successes are here." in index
-    assert index.count("<li ") == 2
+    whole = (site / "index.html").read_text(encoding="utf-8")
+    shown, all_of_them = (re.findall('<li .*data-label="(.+?)"', text) for text in (index, whole))
+    assert shown == all_of_them[:2] and len(all_of_them) == 9
+    pages = (tmp_path / "site" / "grasp").glob("*.html")
+    assert sorted(page.stem for page in pages) == sorted(shown)
     # Failures are not there, so none can be asked for.
     assert 'name="outcome"' not in index
 
