@@ -64,6 +64,7 @@ class Funnel:
             stable.
         removals: (m, 1 + max(Removal)), successes by object and reason of removal.
         refined: (m, 3), attempts, successes and samples of refined palm poses.
+        untested: (m,), refined attempts that only the test split leaves out of the samples.
         audited: (m, 4), lifts, successes, stable grasps and samples among audited attempts: their
             rates are fair if other attempts were chosen for the lift by their chance.
         preshapes: (256, 5), by index of the preshape: attempts, successes, stable grasps and
@@ -80,6 +81,7 @@ class Funnel:
     stable: npt.NDArray[np.int64]
     removals: npt.NDArray[np.int64]
     refined: npt.NDArray[np.int64]
+    untested: npt.NDArray[np.int64]
     audited: npt.NDArray[np.int64]
     preshapes: npt.NDArray[np.int64]
 
@@ -241,6 +243,7 @@ def funnel_of(trials: Trials) -> Funnel:
         stable=zeros(count),
         removals=zeros(count, 1 + max(Removal)),
         refined=zeros(count, 3),
+        untested=zeros(count),
         audited=zeros(count, 4),
         preshapes=zeros(1 + NO_PRESHAPE, 5),
     )
@@ -256,6 +259,7 @@ def funnel_of(trials: Trials) -> Funnel:
         _count(funnel.stable, number[first & stable])
         decided = first & (removal != NONE)
         _count(funnel.removals, (number[decided], removal[decided]))
+        _count(funnel.untested, number[removal == Removal.REFINED_TEST])
 
         # Preshapes, refined palm poses, and audited attempts.
         fair, lifted = first & block["audited"], np.isfinite(block["slip"])
@@ -397,22 +401,33 @@ class Shortfall(NamedTuple):
 def objects_without_samples(funnel: Funnel, config: Config) -> dict[str, Shortfall]:
     """Return, for each object without a sample, why it has none, by its name."""
     return {
-        funnel.names[i]: why_no_sample(funnel.outcomes[i], funnel.removals[i], config)
+        funnel.names[i]: why_no_sample(
+            funnel.outcomes[i], funnel.removals[i], config, int(funnel.untested[i])
+        )
         for i in np.flatnonzero(funnel.samples == 0).tolist()
     }
 
 
-def why_no_sample(outcomes: AnyArray, removals: AnyArray, config: Config) -> Shortfall:
+def why_no_sample(
+    outcomes: AnyArray, removals: AnyArray, config: Config, untested: int = 0
+) -> Shortfall:
     """Return why the attempts at an object yielded no sample.
 
     Args:
         outcomes: (1 + max(Outcome),), attempts by outcome.
         removals: (1 + max(Removal),), successes by reason of removal.
         config: Configuration of the dataset, which states what was already tried.
+        untested: Refined attempts that only the test split leaves out of the samples.
     """
     total = int(outcomes.sum())
     if not total:
         return Shortfall("nothing was tried", "more palm poses (--candidates)")
+    if untested:
+        reason = f"{counted(untested, 'refined grasp')} would be samples, but the test split has "
+        more = "more samples, for which the build goes on (--samples-per-object)"
+        if config.samples_per_object is None:
+            more = "more palm poses (--candidates)"
+        return Shortfall(f"{reason}grasps of the first round only", more)
 
     # Held grasps, if any, are closest to a sample and say more than the most frequent outcome.
     held = int(outcomes[Outcome.SUCCESS])

@@ -248,3 +248,22 @@ def test_split_that_is_not_as_asked_is_told() -> None:
     assert "no sample is in valid." in split_shortfall(counts(4, 0, 2), "class", config)
     assert "no sample is for training" in split_shortfall(counts(0, 0, 9), "class", config)
     assert split_shortfall(counts(0, 0, 0), "class", config) == ""
+
+
+def test_refined_grasps_that_no_split_has_are_the_reason(out: Path) -> None:
+    """Of a tested object of which the first round has no sample."""
+    with h5py.File(out / TRIALS) as file:
+        rows, objects = file["successes/trial_id"][:], file["trials/object"][:]
+    own = np.flatnonzero(objects[rows] == 2)
+    for success, row in zip(own.tolist(), rows[own].tolist(), strict=True):
+        change(out, TRIALS, "trials/generation", row, lambda _: 1)
+        change(out, TRIALS, "successes/removal", success, lambda _: Removal.REFINED_TEST)
+    found = {}
+    for few in ("null", "1"):
+        config = load_config(overrides=[f"samples_per_object={few}"])
+        found[few] = objects_without_samples(count_funnel(out), config)
+    name = count_funnel(out).names[2]
+    assert list(found["1"]) == [name]
+    begin = f"{len(own)} refined grasps would be samples"
+    assert len(own) > 1 and found["1"][name].reason.startswith(begin)
+    assert ["--samples-per-object" in found[few][name].advice for few in found] == [False, True]
