@@ -39,3 +39,13 @@ def test_a_square_has_one_long_side(turn: float) -> None:
     rng = np.random.default_rng(1)
     for _ in range(10):
         np.testing.assert_allclose(smallest_rectangle(rng.permutation(cloud))[0], axes, atol=1e-9)
+
+
+@pytest.mark.parametrize(("shape", "filled"), [((3, 9), True), ((30, 90), False)])
+def test_a_gap_is_filled_where_other_points_are_nearly_as_far_apart(
+    shape: tuple[int, int], filled: bool
+) -> None:
+    """Between two towers, 10 mm from each other, whose points are 7.5 or 0.7 mm apart."""
+    tower, aside = top(0.01, 0.03, shape), np.array([0.015, 0.0, 0.0])
+    field = column_solid(np.concatenate([tower - aside, tower + aside])).field
+    assert (field.interpolate(0.0, 0.0, 0.05) < 0.0) == filled
