@@ -199,6 +199,24 @@ def test_a_hand_of_two_fingers_without_spread_loads(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("name", "joints"),
+    [
+        # Both joints of each finger, without the two of the spread.
+        (
+            "barrett",
+            [f"finger{i}_{part}_joint" for i in (1, 2, 3) for part in ("proximal", "distal")],
+        ),
+        ("franka", ["left_joint", "right_joint"]),
+    ],
+)
+def test_joints_of_the_fingers_can_have_motors_of_their_own(name: str, joints: list[str]) -> None:
+    motors = load_hand(name).own_motors
+    assert list(motors) == joints
+    fingers = len(load_hand(name).fingers)
+    assert list(motors.values()) == sorted([*range(fingers)] * (len(joints) // fingers))
+
+
 def test_a_coupling_that_stops_first_limits_its_finger(tmp_path: Path) -> None:
     coupled = [{"joint": "right_hinge", "ratio": -2.0}]
     fingers = changed_finger(coupled=coupled)[:1]

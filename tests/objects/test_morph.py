@@ -85,6 +85,17 @@ def test_draw_that_crosses_itself_is_drawn_again_and_not_for_ever(
     assert morph_object(original, "stool", 1, seed=0)[1] == 2
 
 
+def test_draw_that_turns_space_inside_out_is_drawn_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = load_original(*find_meshes(stool(tmp_path).parent))
+    answers = [None, original.vertices]
+    monkeypatch.setattr(morph_module, "morph_points", lambda *_: answers.pop(0))
+    vertices, draws = morph_object(original, "stool", 1, seed=0)
+    assert draws == 2
+    np.testing.assert_allclose(vertices, original.vertices, atol=1e-6)
+
+
 def test_directory_has_every_morph_with_its_class_and_the_same_bytes(tmp_path: Path) -> None:
     meshes = tmp_path / "meshes"
     meshes.mkdir()

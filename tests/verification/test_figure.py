@@ -21,7 +21,7 @@ from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.scene import palm_pose
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
-from drakegrasp.verification.figure import verification_figure
+from drakegrasp.verification.figure import FAILS, HELD, STABLE, verification_figure
 from drakegrasp.verification.result import Verification
 
 pytestmark = pytest.mark.sim
@@ -126,6 +126,7 @@ def test_dots_are_on_the_object_and_its_hand_is_shown(verified, held, config):
     figure = verification_figure(result)
     assert texts_of(figure)[0] == f"1_box_a  {result.words}"
     assert result.words.startswith("held")
+    assert result.stable and figure.texts[0].get_color() == STABLE
     line = texts_of(figure)[1].splitlines()[1]
     assert line == "contacts within 3.0 mm of the requested ones (success: 20 mm)"
     line = texts_of(figure)[1].splitlines()[2]
@@ -153,6 +154,9 @@ def test_dots_are_on_the_object_and_its_hand_is_shown(verified, held, config):
 
 @needs_egl
 def test_last_panel_shows_the_last_instant(verified, held, cube, config):
+    slides = replace(held, lift=replace(held.lift, slip=0.5))
+    figure = verification_figure(verified(outcome=Outcome.SUCCESS, tries=(some_try(slides),)))
+    assert figure.texts[0].get_color() == HELD
     closed = replace(held, lift=None)
     placed = replace(closed, outcome=Outcome.START_COLLISION, closed=None)
     for values, title in (
@@ -172,6 +176,7 @@ def test_row_that_is_no_grasp_shows_the_object_alone(verified):
     )
     figure = verification_figure(row)
     assert texts_of(figure) == ["1_box_a  fails: invalid", "number 1 is nan"]
+    assert figure.texts[0].get_color() == FAILS
     assert [dots_of(figure, panel) for panel in (0, 1)] == [{}, {}]
 
 
