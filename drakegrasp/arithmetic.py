@@ -8,6 +8,8 @@ all decisions before a simulation are computed with these functions.
 
 from __future__ import annotations
 
+from decimal import Decimal, localcontext
+
 import numpy as np
 import numpy.typing as npt
 
@@ -76,6 +78,12 @@ def dot(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
 def norm(v: npt.ArrayLike) -> Array:
     """Return the Euclidean lengths (...) of vectors (..., k)."""
     return np.asarray(np.sqrt(dot(v, v)))
+
+
+def cube_root(x: float) -> float:
+    """Return the double nearest to the cube root of a positive number."""
+    with localcontext(prec=40):
+        return float(Decimal(x) ** (Decimal(1) / 3))
 
 
 def sin_cos(angle: npt.ArrayLike) -> tuple[Array, Array]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable
+from fractions import Fraction
 
 import numpy as np
 import pytest
 
-from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos, sin_cos_deg
+from drakegrasp.arithmetic import Array, cube_root, dot, multiply, norm, sin_cos, sin_cos_deg
 
 #: Largest error of a sine or cosine in [-1, 1].
 TOLERANCE = 1e-15
@@ -175,3 +176,13 @@ def test_lengths_that_do_not_fit_are_refused() -> None:
             multiply(np.eye(3), right)
     with pytest.raises(ValueError, match="must be of one length"):
         dot(np.ones(3), np.ones(4))
+
+
+def test_cube_root_is_the_nearest_double() -> None:
+    assert cube_root(27.0) == 3.0
+    for x in np.random.default_rng(0).uniform(1e-9, 1e-6, 200).tolist():
+        root = cube_root(x)
+        off = [
+            abs(Fraction(y) ** 3 - Fraction(x)) for y in (math.nextafter(root, s) for s in (0, 1))
+        ]
+        assert abs(Fraction(root) ** 3 - Fraction(x)) < min(off)

@@ -49,6 +49,14 @@ def check(found: dict[str, object]) -> dict[str, list[str]]:
     return kernels
 
 
+def test_this_process_draws_the_same(tmp_path: Path) -> None:
+    """For one object; for the others, and for other CPUs, in the second tier."""
+    cube = next(draws.objects(tmp_path, None))
+    found = {f"{cube.name}: {what}": value for what, value in draws.object_draws(cube)}
+    assert len(found) > 5
+    assert found == {name: HASHES[name] for name in found}
+
+
 @pytest.mark.nightly
 def test_newest_blas_kernel_changes_no_draw() -> None:
     """The newest of this CPU; all that are older lie between it and the next test's."""

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.ndimage import binary_closing, distance_transform_edt
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from drakegrasp.arithmetic import Array, dot, multiply, norm
+from drakegrasp.arithmetic import Array, cube_root, dot, multiply, norm
 from drakegrasp.errors import GraspError, TooLittleSeenError
 from drakegrasp.frames import as_numbers
 from drakegrasp.mesh.distance_field import DistanceField
@@ -196,7 +196,7 @@ def _grid(points: Array) -> tuple[Array, float, tuple[int, ...]]:
     """Return the first point (3,) [m], the spacing [m] and the shape of a grid around a cloud."""
     low, high = points.min(axis=0) * [1.0, 1.0, 0.0], points.max(axis=0)
     room = high - low + 2 * PADDING * FINEST
-    spacing = max(FINEST, float(np.cbrt(np.prod(room) / CELLS)))
+    spacing = max(FINEST, cube_root(float(np.prod(room)) / CELLS))
     shape = np.ceil((high - low) / spacing).astype(int) + 2 * PADDING + 1
     return low - PADDING * spacing, spacing, tuple(shape.tolist())
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import trimesh
 from scipy.ndimage import distance_transform_edt
 
-from drakegrasp.arithmetic import norm
+from drakegrasp.arithmetic import cube_root, norm
 from drakegrasp.frames import Array
 from drakegrasp.mesh.surfaces import cover_triangles, enumerate_pairs
 
@@ -153,7 +153,7 @@ def make_distance_field(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> Distan
     # The spacing is chosen for about CELLS cells; the padding depends on it, hence the iterations.
     for _ in range(4):
         room = upper - lower + 2 * PADDING * spacing
-        spacing = max(FINEST, float(np.cbrt(np.prod(room) / CELLS)))
+        spacing = max(FINEST, cube_root(float(np.prod(room)) / CELLS))
 
     # An odd fraction of a cell keeps corners and edges of modelled objects off the grid's columns.
     origin = lower - (PADDING - 0.3819) * spacing

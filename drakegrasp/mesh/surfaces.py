@@ -248,7 +248,8 @@ def even_points(count: int) -> Array:
     sequences").
     """
     root = 1.2207440846057596  # of x^4 = x + 1
-    return np.asarray((0.5 + np.arange(1, count + 1)[:, None] / root ** np.arange(1, 4)) % 1.0)
+    powers = np.cumprod([root, root, root])  # NumPy's power has other last bits on some CPUs
+    return np.asarray((0.5 + np.arange(1, count + 1)[:, None] / powers) % 1.0)
 
 
 def cover_triangles(triangles: Array, spacing: float) -> tuple[Array, Faces]:

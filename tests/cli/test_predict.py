@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import h5py
@@ -126,3 +127,16 @@ def test_a_pose_that_is_given_is_checked_with_the_image(files: Path) -> None:
     result = predict(files, f"{SEEN} --camera-pose X_TC.npy --count 1")
     assert result.exit_code == 0, result.output
     assert "% of the pixels beside the object; the camera is" in result.stderr
+
+
+def test_a_png_is_in_millimetres_unless_its_scale_is_given(files: Path) -> None:
+    """Of the same image, quantised: the camera is as far above the fitted table."""
+    depth = np.nan_to_num(np.load(files / "depth.npy"))
+    for name, unit in (("mm", 0.001), ("quarters", 0.00025)):
+        Image.fromarray(np.rint(depth / unit).astype(np.uint16)).save(files / f"{name}.png")
+    heights = []
+    for seen in ("depth.npy", "mm.png", "quarters.png --depth-scale 0.00025"):
+        result = predict(files, SEEN.replace("depth.npy", seen) + " --count 1")
+        assert result.exit_code == 0, result.output
+        heights += re.findall(r"the camera is (\d+) mm above it", result.stderr)
+    np.testing.assert_allclose(list(map(int, heights)), [1e3 * X_TC[2, 3]] * 3, atol=1.0)

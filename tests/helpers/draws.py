@@ -53,10 +53,12 @@ def digest(*parts: object) -> str:
 
 
 def objects(folder: Path, meshes: Path | None) -> Iterator[MeshSource]:
-    """Yield a cube, a cylinder and, where they are, three real meshes."""
+    """Yield a cube, a cylinder, a block and, where they are, three real meshes."""
     cube, cylinder = trimesh.creation.box([0.07] * 3), trimesh.creation.cylinder(0.03, 0.12)
     cylinder.vertices = np.round(cylinder.vertices, 6)  # trimesh's own sines
-    for name, mesh in (("1_cube", cube), ("2_cylinder", cylinder)):
+    # So large that the grid of its distance field is not the finest one.
+    block = trimesh.creation.box([0.18, 0.13, 0.15])
+    for name, mesh in (("1_cube", cube), ("2_cylinder", cylinder), ("3_block", block)):
         mesh.subdivide().subdivide().export(folder / f"{name}.stl")
     yield from find_meshes(folder)
     if meshes is not None:

@@ -268,10 +268,13 @@ def test_bad_mjcf_is_one_line(tmp_path: Path, assets: Path, text: str) -> None:
 def test_bad_part_of_an_object_or_none_costs_only_its_grasps(
     trials: PostureTrials, write: Write, assets: Path
 ) -> None:
-    (assets / "box/urdf/meshes/convex_piece_000.obj").write_text("v 0 0 0\n")
-    (bad, _), (gone, _) = verify_postures([write("0.npy"), write("1.npy", obj_path="gone")], trials)
-    assert re.search(r"convex_piece_000\.obj: must be a convex part", bad.reason)
-    assert "\n" not in bad.reason
+    flat = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n"
+    for text, why in (("v 0 0 0\n", "at least 4 vertices"), (flat, "coplanar")):
+        (assets / "box/urdf/meshes/convex_piece_000.obj").write_text(text)
+        rows = [write("0.npy"), write("1.npy", obj_path="gone")]
+        (bad, _), (gone, _) = verify_postures(rows, trials)
+        assert re.search(rf"convex_piece_000\.obj: must be a convex part, .*{why}", bad.reason)
+        assert "\n" not in bad.reason
     assert "must hold the object's convex parts" in gone.reason
 
 

@@ -8,7 +8,7 @@ from itertools import combinations, permutations
 
 import numpy as np
 import pytest
-from helpers.hands import write_pincer
+from helpers.hands import SLIDER, write_pincer, write_slider
 from helpers.tiers import few
 from scipy.spatial.transform import Rotation
 
@@ -308,6 +308,13 @@ def test_a_posture_of_the_table_is_its_own_first_start(row):
     found, c = find_starts(postures, p_OQ, -rotate_vectors(X_OG, postures.n_G[row]), 3)[0]
     np.testing.assert_array_equal(c, postures.coordinates[row])
     np.testing.assert_allclose(found, X_OG, atol=1e-9)
+
+
+def test_fingers_that_slide_far_have_postures_for_195_mm(tmp_path):
+    """A stroke of 0.1 m counts as one radian, and fingers that turn close by up to 112 degrees."""
+    far = write_slider(tmp_path, SLIDER.replace('upper="0.04"', 'upper="0.5"'))
+    slid = make_postures(load_hand(far)).coordinates[:, 1:]
+    assert 0.18 < slid.max() <= 0.1 * np.deg2rad(112.0)
 
 
 def test_postures_are_within_the_limits_and_where_kinematics_puts_them(pincer):
