@@ -24,6 +24,7 @@ def make_funnel(outcomes: np.ndarray, *names: str, **counts: np.ndarray) -> Funn
         "stable": none,
         "removals": np.zeros((len(names), 1 + max(Removal)), dtype=np.int64),
         "refined": np.zeros((len(names), 3), dtype=np.int64),
+        "untested": none,
         "audited": np.zeros((len(names), 4), dtype=np.int64),
         "preshapes": np.zeros((256, 5), dtype=np.int64),
     }
