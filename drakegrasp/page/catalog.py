@@ -293,7 +293,7 @@ class Catalog:
 
     def _read_files(self, stamps: Mapping[Path, Stamp]) -> None:
         """Read the assembled files, and the manifest of a build not yet in them."""
-        assembled = stamps[self.out / TRIALS_FILE] is not None
+        assembled = os.path.lexists(self.out / TRIALS_FILE)  # a link that leads nowhere is damage
         self._assembled, self._manifest = None, None
         try:
             self._manifest = read_manifest(self.out)

@@ -297,3 +297,10 @@ def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
     (tmp_path / TRIALS).write_bytes(b"nothing")
     with pytest.raises(DataError, match="must be the trials of a dataset, got none"):
         Catalog(tmp_path)
+
+
+def test_trials_that_are_a_link_to_nowhere_are_damaged_and_not_still_to_come(out: Path) -> None:
+    (out / "trials.hdf5").unlink()
+    (out / "trials.hdf5").symlink_to("trials.hdf5")
+    with pytest.raises(DataError, match=r"trials\.hdf5: must be the trials of a dataset"):
+        Catalog(out).current()
