@@ -287,6 +287,14 @@ def test_commands_that_simulate_run(
         grasps = data.column("grasps")
         grasps[1:, :9] += 0.03  # [m]; off the surface, which is known without a simulation
         np.save(tmp_path / "predictions.npy", grasps)
+    # Palm poses as GraspGen writes them: one from above, of a mesh and of an object of the dataset.
+    above = {"confidence": 0.9, "position": [0.0, 0.0, 0.2]}
+    above["orientation"] = {"w": 0.0, "xyz": [1.0, 0.0, 0.0]}
+    palms = {"format": "isaac_grasp", "format_version": 1.0, "grasps": {"grasp_0": above}}
+    (tmp_path / "PREDICTED").mkdir()
+    name = str(data.column("object_props/object_name")[0])
+    for path in (tmp_path / "mug.yaml", tmp_path / "PREDICTED" / f"{name}.yaml"):
+        path.write_text(yaml.safe_dump(palms))
     with h5py.File(tmp_path / "predictions.h5", "w") as file:
         file["test/grasps"], file["test/rows"] = data.column("grasps")[:1], np.array([0])
 
