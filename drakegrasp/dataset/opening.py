@@ -470,7 +470,8 @@ PLAN_TABLES: Sequence[tuple[Field, ...]] = (
         _array("distance", "", "float64"),
         _array("resting", "", "int64"),
         _array("source", "", "int64"),
-        _array("log_density", "", "float64"),
+        _array("spread", "", "float64"),
+        _array("preshape_index", "", "int64"),
     ),
 )
 #: Additional arrays of a plan with external postures; they have as many rows as the palm poses.

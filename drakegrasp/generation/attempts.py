@@ -32,7 +32,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.attempts import posture_attempts
-from drakegrasp.simulation.candidates import children, standoff_attempts
+from drakegrasp.simulation.candidates import children, palm_attempts
 from drakegrasp.simulation.conditions import Conditions, draw_conditions, usual_conditions
 from drakegrasp.simulation.scene import Scene, hand_joint_names
 from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes
@@ -123,7 +123,7 @@ def list_attempts(prepared: PreparedObject, indices: range, config: Config) -> l
     place: Any = {"name": prepared.model.name, "seed": config.seed}
     if drawn.postures is None:
         count = len(hand.preshapes)
-        made = list(standoff_attempts(drawn, indices, config.candidates, **place, preshapes=count))
+        made = list(palm_attempts(drawn, indices, config.candidates, **place, preshapes=count))
     else:
         made = list(posture_attempts(drawn, indices, hand, **place))
     made = [replace(a, unused=hand.unused_in(a.preshape)) for a in made] if hand.preshapes else made

@@ -64,7 +64,7 @@ from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
 from drakegrasp.simulation.attempts import Attempts, misfits
-from drakegrasp.simulation.candidates import found_sampler
+from drakegrasp.simulation.candidates import sampler_class
 from drakegrasp.simulation.drive import drive_of
 
 #: Margin of ranks at the border of a split, which depends on which objects have samples.
@@ -181,7 +181,7 @@ def refuse_unusable(config: Config) -> None:
     """
     refuse_two_ends(config)
     for name in config.candidates.methods:
-        found_sampler(name, config.candidates)
+        sampler_class(name, config.candidates)
     own_filters(config.filters)
 
 

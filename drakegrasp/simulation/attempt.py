@@ -21,8 +21,9 @@ class Source(IntEnum):
     ROTATIONS = 0
     NORMALS = 1
     REFINE = 2
-    OWN = 3  # any other sampler: `above`, one of another package, or a user-defined one
+    OWN = 3  # any other sampler: one of another package, or a user-defined one
     POSTURES = 4  # no sampler: the posture comes from outside
+    CLOSING = 5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

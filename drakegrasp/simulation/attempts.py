@@ -751,7 +751,8 @@ def given_candidates(
         distance=np.full(count, np.nan),
         resting=resting,
         source=np.full(count, Source.POSTURES, dtype=np.int64),
-        log_density=table.log_density,
+        spread=np.full(count, np.nan),
+        preshape_index=np.full(count, -1),
         combinations=count,
         valid=count,
         distinct=count,
@@ -790,7 +791,6 @@ def posture_attempts(
             seed=Stream(seed, object_key(name), i).key,
             resting=int(candidates.resting[i]),
             source=Source.POSTURES,
-            log_density=float(candidates.log_density[i]),
             posture_row=float(given.row[i]),
             audited=is_audited(seed, object_key(name), i, 0, 0),
         )

@@ -29,8 +29,9 @@ from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.seeding import Stream
 from drakegrasp.shapes.catalog import export_builtin
 from drakegrasp.simulation.above import Above
-from drakegrasp.simulation.candidates import normal_candidates, palm_motion, standoff_attempts
+from drakegrasp.simulation.candidates import normal_candidates, standoff_attempts
 from drakegrasp.simulation.conditions import draw_conditions
+from drakegrasp.simulation.palms import palm_motion
 from drakegrasp.simulation.robustness import _noise_factor
 from drakegrasp.simulation.samplers import rotation_candidates
 from drakegrasp.simulation.screen import predict
