@@ -300,21 +300,6 @@ class CandidateConfig(_ExtensibleSection):
         return (self.method,) if isinstance(self.method, str) else self.method
 
 
-class RefineConfig(_Section):
-    """Additional palm poses close to those of samples (by the default filters).
-
-    A palm pose is displaced by normal draws along and about each axis of the palm.
-    """
-
-    children: Annotated[int, Field(ge=0, le=100)] = 0  # of each sample; 0 switches refining off
-    generations: Annotated[int, Field(ge=1, le=4)] = 1  # children of children, and so on
-    shift: Positive = 0.0075  # [m], standard deviation along each axis of the palm
-    turn_deg: Positive = 7.5  # standard deviation about each axis of the palm
-    # Fraction of the objects without refined palm poses: the objects that a split by object selects
-    # first for testing, because refined palm poses of tested objects are not samples.
-    spared: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
-
-
 class ScreenConfig(_Section):
     """Attempts that geometry decides without a simulation; see docs/explanation/screening.md."""
 
@@ -603,7 +588,6 @@ class Config(_Section):
     physics: PhysicsConfig = PhysicsConfig()
     settle: SettleConfig = SettleConfig()
     candidates: CandidateConfig
-    refine: Annotated[RefineConfig, Decides(shards=lambda _, it: it.children)] = RefineConfig()
     screen: ScreenConfig = ScreenConfig()
     close: CloseConfig = CloseConfig()
     lift: LiftConfig = LiftConfig()

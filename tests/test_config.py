@@ -310,10 +310,8 @@ def test_configuration_is_inert() -> None:
 @pytest.mark.parametrize("key", sorted(EVERYTHING))
 def test_simulation_hash_changes_with_what_is_simulated_and_nothing_else(key: str) -> None:
     """A shard is reused when the hash agrees: a key too few mixes data, one too many wastes it."""
-    # How robust a grasp is is asked only with repeats, how far to refine only with children, and
-    # how far it moved if that ends lifts.
-    needed = ["certify.repeats=1", "refine.children=1"]
-    base = load_config(overrides=[text for text in needed if not text.startswith(f"{key}=")])
+    # How robust a grasp is is asked only with repeats, and how far it moved if that ends lifts.
+    base = load_config(overrides=[] if key == "certify.repeats" else ["certify.repeats=1"])
     if key.startswith("lift.stop_"):
         base = override_config(base, ["lift.stop_when=lost_sample"])
     tree = base.to_dict()
@@ -371,7 +369,6 @@ def test_dataset_that_an_older_version_certified_is_read_as_it_is() -> None:
 @pytest.mark.parametrize(
     ("settings", "switch"),
     [
-        (["refine.shift=0.1"], "refine.children=1"),
         (["certify.palm_noise=0.01"], "certify.repeats=1"),
         (["lift.stop_slip=0.02", "lift.stop_turn_deg=20"], "lift.stop_when=lost_sample"),
     ],

@@ -100,16 +100,13 @@ def _table_of_objects(
 ) -> Table:
     """Return a table with a row per object and a row for all objects.
 
-    `row` returns the cells for a range of objects. The last columns are the number of refined
-    samples, if any attempt is refined, and the number of samples.
+    `row` returns the cells for a range of objects. The last column is the number of samples.
     """
-    some = bool(funnel.refined.any())
 
     def cells(name: str, objects: slice) -> list[str]:
-        samples = [funnel.refined[objects, 2].sum()] * some + [funnel.samples[objects].sum()]
-        return [name, *row(objects), *map(_count, samples)]
+        return [name, *row(objects), _count(funnel.samples[objects].sum())]
 
-    heads = ("object", *heads, *["+ refined"] * some, "samples")
+    heads = ("object", *heads, "samples")
     rows = (cells(name, slice(i, i + 1)) for i, name in enumerate(funnel.names))
     return make_table(title, heads, rows, [cells("all", slice(None))], caption=caption)
 
@@ -145,15 +142,7 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
         cells += [funnel.removals[objects, r].sum() for r in removed]
         return list(map(_count, cells))
 
-    caption = ""
-    if funnel.refined.any():
-        tried, held, samples = funnel.refined.sum(axis=0).tolist()
-        caption = (
-            f"refined: palm poses near those of samples: {counted(tried, 'attempt')}, {held:,} "
-            f"held, {counted(samples, 'sample')}; the other columns except the last count the "
-            "first round only"
-        )
-    return _table_of_objects("From palm poses to samples", heads, funnel, row, caption)
+    return _table_of_objects("From palm poses to samples", heads, funnel, row)
 
 
 def hold_table(funnel: Funnel) -> Table:
@@ -188,11 +177,8 @@ def hold_table(funnel: Funnel) -> Table:
 
 def preshape_table(counts: Sequence[PreshapeCount]) -> Table:
     """Return how the attempts of each preshape ended, with one row per preshape."""
-    columns = ["attempts", "held", "stable", "refined", "samples"]
-    if not any(count.refined for count in counts):
-        columns.remove("refined")
-    heads = ["preshape", *("+ refined" if name == "refined" else name for name in columns)]
-    rows = ([c.preshape, *(_count(getattr(c, name)) for name in columns)] for c in counts)
+    heads = ("preshape", "attempts", "held", "stable", "samples")
+    rows = ([c.preshape, *(_count(getattr(c, name)) for name in heads[1:])] for c in counts)
     nameless = any(count.preshape == NO_NAME for count in counts)
     caption = f"{NO_NAME}: postures for which all fingers close" if nameless else ""
     return make_table("Preshapes", heads, rows, caption=caption)
@@ -200,13 +186,9 @@ def preshape_table(counts: Sequence[PreshapeCount]) -> Table:
 
 def split_table(counts: Sequence[SplitCount]) -> Table:
     """Return the paper's Table III with an additional column of objects."""
-    rows = (
-        [c.split, *(_number(n, ",.0f") for n in (c.samples, c.effective, c.objects, c.classes))]
-        for c in counts
-    )
-    heads = ("split", "samples", "in effect", "objects", "classes")
-    caption = "in effect: where samples with almost the same palm count as one"
-    return make_table("Samples by split", heads, rows, caption=caption)
+    heads = ("split", "samples", "objects", "classes")
+    rows = ([c.split, *(_count(getattr(c, name)) for name in heads[1:])] for c in counts)
+    return make_table("Samples by split", heads, rows)
 
 
 def split_line(rule: str, funnel: Funnel, counts: Sequence[SplitCount]) -> str:

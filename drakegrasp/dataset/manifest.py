@@ -61,7 +61,7 @@ VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "
 REQUIRED_VERSIONS = ("drakegrasp", "drake", "hand")
 #: The oldest version of drakegrasp whose results equal those of this one. A change after which the
 #: same settings produce other values sets it to the version in which the change is released.
-RESULTS_SINCE = "0.5.0"
+RESULTS_SINCE = "0.6.0"
 
 
 def _refuse_no_pose(packed: tuple[float, ...]) -> tuple[float, ...]:

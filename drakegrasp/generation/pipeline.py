@@ -509,13 +509,12 @@ class _Build:
         self, headers: Iterable[ShardHeader], manifest: Manifest, counts: Counts
     ) -> None:
         """Run work units, and count their results."""
-        spared, tested = _spared(manifest), _likely_tested(manifest)
+        tested = _likely_tested(manifest)
         units = (
             WorkUnit(
                 out=self._out,
                 header=header,
                 config=manifest.config,
-                refined=header.object_name not in spared,
                 likely_tested=header.object_name in tested,
                 restartable=self._pool is not None,
             )
@@ -587,15 +586,6 @@ def _known_entry(
                 return None
             return entry
     return None
-
-
-def _spared(manifest: Manifest) -> set[str]:
-    """Return the names of the objects whose palm poses are not refined."""
-    # The choice depends on the object's name, as the shard does. A group would not do, because it
-    # can be changed later.
-    share, seed = manifest.config.refine.spared, manifest.config.seed
-    names = (entry.name for entry in manifest.objects)
-    return {name for name in names if rank_in_split(name, seed) < share}
 
 
 def _likely_tested(manifest: Manifest) -> set[str]:

@@ -206,8 +206,8 @@ def _stored_trial(
     manifest, row = read_manifest(out), Trials(out).trial(trial_id)
     config = manifest.config_of(row["object_name"])
     prepared = load_prepared(out, row["object_name"], config)
-    candidate, standoff, child = (int(row[key]) for key in ("candidate", "standoff_index", "child"))
-    return row, prepared, find_attempt(prepared, candidate, standoff, child, config), config
+    candidate, standoff = (int(row[key]) for key in ("candidate", "standoff_index"))
+    return row, prepared, find_attempt(prepared, candidate, standoff, config), config
 
 
 def _difference(a: np.ndarray, b: np.ndarray) -> float:

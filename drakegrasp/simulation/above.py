@@ -17,7 +17,6 @@ from drakegrasp.config import CandidateConfig
 from drakegrasp.mesh.surfaces import even_points, on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream
-from drakegrasp.simulation.candidates import rounded_density
 from drakegrasp.simulation.samplers import make_poses
 
 #: Number of surface points from which the axes are computed.
@@ -38,7 +37,6 @@ class Above:
     """Poses of the palm above the object, looking down.
 
     Attributes:
-        log_density: Log-density of the uniform draw, per m^2 of target, rad of turn and steradian.
         limit: None, because any number of poses can be drawn.
     """
 
@@ -64,11 +62,6 @@ class Above:
         self._half = np.array([ALONG, ACROSS]) * (high - low) / 2.0
         self._axes, self._middle = axes, (low + high) / 2.0
         self._height = float(p_TQ[:, 2].max()) / 2.0
-        area = 4.0 * float(self._half[0] * self._half[1])
-        most, least = (math.cos(math.radians(tilt)) for tilt in TILT)
-        zone = 2.0 * math.pi * (most - least)
-        turns = 4.0 * math.radians(2.0 * YAW)
-        self.log_density = rounded_density(-math.log(area * turns * zone))
 
     def poses(self, count: int) -> Array:
         """Return the first poses (count, 4, 4)."""

@@ -7,7 +7,7 @@ A sampler of the registry yields a sequence of poses at a resting pose. Resting 
 take turns. The first n poses are the same for every `candidates.max` of at least n, so a dataset
 can grow. The paper's method (`rotations`) multiplies a first palm pose with global and local
 rotations. `normals` is the baseline of the paper's Figure 2. A user-defined class may be another
-sampler. `children` draws poses around the palm pose of a grasp that holds.
+sampler.
 
 Nothing here needs Drake. Poses are bitwise equal on every machine: sums, products and square roots
 have a fixed order (`arithmetic`), limits are inclusive by more than rounding, poses are compared
@@ -16,10 +16,9 @@ as rounded integers, and random numbers come from `seeding`.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
 
@@ -28,10 +27,9 @@ import numpy.typing as npt
 import trimesh
 
 from drakegrasp import registry
-from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
-from drakegrasp.config import CandidateConfig, RefineConfig, is_own_class
+from drakegrasp.arithmetic import Array, norm, sin_cos_deg
+from drakegrasp.config import CandidateConfig, is_own_class
 from drakegrasp.errors import ConfigError
-from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.mesh.crossings import first_hits
 from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
@@ -50,12 +48,9 @@ from drakegrasp.table import Table
 BLOCK = 1000
 #: Palms farther than this from the object must face it [m]; no hand is so large.
 FAR = 1.0
-#: Log-densities are rounded to multiples of this: the last bits of a logarithm depend on the
-#: machine.
-_DENSITY_GRID = 2.0**-32
-#: Last numbers of the places of streams: for a sampler at a resting pose, for a child, and for the
-#: draw of audited attempts.
-_SAMPLER, _CHILD, _AUDIT = 2, 1, 3
+#: Last numbers of the places of streams: for a sampler at a resting pose, and for the draw of
+#: audited attempts.
+_SAMPLER, _AUDIT = 2, 3
 #: One of this many attempts is lifted regardless of its chance of a sample and its image.
 AUDIT = 10
 
@@ -70,7 +65,6 @@ class Candidates:
             if the palm ray misses the object.
         resting: (n,), index of each pose's resting pose.
         source: (n,), `Source` of each pose.
-        log_density: (n,), logarithm of the density of each draw, see the schema.
         combinations: Number of combinations of rotations, or of surface points drawn.
         valid: Number of combinations above the table whose palm ray meets the bounding box.
         distinct: Number of different poses among the valid ones.
@@ -82,7 +76,6 @@ class Candidates:
     distance: Array
     resting: npt.NDArray[np.int64]
     source: npt.NDArray[np.int64]
-    log_density: Array
     combinations: int
     valid: int
     distinct: int
@@ -93,13 +86,7 @@ class Candidates:
 
 
 class Sampler(Protocol):
-    """A sequence of palm poses of an object at a resting pose; it does not depend on its length.
-
-    Attributes:
-        log_density: Log-density of the draw of each pose, see the schema.
-    """
-
-    log_density: float
+    """A sequence of palm poses of an object at a resting pose; it does not depend on its length."""
 
     @property
     def limit(self) -> int | None:
@@ -123,7 +110,6 @@ class Rotations:
         self._poses = poses[stream.permutation(len(poses))]
         self._counts = combinations, valid, len(poses)
         self.limit: int | None = len(poses)
-        self.log_density = rounded_density(-math.log(max(len(poses), 1)))
 
     def poses(self, count: int) -> Array:
         """Return the first poses (count, 4, 4)."""
@@ -144,7 +130,6 @@ class Normals:
         self._model, self._X_TO, self._stream = model, X_TO, stream
         self._poses, self._numbers, self._drawn = np.zeros((0, 4, 4)), np.zeros(0, dtype=int), 0
         self.limit: int | None = None
-        self.log_density = rounded_density(-math.log(model.visual.area * 2.0 * math.pi))
 
     def poses(self, count: int) -> Array:
         """Return the first poses (count, 4, 4)."""
@@ -202,7 +187,6 @@ def sample_candidates(
         distance=distance,
         resting=np.array([k for (k, _), _ in turns], dtype=np.int64),
         source=np.array([_source(method) for (_, method), _ in turns], dtype=np.int64),
-        log_density=np.array([samplers[place].log_density for place, _ in turns], dtype=float),
         combinations=combinations,
         valid=valid,
         distinct=distinct,
@@ -362,72 +346,11 @@ def standoff_attempts(
                 seed=stream.key,
                 resting=int(candidates.resting[i]),
                 source=Source(candidates.source[i]),
-                log_density=float(candidates.log_density[i]),
                 audited=is_audited(seed, object_key(name), i, j, 0),
                 preshape=None if shapes is None else int(shapes[j]),
             )
 
 
-def children(parent: Attempt, config: RefineConfig, *, name: str, seed: int) -> list[Attempt]:
-    """Return the attempts around the palm pose of an attempt that holds.
-
-    Args:
-        parent: The attempt that holds; if it is of the last generation, it has no children.
-        config: Number of children, and their distances.
-        name: The object's name.
-        seed: Seed of the dataset.
-    """
-    if parent.generation >= config.generations:
-        return []
-    first = parent.child * config.children + 1
-    return [
-        _child(parent, number, config, name=name, seed=seed)
-        for number in range(first, first + config.children)
-    ]
-
-
-def _child(parent: Attempt, number: int, config: RefineConfig, *, name: str, seed: int) -> Attempt:
-    place = parent.candidate, parent.standoff_index, number
-    stream = Stream(seed, object_key(name), *place, _CHILD)
-    numbers = stream.normal(6)
-    X_GH = palm_motion(numbers, config.shift, np.deg2rad(config.turn_deg))
-
-    # The density of six normal numbers, for three lengths [m] and three angles [rad].
-    scale = config.shift * math.radians(config.turn_deg)
-    density = -0.5 * float(dot(numbers, numbers)) - 3.0 * math.log(2.0 * math.pi * scale)
-    return replace(
-        parent,
-        X_OG=multiply(parent.X_OG, X_GH),
-        ray_hits=True,
-        seed=stream.key,
-        source=Source.REFINE,
-        log_density=rounded_density(density),
-        child=number,
-        parent=parent.child,
-        generation=parent.generation + 1,
-        audited=is_audited(seed, object_key(name), *place),
-    )
-
-
 def is_audited(seed: int, *place: int) -> bool:
-    """Return whether an attempt is audited, given its object, candidate, stand-off and child."""
+    """Return whether an attempt is audited, given its object, candidate and stand-off."""
     return int(Stream(seed, *place, _AUDIT).integers(AUDIT, 1)[0]) == 0
-
-
-def palm_motion(numbers: Array, shift: float, turn: float) -> Array:
-    """Return a random pose (4, 4) of a palm in its frame before the motion.
-
-    Args:
-        numbers: (6,), normal random numbers: along the axes, then about the axes.
-        shift: Standard deviation along each axis [m].
-        turn: Standard deviation of each component of the rotation vector [rad].
-    """
-    vector = turn * numbers[3:]
-    angle = float(norm(vector))
-    axis = vector / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
-    return make_pose(rotation_about(axis, angle), shift * numbers[:3])
-
-
-def rounded_density(log_density: float) -> float:
-    """Return a log-density without the last bits, which depend on the machine."""
-    return round(log_density / _DENSITY_GRID) * _DENSITY_GRID

@@ -20,14 +20,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from drakegrasp.arithmetic import Array, multiply
+from drakegrasp.arithmetic import Array, multiply, norm
 from drakegrasp.config import CertifyConfig, Config, with_whole_lifts
+from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.candidates import palm_motion
 from drakegrasp.simulation.conditions import Conditions, usual_conditions
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.screen import Prediction, centred, predict
@@ -153,6 +153,20 @@ def _noisy(
         friction = materials.friction_hand * _noise_factor(stream, rules.friction_noise)
         mass = materials.mass * _noise_factor(stream, rules.mass_noise)
         yield _with_materials(noisy, known, friction_hand=friction, mass=mass)
+
+
+def palm_motion(numbers: Array, shift: float, turn: float) -> Array:
+    """Return a random pose (4, 4) of a palm in its frame before the motion.
+
+    Args:
+        numbers: (6,), normal random numbers: along the axes, then about the axes.
+        shift: Standard deviation along each axis [m].
+        turn: Standard deviation of each component of the rotation vector [rad].
+    """
+    vector = turn * numbers[3:]
+    angle = float(norm(vector))
+    axis = vector / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
+    return make_pose(rotation_about(axis, angle), shift * numbers[:3])
 
 
 def _with_materials(attempt: Attempt, known: Conditions, **changes: float) -> Attempt:

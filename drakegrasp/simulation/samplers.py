@@ -12,7 +12,6 @@ docs/explanation/sampling.md has an example.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from itertools import islice
@@ -233,7 +232,6 @@ class OwnPoses:
     """The poses that a user-defined sampler yields, in their order.
 
     Attributes:
-        log_density: Log-density of the class; 0 if it has none.
         limit: Number of yielded poses, up to `candidates.max`.
     """
 
@@ -266,9 +264,6 @@ class OwnPoses:
             -1, 4, 4
         )
         self.limit: int | None = len(self._poses)
-        self.log_density = getattr(sampler, "log_density", 0.0)
-        if not isinstance(self.log_density, float) or not math.isfinite(self.log_density):
-            raise ConfigError(f"{name}: log_density must be a finite float, got {self.log_density}")
 
     def poses(self, count: int) -> Array:
         """Return the first poses (count, 4, 4)."""

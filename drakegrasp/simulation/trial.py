@@ -207,9 +207,13 @@ def run_attempt(
             return replace(record, outcome=Outcome(int(verdict)))
 
         return _lift_closed(scene, record, attempt, config, limits, is_visible)
+    except TrialTimeout:
+        return replace(start, outcome=Outcome.TIMEOUT)
+    except (MachineError, MemoryError, OSError):
+        raise
     # A failed assertion in Drake arrives as SystemExit, everything else as RuntimeError.
     except (Exception, SystemExit) as error:
-        return _failed(start, error)
+        return replace(start, outcome=Outcome.SOLVER_ERROR, message=first_line(error))
 
 
 def _scene_for(scene: Scene, attempt: Attempt) -> Scene:
@@ -217,55 +221,6 @@ def _scene_for(scene: Scene, attempt: Attempt) -> Scene:
     if attempt.own_motors and scene.own_motors is not None:
         return scene.own_motors()
     return scene
-
-
-def has_only_scraped(record: TrialRecord) -> bool:
-    """Return whether a hand would have been lifted if it had not scraped the table."""
-    if record.outcome is not Outcome.TABLE_CONTACT or record.closed is None or record.lift:
-        return False
-    # The rule of the table is the last of the rules for closed hands.
-    touched = record.closed.contacts
-    return not touched.hand_on_table
-
-
-def lift_on(
-    scene: Scene,
-    record: TrialRecord,
-    attempt: Attempt,
-    config: Config,
-    *,
-    is_visible: Callable[[], bool] = lambda: True,
-) -> TrialRecord:
-    """Continue an attempt whose hand only scraped the table, as if `scrape_depth` were not set.
-
-    The hand is still closed in the scene: nothing else may have run there since `run_attempt`.
-
-    Args:
-        scene: The scene given to `run_attempt`.
-        record: The record returned by `run_attempt`, see `has_only_scraped`.
-        attempt: See `run_attempt`.
-        config: See `run_attempt`.
-        is_visible: See `run_attempt`.
-
-    Returns:
-        The record with the verdict of the lift.
-    """
-    scene = _scene_for(scene, attempt)
-    close = config.close.model_copy(update={"scrape_depth": None})
-    rules = config.model_copy(update={"close": close})
-    try:
-        return _lift_closed(scene, record, attempt, rules, start_limits(rules), is_visible)
-    except (Exception, SystemExit) as error:
-        return _failed(record, error)
-
-
-def _failed(start: TrialRecord, error: BaseException) -> TrialRecord:
-    """Return the record of an attempt whose simulation failed; raise failures of the machine."""
-    if isinstance(error, TrialTimeout):
-        return replace(start, outcome=Outcome.TIMEOUT)
-    if isinstance(error, MachineError | MemoryError | OSError):
-        raise error
-    return replace(start, outcome=Outcome.SOLVER_ERROR, message=first_line(error))
 
 
 def _lift_closed(

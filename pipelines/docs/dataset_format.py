@@ -104,11 +104,8 @@ rests on the table then, and the forces of the fingertips need not balance.
 ## Versions of the schema
 
 Files with the `schema_version` above can be read. Any other version is rejected with a message that
-names the file and both versions: build the dataset again, in another directory. Version 4 added
-resting poses, sampler, refined palm poses, weights, chance and audit. Version 2 had no conditions
-of an attempt, and no mass, density, friction, scale and axis of each object. Version 1 also had
-other labels: it counted fingers that the object pushed open, and contacts anywhere on a fingertip's
-link.
+names the file and both versions: build the dataset again, in another directory. The
+[changelog](../../CHANGELOG.md) states what each version changed.
 
 ## Seals
 

@@ -23,10 +23,8 @@ def make_funnel(outcomes: np.ndarray, *names: str, **counts: np.ndarray) -> Funn
         "precision": none,
         "stable": none,
         "removals": np.zeros((len(names), 1 + max(Removal)), dtype=np.int64),
-        "refined": np.zeros((len(names), 3), dtype=np.int64),
-        "untested": none,
         "audited": np.zeros((len(names), 4), dtype=np.int64),
-        "preshapes": np.zeros((256, 5), dtype=np.int64),
+        "preshapes": np.zeros((256, 4), dtype=np.int64),
     }
     return Funnel(
         names=names,
@@ -110,7 +108,7 @@ def test_columns_of_the_funnel_add_up_to_the_attempts(compact: bool) -> None:
 
 
 def test_preshape_table_has_a_row_of_each_and_says_which_is_of_none() -> None:
-    counts = [PreshapeCount("[red]", 1200, 7, 5, 0, 4), PreshapeCount(NO_NAME, 3, 1, 0, 0, 0)]
+    counts = [PreshapeCount("[red]", 1200, 7, 5, 4), PreshapeCount(NO_NAME, 3, 1, 0, 0)]
     text = printed(preshape_table(counts))
     assert ["[red]", "1,200", "7", "5", "4"] in cells(text)
     assert [NO_NAME, "3", "1", "0", "0"] in cells(text)

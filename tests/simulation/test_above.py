@@ -52,11 +52,3 @@ def test_palms_aim_along_the_major_axis_and_turn_by_quarters(drawn) -> None:
     quarter = np.round(angle / 90.0)
     assert np.abs(angle - 90.0 * quarter).max() < YAW + 12.0
     assert (np.bincount(quarter.astype(int) % 4, minlength=4) > 100).all()
-
-
-def test_density_is_of_the_uniform_draw(drawn) -> None:
-    target = ALONG * ACROSS * SIZE[0] * SIZE[1]
-    zone = 2.0 * np.pi * -np.diff(np.cos(np.deg2rad(TILT)))[0]
-    expected = -np.log(target * 4.0 * np.deg2rad(2.0 * YAW) * zone)
-    # The bar's ends are seen to the nearest of 2048 points.
-    np.testing.assert_allclose(drawn[2].log_density, expected, atol=0.05)

@@ -35,6 +35,7 @@ from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.schema import CONDITION_FIELDS, NO_PRESHAPE
 from drakegrasp.errors import HandError
+from drakegrasp.filters import Removal
 from drakegrasp.frames import invert_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.folder import is_hand
@@ -88,7 +89,7 @@ def trial_rules(trials: CheckedFile, dataset: Dataset | None) -> list[list[Rule]
 
 
 def numbers(batch: Batch, candidates: AnyArray | None) -> Iterator[Violation]:
-    """The numbers of a trial are valid, and a refined palm pose has a parent.
+    """The numbers of a trial are valid.
 
     Args:
         batch: Rows of `/trials`.
@@ -109,29 +110,18 @@ def numbers(batch: Batch, candidates: AnyArray | None) -> Iterator[Violation]:
         ("object", "rows of /objects", objects),
         ("candidate", "candidates of its object", most),
         ("standoff_index", "stand-offs", len(config.candidates.standoffs) if config else np.inf),
-        ("child", "numbers in a family", np.inf),
     ):
         bad = (batch[name] < 0) | (batch[name] >= limit)
         yield from batch.broken(f"{name} must be one of the {of}", bad, batch[name])
 
-    # The first attempt of a family has no parent. Only a posture from outside may have an unknown
-    # density or no preshape.
-    child, source, preshape = batch["child"], batch["source"], batch["preshape"]
-    refined, given = child > 0, source == Source.POSTURES
-    first = (batch["generation"] > 0) != refined
-    drawn = ((source == Source.REFINE) != refined) | (source > max(Source))
-    dense = ~np.isfinite(batch["log_density"]) & ~given
-    shape = (preshape == NO_PRESHAPE) & (~given | (batch["unused"] > 0))
+    # Only a posture from outside may have no preshape.
+    source, preshape = batch["source"], batch["preshape"]
+    shape = (preshape == NO_PRESHAPE) & ((source != Source.POSTURES) | (batch["unused"] > 0))
     for name, bad, must in (
-        ("generation", first, "0 for the first of a family and positive for others"),
-        ("source", drawn, "2 (refine) for a refined palm pose, and 0, 1, 3 or 4 for another"),
-        ("log_density", dense, "finite but for postures"),
+        ("source", ~np.isin(source, list(Source)), "0, 1, 3 or 4"),
         ("preshape", shape, "255 of postures only, which use all fingers"),
     ):
         yield from batch.broken(f"{name} must be {must}", bad, batch[name])
-    if config is not None:
-        parent = np.where(refined, (child - 1) // max(config.refine.children, 1), 0)
-        yield from batch.follows("parent", parent, "child")
 
 
 def complete_stages(batch: Batch) -> Iterator[Violation]:
@@ -291,13 +281,13 @@ def resting_poses(batch: Batch, manifest: Manifest) -> Iterator[Violation]:
 def conditions(batch: Batch, manifest: Manifest, model: LoadModel) -> Iterator[Violation]:
     """Friction, mass, looks, cameras and noise are those that the seed draws, or the defaults."""
     due = {f.name: np.array(batch[f.name]) for f in CONDITION_FIELDS}
-    identity = ("candidate", "standoff_index", "child")
+    identity = ("candidate", "standoff_index")
     for name, known, rows in _by_object(batch, manifest, model):
         own = manifest.config_of(name)
         # If nothing is drawn, all attempts of an object have the same conditions.
         same = own.randomize == RandomizeConfig()
         for chosen in [rows] if same else rows[:, None]:
-            numbers = [0, 0, 0] if same else [int(batch[key][chosen[0]]) for key in identity]
+            numbers = [0, 0] if same else [int(batch[key][chosen[0]]) for key in identity]
             for key, value in draw_conditions(known, own, *numbers).values().items():
                 due[key][chosen] = value
     for key, values in due.items():
@@ -360,4 +350,7 @@ def successes(trials: CheckedFile) -> Iterator[Violation]:
         different = sorted(set(batch["trial_id"].tolist()) ^ set(due.tolist()))
         got = f"differences at trials {different[:5]}" if different else "another order"
         yield of_file(trials.name, "trial_id must list the successes of /trials", got, "/successes")
+    known, removal = [r.value for r in Removal], batch["removal"]
+    what = f"removal must be one of {', '.join(map(str, known))}"
+    yield from batch.broken(what, ~np.isin(removal, known), removal)
     yield from ranges(batch)
