@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 
 #: Outcomes in the order of the funnel. Outcomes that only verdicts have are not among them.
 _FUNNEL = [o for group in GROUPS for o in Outcome if o.group == group]
-_RARE = ("left", "moved")
 #: Maximum number of objects without samples whose reasons are printed.
 BARREN = 10
 #: Smallest width of a terminal for which the audit has all of its columns [characters].
@@ -128,10 +127,10 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
     groups = {_head(o): [o] for o in shown}
     removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
     if compact:
-        # Space is scarce, and few datasets have lifts that were ended early or left out.
+        # Space is scarce, and few datasets have lifts that were ended early.
         there, removed = funnel.outcomes.sum(axis=0), []
         groups = {name: [o for o in _FUNNEL if o.group == name] for name in GROUPS}
-        groups = {h: g for h, g in groups.items() if h not in _RARE or there[g].any()}
+        groups = {h: g for h, g in groups.items() if h != "moved" or there[g].any()}
     heads = ["poses", "attempts", *groups]
     heads += [f"- {r.label}".replace("_", "\n") for r in removed]
 
@@ -151,27 +150,17 @@ def hold_table(funnel: Funnel) -> Table:
         "held: the outcome success; precision: held with the fingertips alone; stable: precision, "
         "and the object moved by less than 5 mm and 5° in the hand"
     ]
-    # If lifts were chosen by their predicted probability, only audited lifts yield the fraction.
-    held, stable, head = funnel.outcomes[:, Outcome.SUCCESS], funnel.stable, "stable\nof held"
-    whole, part = held, stable
-    if not funnel.all_lifted:
-        head, (whole, part) = "stable of held\n(audit)", funnel.audited.T[1:3]
-        notes.append(
-            "audit: one attempt in ten, drawn at random, is lifted even if a sample is improbable; "
-            "only these lifts show which fraction of the held grasps is stable"
-        )
+    held, stable = funnel.outcomes[:, Outcome.SUCCESS], funnel.stable
     if note := held_note(funnel):
         notes.append(note)
 
     def row(objects: slice) -> list[str]:
         counts = (funnel.outcomes.sum(axis=1), held, funnel.precision, stable)
-        all_held, all_stable = int(whole[objects].sum()), int(part[objects].sum())
+        all_held, all_stable = int(held[objects].sum()), int(stable[objects].sum())
         share = f"{all_stable / all_held:.0%}" if all_held else "-"
-        if all_held and not funnel.all_lifted:
-            share = f"{all_stable:,} of {all_held:,}, {share}"
         return [*(_count(count[objects].sum()) for count in counts), share]
 
-    heads = ["attempts", "held", "precision", "stable", head]
+    heads = ["attempts", "held", "precision", "stable", "stable\nof held"]
     return _table_of_objects("How well the hand holds", heads, funnel, row, "\n".join(notes))
 
 

@@ -519,18 +519,11 @@ TRIAL_FIELDS: tuple[Field, ...] = (
               "pose of the palm at the start; the candidate's pose if the palm ray misses"),
     ),
     *CONDITION_FIELDS,
-    Field("audited", "", "bool", "-", "-",
-          "whether a closed hand that may lift is lifted in any case; this is drawn for one "
-          "attempt in ten",
-          of="attempt.audited"),
     *_since(
         Stage.CLOSED,
         _TIME_CLOSE,
         _CLEARANCE["close"],
         *_CLOSED,
-        Field("chance", "", "float64", "-", "-",
-              "predicted probability that a closed hand that may lift yields a sample; NaN for "
-              "hands without a model of this probability", some=True, of="trial.chance"),
     ),
     *_since(
         Stage.LIFTED,
@@ -803,9 +796,6 @@ SCENE_GRASP_FIELDS: tuple[Field, ...] = (
     Field("held", "", "bool", "-", "-", "whether the grasp holds"),
     *_WORDS,
     Field("sample", "", "bool", "-", "-", "whether the grasp is a sample of the dataset"),
-    Field("audited", "", "bool", "-", "-",
-          "whether the hand was lifted whatever its predicted probability: such hands are an "
-          "unbiased sample of the hands that may lift", of="audited"),
     Field("source", "", "uint8", "-", "-", "sampler of the palm pose, see /trials", of="source"),
     *(replace(field, of=field.name) for field in HOLD_FIELDS),
     *_PRESHAPE,

@@ -37,8 +37,8 @@ from drakegrasp.runtime.executor import Executor, run_here
 NO_NAME = "-"
 #: Columns of the attempts that a funnel counts.
 _COUNTED = (
-    *("object", "outcome", "removal", "standoff_index", "audited", "slip"),
-    *("precision", "stable", "preshape"),
+    *("object", "outcome", "removal", "standoff_index", "precision"),
+    *("stable", "preshape"),
 )
 
 
@@ -56,8 +56,6 @@ class Funnel:
         precision, stable: (m,), successes that are precision grasps, and those that are also
             stable.
         removals: (m, 1 + max(Removal)), successes by object and reason of removal.
-        audited: (m, 4), lifts, successes, stable grasps and samples among audited attempts: their
-            rates are fair if other attempts were chosen for the lift by their chance.
         preshapes: (256, 4), by index of the preshape: attempts, successes, stable grasps and
             samples.
     """
@@ -71,18 +69,12 @@ class Funnel:
     precision: npt.NDArray[np.int64]
     stable: npt.NDArray[np.int64]
     removals: npt.NDArray[np.int64]
-    audited: npt.NDArray[np.int64]
     preshapes: npt.NDArray[np.int64]
 
     @property
     def samples(self) -> npt.NDArray[np.int64]:
         """(m,), samples of each object."""
         return self.removals[:, Removal.KEPT]
-
-    @property
-    def all_lifted(self) -> bool:
-        """Whether each closed hand that may lift was lifted."""
-        return not self.outcomes[:, Outcome.NOT_LIFTED].any()
 
 
 @dataclass(frozen=True)
@@ -223,15 +215,14 @@ def funnel_of(trials: Trials) -> Funnel:
         precision=zeros(count),
         stable=zeros(count),
         removals=zeros(count, 1 + max(Removal)),
-        audited=zeros(count, 4),
         preshapes=zeros(1 + NO_PRESHAPE, 4),
     )
     for block in trials.blocks(_COUNTED):
         number, outcome, removal = (block[name] for name in ("object", "outcome", "removal"))
         held, sample = outcome == Outcome.SUCCESS, removal == Removal.KEPT
-        stable, every = block["stable"], np.ones(len(number), dtype=np.bool_)
+        stable, preshape = block["stable"], block["preshape"]
 
-        # Palm poses, outcomes, labels of the hold, and removals.
+        # Palm poses, outcomes, labels of the hold, removals, and preshapes.
         _count(funnel.candidates, number[block["standoff_index"] == 0])
         _count(funnel.outcomes, (number, outcome))
         _count(funnel.precision, number[block["precision"]])
@@ -239,14 +230,10 @@ def funnel_of(trials: Trials) -> Funnel:
         decided = removal != NONE
         _count(funnel.removals, (number[decided], removal[decided]))
 
-        # Preshapes, and audited attempts.
-        fair, lifted = block["audited"], np.isfinite(block["slip"])
-        for counts, of, chosen in (
-            (funnel.preshapes, block["preshape"], (every, held, held & stable, sample)),
-            (funnel.audited, number, (fair & own for own in (lifted, held, stable, sample))),
-        ):
-            for column, own in zip(counts.T, chosen, strict=True):
-                _count(column, of[own])
+        every = np.ones_like(held)
+        chosen = every, held, held & stable, sample
+        for column, own in zip(funnel.preshapes.T, chosen, strict=True):
+            _count(column, preshape[own])
     return funnel
 
 
@@ -276,22 +263,12 @@ def _count(counts: npt.NDArray[np.int64], cells: Any) -> None:
 
 def held_note(funnel: Funnel) -> str:
     """Return why there may be more held grasps than were counted; empty if there is no reason."""
-    moved, left = funnel.outcomes[:, [Outcome.MOVED, Outcome.NOT_LIFTED]].sum(axis=0).tolist()
-    reasons = []
-    if moved:
-        ended = f"{counted(moved, 'lift')} ended early, without a verdict (moved)"
-        reasons.append(f"{ended}, because the object moved more in the hand than a sample may")
-    if left:
-        lifts, held, stable, samples = funnel.audited.sum(axis=0).tolist()
-        # Before the files are assembled, it is unknown which successes are samples.
-        found = [f"{held:,} held", f"{stable:,} stable"]
-        found += [counted(samples, "sample")] if funnel.removals.any() else []
-        reasons.append(
-            f"{counted(left, 'closed hand')} did not lift (not_lifted), because a sample was "
-            "improbable or the image too flat"
-            + (f"; {counted(lifts, 'lift')} of the audit: {', '.join(found)}" if lifts else "")
-        )
-    return f"the number of held grasps is a lower bound: {'; '.join(reasons)}" if reasons else ""
+    moved = int(funnel.outcomes[:, Outcome.MOVED].sum())
+    if not moved:
+        return ""
+    ended = f"{counted(moved, 'lift')} ended early, without a verdict (moved)"
+    why = "because the object moved more in the hand than a sample may"
+    return f"the number of held grasps is a lower bound: {ended}, {why}"
 
 
 def count_splits(out: Path) -> list[SplitCount]:
@@ -395,9 +372,7 @@ def why_no_sample(outcomes: AnyArray, removals: AnyArray, config: Config) -> Sho
         removal = Removal(int(np.argmax(removals)))
         reason = f"{held:,} held, none a sample: mostly {removal.label} ({removals[removal]:,})"
         if removal is Removal.FLAT_DEPTH:
-            # If lifts of flat images were left out, the filter cannot be wider than that limit.
-            least = f"{config.lift.least_depth_variance:g}"
-            ways = f"`drakegrasp assemble OUT --set filters.min_depth_variance={least}`"
+            ways = "`drakegrasp assemble OUT --set filters.min_depth_variance=0`"
             return Shortfall(reason, f"{ways}, which keeps flat depth images")
         return Shortfall(reason, "more palm poses (--candidates), or other limits in `filters`")
 

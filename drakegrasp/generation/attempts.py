@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from drakegrasp.dataset.assembly.survey import successes_of
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.schema import CAMERAS, NO_PRESHAPE, sizes
 from drakegrasp.dataset.shards import ShardHeader, trial_columns
-from drakegrasp.errors import DataError, MachineError
+from drakegrasp.errors import DataError
 from drakegrasp.filters import RULES, Removal, first_removal
 from drakegrasp.frames import Array, pack_pose
 from drakegrasp.grasp import unused_fingers
@@ -169,32 +169,11 @@ def try_attempt(
 ) -> TrialRecord:
     """Run the trial of one attempt; replace the scene if Drake failed in it."""
     X_TO = setup.prepared.resting_poses[attempt.resting]
-    is_visible = partial(_is_visible, setup, attempt, X_TO)
-    record = run_attempt(
-        setup.scene_of(attempt), X_TO, attempt, setup.config, prediction, is_visible=is_visible
-    )
+    record = run_attempt(setup.scene_of(attempt), X_TO, attempt, setup.config, prediction)
     if record.outcome is Outcome.SOLVER_ERROR:
         forget_scenes()
         setup.renew_scene()
     return record
-
-
-def _is_visible(setup: TrialSetup, attempt: Attempt, X_TO: Array) -> bool:
-    """Return whether the otm depth image of an attempt has enough variance for a lift.
-
-    Raises:
-        MachineError: If the renderer fails, which is not a failure of the grasp.
-    """
-    least = setup.config.lift.least_depth_variance
-    if least == 0.0:
-        return True
-    try:
-        depth = _seen(setup, attempt, X_TO, "otm")["image_otm"][3]
-    except MachineError:
-        raise
-    except (RuntimeError, SystemExit) as error:
-        raise MachineError(f"{setup.prepared.model.name}: cannot render: {error}") from None
-    return bool(depth.astype(float).var() >= least)
 
 
 # Rows of a shard

@@ -183,7 +183,7 @@ def _certify_seconds(config: Config) -> float:
     """Return the mean time of certifying per success [s]; other lifts are not counted."""
     rules = config.certify
     simulations = rules.repeats + rules.friction_steps + 1 if config.certified else 0
-    return CERTIFY_SECONDS * (rules.share or 0.0) * simulations
+    return CERTIFY_SECONDS * rules.share * simulations
 
 
 def _duration(seconds: float) -> str:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from drakegrasp.config import Config, continued
+from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.assembly.split import rank_in_split
 from drakegrasp.dataset.assembly.survey import own_filters
@@ -233,7 +233,6 @@ def build_locked(
         known = claim_directory(out, config)
         if known is not None:
             refuse_missing(known, [source.name for source in sources], out)
-            config = continued(config, known.config)
         config = carry_hand(out, config, known.config.hand if known else None)
 
         notices = [] if dead is None else [f"the lock of a dead build was taken over: {dead}"]

@@ -305,7 +305,7 @@ class _Experiment:
         """
         rules, known = self._config.certify, set(self._samples(trials, looks))
         tested = rules.share_tested if self._unit.likely_tested else 0.0
-        of_samples = max(rules.share or 0.0, tested)
+        of_samples = max(rules.share, tested)
         holds = {field.name: field.empty(len(self._attempts), {}) for field in HOLD_FIELDS}
         look_of = {row: k for k, row in enumerate(looks["row"].tolist())}
         for row in np.flatnonzero(np.isfinite(trials["time_lift"])).tolist():

@@ -257,8 +257,6 @@ def words_of(snapshot: Snapshot, i: int) -> list[str]:
         words.append("stable" if table.stable[i] else "precision" if table.precision[i] else "held")
     if table.outcome[i] == Outcome.MOVED:
         words.append("lift ended, not judged")
-    if table.outcome[i] == Outcome.NOT_LIFTED:
-        words.append("not lifted, not judged")
     if table.split[i] != NONE:
         words.append(SPLITS[table.split[i]])
     if table.removal[i] not in (NONE, Removal.KEPT):

@@ -38,7 +38,6 @@ class Attempt:
             hand.
         ray_hits: Whether the palm ray meets the object; true if no ray places the palm.
         conditions: Friction, mass, appearance and cameras; None for the usual conditions.
-        audited: Whether the closed hand is lifted regardless of its chance and its image.
         path: Positions (3, j) of all joints [rad or m], in the plant's order, for a posture that
             spread and closing cannot describe: where the trial begins, where the fingers hold the
             object, and where separate motors then move to and press.
@@ -60,7 +59,6 @@ class Attempt:
     closing: Array | None = None
     ray_hits: bool = True
     conditions: Conditions | None = None
-    audited: bool = False
     path: Array | None = None
     own_motors: bool = False
     preshape: int | None = None

@@ -34,7 +34,7 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.attempt import Attempt, Source
-from drakegrasp.simulation.candidates import Candidates, is_audited
+from drakegrasp.simulation.candidates import Candidates
 from drakegrasp.simulation.posture import (
     BESIDE_GRASP,
     Posture,
@@ -785,5 +785,4 @@ def posture_attempts(
             resting=int(candidates.resting[i]),
             source=Source.POSTURES,
             posture_row=float(given.row[i]),
-            audited=is_audited(seed, object_key(name), i, 0, 0),
         )

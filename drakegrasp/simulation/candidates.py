@@ -48,11 +48,8 @@ from drakegrasp.table import Table
 BLOCK = 1000
 #: Palms farther than this from the object must face it [m]; no hand is so large.
 FAR = 1.0
-#: Last numbers of the places of streams: for a sampler at a resting pose, and for the draw of
-#: audited attempts.
-_SAMPLER, _AUDIT = 2, 3
-#: One of this many attempts is lifted regardless of its chance of a sample and its image.
-AUDIT = 10
+#: Last number of the place of the stream of a sampler at a resting pose.
+_SAMPLER = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -346,11 +343,5 @@ def standoff_attempts(
                 seed=stream.key,
                 resting=int(candidates.resting[i]),
                 source=Source(candidates.source[i]),
-                audited=is_audited(seed, object_key(name), i, j, 0),
                 preshape=None if shapes is None else int(shapes[j]),
             )
-
-
-def is_audited(seed: int, *place: int) -> bool:
-    """Return whether an attempt is audited, given its object, candidate and stand-off."""
-    return int(Stream(seed, *place, _AUDIT).integers(AUDIT, 1)[0]) == 0

@@ -87,8 +87,6 @@ def placed_object(item: BuiltinObject) -> PlacedObject:
         "objects.mass": MASSES[int(u[0] * len(MASSES))],
         "physics.friction_hand": friction,
         "physics.friction_table": friction,
-        "lift.least_chance": 0,
-        "lift.least_depth_variance": 0,
         "lift.stop_when": "never",
     }
     config = dg.load_config("fast", [f"{key}={value}" for key, value in values.items()])

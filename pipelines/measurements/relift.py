@@ -141,13 +141,12 @@ def try_again(
         return {"change": change, **told, "seconds": spent, **measured(hand, record)}
 
     if other is not None:
-        # Every hand that may lift does so, whatever its chance, because verdicts are compared.
         # Friction and mass are those of the requested settings.
         asked = {"physics": other.physics, "randomize": other.randomize}
         rules = stored.model_copy(update=asked)
         again = find_attempt(model, candidate, standoff, rules)
         both = ((STORED, attempt, stored), (SET, again, other))
-        return [once(name, replace(each, audited=True), by) for name, each, by in both]
+        return [once(name, each, by) for name, each, by in both]
     whole = with_whole_lifts(stored)
     half = {"time_step": whole.physics.time_step / 2.0, "coarse_steps": 1}
     finer = whole.model_copy(update={"physics": whole.physics.model_copy(update=half)})

@@ -63,13 +63,6 @@ def test_words_of_a_build_that_runs_are_those_of_its_shards(out: Path) -> None:
     assert not unfinished.funnel.removals[:, Removal.KEPT].any()
 
 
-def test_audited_attempts_are_counted(out: Path) -> None:
-    """Of the first object a sample, a lost lift and a missed one."""
-    for row in (SUCCESS, SLIPPED, MISSING):
-        change(out, TRIALS, "trials/audited", row, lambda _: True)
-    assert count_funnel(out).audited.tolist() == [[2, 1, 1, 1], [0] * 4, [0] * 4]
-
-
 def test_attempts_are_counted_by_preshape(out: Path, tmp_path: Path) -> None:
     """Of the second preshape a success that is stable and one that is not, and a missed attempt."""
     for row in (SUCCESS, 3, MISSING):

@@ -57,7 +57,6 @@ SAMPLES = (
     "filters.min_camera_height=-1",
     "filters.max_surface_distance=1",
     "filters.max_normal_angle_deg=null",
-    *("lift.least_chance=0", "lift.least_depth_variance=0"),
 )
 
 #: Formats of an export that only go out: contacts, meshes, pictures, scenes, or episodes, from

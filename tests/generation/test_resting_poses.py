@@ -19,12 +19,9 @@ from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import MachineError
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
-from drakegrasp.generation import attempts
 from drakegrasp.generation.pipeline import build
-from drakegrasp.generation.replay import record_trial, replay_trial
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
@@ -80,43 +77,6 @@ def samples(out: Path) -> np.ndarray:
 
 def test_check_finds_nothing(dataset: Path) -> None:
     assert [str(v) for v in check_dataset(dataset)] == []
-
-
-def test_hands_whose_image_is_flat_are_not_lifted_and_no_sample_is_lost(
-    dataset: Path,
-    sources: list[MeshSource],
-    config: Config,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def fail(*_: object) -> None:
-        raise RuntimeError("no OpenGL")
-
-    seeing = override_config(config, ["lift.least_depth_variance=0.001"])
-    out = tmp_path / "out"
-    build(sources[1:], out, seeing, run_here, show=False)
-    assert [str(v) for v in check_dataset(out)] == []
-
-    # The same attempts of the second object; of those that were lifted, the same bits.
-    whole, now = trials(dataset), trials(out)
-    begin = int(np.argmax(whole["object"] == 1))
-    whole = {name: values[begin:] for name, values in whole.items()}
-    left = now["outcome"] == Outcome.NOT_LIFTED
-    assert left.any()
-    assert not now["audited"][left].any()
-    for name in ("candidate", "closed_p_OQ", "X_OG"):
-        assert np.array_equal(whole[name], now[name], equal_nan=True)
-    assert np.array_equal(whole["lifted_p_OQ"][~left], now["lifted_p_OQ"][~left], equal_nan=True)
-    before, after = samples(dataset), samples(out)
-    assert len(after) > 2
-    assert (before[before >= begin] - begin).tolist() == after.tolist()
-
-    # A recording of such a hand shows no lift; a renderer that fails is the machine's failure.
-    (flat, *_) = np.flatnonzero(left & (whole["outcome"] == Outcome.SUCCESS)).tolist()
-    assert record_trial(out, flat, tmp_path / "trial.html") is Outcome.NOT_LIFTED
-    monkeypatch.setattr(attempts, "render", fail)
-    with pytest.raises(MachineError, match="cannot render: no OpenGL"):
-        replay_trial(out, flat)
 
 
 def test_samplers_and_resting_poses_take_turns(dataset: Path) -> None:

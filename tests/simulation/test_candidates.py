@@ -374,15 +374,6 @@ def test_turns_go_on_without_a_sampler_that_has_no_more(box: ObjectModel) -> Non
     assert np.all(drawn.source[2 * distinct :] == Source.NORMALS)
 
 
-def test_one_attempt_in_ten_is_audited_whatever_is_tried_with_it() -> None:
-    made = []
-    for seed in range(40):
-        made += [each.audited for each in attempts(range(30), seed=seed)]
-    assert [each.audited for each in attempts(range(10, 20))] == made[30:60]
-    assert np.flatnonzero(made[:65]).tolist() == [5, 7, 22, 59, 64]  # draws are for ever
-    assert np.mean(made) == pytest.approx(0.1, abs=4 * np.sqrt(0.1 / len(made)))
-
-
 def test_enough_room_keeps_every_distinct_pose(box: ObjectModel) -> None:
     drawn = sample_candidates(box, BOX_X_TO, COARSE, 0)
     poses, combinations, valid = rotation_candidates(box.half_extents, BOX_X_TO, COARSE, stream())
