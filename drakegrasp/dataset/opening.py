@@ -160,7 +160,7 @@ def refuse_other_codes(
     if isinstance(codes, int):
         bad, must = (values < 0) | (values >= codes), f"0 to {codes - 1}"
     else:
-        bad, must = ~np.isin(values, codes), f"{min(codes)} to {max(codes)}"
+        bad, must = ~np.isin(values, codes), f"one of {', '.join(str(int(c)) for c in codes)}"
     if bad.any():
         row = int(np.argmax(bad))
         raise DataError(f"{path}: {name} must be {must}, got {values[row]} in row {first + row}")

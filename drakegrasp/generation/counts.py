@@ -60,12 +60,11 @@ class Counts:
             units = {of[0].object_name: of for of in headers_by_object(manifest) if of}
             self.target = Target(manifest.config, units)
 
-        # Progress: all attempts, attempts of the first round, and reused attempts. Before the build
-        # only the number of the first round is known; refined attempts follow from the samples.
+        # Progress: all attempts, and those that are done or reused.
         self._pool, self._report = pool, report
         standoffs = len(manifest.config.candidates.standoffs)
         self._total = standoffs * sum(entry.candidates for entry in manifest.objects)
-        self._standoffs, self._done, self._first = standoffs, 0, 0
+        self._done = 0
         self._outcomes: Counter[Outcome] = Counter()
         self._reused_attempts = 0
 
@@ -99,7 +98,6 @@ class Counts:
         self._outcomes.update(outcomes)
         self._attempts[header.object_name] += sum(outcomes.values())
         self._ended[header.object_name] += sum(outcomes.get(outcome, 0) for outcome in ENDED)
-        self._first += self._standoffs * (header.stop - header.start)
         self._done += sum(outcomes.values())
         self._reused_attempts += reused * sum(outcomes.values())
         if self._max_grasps is not None:
@@ -143,9 +141,7 @@ class Counts:
             enough = sum(min(found, self._each) for found in self._found.values())
             ends.append((enough, self._each * len(self._found)))
         made = [self._done * max(wanted / found, 1.0) for found, wanted in ends if found]
-        # Expect as many refined attempts per attempt of the first round as so far.
-        whole = -(-self._total * self._done // self._first) if self._first else self._total
-        return min([whole, *map(ceil, made)])
+        return min([self._total, *map(ceil, made)])
 
     def needs(self, header: ShardHeader) -> bool:
         """Return whether a unit's object has too few grasps in the units before the first gap."""

@@ -42,7 +42,6 @@ class Plan:
     Attributes:
         objects: Number of objects.
         attempts: Number of attempts.
-        refined: Number of refined attempts among them, which is only an expectation.
         units: Number of work units.
         workers: Number of workers.
         stages: Wall-clock time of each stage: start, prepare, simulate, assemble [s].
@@ -53,7 +52,6 @@ class Plan:
 
     objects: int
     attempts: int
-    refined: int
     units: int
     workers: int
     stages: dict[str, float]
@@ -100,15 +98,14 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
     ranges = tuple(config.unit_ranges(config.candidates.max))
     units = objects * len(ranges)
     standoffs = len(config.candidates.standoffs)
-    first = objects * config.candidates.max * standoffs
-    attempts = first + (refined := round(first * _refined(config, times)))
+    attempts = objects * config.candidates.max * standoffs
     successes = attempts * times.successes
     samples = successes * times.samples
 
     # The mean attempt, and the scenes: all workers that share an object's units build its scene.
     attempt = times.attempt + times.successes * (times.look + _certify_seconds(config))
     scenes = objects * min(workers, len(ranges))
-    longest = standoffs * max(map(len, ranges)) * attempts / first * attempt
+    longest = standoffs * max(map(len, ranges)) * attempt
 
     # Assembling has one task per object, and then one task per block of rows. Meanwhile one process
     # writes the packed rows to the files.
@@ -118,7 +115,6 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
     return Plan(
         objects=objects,
         attempts=attempts,
-        refined=refined,
         units=units,
         workers=workers,
         stages={
@@ -168,10 +164,9 @@ def plan_request(
 def plan_lines(plan: Plan) -> list[str]:
     """Return the lines that are printed for a plan."""
     stages = ", ".join(f"{name} {_duration(seconds)}" for name, seconds in plan.stages.items())
-    refined = f", of them about {plan.refined:,} refined" if plan.refined else ""
     return [
         f"from the beginning: {counted(plan.objects, 'object')}, "
-        f"{counted(plan.attempts, 'attempt')} in {counted(plan.units, 'work unit')}{refined}",
+        f"{counted(plan.attempts, 'attempt')} in {counted(plan.units, 'work unit')}",
         f"expected {_duration(plan.seconds)} on {counted(plan.workers, 'worker')} ({stages})",
         f"expected {plan.core_hours:,.2f} core-hours",
         f"expected {counted(plan.samples, 'sample')}, {_size(plan.bytes)} on disk",
@@ -184,20 +179,11 @@ def _shared(tasks: int, workers: int, seconds: float) -> float:
     return max(math.ceil(tasks / workers) * seconds, tasks * TASK_SECONDS)
 
 
-def _refined(config: Config, times: StageTimes) -> float:
-    """Return the mean number of refined attempts per attempt of the first round."""
-    total, born = 0.0, config.refine.children * times.parents
-    for _ in range(config.refine.generations):
-        total += born
-        born *= config.refine.children * times.refined_parents
-    return total
-
-
 def _certify_seconds(config: Config) -> float:
     """Return the mean time of certifying per success [s]; other lifts are not counted."""
     rules = config.certify
     simulations = rules.repeats + rules.friction_steps + 1 if config.certified else 0
-    return CERTIFY_SECONDS * (rules.share or 0.0) * simulations
+    return CERTIFY_SECONDS * rules.share * simulations
 
 
 def _duration(seconds: float) -> str:
@@ -235,9 +221,6 @@ class StageTimes:
         sample_bytes: Size of a row in grasping_oto.hdf5 and grasping_otm.hdf5 together [B].
         object_bytes: Size of the files of an object [B].
         source: Source of the figures, for the reader.
-        parents: Fraction of the attempts of the first round that a configuration with refinement
-            refines.
-        refined_parents: Fraction of the refined attempts that are refined again.
     """
 
     prepare: NonNegative
@@ -255,8 +238,6 @@ class StageTimes:
     sample_bytes: NonNegative
     object_bytes: NonNegative
     source: str
-    parents: NonNegative = 0.005
-    refined_parents: NonNegative = 0.4
 
 
 #: Measured with the log and the files of thirty G3DB meshes with 400 palm poses each (34,800
@@ -283,16 +264,14 @@ MEASURED = StageTimes(
 )
 
 
-#: Measured with four built-in objects with 24 palm poses each (288 attempts, and 232 refined
-#: attempts; 26 samples; 51 s on one core; preset `fast`, 2026-11-27). All other values are those
-#: of `MEASURED`.
+#: Measured with four built-in objects with 24 palm poses each (288 attempts, with refined palm
+#: poses about their samples; 26 samples; 51 s on one core; preset `fast`, 2026-11-27). All other
+#: values are those of `MEASURED`.
 FAST = replace(
     MEASURED,
     attempt=0.064,
     successes=0.17,
     samples=0.30,
-    parents=0.035,
-    refined_parents=0.24,
     source="measured on 4 built-in objects with the preset fast; --times FILE uses your own",
 )
 

@@ -17,7 +17,6 @@ as rounded integers, and random numbers come from `seeding`.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,15 +28,15 @@ import numpy.typing as npt
 import trimesh
 
 from drakegrasp import registry
-from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
-from drakegrasp.config import CandidateConfig, Config, RefineConfig, is_own_class
+from drakegrasp.arithmetic import Array, norm, sin_cos_deg
+from drakegrasp.config import CandidateConfig, Config, is_own_class
 from drakegrasp.errors import ConfigError
 from drakegrasp.mesh.crossings import first_hits
 from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.attempt import Attempt, Source
-from drakegrasp.simulation.palms import Shape, palm_motion
+from drakegrasp.simulation.palms import Shape
 from drakegrasp.simulation.samplers import (
     OwnPoses,
     above_table,
@@ -53,14 +52,8 @@ OURS = ("rotations", "normals", "closing")
 BLOCK = 1000
 #: Palms farther than this from the object must face it [m]; no hand is so large.
 FAR = 1.0
-#: Log-densities are rounded to multiples of this: the last bits of a logarithm depend on the
-#: machine.
-_DENSITY_GRID = 2.0**-32
-#: Last numbers of the places of streams: for a sampler at a resting pose, for a child, and for the
-#: draw of audited attempts.
-_SAMPLER, _CHILD, _AUDIT = 2, 1, 3
-#: One of this many attempts is lifted regardless of its chance of a sample and its image.
-AUDIT = 10
+#: Last number of the place of the stream of a sampler at a resting pose.
+_SAMPLER = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,7 +93,7 @@ class Candidates:
 
 
 #: The shape of a palm whose spread and preshape are drawn for each attempt.
-DRAWN = Shape(None, math.nan)
+DRAWN = Shape(None, np.nan)
 #: The resting pose and the sampler of a palm.
 Place: TypeAlias = tuple[int, str]
 #: What a sampler may take; only those of the package take the last one.
@@ -120,7 +113,7 @@ class Sampler(Protocol):
 class Rotations:
     """The distinct poses of the paper's rotations in random order, see `rotation_candidates`."""
 
-    def __init__(self, model: ObjectModel, X_TO: Array, config: Config, stream: Stream) -> None:
+    def __init__(self, model: ObjectModel, X_TO: Array, stream: Stream, config: Config) -> None:
         """Enumerate and shuffle the poses."""
         poses, combinations, valid = rotation_candidates(
             model.half_extents, X_TO, config.candidates, stream
@@ -383,54 +376,3 @@ def palm_attempts(
                 ray_hits=bool(np.isfinite(distance)),
                 preshape=None if shapes is None else int(shapes[j]),
             )
-
-
-def children(parent: Attempt, config: RefineConfig, *, name: str, seed: int) -> list[Attempt]:
-    """Return the attempts around the palm pose of an attempt that holds.
-
-    Args:
-        parent: The attempt that holds; if it is of the last generation, it has no children.
-        config: Number of children, and their distances.
-        name: The object's name.
-        seed: Seed of the dataset.
-    """
-    if parent.generation >= config.generations:
-        return []
-    first = parent.child * config.children + 1
-    return [
-        _child(parent, number, config, name=name, seed=seed)
-        for number in range(first, first + config.children)
-    ]
-
-
-def _child(parent: Attempt, number: int, config: RefineConfig, *, name: str, seed: int) -> Attempt:
-    place = parent.candidate, parent.standoff_index, number
-    stream = Stream(seed, object_key(name), *place, _CHILD)
-    numbers = stream.normal(6)
-    X_GH = palm_motion(numbers, config.shift, np.deg2rad(config.turn_deg))
-
-    # The density of six normal numbers, for three lengths [m] and three angles [rad].
-    scale = config.shift * math.radians(config.turn_deg)
-    density = -0.5 * float(dot(numbers, numbers)) - 3.0 * math.log(2.0 * math.pi * scale)
-    return replace(
-        parent,
-        X_OG=multiply(parent.X_OG, X_GH),
-        ray_hits=True,
-        seed=stream.key,
-        source=Source.REFINE,
-        log_density=rounded_density(density),
-        child=number,
-        parent=parent.child,
-        generation=parent.generation + 1,
-        audited=is_audited(seed, object_key(name), *place),
-    )
-
-
-def is_audited(seed: int, *place: int) -> bool:
-    """Return whether an attempt is audited, given its object, candidate, stand-off and child."""
-    return int(Stream(seed, *place, _AUDIT).integers(AUDIT, 1)[0]) == 0
-
-
-def rounded_density(log_density: float) -> float:
-    """Return a log-density without the last bits, which depend on the machine."""
-    return round(log_density / _DENSITY_GRID) * _DENSITY_GRID

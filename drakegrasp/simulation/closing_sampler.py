@@ -37,8 +37,8 @@ GOOD, BEST, LEAST = 0.75, 5, 0.25
 #: grasps.
 NEAR = 0.020, 30.0
 #: Least downward component of the approach of palms from above and of slanted ones: the sines of
-#: 60 and 30 degrees. Palms with more than the last one, the cosine of 14 degrees, are left out: their
-#: camera sees a flat image, which is no sample.
+#: 60 and 30 degrees. Palms with more than the last one, the cosine of 14 degrees, are left out:
+#: their camera sees a flat image, which is no sample.
 ABOVE, SLANTED, FLAT = float(np.sqrt(0.75)), 0.5, 0.97
 #: While palms from other sides close well, at most so many palms from above for each of these.
 MOST_ABOVE = 1.5

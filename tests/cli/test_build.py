@@ -289,15 +289,6 @@ def test_bar_ends_where_the_build_does(whole: Path, ends: dict[str, int], expect
         assert shown[f"of {ends['samples']:,} samples"] == 2
 
 
-def test_bar_counts_refined_attempts(whole: Path) -> None:
-    """What is left of the first round is taken to have as many as what is done."""
-    manifest, shown = read_manifest(whole), list[tuple[int, int]]()
-    counts = Counts(manifest, None, lambda done, total, **_: shown.append((done, total)))
-    header = replace(next(manifest.headers()), start=0, stop=1)
-    counts.add(UnitSummary(header=header, outcomes={Outcome.DROPPED: 7}, seconds={}, errors={}))
-    assert shown[-1] == (7, 84)  # 36 of the first round, of which three led to four more
-
-
 def test_build_connects_with_the_certificates_that_it_is_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

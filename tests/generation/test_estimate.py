@@ -74,16 +74,7 @@ def test_certificates_cost_their_trials() -> None:
     assert seconds[1] - seconds[0] == pytest.approx(2 * (2 + 5) * CERTIFY_SECONDS)
 
 
-def test_refined_attempts_are_in_the_plan_of_a_preset_that_refines() -> None:
-    """Of a hundred attempts ten have four children, of which two have four, and so on."""
-    times = replace(EVEN, parents=0.1, refined_parents=0.05)
-    refining = override_config(SMALL, ["refine.children=4", "refine.generations=2"])
-    plan = plan_build(1, refining, 1, times)
-    assert (plan.attempts, plan.refined) == (300 + 120 + 24, 120 + 24)
-    assert plan.stages["simulate"] == pytest.approx(0.1 * plan.attempts)
-    assert ", of them about 144 refined" in plan_lines(plan)[0]
-
-    # A preset has the times that were measured with it.
+def test_a_preset_has_the_times_that_were_measured_with_it() -> None:
     assert "preset fast" in measured_times(load_config("fast")).source
     assert "preset paper" in measured_times(load_config("paper")).source
 
