@@ -47,7 +47,7 @@ NOT_RUN = {
     "drakegrasp scenes TRIED": "wants a dataset; tests/generation/test_make_scenes.py",
     "python docs/examples/": "tests/test_examples.py runs it",
     "python pipelines/measurements/": "measures for minutes to hours",
-    "drakegrasp build ": "simulates for minutes to hours; tests/generation; with --plan it is run",
+    "drakegrasp build ": "simulates for minutes to hours; tests/generation; a dry run is run",
     "drakegrasp objects export ": "makes hundreds of meshes; tests/shapes/test_shape_catalog.py",
     "drakegrasp inspect ": "serves until Ctrl-C; tests/page/test_serve.py",
     "drakegrasp figures OUT --compare ": "wants two datasets; tests/pictures/test_picture_files.py",
@@ -124,7 +124,7 @@ BLOCKS = blocks()
 
 def why_not(line: str) -> str | None:
     """Return why a line of a plain block is not run; None if it is."""
-    if "--plan" in line and "--times" not in line:
+    if line.startswith("drakegrasp build ") and "--dry-run" in line:
         return None
     return next((why for start, why in NOT_RUN.items() if line.startswith(start)), None)
 

@@ -20,7 +20,8 @@ from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import claim_directory, release_directory
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
 from drakegrasp.dataset.paths import FILE_NAME as MANIFEST
-from drakegrasp.errors import DataError, GraspError
+from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
+from drakegrasp.errors import DataError, GraspError, counted
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.generation.pipeline import (
     BuildReport,
@@ -30,7 +31,13 @@ from drakegrasp.generation.pipeline import (
     refuse_part,
     refuse_unusable,
 )
-from drakegrasp.generation.request import BUILTIN, Part, read_part, refuse_unknown
+from drakegrasp.generation.request import (
+    BUILTIN,
+    BuildRequest,
+    Part,
+    read_part,
+    refuse_unknown,
+)
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import carry_hand
 from drakegrasp.hand.settings import load_config
@@ -162,17 +169,7 @@ def build_on(
     refuse_unusable(config)
     refuse_part(part, config)
     config = posture_config(config, postures)
-    known = draw_builtin(config.builtin) if sources is None else sources
-    refuse_unknown(only, [each.name for each in known])
-    if postures is not None:
-        postures = postures.refuse(unknown_objects(postures, [each.name for each in known]))
-        named = dict.fromkeys(
-            name for name, bad in zip(postures.objects, postures.invalid, strict=True) if not bad
-        )
-        only = [name for name in named if not only or name in only]
-        if not only:
-            why = f": {postures.refused}" if postures.refused else ", got none of them"
-            raise GraspError(f"postures must be of an object that is built{why}")
+    only, postures = _chosen(_names(sources, config), only, postures)
     with build_lock(out) as dead, ExitStack() as stack:
         # A directory that cannot be used is rejected before workers start.
         before = claim_directory(out, config)
@@ -207,6 +204,85 @@ def build_on(
             pool=on_workers.pool,
             show=show,
         )
+
+
+def _names(sources: Sequence[MeshSource] | None, config: Config) -> list[str]:
+    """Return the names of the meshes, or of the built-in objects if `sources` is None."""
+    known = draw_builtin(config.builtin) if sources is None else sources
+    return [each.name for each in known]
+
+
+def _chosen(
+    names: Sequence[str], only: Sequence[str], postures: Attempts | None
+) -> tuple[Sequence[str], Attempts | None]:
+    """Return the names of the objects to build, none for all, and the postures of these objects.
+
+    Raises:
+        MeshError: If `only` names no object.
+        GraspError: If no posture is for one of the objects.
+    """
+    refuse_unknown(only, names)
+    if postures is None:
+        return only, None
+    postures = postures.refuse(unknown_objects(postures, names))
+    named = dict.fromkeys(
+        name for name, bad in zip(postures.objects, postures.invalid, strict=True) if not bad
+    )
+    only = [name for name in named if not only or name in only]
+    if not only:
+        why = f": {postures.refused}" if postures.refused else ", got none of them"
+        raise GraspError(f"postures must be of an object that is built{why}")
+    return only, postures
+
+
+def known_work(request: BuildRequest, part: str | None = None) -> list[str]:
+    """Return lines on the work of a build as far as it is known before; nothing is written.
+
+    Args:
+        request: What to build.
+        part: See `build_dataset`.
+
+    Raises:
+        MeshError, GraspError, ConfigError: As `build_dataset`.
+    """
+    config = request.config
+    refuse_unusable(config)
+    job = None if part is None else read_part(part)
+    refuse_part(job, config)
+    hand = load_hand(config.hand_source)
+    drive_of(hand, config.lift)
+    postures = None
+    if request.postures is not None:
+        postures = read_attempts(request.postures, hand, read_as=request.read_as)
+    posture_config(config, postures)
+    names = _names(find_sources(request.objects, request.units, request.manifest), config)
+    only, postures = _chosen(names, request.only, postures)
+    objects = len(set(only or names))
+
+    # A posture is tried in each resting pose and with each preshape that it allows.
+    if postures is not None:
+        rows = sum(len(postures.of_object(name)) for name in only)
+        return [f"{counted(objects, 'object')}: {counted(rows, 'posture')}"]
+    poses, standoffs = config.candidates.max, len(config.candidates.standoffs)
+    units = objects * sum(1 for _ in config.unit_ranges(poses))
+    attempts = counted(objects * poses * standoffs, "attempt")
+    lines = [f"{counted(objects, 'object')}: at most {attempts} in {counted(units, 'work unit')}"]
+    if job is not None:
+        of_job = sum(map(job.has, range(units)))
+        lines.append(f"part {part}: at most {of_job:,} of these work units")
+    return lines + _image_lines(config, objects)
+
+
+def _image_lines(config: Config, objects: int) -> list[str]:
+    """Return a line on the images of the samples that are wanted; none if no number is."""
+    each = config.samples_per_object
+    wanted = [n for n in (config.samples, each and objects * each) if n is not None]
+    if not wanted:
+        return []
+    # Their size on the disk depends on how well they can be compressed.
+    images = [field.empty(1, {"S": config.camera.size}) for field in DATA_FIELDS if field.sample]
+    size = min(wanted) * len(CAMERAS) * sum(image.nbytes for image in images)
+    return [f"images of {counted(min(wanted), 'sample')}: {size / 1e6:,.1f} MB before compression"]
 
 
 def _release_unused(out: Path) -> None:

@@ -26,12 +26,11 @@ from drakegrasp.runtime.executor import processes
 
 if TYPE_CHECKING:
     from drakegrasp.generation.pipeline import BuildReport
-    from drakegrasp.generation.request import BuildRequest
 
 
 @click.command(cls=Command)
 @described
-def build(times: Path | None, plan: bool = False, part: str | None = None, **options: Any) -> None:
+def build(dry_run: bool = False, part: str | None = None, **options: Any) -> None:
     """Build a dataset from a directory of meshes.
 
     The command simulates grasps of every object and writes trials.hdf5,
@@ -41,21 +40,16 @@ def build(times: Path | None, plan: bool = False, part: str | None = None, **opt
         BUILD, CONNECTION
         --part I/N: Only run every Nth work unit, starting with the Ith; `merge` joins the datasets
             of all N parts.
-        --plan: Only print the hours and bytes that the build would need.
-        --times
+        --dry-run: Only print the amount of work that is known before the build.
     """
-    from drakegrasp.api.building import build_dataset
+    from drakegrasp.api.building import build_dataset, known_work
 
     workers = chosen_workers(options)
     request = parse_request(options)
-    if plan and request.postures is not None:
-        raise click.UsageError("--plan must be used without --postures: a row is an attempt")
-    if plan and part is not None:
-        raise click.UsageError("--plan must be used without --part: it is of the whole build")
     if request.read_as and request.postures is None:
         raise click.UsageError(f"--{next(iter(request.read_as))} must be used with --postures")
-    if plan:
-        print_plan(request, workers["workers"], times)
+    if dry_run:
+        say("\n".join(known_work(request, part)))
         return
     report = build_dataset(
         request.objects,
@@ -281,15 +275,6 @@ def replay(out: Path, *, trial: int, html: Path | None = None) -> None:
         say(str(html))
     if not again.same:
         sys.exit(1)
-
-
-def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -> None:
-    """Print the expected duration and size of a requested build."""
-    from drakegrasp.generation.estimate import logged_times, plan_lines, plan_request, read_times
-
-    logged = logged_times(request.out, request.config)
-    measured = logged if times is None else read_times(times)
-    say("\n".join(plan_lines(plan_request(request, workers, measured))))
 
 
 def print_report(report: BuildReport) -> None:

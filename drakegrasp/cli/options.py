@@ -219,7 +219,6 @@ def _shared(
     tls_cert: Annotated[Path | None, FILE] = None,
     tls_key: Annotated[Path | None, FILE] = None,
     tls: bool = True,
-    times: Annotated[Path | None, FILE] = None,
     quiet: bool = False,
     as_json: bool = False,
 ) -> None:
@@ -263,8 +262,6 @@ def _shared(
         --tls-key FILE: Private key of the certificate.
         --tls/--no-tls: Whether connections need a certificate. Workers that the command starts get
             a certificate that is created for the run.
-        --times FILE: Estimate with the times that measure_stages.py of pipelines/measurements
-            printed. [default: OUT/log.jsonl, else times measured on other meshes]
         --quiet: Show no progress.
         --json (as_json): Print one document of JSON instead of text.
     """

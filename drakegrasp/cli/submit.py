@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from drakegrasp.cli.console import OneCommand, say
-from drakegrasp.cli.datasets import print_plan, print_report
+from drakegrasp.cli.datasets import print_report
 from drakegrasp.cli.options import NEW_FILE, Named, chosen_tls, described, parse_request
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ _ALONE = ("--dry-run", "--tls")
 @click.argument("where", nargs=-1, metavar="[HOST...|ADDRESS|PATH]")
 def submit(
     where: tuple[str, ...],
-    times: Path | None,
     address: str | None,
     kind: Annotated[str, Named("clusters")] = "local",
     scheduler: str | None = None,
@@ -54,9 +53,9 @@ def submit(
         drakegrasp submit --cluster slurm --workers 200 --interface ib0 OPTIONS
         drakegrasp submit --scheduler tls://10.0.0.1:8786 OPTIONS
 
-    The command first prints what will run and the expected duration; with --dry-run it stops there.
-    The same command continues an interrupted build, on any cluster. See docs/how-to/clusters.md for
-    the details and pipelines/recipes/ for an example of each.
+    The command first prints which workers it will use. The same command continues an interrupted
+    build, on any cluster. See docs/how-to/clusters.md for the details and pipelines/recipes/ for an
+    example of each.
 
     Options:
         --cluster KIND (kind): Where the work runs: local, ssh, slurm, pbs, lsf, sge, htcondor, oar,
@@ -72,11 +71,12 @@ def submit(
         --host ADDRESS: In place of --interface: address on which the scheduler listens.
         --with KEY=VALUE (own): A setting that only this kind of cluster has, e.g. image for
             kubernetes; may be given several times.
-        TLS, --times
-        --dry-run: Only print what would run, and the script of a job.
+        TLS
+        --dry-run: Only print which workers would run, the amount of work that is known before the
+            build, and the script of a job.
         --script FILE: Only write the script of a job, or the manifest of kubernetes.
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
-    from drakegrasp.api.building import build_on, find_sources
+    from drakegrasp.api.building import build_on, find_sources, known_work
     from drakegrasp.cluster.kinds import AddressMissingError, cluster_of, describe, present
     from drakegrasp.exchange.attempts import read_attempts
     from drakegrasp.hand.description import load_hand
@@ -99,8 +99,8 @@ def submit(
 
     # Print what will run before anything starts.
     say("\n".join(describe(cluster)))
-    if request.postures is None:
-        print_plan(request, cluster.count(), times)
+    if dry_run:
+        say("\n".join(known_work(request)))
     if dry_run or script is not None:
         _give_script(cluster, request.out, script)
         return

@@ -202,6 +202,19 @@ def joined(client: Client | None, workers: Workers) -> AbstractContextManager[Cl
     return nullcontext(client)
 
 
+def refuse_open(address: str, tls: bool) -> None:
+    """Reject the address of a scheduler that wants no certificate, unless `tls` is False.
+
+    Raises:
+        ConfigError: If it is such an address.
+    """
+    if tls and not address.startswith("tls://"):
+        raise ConfigError(
+            f"scheduler must have an address that begins with tls://, got {address}: anybody who "
+            "reaches its port can run programs as you; --no-tls (tls=False) connects all the same"
+        )
+
+
 def _connect_remote(
     scheduler: str | None, scheduler_file: str | Path | None, security: Security | None, tls: bool
 ) -> Client:
@@ -213,11 +226,7 @@ def _connect_remote(
         address = _address_of(Path(file))
         if address is None:
             raise MachineError(f"{file}: must be the file of a running Dask scheduler, got another")
-    if tls and not str(address).startswith("tls://"):
-        raise ConfigError(
-            f"scheduler must have an address that begins with tls://, got {address}: anybody who "
-            "reaches its port can run programs as you; --no-tls (tls=False) connects all the same"
-        )
+    refuse_open(str(address), tls)
     try:
         return _RemoteClient(
             scheduler, scheduler_file=file, timeout=CONNECT_SECONDS, security=security

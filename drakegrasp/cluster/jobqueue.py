@@ -83,10 +83,6 @@ class Jobs(Remote):
         options = self.setting("scheduler-options") or {}
         return bool(self.setting("interface") or {"host", "interface"} & set(options))
 
-    def count(self) -> int:
-        """Return how many workers there will be."""
-        return self.per_job * self.jobs
-
     def line(self) -> str:
         """Return a description of the resources that each job requests."""
         memory = (
@@ -94,7 +90,8 @@ class Jobs(Remote):
         )
         walltime = f"walltime {self._walltime() or 'of the queue'}"
         jobs = f"{counted(self.jobs, f'{self.title} job')} ({self.per_job} in each)"
-        return f"{counted(self.count(), 'worker')} in {jobs}, {memory}, {walltime}"
+        workers = counted(self.per_job * self.jobs, "worker")
+        return f"{workers} in {jobs}, {memory}, {walltime}"
 
     def _walltime(self) -> str | None:
         """Return the time limit of a job; None if it is not stated."""

@@ -34,6 +34,7 @@ from drakegrasp.cluster.connect import (
     connect,
     dashboard_line,
     dask_settings,
+    refuse_open,
 )
 from drakegrasp.errors import ConfigError, MachineError, counted
 
@@ -104,13 +105,9 @@ class Local:
         if self.memory is not None:
             memory_bytes(self.memory)
 
-    def count(self) -> int | None:
-        """Return the number of workers; None if it is known only after the start."""
-        return self.workers
-
     def line(self) -> str:
         """Return a description of what will be started."""
-        count = self.count()
+        count = self.workers
         return f"{counted(count, 'worker')} on this machine" if count else "workers on this machine"
 
     def is_open(self) -> bool:
@@ -147,14 +144,15 @@ class Running(Local):
 
     follow, options, how = (1, 1, "its address"), (), "scheduler"
 
+    def __post_init__(self) -> None:
+        """Reject options that are not possible, and an address that wants no certificate."""
+        super().__post_init__()
+        if self.how == "scheduler":
+            refuse_open(self.where[0], self.tls)
+
     def line(self) -> str:
         """Return a description of the workers that will be used."""
         return f"the workers of {' '.join(self.where)}"
-
-    def count(self) -> int | None:
-        """Return the number of workers of the scheduler."""
-        with self.connected(Path()) as client:
-            return max(1, len(client.nthreads()))
 
     def connected(self, out: Path) -> AbstractContextManager[Client]:
         """Return a context manager that connects to the scheduler and yields a client."""

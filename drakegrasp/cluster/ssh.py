@@ -52,15 +52,11 @@ class Ssh(Remote):
         self.per_host = cores
         self.listening()
 
-    def count(self) -> int:
-        """Return how many workers there will be."""
-        return len(self.where) * self.per_host
-
     def line(self) -> str:
         """Return a description of the workers that will be started."""
         hosts = dict.fromkeys(self.where)
         on = f"{' '.join(hosts)}, scheduler on {self.where[0]}"
-        return f"{self.count()} workers over ssh on {on}"
+        return f"{len(self.where) * self.per_host} workers over ssh on {on}"
 
     def start(self, security: Security | None) -> SpecCluster:
         """Start scheduler and workers.

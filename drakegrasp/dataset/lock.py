@@ -13,9 +13,9 @@ another machine counts as alive; the message says which file to remove if that p
 The library filelock cannot replace this module: its flock does not name the holder, so the message
 of a rejected build could not say who builds, and a build could not report whose lock it took over.
 
-`log.jsonl` lists the events of the builds with their times, one line of JSON each. People, their
-tools and the estimate of the remaining time read it. No data are derived from it, and it is the
-only file of a dataset that depends on the clock.
+`log.jsonl` lists the events of the builds with their times, one line of JSON each. People and their
+tools read it. No data are derived from it, and it is the only file of a dataset that depends on the
+clock.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from pathlib import Path
 from typing import Any
 
 from drakegrasp.errors import DataError
-from drakegrasp.foreign_files import parse_json, refuse_irregular
 from drakegrasp.runtime.environment import Process, this_process
 from drakegrasp.runtime.files import (
     LIST_NAME,
@@ -264,23 +263,3 @@ class BuildLog:
             os.write(descriptor, line.encode())
         finally:
             os.close(descriptor)
-
-
-def read_log(out: Path) -> Iterator[dict[str, Any]]:
-    """Yield the events of a directory's builds, oldest first; nothing if there is no log.
-
-    A line that is not an event is skipped, for example one that a full disk has cut off.
-    """
-    try:
-        refuse_irregular(out / LOG_FILE)
-        file = (out / LOG_FILE).open("rb")
-    except OSError:
-        return
-    with file:
-        for line in file:
-            try:
-                event = parse_json(line)
-            except ValueError:
-                continue
-            if isinstance(event, dict) and isinstance(event.get("event"), str):
-                yield event

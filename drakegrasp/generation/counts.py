@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import takewhile
-from math import ceil
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.assembly.survey import headers_by_object
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import ConfigError, listed
+from drakegrasp.generation.extrapolation import Extrapolation
 from drakegrasp.generation.work_unit import UnitSummary
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import WorkerPool
@@ -60,19 +60,12 @@ class Counts:
             units = {of[0].object_name: of for of in headers_by_object(manifest) if of}
             self.target = Target(manifest.config, units)
 
-        # Progress: all attempts, and those that are done or reused.
+        # Progress.
         self._pool, self._report = pool, report
-        standoffs = len(manifest.config.candidates.standoffs)
-        self._total = standoffs * sum(entry.candidates for entry in manifest.objects)
-        self._done = 0
+        self._extrapolation = Extrapolation(manifest)
+        self._wanted = manifest.config.samples
         self._outcomes: Counter[Outcome] = Counter()
-        self._reused_attempts = 0
-
-        # Limits that end a build before all attempts are made: the total number of samples, and
-        # for each object the number of samples or of grasps.
-        config = manifest.config
-        self._wanted, self._each = config.samples, config.samples_per_object or config.max_grasps
-        self._found = Counter(dict.fromkeys((entry.name for entry in manifest.objects), 0))
+        self._samples = self._reused_attempts = 0
 
         # For each object: all attempts, and those that ended because of the machine.
         self._attempts: Counter[str] = Counter()
@@ -94,12 +87,13 @@ class Counts:
         if self.target is not None and samples is not None:
             self.target.found[header] = samples
         grasps = outcomes.get(Outcome.SUCCESS, 0)
-        self._found[header.object_name] += grasps if samples is None else samples
+        self._samples += samples or 0
         self._outcomes.update(outcomes)
-        self._attempts[header.object_name] += sum(outcomes.values())
+        attempts = sum(outcomes.values())
+        self._extrapolation.add(header, attempts, grasps if samples is None else samples)
+        self._attempts[header.object_name] += attempts
         self._ended[header.object_name] += sum(outcomes.get(outcome, 0) for outcome in ENDED)
-        self._done += sum(outcomes.values())
-        self._reused_attempts += reused * sum(outcomes.values())
+        self._reused_attempts += reused * attempts
         if self._max_grasps is not None:
             self._close_gap(header, grasps)
         self.show()
@@ -124,24 +118,11 @@ class Counts:
             if self._outcomes[outcome]:
                 figures[outcome.label] = self._outcomes[outcome]
         if self._wanted is not None:
-            figures[f"of {self._wanted:,} samples"] = self._found.total()
+            figures[f"of {self._wanted:,} samples"] = self._samples
         if self._pool is not None:
             figures["workers"] = self._pool.size
-        self._report(self._done, self._expected(), found=self._reused_attempts, **figures)
-
-    def _expected(self) -> int:
-        """Return the expected number of attempts of the build, at the success rate so far.
-
-        The build makes all attempts, unless it finds the requested samples or grasps before.
-        """
-        ends = []
-        if self._wanted is not None:
-            ends.append((self._found.total(), self._wanted))
-        if self._each is not None:
-            enough = sum(min(found, self._each) for found in self._found.values())
-            ends.append((enough, self._each * len(self._found)))
-        made = [self._done * max(wanted / found, 1.0) for found, wanted in ends if found]
-        return min([self._total, *map(ceil, made)])
+        done, total = self._attempts.total(), self._extrapolation.total()
+        self._report(done, total, found=self._reused_attempts, **figures)
 
     def needs(self, header: ShardHeader) -> bool:
         """Return whether a unit's object has too few grasps in the units before the first gap."""

@@ -480,6 +480,7 @@ class _Build:
             for path, reason in damaged:
                 counts.damaged.append(path)
                 self.log("damaged shard", reason=reason)
+        counts.show()  # the first unit may take a minute
 
         target = counts.target
         if target is None:

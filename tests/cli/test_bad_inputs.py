@@ -25,10 +25,9 @@ from helpers.scripts import load_script
 from helpers.tiers import in_second_tier
 
 from drakegrasp.cli.main import main
-from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.hand.files import MODELS
 
-MANIFEST, REJECT, LOG = "manifest.json", "reject.json", "log.jsonl"
+MANIFEST, REJECT = "manifest.json", "reject.json"
 SHARD = "shards/1_box_a/0000000-0000002.h5"
 MODEL, PLAN = "objects/1_box_a.npz", "objects/1_box_a.plan.h5"
 #: What the dataset of the tests was made with.
@@ -55,7 +54,6 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "export glb": ("export", "{out}", "{to}/glb", "--to", "glb", "--quiet"),
     "verify": ("verify", f"{{out}}/{OTO}", "--out", "{to}/verdicts", "--workers", "1", "--quiet"),
     "build": _BUILD,
-    "build --plan": (*_BUILD, "--plan"),
 }
 
 
@@ -258,27 +256,6 @@ def test_attributes_that_contradict(base: Path, tmp_path: Path, command: str, na
     )
 
 
-def test_log_is_skipped_where_no_build_wrote_it(base: Path, tmp_path: Path) -> None:
-    """A log is no data: what is wrong in it leaves the estimate of what is right."""
-    out = make_dataset(tmp_path / "out", base / "meshes")  # of the usual configuration
-    places = {"out": out, "meshes": base / "meshes"}
-    started = {"event": "started", "config_hash": read_manifest(out).config.simulation_hash()}
-    done = {"event": "unit done", "object": "1_box_a", "outcomes": {"success": 3}}
-    seconds = {"seconds": {"try": 1.0, "look": 0.5}}
-    sound = "".join(f"{json.dumps(event)}\n" for event in (started, {**done, **seconds}))
-    (out / LOG).write_text(sound)
-    expected = run(COMMANDS["build --plan"], **places)
-    assert "3 attempts of 1 object " in expected.stdout
-    wrong = {}
-    for kind in manifests.LOG:
-        (out / LOG).write_text(sound)
-        kind.spoil(out / LOG)
-        result = run(COMMANDS["build --plan"], **places)
-        if (result.exit_code, result.output) != (0, expected.output):
-            wrong[kind.name] = wrong_answer(result, ()) or "another estimate"
-    report("log.jsonl / build --plan", manifests.LOG, wrong)
-
-
 def walk_file(
     base: Path,
     tmp_path: Path,
@@ -374,7 +351,7 @@ def test_configurations(base: Path, tmp_path: Path) -> None:
     sound = b"""{seed: 1, builtin: {seed: 0}, candidates: {max: 4},
         physics: {}, lift: {}, camera: {}, split: {}}"""
     sound = yaml.safe_dump(yaml.safe_load(sound)).encode()
-    command = "build --objects {meshes} --out {to}/out --config {file} --plan"
+    command = "build --objects {meshes} --out {to}/out --config {file} --dry-run"
     walk_file(base, tmp_path, sound, ".yaml", text_kinds.CONFIG, command)
 
 
@@ -385,7 +362,7 @@ MORPH = "objects morph {meshes} --per-mesh 1 --out {to}/morphs"
 @pytest.mark.parametrize(
     ("command", "share"),
     [
-        ("build --objects {meshes} --out {to}/out --plan", 1),
+        ("build --objects {meshes} --out {to}/out --dry-run", 1),
         *((AUDIT, 4), (MORPH, 4)),  # the same function reads the file for them
         *(in_second_tier((command, 1)) for command in (AUDIT, MORPH)),
     ],
@@ -410,9 +387,9 @@ def test_options(base: Path, tmp_path: Path, option: str) -> None:
         to = tmp_path / "to"
         to.mkdir()
         objects = "builtin" if option in ("--per-class", "--objects-seed") else base / "meshes"
-        words = ["build", "--objects", str(objects), "--out", str(to / "out"), "--quiet", "--plan"]
-        if option == "--workers" or option.startswith("--scheduler"):
-            words.remove("--plan")
+        words = ["build", "--objects", str(objects), "--out", str(to / "out"), "--quiet"]
+        if option != "--workers" and not option.startswith("--scheduler"):
+            words.append("--dry-run")
         if option in words:
             k = words.index(option)
             del words[k : k + 2]

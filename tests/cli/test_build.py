@@ -258,35 +258,20 @@ def test_few_crashes_are_no_error(whole: Path) -> None:
         assert len(counts.unexplained()) == said
 
 
-@pytest.mark.parametrize(
-    ("ends", "expected"),
-    [
-        ({}, 36),
-        ({"samples": 10}, 15),  # two of ten after three attempts
-        ({"samples": 1000}, 36),  # all palm poses end before
-        ({"samples_per_object": 1}, 9),  # one object of three has its sample
-        ({"max_grasps": 1}, 9),
-        ({"samples": 2, "samples_per_object": 4}, 3),  # the first end is there
-    ],
-)
-def test_bar_ends_where_the_build_does(whole: Path, ends: dict[str, int], expected: int) -> None:
-    """A time left that is by all attempts would be hours beside a target that is met in seconds."""
-    manifest, shown = read_manifest(whole), dict[str, int]()
-
-    def report(done: int, total: int, *, found: int = 0, **figures: int) -> None:
-        shown.update(done=done, total=total, **figures)
-
-    changed = manifest.config.model_copy(update=ends)
-    counts = Counts(replace(manifest, config=changed), None, report)
-    header = replace(next(manifest.headers()), start=0, stop=1)
-    samples = None if "max_grasps" in ends else 2
-    outcomes = {Outcome.SUCCESS: 2, Outcome.RAY_MISS: 1}
-    counts.add(
-        UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={}, samples=samples)
+def test_bar_counts_the_samples_of_a_target(whole: Path) -> None:
+    manifest, shown = read_manifest(whole), list[tuple[int, int | None, dict[str, int]]]()
+    config = manifest.config.model_copy(update={"samples": 1000})
+    counts = Counts(
+        replace(manifest, config=config),
+        None,
+        lambda done, total, *, found, **figures: shown.append((done, total, figures)),
     )
-    assert (shown["done"], shown["total"]) == (3, expected)
-    if "samples" in ends:
-        assert shown[f"of {ends['samples']:,} samples"] == 2
+    for header in manifest.headers():
+        outcomes = {Outcome.SUCCESS: 2, Outcome.RAY_MISS: 1}
+        counts.add(UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={}, samples=1))
+    units = len(shown)
+    assert shown[0] == (3, None, {"grasps": 2, "of 1,000 samples": 1})
+    assert shown[-1] == (3 * units, 3 * units, {"grasps": 2 * units, "of 1,000 samples": units})
 
 
 def test_build_connects_with_the_certificates_that_it_is_given(

@@ -20,6 +20,7 @@ import pytest
 from click.testing import CliRunner, Result
 from distributed import Client, rpc
 from distributed.security import Security
+from helpers import commands
 from helpers.assertions import assert_same_dataset
 from helpers.meshes import write_fixed
 from helpers.scripts import PIPELINES, load_script
@@ -56,7 +57,7 @@ def run(*arguments: str | Path) -> Result:
     return CliRunner().invoke(load_script("submit_build").main, [str(a) for a in arguments])
 
 
-def plan_only(out: Path, *arguments: str | Path) -> Result:
+def dry_run(out: Path, *arguments: str | Path) -> Result:
     return run("--objects", "builtin", "--out", out, *arguments, "--dry-run")
 
 
@@ -75,12 +76,11 @@ def test_dry_run_says_what_would_run_and_makes_nothing(
     tmp_path: Path, arguments: list[str], words: str
 ) -> None:
     out = tmp_path / "out"
-    result = plan_only(out, *arguments)
+    result = dry_run(out, *arguments)
     assert result.exit_code == 0, result.output
     assert words in result.stdout
-    assert "3,840,000 attempts" in result.stdout
-    assert "on 3 workers" in result.stdout
-    assert "core-hours" in result.stdout
+    work = commands.run("build", "--objects", "builtin", "--out", out, "--dry-run").stdout
+    assert "3,840,000 attempts" in work and work in result.stdout
     assert not out.exists()
 
 
@@ -88,7 +88,7 @@ def test_a_dry_run_needs_no_address_of_the_scheduler(tmp_path: Path) -> None:
     """It says that one is missing; without --dry-run that is an error."""
     words = ["--cluster", "ssh", "a", "--cores", "2"]
     said, refused = "--interface NAME or --host ADDRESS must be given", tmp_path / "out"
-    result = plan_only(refused, *words)
+    result = dry_run(refused, *words)
     assert (result.exit_code, f"note: {said}" in result.stdout) == (0, True)
     result = run("--objects", "builtin", "--out", refused, *words)
     assert (result.exit_code, f"error: {said}" in result.stderr) == (2, True)
@@ -96,11 +96,11 @@ def test_a_dry_run_needs_no_address_of_the_scheduler(tmp_path: Path) -> None:
 
 def test_open_port_is_warned_of(tmp_path: Path) -> None:
     ssh = ["--cluster", "ssh", "a", "--cores", "1", "--host", "10.0.0.1"]
-    said = plan_only(tmp_path / "out", *ssh, "--no-tls").stdout
+    said = dry_run(tmp_path / "out", *ssh, "--no-tls").stdout
     assert "connections: not encrypted" in said
     assert "can run programs as you" in said
     for given in (ssh, [*ssh, "--tls"], ["--workers", "1"]):
-        said = plan_only(tmp_path / "out", *given).stdout
+        said = dry_run(tmp_path / "out", *given).stdout
         assert "connections: TLS" in said
         assert "warning" not in said
 
@@ -168,7 +168,7 @@ def test_bad_options_are_one_line_and_make_nothing(
     tmp_path: Path, arguments: list[str], words: str
 ) -> None:
     out = tmp_path / "out"
-    result = plan_only(out, *arguments)
+    result = dry_run(out, *arguments)
     assert result.exit_code == 2, result.output
     (line,) = result.stderr.splitlines()
     assert line.startswith("error: ")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -19,7 +20,6 @@ from drakegrasp.api.building import build_dataset
 from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
-from drakegrasp.dataset.lock import read_log
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.shards import read_shard, trial_columns, write_shard
@@ -290,7 +290,8 @@ def test_a_build_that_trains_nothing_says_so_before_it_prepares(
             build(find_meshes(meshes), out, load_config("paper"), stop, show=show)
         said = capsys.readouterr().err
         assert ("nothing will train: every class has one object" in said) is show
-    notices = [event["text"] for event in read_log(out) if event["event"] == "notice"]
+    events = map(json.loads, (out / "log.jsonl").read_text().splitlines())
+    notices = [event["text"] for event in events if event["event"] == "notice"]
     assert [text.partition(":")[0] for text in notices] == ["nothing will train"] * 2
 
 

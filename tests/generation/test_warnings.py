@@ -6,37 +6,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.entries import object_entry
 from helpers.hands import write_pincer
 
 from drakegrasp.config import SplitConfig
-from drakegrasp.dataset.manifest import Manifest, ObjectEntry
+from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.generation.cautions import nothing_trains, too_heavy
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource
 
 
-def entry(name: str, mass: float) -> ObjectEntry:
-    return ObjectEntry(
-        name=name,
-        class_name="thing",
-        mesh_sha256="0",
-        scale=1.0,
-        up="+z",
-        mass=mass,
-        density=1000.0,
-        friction=None,
-        collision_error=0.0,
-        resting=(),
-        candidates=1,
-        combinations=1,
-        valid=1,
-        distinct=1,
-        notes=(),
-    )
-
-
 def manifest(hand: str, *masses: float) -> Manifest:
-    objects = tuple(entry(f"{i}_thing", mass) for i, mass in enumerate(masses))
+    objects = tuple(object_entry(f"{i}_thing", mass=mass) for i, mass in enumerate(masses))
     return Manifest(config=load_config(hand=hand), objects=objects, versions={})
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 
 import pytest
 from rich.console import Console
@@ -16,7 +17,7 @@ def lines(width: int) -> list[str]:
     """Return what a terminal of a width shows after a while."""
     console = Console(file=io.StringIO(), width=width, force_terminal=True, color_system=None)
     bar = _Bar("attempts", console)
-    task = bar.add_task("simulate  ", total=1_260_000, figures=FIGURES)
+    task = bar.add_task("simulate  ", total=1_260_000, figures=FIGURES, speed=64.2)
     bar.update(task, completed=8350)
     with console.capture() as capture:
         console.print(bar.get_renderable())
@@ -29,25 +30,54 @@ def test_nothing_is_cut_off(width: int) -> None:
     assert len(shown) == (1 if width >= ONE_LINE else 2)
     whole = " ".join(shown)
     assert "\N{HORIZONTAL ELLIPSIS}" not in whole
-    for words in ("simulate", "8350/1260000", "attempts/s", FIGURES, "left"):
+    for words in ("simulate", "8350/1260000", "64.2 attempts/s", FIGURES, "5:24:57 left"):
         assert words in whole
     assert max(map(len, shown)) <= width
 
 
-def test_what_was_there_before_says_nothing_of_the_speed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thousand found at once, then one a second: 899 seconds are left, and not 80."""
+Reports = Iterable[tuple[float, int, int | None, int]]
+
+
+def last_line(
+    reports: Reports, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> str:
+    """Return what a bar shows after reports: each its time [s], done, total and found."""
     now = 0.0
-    bars: list[_Bar] = []
-    monkeypatch.setattr("rich.console.monotonic", lambda: now)
-    monkeypatch.setattr(_Bar, "start", lambda bar: None)
-    monkeypatch.setattr("rich.live.Live.is_started", True)
-    monkeypatch.setattr(_Bar, "stop", lambda bar: bars.append(bar))
+    monkeypatch.setattr("time.monotonic", lambda: now)
     with progress_bar("simulate", "attempts") as report:
-        report(500, 2000, found=500)
-        report(1000, 2000, found=1000)
-        for _ in range(101):
-            now += 1.0
-            report(1000 + round(now), 2000, found=1000)
-    (bar,) = bars
-    assert bar.tasks[0].speed == pytest.approx(1.0)
-    assert bar.tasks[0].time_remaining == 899
+        for moment, done, total, found in reports:
+            now = moment
+            report(done, total, found=found)
+    return " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("reports", "words"),
+    [
+        # A thousand found at once, then one a second: 899 seconds are left, and not 80.
+        (
+            [(0, 500, 2000, 500), *((i, 1000 + i, 2000, 1000) for i in range(102))],
+            "1101/2000 1.0 attempts/s 0:00:00 0:14:59 left",
+        ),
+        # The total is another one after each report, and the first report is after the first steps.
+        ([(10.0, 20, 200, 0), (20, 40, 100, 0)], "40/100 2.0 attempts/s 0:00:00 0:00:30 left"),
+        # Without a total there is a speed, but no time.
+        ([(10.0, 20, None, 0)], "20/? 2.0 attempts/s 0:00:00"),
+        # Before the first step nothing is known.
+        ([(10.0, 0, 100, 0)], "0/100 - attempts/s 0:00:00"),
+        # Of steps that each take longer than the window, the speed is that of the last.
+        ([(i * 1000.0, i, 10, 0) for i in range(5)], "4/10 0.0 attempts/s 0:00:00 1:40:00 left"),
+        # A speed of long ago does not count.
+        (
+            [(100.0, 1000, 3000, 0), *((100.0 + 100 * i, 1000 + i, 3000, 0) for i in range(9))],
+            "1008/3000 0.0 attempts/s 0:00:00 2 days, 7:20:00 left",
+        ),
+    ],
+)
+def test_time_left_is_by_the_latest_speed(
+    reports: Reports,
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert last_line(reports, monkeypatch, capsys).endswith(words)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from helpers.bad_inputs.json_kinds import table, twice, value_kind
 from helpers.bad_inputs.kinds import ANY_TEXT, Kind, whole_file
 
@@ -121,34 +119,5 @@ REJECTED_IDS: tuple[Kind, ...] = tuple(
     for text in (
         *(b"-1", b"1", b"1.5", b"nan", b"x", b"0 3", b"0,3", b"99999999", b"9" * 5000),
         *(b"\xff\xfe", b"\x00", "²".encode(), "٣".encode()),
-    )
-)
-
-
-def _log(text: bytes) -> Kind:
-    name = f"the line {text[:120]!r}"
-
-    def spoil(path: Path) -> None:
-        path.write_bytes(path.read_bytes() + text + b"\n")
-
-    return Kind(name, spoil)
-
-
-#: Lines that no build writes, after sound ones.
-_DONE = b'{"time": "x", "event": "unit done", "object": "1_box_a", "outcomes": %b, "seconds": %b}'
-LOG: tuple[Kind, ...] = tuple(
-    _log(text)
-    for text in (
-        *(b"[]", b"5", b"null", b'"x"', b"{}", b"{", b"\xff", b"[" * 100_000, b"9" * 10_000),
-        *(b'{"event": 5}', b'{"event": null}', b'{"event": []}', b'{"event": "started"}'),
-        *(b'{"event": "started", "config_hash": 5}', b'{"event": "started", "config_hash": []}'),
-        *(b'{"event": "unit done"}', b'{"event": "unit done", "seconds": 5}'),
-        *(_DONE % (outcomes, b'{"try": 1}') for outcomes in (b"null", b"5", b"[]", b'"x"')),
-        *(_DONE % (b'{"success": %b}' % n, b'{"try": 1}') for n in (b"-3", b"NaN", b'"x"', b"0.5")),
-        *(_DONE % (b'{"success": 3}', seconds) for seconds in (b"5", b"[]", b'"x"', b"true")),
-        *(
-            _DONE % (b'{"success": 3}', b'{"try": %b}' % n)
-            for n in (b"-3", b"NaN", b'"x"', b"null", b"[]", b"1e999", b"1e308")
-        ),
     )
 )

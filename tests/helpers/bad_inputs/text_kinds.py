@@ -168,7 +168,6 @@ OPTIONS: dict[str, tuple[str, ...]] = {
     "--manifest": ("", " ", ".", "nowhere.yaml", "a" * 5000),
     "--scheduler": ("", " "),
     "--scheduler-file": ("", " ", ".", "nowhere.json"),
-    "--times": ("", " ", ".", "nowhere.json"),
     "--out": ("", " ", "a" * 5000, "\x00"),
     "--objects": ("", " ", "nowhere", "\x00", "a" * 5000),
     "--set": (

@@ -82,10 +82,6 @@ class Half(Local):
 
     options = ("memory",)
 
-    def count(self):
-        """Return how many workers there will be."""
-        return max(1, (os.cpu_count() or 1) // 2)
-
     def connected(self, out):
         """Return what starts the workers when it is entered."""
-        return connect(self.count(), memory=self.memory)
+        return connect(max(1, (os.cpu_count() or 1) // 2), memory=self.memory)
