@@ -97,11 +97,11 @@ class Counts:
         done, total = self._progress()
         self._report(done, total, found=self._before, **figures)
 
-    def _progress(self) -> tuple[int, int]:
-        """Return how much is done, and how much is due."""
+    def _progress(self) -> tuple[int, int | None]:
+        """Return how much is done, and how much is due; None until each object has been tried."""
         if self._target is None:
             return self._done, self._palms
-        return self._target.found, self._target.wanted
+        return self._target.found, self._target.wanted if self._target.has_begun else None
 
 
 def refuse_two_ends(config: Config) -> None:

@@ -118,6 +118,11 @@ class Target:
         return self._lost != before
 
     @property
+    def has_begun(self) -> bool:
+        """Whether each object has been tried."""
+        return all(item.known or not item.units for item in self._objects.values())
+
+    @property
     def wanted(self) -> int:
         """Number of hits at which the build ends, if every object yields its share."""
         each = self._config.samples_per_object or self._config.max_grasps
@@ -178,7 +183,6 @@ class Target:
     def warnings(self) -> list[str]:
         """Return lines that state which part of the target was not reached, and what is uneven."""
         config, lines = self._config, list[str]()
-        each = config.samples_per_object or config.max_grasps
         what = "grasps" if config.max_grasps is not None else "samples"
         counts, spent, vain = dict[str, int](), list[str](), list[str]()
         shares = self._shares()

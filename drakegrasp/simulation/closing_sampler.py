@@ -11,7 +11,6 @@ out, until there is no other.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -30,21 +29,20 @@ from drakegrasp.simulation.screen import centre
 
 #: Number of surface points around which palms are made.
 POINTS = 2048
-#: A palm is good if its score is at least this fraction of the score of the best few; and the least
-#: score of a good palm.
-GOOD, BEST, LEAST = 0.75, 5, 0.25
+#: A palm is good if its score is at least a fraction of the score of the best few: first the first
+#: one, which then falls to the second one in steps of the third one. Least score of a good palm.
+GOOD, BEST, LEAST = (0.95, 0.7, 0.05), 5, 0.25
 #: Palms are near if they are closer than both limits [m, degree], those of the number of distinct
-#: grasps.
-NEAR = 0.020, 30.0
+#: grasps; if all good palms are near others, the limits are halved, down to this fraction of them.
+NEAR, NEAREST = (0.020, 30.0), 0.2
 #: Least downward component of the approach of palms from above and of slanted ones: the sines of
 #: 60 and 30 degrees. Palms with more than the last one, the cosine of 14 degrees, are left out:
 #: their camera sees a flat image, which is no sample.
 ABOVE, SLANTED, FLAT = float(np.sqrt(0.75)), 0.5, 0.97
 #: While palms from other sides close well, at most so many palms from above for each of these.
 MOST_ABOVE = 1.5
-#: Number of rounds in a row in vain after which a side counts as not free; if no side has had a
-#: palm, the sampler ends.
-PATIENCE = 3
+#: Number of rounds in a row without a good palm after which a side counts as not free.
+PATIENCE = 2
 #: Numbers of palms drawn in a round.
 ROUND = {"above": 16, "slanted": 12, "beside": 12, "near": 12, "surface": 12}
 #: Random numbers of a palm; the first chooses preshape and spread.
@@ -105,69 +103,69 @@ class Closing:
             for palm in palms.fixed()
         ]
 
-        # The order, the good palms of each side that wait for their turn, and the best scores.
+        # The order, the palms of each side that wait for their turn, best first; the best scores.
         self._order: list[Palm] = []
         self._waiting: list[list[Palm]] = [[], [], []]
         self._best: list[float] = []
 
-        # Rounds in a row in vain, for each side, and what counts as near, as a fraction of `NEAR`.
-        self._vain, self._near = [0, 0, 0], 1.0
+        # What counts as good and as near, and the rounds in a row without a good palm of each side.
+        self._good, self._near, self._vain = GOOD[0], 1.0, [0, 0, 0]
         self._add(fixed)
 
     def poses(self) -> Iterator[tuple[Array, Shape]]:
         """Yield palm poses X_OG (4, 4) and the shape of the hand, as long as palms close well."""
         X_OL = invert_pose(self._X_LO)
-        while True:
+        while self._near >= NEAREST:
             palm = self._next()
             if palm is not None:
                 self._order.append(palm)
                 yield multiply(X_OL, palm.X_LG), palm.shape
             elif min(self._vain) < PATIENCE:
                 self._add(self._draw())
-            else:
+            elif not self._order and not any(self._waiting):
                 return
+            elif self._good > GOOD[1]:
+                self._good, self._vain = self._good - GOOD[2], [PATIENCE - 1] * 3
+            else:
+                self._near, self._vain = self._near / 2.0, [0, 0, 0]
 
     def _next(self) -> Palm | None:
         """Return the next palm of the order, or None if more must be drawn first."""
-        counts = np.bincount([palm.side for palm in self._order], minlength=3)
-        free = [side for side in range(3) if self._vain[side] < PATIENCE or self._waiting[side]]
-        ready = [side for side in free if self._waiting[side]]
+        least = max(LEAST, self._good * self._best[0])
+        for side, waiting in enumerate(self._waiting):
+            while waiting and waiting[0].score >= least and self._is_near(waiting[0].X_LG):
+                waiting.pop(0)
+            if waiting and waiting[0].score >= least:
+                self._vain[side] = min(self._vain[side], PATIENCE - 1)
+        ready = [s for s in range(3) if self._waiting[s] and self._waiting[s][0].score >= least]
         if not ready:
             return None
 
         # The side with the fewest palms comes next, and those from above do not outnumber others.
+        counts = np.bincount([palm.side for palm in self._order], minlength=3)
         side = min(ready, key=lambda side: (counts[side], -side))
-        others = counts[1] + counts[2]
-        if side == 0 and len(free) > 1 and counts[0] >= MOST_ABOVE * (others + 1):
+        others_are_free = min(self._vain[1:]) < PATIENCE
+        if side == 0 and others_are_free and counts[0] >= MOST_ABOVE * (counts[1] + counts[2] + 1):
             return None
         return self._waiting[side].pop(0)
 
     def _add(self, drawn: Sequence[tuple[Array, Shape]]) -> None:
-        """Close the hand at palms, and let the good ones wait for their turn."""
+        """Close the hand at palms, and let those that close well wait for their turn."""
         fresh = [
             (X_LG, shape) for X_LG, shape in drawn if -X_LG[2, 2] < FLAT and not self._is_near(X_LG)
         ]
-        palms = sorted(self._closed(fresh), key=lambda palm: -palm.score)
+        palms = self._closed(fresh)
         self._best = sorted([*self._best, *(palm.score for palm in palms)])[-BEST:]
-        least = max(LEAST, GOOD * self._best[0])
-        good = [palm for palm in palms if palm.score >= least]
-
-        # Of palms that are near each other, the best waits.
-        before = [len(waiting) for waiting in self._waiting]
-        for palm in good:
-            if not self._is_near(palm.X_LG):
-                self._waiting[palm.side].append(palm)
+        least = max(LEAST, self._good * self._best[0])
         for side, waiting in enumerate(self._waiting):
-            self._vain[side] = 0 if len(waiting) > before[side] else self._vain[side] + 1
-
-        # Where the best palms are near each other already, others may be nearer.
-        if min(self._vain) >= PATIENCE and (self._order or any(self._waiting)):
-            self._near, self._vain = self._near / 2.0, [0, 0, 0]
+            own = [palm for palm in palms if palm.side == side and palm.score >= LEAST]
+            self._waiting[side] = sorted([*waiting, *own], key=lambda palm: -palm.score)
+            found = any(palm.score >= least for palm in own)
+            self._vain[side] = 0 if found else self._vain[side] + 1
 
     def _is_near(self, X_LG: Array) -> bool:
-        """Return whether a palm is near one in the order or one that waits."""
-        others = [*self._order, *chain(*self._waiting)]
-        X = np.reshape([other.X_LG for other in others], (-1, 4, 4))
+        """Return whether a palm is near one in the order."""
+        X = np.reshape([other.X_LG for other in self._order], (-1, 4, 4))
         shift = norm(X[:, :3, 3] - X_LG[:3, 3])
         cosine = (dot(X[:, :3, :3].reshape(-1, 9), X_LG[:3, :3].ravel()) - 1.0) / 2.0
         closer = cosine >= sin_cos_deg(self._near * NEAR[1])[1]
