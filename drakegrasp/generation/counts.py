@@ -60,7 +60,7 @@ class Counts:
             units = {of[0].object_name: of for of in headers_by_object(manifest) if of}
             self.target = Target(manifest.config, units)
 
-        # Progress.
+        # What the bar shows.
         self._pool, self._report = pool, report
         self._extrapolation = Extrapolation(manifest)
         self._wanted = manifest.config.samples
