@@ -300,21 +300,6 @@ class CandidateConfig(_ExtensibleSection):
         return (self.method,) if isinstance(self.method, str) else self.method
 
 
-class RefineConfig(_Section):
-    """Additional palm poses close to those of samples (by the default filters).
-
-    A palm pose is displaced by normal draws along and about each axis of the palm.
-    """
-
-    children: Annotated[int, Field(ge=0, le=100)] = 0  # of each sample; 0 switches refining off
-    generations: Annotated[int, Field(ge=1, le=4)] = 1  # children of children, and so on
-    shift: Positive = 0.0075  # [m], standard deviation along each axis of the palm
-    turn_deg: Positive = 7.5  # standard deviation about each axis of the palm
-    # Fraction of the objects without refined palm poses: the objects that a split by object selects
-    # first for testing, because refined palm poses of tested objects are not samples.
-    spared: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
-
-
 class ScreenConfig(_Section):
     """Attempts that geometry decides without a simulation; see docs/explanation/screening.md."""
 
@@ -338,8 +323,8 @@ class CloseConfig(_Section):
     stop_speed: Positive = 0.01  # [rad/s, or 0.1 m/s], slower fingers count as stopped
     check_period: Positive = 0.1  # [s] of simulation between two checks
     # [m], the outcome is `table_contact` if the hand is deeper below the table's top at any time of
-    # closing or lifting. Null: not measured, as in datasets of versions without this key.
-    scrape_depth: Annotated[NonNegative | None, _told_unless(None)] = 5e-4
+    # closing or lifting. Null: not measured.
+    scrape_depth: NonNegative | None = 5e-4
 
 
 #: Mark of settings that end lifts early; if unused, hashes are those of versions without them.
@@ -366,30 +351,19 @@ class LiftConfig(_Section):
     # [m], of the object in the hand since its release
     stop_slip: Annotated[Positive, _STOPS] = 0.010
     stop_turn_deg: Annotated[Positive, _STOPS] = 10.0  # of the object since its release
-    # Closed hands with a smaller predicted probability of a sample are not lifted, except for a
-    # tenth of them; 0: all are lifted.
-    least_chance: Annotated[float, Field(ge=0.0, lt=1.0), _counts_unless(0.0)] = 0.0
-    # Closed hands whose otm depth image has a smaller variance [m^2] are also not lifted, except
-    # for the same tenth.
-    least_depth_variance: Annotated[NonNegative, _counts_unless(0.0)] = 0.0
-
-
-#: Mark of keys that older versions lack: files without certificates are equal to theirs.
-_CERTIFIED = Decides(files=lambda certify, _: certify.certified)
 
 
 class CertifyConfig(_Section):
     """How much disturbance lifted attempts tolerate; see docs/explanation/physics.md."""
 
     repeats: NonNegativeCount = 0  # disturbed lifts of each selected attempt; 0: none
-    # Probability that a sample (by the default filters) is selected; null stores nothing, as in
-    # datasets whose successes an older version certified.
-    share: Annotated[Share | None, _CERTIFIED] = 1.0
+    # Probability that a sample (by the default filters) is selected.
+    share: Share = 1.0
     # Probability that any other lifted attempt is selected.
-    share_others: Annotated[Share, _CERTIFIED] = 0.0
+    share_others: Share = 0.0
     # Probability that a sample is selected if a split by object is likely to use its object for
     # testing or validation; the larger of this value and `share` is used.
-    share_tested: Annotated[Share, _CERTIFIED] = 0.0
+    share_tested: Share = 0.0
     palm_noise: NonNegative = 0.002  # [m], standard deviation along each axis of the palm
     palm_noise_deg: NonNegative = 1.0  # standard deviation about each axis of the palm
     friction_noise: NonNegative = 0.1  # standard deviation of the coefficient's logarithm
@@ -400,7 +374,7 @@ class CertifyConfig(_Section):
     @property
     def certified(self) -> bool:
         """Whether files store the disturbance that attempts tolerate (`schema.HOLD_FIELDS`)."""
-        return self.repeats > 0 and self.share is not None
+        return self.repeats > 0
 
 
 class CameraConfig(_Section):
@@ -603,7 +577,6 @@ class Config(_Section):
     physics: PhysicsConfig = PhysicsConfig()
     settle: SettleConfig = SettleConfig()
     candidates: CandidateConfig
-    refine: Annotated[RefineConfig, Decides(shards=lambda _, it: it.children)] = RefineConfig()
     screen: ScreenConfig = ScreenConfig()
     close: CloseConfig = CloseConfig()
     lift: LiftConfig = LiftConfig()
@@ -639,15 +612,7 @@ class Config(_Section):
 
     @model_validator(mode="after")
     def _filters_within_stop(self) -> Config:
-        # A grasp that a looser filter would keep may be among the hands that were not lifted.
-        if self.filters.min_depth_variance < self.lift.least_depth_variance:
-            raise ValueError(
-                f"filters.min_depth_variance must be at least {self.lift.least_depth_variance}, "
-                "where lift.least_depth_variance left out what is flatter, "
-                f"got {self.filters.min_depth_variance}"
-            )
-
-        # It may also be among the lifts that were ended early.
+        # A grasp that a looser filter would keep may be among the lifts that were ended early.
         if self.lift.stop_when == "never":
             return self
         if self.filters.require == "held":
@@ -740,33 +705,8 @@ def preset_names() -> list[str]:
 
 def with_whole_lifts(config: Config) -> Config:
     """Return a configuration that lifts each closed hand until its result is certain."""
-    lift = config.lift.model_copy(
-        update={"stop_when": "never", "least_chance": 0.0, "least_depth_variance": 0.0}
-    )
+    lift = config.lift.model_copy(update={"stop_when": "never"})
     return config.model_copy(update={"lift": lift})
-
-
-#: Samplers of the preset `fast` in versions without the sampler `above`.
-_FAST_BEFORE = ("normals",) * 7 + ("rotations",)
-
-
-def continued(config: Config, known: Config) -> Config:
-    """Return the configuration with which a build continues a dataset.
-
-    Args:
-        config: Configuration of the build. Values that are only defaults, or only those of the
-            preset `fast`, are replaced by the values with which the dataset began.
-        known: Configuration of the dataset.
-    """
-    by_default = config.close.scrape_depth == CloseConfig().scrape_depth
-    if known.close.scrape_depth is None and by_default:
-        close = config.close.model_copy(update={"scrape_depth": None})
-        config = config.model_copy(update={"close": close})
-    by_preset = list(config.candidates.methods) == read_settings("fast")["candidates"]["method"]
-    if known.candidates.method == _FAST_BEFORE and by_preset:
-        candidates = config.candidates.model_copy(update={"method": _FAST_BEFORE})
-        config = config.model_copy(update={"candidates": candidates})
-    return config
 
 
 def parse_config(tree: dict[str, Any], context: str | None = None) -> Config:
@@ -798,18 +738,9 @@ def parse_config(tree: dict[str, Any], context: str | None = None) -> Config:
 def parse_stored(tree: Any) -> Config:
     """Return the configuration that a file of a dataset stores as JSON.
 
-    A configuration without `certify.share` is from a version that certified successes in another
-    way. One without `close.scrape_depth` is from a version that did not check whether hands came
-    below the table's top while they closed.
-
     Raises:
         ConfigError: See `load_config`.
     """
-    certify = tree.get("certify") if isinstance(tree, dict) else None
-    if isinstance(certify, dict) and certify.get("repeats"):
-        tree = {**tree, "certify": {"share": None, **certify}}
-    if isinstance(tree, dict) and isinstance(close := tree.get("close"), dict):
-        tree = {**tree, "close": {"scrape_depth": None, **close}}
     return parse_config(tree, _STORED)
 
 

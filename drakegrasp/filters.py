@@ -44,7 +44,6 @@ class Removal(IntEnum):
     # Values are stored in files: a later filter has the next number, which is not its place.
     SUSPICIOUS = 12  # the suspicion score or a part of it is too high; before OUTLIER
     MISSING_FINGER = 13  # a fingertip that is not required does not touch; the first filter
-    REFINED_TEST = 14  # a refined palm pose in the test split; after the split is drawn
     OWN = 15  # a user-defined filter does not keep it; before OUTLIER
     NEAR_CONE = 16  # a fingertip uses too much of its friction cone; before OUTLIER
 

@@ -24,7 +24,6 @@ GROUPS = {
     "no ray": Stage.PLACED,
     "collis.": Stage.PLACED,
     "no grip": Stage.CLOSED,
-    "left": Stage.CLOSED,
     "lost": Stage.LIFTED,
     "moved": Stage.LIFTED,
     "errors": Stage.PLACED,
@@ -62,7 +61,6 @@ class Outcome(IntEnum):
         "no grip",
         "the closing or lifting hand, or the lifted object, touches the table",
     )
-    # In datasets of older versions, this includes what is now PARTLY_HELD.
     SLIPPED = (
         8,
         "lost",
@@ -76,12 +74,9 @@ class Outcome(IntEnum):
         "the limit of computing time passed, which says nothing about the grasp",
     )
     CRASHED = 12, "errors", "its process was killed, which says nothing about the grasp"
-    # Outcomes in result files of older versions.
-    UNREACHABLE = 13, "", "no wrist pose brings the fingertips to the contacts"
     OFF_SURFACE = 14, "", "a contact, or its normal, is off the surface"  # by forces only
     # For this outcome and the next, it is unknown whether the hand would have held the object.
     MOVED = 15, "moved", "the object moved more in the hand than a sample may"
-    NOT_LIFTED = 16, "left", "the closed hand has a small chance of a sample, or a flat image"
     INVALID = 17, "", "the row of numbers is not a valid grasp"  # it counts as a failure
     PARTLY_HELD = (
         18,
@@ -107,7 +102,7 @@ class Outcome(IntEnum):
     @property
     def dataset_only(self) -> bool:
         """Whether only datasets have this outcome, because verification tries whole lifts."""
-        return self.group in ("left", "moved")
+        return self.group == "moved"
 
     @property
     def stage(self) -> Stage:

@@ -13,10 +13,13 @@ import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
+#: In place of the date in the title of a version that is not released yet.
+UNRELEASED = "unreleased"
 #: Maximum number of lines of a release's section in the changelog, so that users read it.
 SECTION_LINES = 60
 
@@ -28,6 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.parse_args(argv)
     version, faults = read_version(ROOT), disagreements(ROOT)
+    if "date-released" not in read_citation(ROOT):
+        faults.append("CITATION.cff: date-released must be the date of the release, got none")
     if git("status", "--porcelain"):
         faults.append("the work tree must have no changes: commit them first")
     if git("tag", "--list", f"v{version}"):
@@ -48,15 +53,18 @@ def read_version(root: Path) -> str:
     return str(stated["project"]["version"])
 
 
+def read_citation(root: Path) -> dict[str, Any]:
+    """Return `CITATION.cff`, which states no date before the release."""
+    citation: dict[str, Any] = yaml.safe_load((root / "CITATION.cff").read_text("utf-8"))
+    return citation
+
+
 def disagreements(root: Path) -> list[str]:
     """Return how the changelog and the citation disagree with the version, one line each."""
     version = read_version(root)
     _, *sections = re.split(r"^## ", (root / "CHANGELOG.md").read_text("utf-8"), flags=re.M)
-    # What comes after the release has no version yet.
-    released = [text for text in sections if not text.startswith("Unreleased\n")]
-    newest = released[0].splitlines() if released else [""]
-    citation = yaml.safe_load((root / "CITATION.cff").read_text("utf-8"))
-    title = f"{version} ({citation['date-released']})"
+    newest, citation = sections[0].splitlines() if sections else [""], read_citation(root)
+    title = f"{version} ({citation.get('date-released', UNRELEASED)})"
     faults = []
     if str(citation["version"]) != version:
         faults.append(f"CITATION.cff: version must be {version}, got {citation['version']}")

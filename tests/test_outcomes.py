@@ -21,10 +21,8 @@ TABLE = [
     ("solver_error", 10, PLACED, True),
     ("timeout", 11, PLACED, True),
     ("crashed", 12, PLACED, True),
-    ("unreachable", 13, PLACED, False),
     ("off_surface", 14, PLACED, False),
     ("moved", 15, LIFTED, False),
-    ("not_lifted", 16, CLOSED, False),
     ("invalid", 17, PLACED, False),
     ("partly_held", 18, LIFTED, False),
 ]
@@ -40,12 +38,8 @@ def test_stages_are_ordered_and_frozen() -> None:
 
 
 def test_no_file_of_a_dataset_holds_what_only_verification_tells() -> None:
-    assert {o.label for o in Outcome if o.verification_only} == {
-        "unreachable",
-        "off_surface",
-        "invalid",
-    }
+    assert {o.label for o in Outcome if o.verification_only} == {"off_surface", "invalid"}
 
 
 def test_no_verification_ends_a_lift_early() -> None:
-    assert {o.label for o in Outcome if o.dataset_only} == {"moved", "not_lifted"}
+    assert {o.label for o in Outcome if o.dataset_only} == {"moved"}

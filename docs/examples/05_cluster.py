@@ -21,7 +21,7 @@ def main() -> None:
     with LocalCluster(n_workers=2, threads_per_worker=1) as cluster, Client(cluster) as client:
         # A build connects by an address or by a scheduler file that every machine can read.
         client.write_scheduler_file("example/scheduler.json")
-        overrides = ["candidates.max=8", "unit_candidates=4", "refine.children=0"]
+        overrides = ["candidates.max=8", "unit_candidates=4"]
         config = dg.load_config("fast", overrides=overrides)
         # This scheduler listens on this machine only; others need a certificate (tls_files).
         reach = {"scheduler_file": "example/scheduler.json", "tls": False}

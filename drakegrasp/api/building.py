@@ -15,7 +15,7 @@ from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.connect import Workers, dashboard_line, has_dashboard, joined
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.cluster.wire import by_wire
-from drakegrasp.config import Config, continued
+from drakegrasp.config import Config
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import claim_directory, release_directory
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
@@ -173,7 +173,6 @@ def build_on(
     with build_lock(out) as dead, ExitStack() as stack:
         # A directory that cannot be used is rejected before workers start.
         before = claim_directory(out, config)
-        config = config if before is None else continued(config, before.config)
 
         # Workers read the hand from the directory.
         config = carry_hand(out, config, before.config.hand if before else None)

@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 
 #: Outcomes in the order of the funnel. Outcomes that only verdicts have are not among them.
 _FUNNEL = [o for group in GROUPS for o in Outcome if o.group == group]
-_RARE = ("left", "moved")
 #: Maximum number of objects without samples whose reasons are printed.
 BARREN = 10
 #: Smallest width of a terminal for which the audit has all of its columns [characters].
@@ -100,16 +99,13 @@ def _table_of_objects(
 ) -> Table:
     """Return a table with a row per object and a row for all objects.
 
-    `row` returns the cells for a range of objects. The last columns are the number of refined
-    samples, if any attempt is refined, and the number of samples.
+    `row` returns the cells for a range of objects. The last column is the number of samples.
     """
-    some = bool(funnel.refined.any())
 
     def cells(name: str, objects: slice) -> list[str]:
-        samples = [funnel.refined[objects, 2].sum()] * some + [funnel.samples[objects].sum()]
-        return [name, *row(objects), *map(_count, samples)]
+        return [name, *row(objects), _count(funnel.samples[objects].sum())]
 
-    heads = ("object", *heads, *["+ refined"] * some, "samples")
+    heads = ("object", *heads, "samples")
     rows = (cells(name, slice(i, i + 1)) for i, name in enumerate(funnel.names))
     return make_table(title, heads, rows, [cells("all", slice(None))], caption=caption)
 
@@ -131,10 +127,10 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
     groups = {_head(o): [o] for o in shown}
     removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
     if compact:
-        # Space is scarce, and few datasets have lifts that were ended early or left out.
+        # Space is scarce, and few datasets have lifts that were ended early.
         there, removed = funnel.outcomes.sum(axis=0), []
         groups = {name: [o for o in _FUNNEL if o.group == name] for name in GROUPS}
-        groups = {h: g for h, g in groups.items() if h not in _RARE or there[g].any()}
+        groups = {h: g for h, g in groups.items() if h != "moved" or there[g].any()}
     heads = ["poses", "attempts", *groups]
     heads += [f"- {r.label}".replace("_", "\n") for r in removed]
 
@@ -145,15 +141,7 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
         cells += [funnel.removals[objects, r].sum() for r in removed]
         return list(map(_count, cells))
 
-    caption = ""
-    if funnel.refined.any():
-        tried, held, samples = funnel.refined.sum(axis=0).tolist()
-        caption = (
-            f"refined: palm poses near those of samples: {counted(tried, 'attempt')}, {held:,} "
-            f"held, {counted(samples, 'sample')}; the other columns except the last count the "
-            "first round only"
-        )
-    return _table_of_objects("From palm poses to samples", heads, funnel, row, caption)
+    return _table_of_objects("From palm poses to samples", heads, funnel, row)
 
 
 def hold_table(funnel: Funnel) -> Table:
@@ -162,37 +150,24 @@ def hold_table(funnel: Funnel) -> Table:
         "held: the outcome success; precision: held with the fingertips alone; stable: precision, "
         "and the object moved by less than 5 mm and 5° in the hand"
     ]
-    # If lifts were chosen by their predicted probability, only audited lifts yield the fraction.
-    held, stable, head = funnel.outcomes[:, Outcome.SUCCESS], funnel.stable, "stable\nof held"
-    whole, part = held, stable
-    if not funnel.all_lifted:
-        head, (whole, part) = "stable of held\n(audit)", funnel.audited.T[1:3]
-        notes.append(
-            "audit: one attempt in ten, drawn at random, is lifted even if a sample is improbable; "
-            "only these lifts show which fraction of the held grasps is stable"
-        )
+    held, stable = funnel.outcomes[:, Outcome.SUCCESS], funnel.stable
     if note := held_note(funnel):
         notes.append(note)
 
     def row(objects: slice) -> list[str]:
         counts = (funnel.outcomes.sum(axis=1), held, funnel.precision, stable)
-        all_held, all_stable = int(whole[objects].sum()), int(part[objects].sum())
+        all_held, all_stable = int(held[objects].sum()), int(stable[objects].sum())
         share = f"{all_stable / all_held:.0%}" if all_held else "-"
-        if all_held and not funnel.all_lifted:
-            share = f"{all_stable:,} of {all_held:,}, {share}"
         return [*(_count(count[objects].sum()) for count in counts), share]
 
-    heads = ["attempts", "held", "precision", "stable", head]
+    heads = ["attempts", "held", "precision", "stable", "stable\nof held"]
     return _table_of_objects("How well the hand holds", heads, funnel, row, "\n".join(notes))
 
 
 def preshape_table(counts: Sequence[PreshapeCount]) -> Table:
     """Return how the attempts of each preshape ended, with one row per preshape."""
-    columns = ["attempts", "held", "stable", "refined", "samples"]
-    if not any(count.refined for count in counts):
-        columns.remove("refined")
-    heads = ["preshape", *("+ refined" if name == "refined" else name for name in columns)]
-    rows = ([c.preshape, *(_count(getattr(c, name)) for name in columns)] for c in counts)
+    heads = ("preshape", "attempts", "held", "stable", "samples")
+    rows = ([c.preshape, *(_count(getattr(c, name)) for name in heads[1:])] for c in counts)
     nameless = any(count.preshape == NO_NAME for count in counts)
     caption = f"{NO_NAME}: postures for which all fingers close" if nameless else ""
     return make_table("Preshapes", heads, rows, caption=caption)
@@ -200,13 +175,9 @@ def preshape_table(counts: Sequence[PreshapeCount]) -> Table:
 
 def split_table(counts: Sequence[SplitCount]) -> Table:
     """Return the paper's Table III with an additional column of objects."""
-    rows = (
-        [c.split, *(_number(n, ",.0f") for n in (c.samples, c.effective, c.objects, c.classes))]
-        for c in counts
-    )
-    heads = ("split", "samples", "in effect", "objects", "classes")
-    caption = "in effect: where samples with almost the same palm count as one"
-    return make_table("Samples by split", heads, rows, caption=caption)
+    heads = ("split", "samples", "objects", "classes")
+    rows = ([c.split, *(_count(getattr(c, name)) for name in heads[1:])] for c in counts)
+    return make_table("Samples by split", heads, rows)
 
 
 def split_line(rule: str, funnel: Funnel, counts: Sequence[SplitCount]) -> str:

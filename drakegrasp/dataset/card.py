@@ -268,7 +268,6 @@ def _counts(file: h5py.File, funnel: Funnel) -> dict[str, Any]:
         "splits": {
             row.split: {
                 "samples": row.samples,
-                "in effect": None if np.isnan(row.effective) else round(row.effective),
                 "objects": row.objects,
                 "classes": row.classes,
             }
@@ -294,7 +293,6 @@ def _row(
         "held": funnel.outcomes[:, Outcome.SUCCESS],
         "precision": funnel.precision,
         "stable": funnel.stable,
-        "refined": funnel.refined[:, 2],
         "samples": funnel.samples,
     }
     return {
@@ -407,7 +405,7 @@ def _how_many(content: Mapping[str, Any]) -> str:
     tables = [
         (
             f"Samples by split, which is by {content['split_by']}",
-            ("split", "samples", "in effect", "objects", "classes"),
+            ("split", "samples", "objects", "classes"),
             splits,
         ),
         ("By class", ("class", "objects", *names), classes),
@@ -421,9 +419,7 @@ def _how_many(content: Mapping[str, Any]) -> str:
 
 *Held* are the attempts that lifted the object and kept it in the hand; *precision* grasps are those
 of them that the fingertips held alone; *stable* those of these in which the object moved by less
-than 5 mm and 5 degrees in the hand. These count palm poses of the first round. *Refined* are
-samples whose palm pose was drawn about that of another sample; *samples* all held grasps that
-passed all filters; *in effect* their number where those with almost the same palm count as one."""
+than 5 mm and 5 degrees in the hand; *samples* those that passed all filters."""
     return "\n\n".join([head, *parts])
 
 

@@ -32,7 +32,6 @@ from drakegrasp.config import (
     Positive,
     Seed,
     Share,
-    continued,
     parse_stored,
 )
 from drakegrasp.dataset.assembly.split import Rule, number_poses, split_rule
@@ -50,7 +49,7 @@ from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import read_pose, unpack_pose
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
-from drakegrasp.hand.folder import HAND_FOLDER, carried_hand, hand_digest, is_hand
+from drakegrasp.hand.folder import HAND_FOLDER, carried_hand, hand_digest
 from drakegrasp.hand.settings import override_config
 from drakegrasp.runtime.files import probe_folder, refuse_half_replaced, write_atomic
 
@@ -61,7 +60,7 @@ VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "
 REQUIRED_VERSIONS = ("drakegrasp", "drake", "hand")
 #: The oldest version of drakegrasp whose results equal those of this one. A change after which the
 #: same settings produce other values sets it to the version in which the change is released.
-RESULTS_SINCE = "0.5.0"
+RESULTS_SINCE = "0.6.0"
 
 
 def _refuse_no_pose(packed: tuple[float, ...]) -> tuple[float, ...]:
@@ -90,20 +89,6 @@ Whole = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Pose = Annotated[
     tuple[Number, ...], Field(min_length=12, max_length=12), AfterValidator(_refuse_no_pose)
 ]
-
-
-#: Replaces the section `verify` in every signature. No row depends on that section, and its first
-#: defaults keep the signatures of datasets that were built with them.
-VERIFY_BEFORE = {
-    "max_surface_distance": 0.01,
-    "max_residual": 0.008,
-    "max_normal_error_deg": 45.0,
-    "max_contact_error": 0.01,
-    "open_margin_deg": 20.0,
-    "max_tries": 5,
-    "max_position_error": 0.01,
-    "max_angle_error_deg": 5.0,
-}
 
 
 @with_config(ConfigDict(extra="forbid"))
@@ -278,7 +263,7 @@ class Manifest:
         """Return a hash of everything that determines a row of the dataset, hexadecimal."""
         unlicensed = tuple(replace(entry, licence=None) for entry in self.objects)
         content = _content(replace(self, objects=unlicensed, refused=()))
-        content["config"]["verify"] = VERIFY_BEFORE
+        del content["config"]["verify"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
@@ -483,10 +468,8 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
     # With a manifest, the build must continue the same dataset.
     manifest = read_manifest(out)
     installed = installed_versions(config)
-    same_hand = is_hand(config.hand_source, manifest.versions.get("hand"))
-    if same_hand:  # wherever the hand's files are
+    if installed["hand"] == manifest.versions.get("hand"):  # wherever the hand's files are
         config = config.with_hand(manifest.config.hand)
-    config = continued(config, manifest.config)
     if manifest.config.simulation_hash() != config.simulation_hash():
         raise DataError(
             f"{out}: must be empty or hold this configuration's dataset, got one that differs in "
@@ -497,8 +480,6 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
             f"{out}: must be of one seed to be built on, got a merged dataset of several; build on "
             "those that it was merged of"
         )
-    if same_hand:  # version 0.2 had another digest for the same files
-        installed["hand"] = manifest.versions["hand"]
     if (name := other_version(manifest.versions, installed)) is not None:
         raise DataError(
             f"{out}: must be continued with {name} {manifest.versions.get(name)}, which made it, "

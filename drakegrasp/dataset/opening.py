@@ -160,7 +160,7 @@ def refuse_other_codes(
     if isinstance(codes, int):
         bad, must = (values < 0) | (values >= codes), f"0 to {codes - 1}"
     else:
-        bad, must = ~np.isin(values, codes), f"{min(codes)} to {max(codes)}"
+        bad, must = ~np.isin(values, codes), f"one of {', '.join(str(int(c)) for c in codes)}"
     if bad.any():
         row = int(np.argmax(bad))
         raise DataError(f"{path}: {name} must be {must}, got {values[row]} in row {first + row}")
@@ -470,7 +470,8 @@ PLAN_TABLES: Sequence[tuple[Field, ...]] = (
         _array("distance", "", "float64"),
         _array("resting", "", "int64"),
         _array("source", "", "int64"),
-        _array("log_density", "", "float64"),
+        _array("spread", "", "float64"),
+        _array("preshape_index", "", "int64"),
     ),
 )
 #: Additional arrays of a plan with external postures; they have as many rows as the palm poses.

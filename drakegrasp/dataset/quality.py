@@ -235,7 +235,7 @@ MUCH = 0.5
 #: Columns of `/trials` from which the predictors follow.
 PREDICTED_BY = (
     *COLUMNS,
-    *("lifted_nhat_Q_O", "lifted_area", "friction_hand", "chance", "slip_released"),
+    *("lifted_nhat_Q_O", "lifted_area", "friction_hand", "slip_released"),
 )
 
 
@@ -339,7 +339,6 @@ def predictors(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, Array]:
         "sum of normals": -doubts.values["normal_sum"],
         "normal angle": -doubts.values["normal_angle"],
         "suspicion": -doubts.score,
-        "chance before the lift": np.asarray(columns["chance"], dtype=float),
     }
 
 

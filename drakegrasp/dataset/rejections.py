@@ -40,19 +40,14 @@ class AttemptKey:
         object: Name of its object.
         candidate: Index of its palm pose among the object's candidates.
         standoff_index: Index into the configuration's stand-offs.
-        child: Number in the family of that first-round attempt, which itself has number 0.
     """
 
     object: Name
     candidate: Annotated[int, Field(ge=0, le=2**31 - 1)]
     standoff_index: Annotated[int, Field(ge=0, le=255)]
-    child: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
 
     def __str__(self) -> str:
-        refined = f", refined {self.child}" if self.child else ""
-        return (
-            f"{self.object}, palm pose {self.candidate}, stand-off {self.standoff_index}{refined}"
-        )
+        return f"{self.object}, palm pose {self.candidate}, stand-off {self.standoff_index}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -59,8 +59,8 @@ class SceneDataset:
     """Views of one split with grasps, as a sequence of items: dictionaries of NumPy arrays.
 
     An item is a view with some grasps of its scene that are drawn for it: good and bad ones
-    alternate, and good ones are drawn by their weights. The frame A is {T}, the table's, or {C},
-    the view's camera. A split without a grasp to draw has length 0.
+    alternate. The frame A is {T}, the table's, or {C}, the view's camera. A split without a grasp
+    to draw has length 0.
 
     | key | shape, type | what |
     |---|---|---|
@@ -75,7 +75,6 @@ class SceneDataset:
     | `visible` | (g, k) bool | whether the camera sees the contact after closing |
     | `held`, `sample`, `precision`, `stable`, `tested` | (g,) bool | labels, see the schema |
     | `outcome` | (g,) uint8 | see `Outcome` |
-    | `weight` | (g,) float32 | of a sample among samples like it; 0 of others |
     | `p_hold_samples`, `p_hold_repeats` | (g,) int32 | k of n disturbed repeats, or 0 |
     | `trial_id` | (g,) int64 | row of trials.hdf5 |
     | `X_TC` | (4, 4) float32 | pose of the camera; X_TA is this, or 1 |
@@ -290,7 +289,7 @@ class SceneDataset:
         self._X_TC = unpack_pose(views["X_TC"])
 
     def _choose(self, negatives: Negatives, positives: Positives) -> None:
-        """Find the good and bad grasps of each scene, and the weights of the good ones."""
+        """Find the good and bad grasps of each scene."""
         grasps = self.tables["grasps"]
         bad = grasps["tested"] & ~grasps["held"]
         if negatives == "closed":
@@ -298,19 +297,17 @@ class SceneDataset:
         if negatives == "none":
             bad[:] = False
         good = grasps[positives]
-        weight = np.where(grasps["sample"], grasps["weight"], 1.0).astype(float)
         self._kinds = []
         for first, last in zip(self._bounds[:-1], self._bounds[1:], strict=True):
             rows = np.arange(first, last)
-            own = rows[good[rows]]
-            self._kinds.append((own, np.cumsum(weight[own]), rows[bad[rows]]))
+            self._kinds.append((rows[good[rows]], rows[bad[rows]]))
 
     def _order_of(
         self, balance: Balance, names: Collection[str] | None
     ) -> tuple[AnyArray, AnyArray]:
         """Return the views to draw from, and for each item the index of its object or view."""
         scenes = self.tables["scenes"]
-        usable = np.array([len(good) + len(bad) > 0 for good, _, bad in self._kinds], dtype=bool)
+        usable = np.array([len(good) + len(bad) > 0 for good, bad in self._kinds], dtype=bool)
         usable &= scenes["split"] == SPLITS.index(self.split)
         if names is not None:
             usable &= np.isin(self.names, sorted(names))[scenes["object"][:, 0]]
@@ -336,14 +333,13 @@ class SceneDataset:
 
     def _drawn(self, scene: int, stream: Stream) -> npt.NDArray[np.int64]:
         """Return rows (g,) of /grasps: good and bad ones alternate."""
-        good, until, bad = self._kinds[scene]
+        good, bad = self._kinds[scene]
         u = stream.uniform(self._grasps)
         rows = np.empty(self._grasps, dtype=np.int64)
         is_good = np.arange(self._grasps) % 2 == 0 if len(good) and len(bad) else len(good) > 0
         is_good = np.broadcast_to(is_good, self._grasps)
         if len(good):
-            chosen = np.searchsorted(until, u[is_good] * until[-1], side="right")
-            rows[is_good] = good[np.minimum(chosen, len(good) - 1)]
+            rows[is_good] = good[(u[is_good] * len(good)).astype(np.int64)]
         if len(bad):
             rows[~is_good] = bad[(u[~is_good] * len(bad)).astype(np.int64)]
         return rows
@@ -502,7 +498,7 @@ class Rounds:
 #: Fields of /grasps that items contain unchanged.
 _AS_STORED = (
     *("q_open", "q", "q_held", "held", "sample", "precision", "stable", "tested", "outcome"),
-    *("weight", "p_hold_samples", "p_hold_repeats", "trial_id"),
+    *("p_hold_samples", "p_hold_repeats", "trial_id"),
 )
 
 
@@ -522,7 +518,7 @@ _COPIED = {f.name: f.of for f in SCENE_GRASP_FIELDS if f.of} | {
 #: Columns of /trials from which grasps of scenes follow.
 GRASPS_FOLLOW_FROM = (
     *dict.fromkeys(_COPIED.values()),
-    *("candidate", "standoff_index", "child", "resting", "spread", "time_lift"),
+    *("candidate", "standoff_index", "resting", "spread", "time_lift"),
     *("X_OG", "X_OG_lifted"),
     *(f"{when}_{name}" for when in ("closed", "lifted") for name in ("p_OQ", "nhat_Q_O", "f_Q_O")),
 )
@@ -550,21 +546,20 @@ def open_rows(path: Path, *, split: str, fewer_fingers: bool = False) -> GraspDa
     return GraspDataset(path, split=split, fewer_fingers=fewer_fingers)
 
 
-def grasps_of_trials(trials: Mapping[str, AnyArray], X_TO: Array, weights: Array) -> Columns:
+def grasps_of_trials(trials: Mapping[str, AnyArray], X_TO: Array, samples: AnyArray) -> Columns:
     """Return the columns of /grasps that follow from trials, at the poses of their objects.
 
     Args:
         trials: Columns of n trials, by GRASPS_FOLLOW_FROM.
         X_TO: Poses of the trials' objects in the scenes, (n, 4, 4).
-        weights: (n,), weights of the trials that are samples, NaN for others.
+        samples: (n,), whether each trial is a sample.
     """
     outcome, R_OT = trials["outcome"], np.swapaxes(X_TO[:, :3, :3], 1, 2)
     columns = {name: trials[of] for name, of in _COPIED.items()}
     columns |= {
         "tested": np.isin(outcome, LIFTED) & np.isfinite(trials["time_lift"]),
         "held": outcome == Outcome.SUCCESS,
-        "sample": np.isfinite(weights),
-        "weight": np.nan_to_num(weights),
+        "sample": samples,
     }
     for suffix, when, X_OG in (("", "closed", "X_OG"), ("_held", "lifted", "X_OG_lifted")):
         columns[f"X_TG{suffix}"] = pack_pose(multiply(X_TO, unpack_pose(trials[X_OG])))
@@ -579,7 +574,7 @@ class SceneRows(GraspDataset):
     """The views of a split as rows, with what scoring and verification need of `GraspDataset`.
 
     A row is a view of a scene that has a sample, in the order of `SceneDataset.views` with
-    `negatives="none"`. The row's own grasp is one of these samples, drawn by their weights.
+    `negatives="none"`. The row's own grasp is one of these samples.
     Everything is in the view's camera frame. Verdicts are for the object where it rested in its
     trials, so the camera (`frame_work2cam_view`) is turned and moved back with the object.
 

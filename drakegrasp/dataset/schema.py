@@ -21,7 +21,7 @@ from drakegrasp.filters import Removal
 from drakegrasp.outcomes import Outcome, Stage
 
 #: Increases with every change of the table that an older reader cannot read.
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 #: What to do with a file of another version, whose labels have other meanings.
 OTHER_SCHEMA = "build the dataset again with this version of drakegrasp, in another directory"
 
@@ -312,23 +312,12 @@ _CLOSED = tuple(field for field in _contacts("closed", "trial.closed", "when clo
 # For a lift that ends early, the instant at which it ends.
 _LIFTED = _contacts("lifted", "trial.lift", "after the lift")
 
-# Origin of a palm pose; an attempt's identity is object, candidate, stand-off and child.
+# Origin of a palm pose; an attempt's identity is object, candidate and stand-off.
 _LINEAGE = (
     Field("resting", "", "uint8", "-", "-", "index of the object's resting pose"),
     Field("source", "", "uint8", "-", "-",
-          "sampler of the palm pose: 0 rotations, 1 normals, 2 refine, 3 other; 4 for a posture "
-          "from a file"),
-    Field("generation", "", "uint8", "-", "-",
-          "0: first round; else the number of refined palm poses up to this one"),
-    Field("child", "", "int32", "-", "-",
-          "number in the family of a first-round attempt, whose number is 0; children of n have "
-          "the numbers n c + 1 to n c + c, with c = refine.children"),
-    Field("parent", "", "int32", "-", "-",
-          "number of the parent in the family, which has the same candidate and stand-off"),
-    Field("log_density", "", "float64", "-", "-",
-          "logarithm of the density of the palm pose's draw: among the distinct rotations; per "
-          "m^2 of surface and rad of roll; per m^3 rad^3 about the parent's palm pose; for a "
-          "posture the value of its file, or NaN", some=True),
+          "sampler of the palm pose: 0 rotations, 1 normals, 3 other; 4 for a posture from a "
+          "file"),
 )
 #: `preshape` of a posture without one, with which all fingers of a hand with preshapes close.
 NO_PRESHAPE = 255
@@ -458,9 +447,6 @@ DATA_FIELDS: tuple[Field, ...] = (
           "contact points and normals after the lift, relative to the resting object"),
     Field("trial_id", "", "int64", "-", "-", "row of trials.hdf5"),
     *_copied("grasp_props", *_WORDS, *_LINEAGE, *_PRESHAPE),
-    Field("grasp_props/weight", "", "float32", "-", "-",
-          "1 / number of samples, itself included, of the same object and resting pose whose "
-          "palm is within 10 mm and 15 deg"),
     *_copied("grasp_props", *_SLIP, *_RELEASED, _SLIP_USE),
     Field("grasp_props/other_links_held", "", "uint8", "-", "-",
           "number of other links of the hand that touch the object after the lift",
@@ -510,8 +496,7 @@ TRIAL_FIELDS: tuple[Field, ...] = (
     *_measured(
         "attempt",
         Field("candidate", "", "int32", "-", "-",
-              "index of the palm pose among its object's candidates; in a family, that of the "
-              "first attempt"),
+              "index of the palm pose among its object's candidates"),
         Field("standoff_index", "", "uint8", "-", "-",
               "index into the configuration's candidates.standoffs"),
         *_LINEAGE,
@@ -524,8 +509,7 @@ TRIAL_FIELDS: tuple[Field, ...] = (
         *_PRESHAPE,
         _SPREAD,
         Field("seed", "", "uint64", "-", "-",
-              "state of the random stream of the candidate or of the refined palm pose, from which "
-              "the spread was drawn"),
+              "state of the random stream of the candidate, from which the spread was drawn"),
     ),
     _verdict("trial.outcome", [outcome for outcome in Outcome if not outcome.verification_only]),
     *_measured(
@@ -535,18 +519,11 @@ TRIAL_FIELDS: tuple[Field, ...] = (
               "pose of the palm at the start; the candidate's pose if the palm ray misses"),
     ),
     *CONDITION_FIELDS,
-    Field("audited", "", "bool", "-", "-",
-          "whether a closed hand that may lift is lifted in any case; this is drawn for one "
-          "attempt in ten",
-          of="attempt.audited"),
     *_since(
         Stage.CLOSED,
         _TIME_CLOSE,
         _CLEARANCE["close"],
         *_CLOSED,
-        Field("chance", "", "float64", "-", "-",
-              "predicted probability that a closed hand that may lift yields a sample; NaN for "
-              "hands without a model of this probability", some=True, of="trial.chance"),
     ),
     *_since(
         Stage.LIFTED,
@@ -608,7 +585,7 @@ LOOK_FIELDS: tuple[Field, ...] = (
 SUCCESS_FIELDS: tuple[Field, ...] = (
     Field("trial_id", "", "int64", "-", "-", "row of /trials"),
     Field("removal", "", "uint8", "-", "-",
-          f"why the success is not a sample: {_labels(list(Removal))}", limits=(0, max(Removal))),
+          f"why the success is not a sample: {_labels(list(Removal))}"),
     *CERTIFICATE_FIELDS,
 )
 
@@ -819,14 +796,7 @@ SCENE_GRASP_FIELDS: tuple[Field, ...] = (
     Field("held", "", "bool", "-", "-", "whether the grasp holds"),
     *_WORDS,
     Field("sample", "", "bool", "-", "-", "whether the grasp is a sample of the dataset"),
-    Field("audited", "", "bool", "-", "-",
-          "whether the hand was lifted whatever its predicted probability: such hands are an "
-          "unbiased sample of the hands that may lift", of="audited"),
     Field("source", "", "uint8", "-", "-", "sampler of the palm pose, see /trials", of="source"),
-    Field("family", "", "int32", "-", "-",
-          "number, within the scene, of the first-round attempt from which the grasp was refined, "
-          "or of the grasp itself"),
-    Field("weight", "", "float32", "-", "-", "weight of a sample, see /train; 0 for other grasps"),
     *(replace(field, of=field.name) for field in HOLD_FIELDS),
     *_PRESHAPE,
     Field("X_TG", "12", "float32", "m, -", "T", "pose of the palm at the start and while closing"),

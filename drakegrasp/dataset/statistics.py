@@ -6,7 +6,6 @@ which objects have no sample, which part of a split is too small, and what would
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Sequence
 from contextlib import suppress
@@ -19,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config, SplitConfig, ways_to_grasps
-from drakegrasp.dataset.assembly.split import effective_number
 from drakegrasp.dataset.assembly.survey import shards_sha256
 from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_names
 from drakegrasp.dataset.manifest import read_manifest
@@ -37,21 +35,16 @@ from drakegrasp.runtime.executor import Executor, run_here
 
 #: Name shown for postures without a preshape, for which all fingers close.
 NO_NAME = "-"
-#: Columns of `Funnel.refined`.
-REFINED = ("attempts", "held", "samples")
 #: Columns of the attempts that a funnel counts.
 _COUNTED = (
-    *("object", "outcome", "removal", "generation", "standoff_index", "audited", "slip"),
-    *("precision", "stable", "preshape"),
+    *("object", "outcome", "removal", "standoff_index", "precision"),
+    *("stable", "preshape"),
 )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Funnel:
     """Numbers of candidates, outcomes and removals of each of m objects.
-
-    Attempts and held grasps are those of the first round, since palm poses around held grasps
-    succeed far more often. The number of all samples, including refined ones, is `samples`.
 
     Attributes:
         names, classes: (m,), names and classes of the objects.
@@ -63,12 +56,8 @@ class Funnel:
         precision, stable: (m,), successes that are precision grasps, and those that are also
             stable.
         removals: (m, 1 + max(Removal)), successes by object and reason of removal.
-        refined: (m, 3), attempts, successes and samples of refined palm poses.
-        untested: (m,), refined attempts that only the test split leaves out of the samples.
-        audited: (m, 4), lifts, successes, stable grasps and samples among audited attempts: their
-            rates are fair if other attempts were chosen for the lift by their chance.
-        preshapes: (256, 5), by index of the preshape: attempts, successes, stable grasps and
-            samples of the first round, and refined samples.
+        preshapes: (256, 4), by index of the preshape: attempts, successes, stable grasps and
+            samples.
     """
 
     names: tuple[str, ...]
@@ -80,20 +69,12 @@ class Funnel:
     precision: npt.NDArray[np.int64]
     stable: npt.NDArray[np.int64]
     removals: npt.NDArray[np.int64]
-    refined: npt.NDArray[np.int64]
-    untested: npt.NDArray[np.int64]
-    audited: npt.NDArray[np.int64]
     preshapes: npt.NDArray[np.int64]
 
     @property
     def samples(self) -> npt.NDArray[np.int64]:
-        """(m,), all samples of each object, including refined ones."""
-        return self.removals[:, Removal.KEPT] + self.refined[:, 2]
-
-    @property
-    def all_lifted(self) -> bool:
-        """Whether each closed hand that may lift was lifted."""
-        return not self.outcomes[:, Outcome.NOT_LIFTED].any()
+        """(m,), samples of each object."""
+        return self.removals[:, Removal.KEPT]
 
 
 @dataclass(frozen=True)
@@ -102,31 +83,23 @@ class PreshapeCount:
 
     Attributes:
         preshape: Name of the preshape, or `NO_NAME` for postures without a preshape.
-        attempts, held, stable: Number of attempts of the first round, and how many of them are
-            held and stable.
-        refined: Number of refined samples.
-        samples: Number of all samples, including the refined ones.
+        attempts, held, stable, samples: Number of attempts, and how many of them are held, stable,
+            and samples.
     """
 
     preshape: str
     attempts: int
     held: int
     stable: int
-    refined: int
     samples: int
 
 
 @dataclass(frozen=True, kw_only=True)
 class SplitCount:
-    """A row of the paper's Table III: numbers of samples, objects and classes of a split.
-
-    `effective` is the number of samples if near-identical ones count once, see
-    `assembly.split.effective_number`.
-    """
+    """A row of the paper's Table III: numbers of samples, objects and classes of a split."""
 
     split: str
     samples: int
-    effective: float
     objects: int
     classes: int
 
@@ -242,35 +215,25 @@ def funnel_of(trials: Trials) -> Funnel:
         precision=zeros(count),
         stable=zeros(count),
         removals=zeros(count, 1 + max(Removal)),
-        refined=zeros(count, 3),
-        untested=zeros(count),
-        audited=zeros(count, 4),
-        preshapes=zeros(1 + NO_PRESHAPE, 5),
+        preshapes=zeros(1 + NO_PRESHAPE, 4),
     )
     for block in trials.blocks(_COUNTED):
         number, outcome, removal = (block[name] for name in ("object", "outcome", "removal"))
         held, sample = outcome == Outcome.SUCCESS, removal == Removal.KEPT
-        first, stable = block["generation"] == 0, block["stable"]
+        stable, preshape = block["stable"], block["preshape"]
 
-        # Palm poses, outcomes, labels of the hold, and removals of the first round.
-        _count(funnel.candidates, number[first & (block["standoff_index"] == 0)])
-        _count(funnel.outcomes, (number[first], outcome[first]))
-        _count(funnel.precision, number[first & block["precision"]])
-        _count(funnel.stable, number[first & stable])
-        decided = first & (removal != NONE)
+        # Palm poses, outcomes, labels of the hold, removals, and preshapes.
+        _count(funnel.candidates, number[block["standoff_index"] == 0])
+        _count(funnel.outcomes, (number, outcome))
+        _count(funnel.precision, number[block["precision"]])
+        _count(funnel.stable, number[stable])
+        decided = removal != NONE
         _count(funnel.removals, (number[decided], removal[decided]))
-        _count(funnel.untested, number[removal == Removal.REFINED_TEST])
 
-        # Preshapes, refined palm poses, and audited attempts.
-        fair, lifted = first & block["audited"], np.isfinite(block["slip"])
-        for counts, of, among, chosen in (
-            (funnel.preshapes, block["preshape"], first, (True, held, held & stable, sample)),
-            (funnel.preshapes[:, 4:], block["preshape"], ~first, (sample,)),
-            (funnel.refined, number, ~first, (True, held, sample)),
-            (funnel.audited, number, fair, (lifted, held, stable, sample)),
-        ):
-            for column, own in zip(counts.T, chosen, strict=False):
-                _count(column, of[among & own])
+        every = np.ones_like(held)
+        chosen = every, held, held & stable, sample
+        for column, own in zip(funnel.preshapes.T, chosen, strict=True):
+            _count(column, preshape[own])
     return funnel
 
 
@@ -288,8 +251,7 @@ def preshapes_of(funnel: Funnel, config: Config) -> list[PreshapeCount]:
         named.append((NO_PRESHAPE, NO_NAME))
     counts = []
     for i, name in named:
-        attempts, held, stable, kept, refined = funnel.preshapes[i].tolist()
-        counts.append(PreshapeCount(name, attempts, held, stable, refined, kept + refined))
+        counts.append(PreshapeCount(name, *funnel.preshapes[i].tolist()))
     return counts
 
 
@@ -301,22 +263,12 @@ def _count(counts: npt.NDArray[np.int64], cells: Any) -> None:
 
 def held_note(funnel: Funnel) -> str:
     """Return why there may be more held grasps than were counted; empty if there is no reason."""
-    moved, left = funnel.outcomes[:, [Outcome.MOVED, Outcome.NOT_LIFTED]].sum(axis=0).tolist()
-    reasons = []
-    if moved:
-        ended = f"{counted(moved, 'lift')} ended early, without a verdict (moved)"
-        reasons.append(f"{ended}, because the object moved more in the hand than a sample may")
-    if left:
-        lifts, held, stable, samples = funnel.audited.sum(axis=0).tolist()
-        # Before the files are assembled, it is unknown which successes are samples.
-        found = [f"{held:,} held", f"{stable:,} stable"]
-        found += [counted(samples, "sample")] if funnel.removals.any() else []
-        reasons.append(
-            f"{counted(left, 'closed hand')} did not lift (not_lifted), because a sample was "
-            "improbable or the image too flat"
-            + (f"; {counted(lifts, 'lift')} of the audit: {', '.join(found)}" if lifts else "")
-        )
-    return f"the number of held grasps is a lower bound: {'; '.join(reasons)}" if reasons else ""
+    moved = int(funnel.outcomes[:, Outcome.MOVED].sum())
+    if not moved:
+        return ""
+    ended = f"{counted(moved, 'lift')} ended early, without a verdict (moved)"
+    why = "because the object moved more in the hand than a sample may"
+    return f"the number of held grasps is a lower bound: {ended}, {why}"
 
 
 def count_splits(out: Path) -> list[SplitCount]:
@@ -335,7 +287,6 @@ def splits_of(file: h5py.File) -> list[SplitCount]:
         SplitCount(
             split=split,
             samples=len(file[split]["grasps"]),
-            effective=effective_number(file[split]["grasp_props/weight"][:]),
             objects=len(set(read_names(file[split]["object_props/object_name"]))),
             classes=len(set(read_names(file[split]["object_props/class_name"]))),
         )
@@ -367,14 +318,11 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
             "outcomes": labelled(Outcome, funnel.outcomes[i]),
             **{key: int(getattr(funnel, key)[i]) for key in ("precision", "stable")},
             "removals": labelled(Removal, funnel.removals[i]),
-            "refined": dict(zip(REFINED, funnel.refined[i].tolist(), strict=True)),
             "samples": int(funnel.samples[i]),
         }
         for i, name in enumerate(funnel.names)
     ]
     splits = [] if unfinished else [asdict(split) for split in count_splits(out)]
-    for split in splits:
-        split["effective"] = split["effective"] if math.isfinite(split["effective"]) else None
     units = {"done": unfinished.done, "total": unfinished.total} if unfinished else None
     counts: dict[str, Any] = {
         "objects": objects,
@@ -401,33 +349,22 @@ class Shortfall(NamedTuple):
 def objects_without_samples(funnel: Funnel, config: Config) -> dict[str, Shortfall]:
     """Return, for each object without a sample, why it has none, by its name."""
     return {
-        funnel.names[i]: why_no_sample(
-            funnel.outcomes[i], funnel.removals[i], config, int(funnel.untested[i])
-        )
+        funnel.names[i]: why_no_sample(funnel.outcomes[i], funnel.removals[i], config)
         for i in np.flatnonzero(funnel.samples == 0).tolist()
     }
 
 
-def why_no_sample(
-    outcomes: AnyArray, removals: AnyArray, config: Config, untested: int = 0
-) -> Shortfall:
+def why_no_sample(outcomes: AnyArray, removals: AnyArray, config: Config) -> Shortfall:
     """Return why the attempts at an object yielded no sample.
 
     Args:
         outcomes: (1 + max(Outcome),), attempts by outcome.
         removals: (1 + max(Removal),), successes by reason of removal.
         config: Configuration of the dataset, which states what was already tried.
-        untested: Refined attempts that only the test split leaves out of the samples.
     """
     total = int(outcomes.sum())
     if not total:
         return Shortfall("nothing was tried", "more palm poses (--candidates)")
-    if untested:
-        reason = f"{counted(untested, 'refined grasp')} would be samples, but the test split has "
-        more = "more samples, for which the build goes on (--samples-per-object)"
-        if config.samples_per_object is None:
-            more = "more palm poses (--candidates)"
-        return Shortfall(f"{reason}grasps of the first round only", more)
 
     # Held grasps, if any, are closest to a sample and say more than the most frequent outcome.
     held = int(outcomes[Outcome.SUCCESS])
@@ -435,9 +372,7 @@ def why_no_sample(
         removal = Removal(int(np.argmax(removals)))
         reason = f"{held:,} held, none a sample: mostly {removal.label} ({removals[removal]:,})"
         if removal is Removal.FLAT_DEPTH:
-            # If lifts of flat images were left out, the filter cannot be wider than that limit.
-            least = f"{config.lift.least_depth_variance:g}"
-            ways = f"`drakegrasp assemble OUT --set filters.min_depth_variance={least}`"
+            ways = "`drakegrasp assemble OUT --set filters.min_depth_variance=0`"
             return Shortfall(reason, f"{ways}, which keeps flat depth images")
         return Shortfall(reason, "more palm poses (--candidates), or other limits in `filters`")
 

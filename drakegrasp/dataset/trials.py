@@ -211,7 +211,6 @@ class Trials:
         outcome: Outcome | str | Sequence[Outcome | str] | None = None,
         object_name: str | None = None,
         class_name: str | None = None,
-        refined: bool | None = None,
         sample: bool | None = None,
     ) -> Trials:
         """Return the attempts that meet all given conditions.
@@ -220,7 +219,6 @@ class Trials:
             outcome: One or several outcomes, as `Outcome` or by their labels, e.g. "success".
             object_name: Name of the object.
             class_name: Name of the object's class.
-            refined: Whether the palm pose is refined, i.e. drawn around that of a held grasp.
             sample: Whether the attempt is a sample of the dataset.
 
         Raises:
@@ -237,8 +235,6 @@ class Trials:
                 if not own.any():
                     raise DataError(f"{key} must be one of the dataset's, got {name!r}")
                 mask &= own[self["object"]]
-        if refined is not None:
-            mask &= (self["generation"] > 0) == refined
         if sample is not None:
             mask &= (self["removal"] == Removal.KEPT) == sample
         return self[mask]

@@ -66,7 +66,7 @@ ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml"
 MOST_BYTES = 1_000_000_000
 #: The arrays of our own layout that are neither poses nor joints.
 _TEXTS = ("object", "joints", "source", "frame", "link", "preshape")
-_SCALARS = ("resting", "log_density", "scale")
+_SCALARS = ("resting", "scale")
 _KNOWN = (
     *_TEXTS,
     *("X_FG", "position", "quaternion", "q_grasp", "q_pregrasp", "q_squeeze"),
@@ -238,7 +238,6 @@ def write_attempts(path: Path, table: Attempts, hand: Hand, *, network: str | No
         "q_squeeze": table.q_squeeze,
         "X_TO": table.X_TO,
         "scale": table.scale,
-        "log_density": table.log_density,
         **dict(zip(CONDITIONS, table.conditions.T, strict=True)),
     }
     arrays = {

@@ -163,8 +163,7 @@ def _chosen(out: Path, attempts: Attempts) -> list[dict[str, Any]]:
     outcomes = [Outcome(int(value)) for value in columns["outcome"]]
     sample = columns["removal"] == Removal.KEPT
     held = np.array([outcome is Outcome.SUCCESS for outcome in outcomes])
-    # It is not known whether a hand that was not lifted holds.
-    known = np.array([o.stage >= Stage.CLOSED and o is not Outcome.NOT_LIFTED for o in outcomes])
+    known = np.array([outcome.stage >= Stage.CLOSED for outcome in outcomes])
     chosen = {"samples": sample, "failed": known & ~held, "all": known}[attempts]
     if not chosen.any():
         raise DataError(f"{out}: must have attempts to export ({attempts}), got none")

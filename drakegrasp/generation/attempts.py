@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from drakegrasp.dataset.assembly.survey import successes_of
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.schema import CAMERAS, NO_PRESHAPE, sizes
 from drakegrasp.dataset.shards import ShardHeader, trial_columns
-from drakegrasp.errors import DataError, MachineError
+from drakegrasp.errors import DataError
 from drakegrasp.filters import RULES, Removal, first_removal
 from drakegrasp.frames import Array, pack_pose
 from drakegrasp.grasp import unused_fingers
@@ -32,12 +32,12 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.attempts import posture_attempts
-from drakegrasp.simulation.candidates import children, standoff_attempts
+from drakegrasp.simulation.candidates import palm_attempts
 from drakegrasp.simulation.conditions import Conditions, draw_conditions, usual_conditions
 from drakegrasp.simulation.scene import Scene, hand_joint_names
 from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes
 from drakegrasp.simulation.screen import Prediction, centred, predict
-from drakegrasp.simulation.trial import TrialRecord, lift_on, run_attempt
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.table import AnyArray, Table
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
 from drakegrasp.vision.depth_sensor import spoil_depth
@@ -118,55 +118,31 @@ def _load(out: Path, name: str, mesh_sha256: str, config: Config) -> PreparedObj
 
 
 def list_attempts(prepared: PreparedObject, indices: range, config: Config) -> list[Attempt]:
-    """Return the attempts of a range of an object's candidates, with their conditions."""
-    drawn, hand = prepared.candidates, load_hand(config.hand_source)
-    place: Any = {"name": prepared.model.name, "seed": config.seed}
+    """Return the attempts of a range of an object's candidates, with their conditions.
+
+    Their palms are centred, see `centred`.
+    """
+    drawn, hand, model = prepared.candidates, load_hand(config.hand_source), prepared.model
+    place: Any = {"name": model.name, "seed": config.seed}
     if drawn.postures is None:
         count = len(hand.preshapes)
-        made = list(standoff_attempts(drawn, indices, config.candidates, **place, preshapes=count))
+        made = list(palm_attempts(drawn, indices, config.candidates, **place, preshapes=count))
     else:
         made = list(posture_attempts(drawn, indices, hand, **place))
     made = [replace(a, unused=hand.unused_in(a.preshape)) for a in made] if hand.preshapes else made
-    return _completed(prepared.model, made, config)
-
-
-def list_children(prepared: PreparedObject, parent: Attempt, config: Config) -> list[Attempt]:
-    """Return the attempts near a parent attempt that held, with their conditions."""
-    made = children(parent, config.refine, name=prepared.model.name, seed=config.seed)
-    return _completed(prepared.model, made, config)
+    return [
+        replace(
+            each, conditions=draw_conditions(model, config, each.candidate, each.standoff_index)
+        )
+        for each in centred(model, hand, made)
+    ]
 
 
 def find_attempt(
-    prepared: PreparedObject, candidate: int, standoff_index: int, child: int, config: Config
+    prepared: PreparedObject, candidate: int, standoff_index: int, config: Config
 ) -> Attempt:
-    """Return an attempt by its identity in a dataset, with its conditions.
-
-    Raises:
-        DataError: If a family has no child of this number.
-    """
-    siblings, generations = config.refine.children, config.refine.generations
-    most = sum(siblings**k for k in range(1, generations + 1))
-    if not 0 <= child <= most:
-        raise DataError(f"child must be 0 to {most}, got {child}")
-    if child == 0:
-        first = list_attempts(prepared, range(candidate, candidate + 1), config)
-        return first[standoff_index]
-    number, place = divmod(child - 1, siblings)
-    parent = find_attempt(prepared, candidate, standoff_index, number, config)
-    return list_children(prepared, parent, config)[place]
-
-
-def _completed(model: ObjectModel, attempts: Sequence[Attempt], config: Config) -> list[Attempt]:
-    """Return attempts with centred palms, see `centred`, and with their conditions."""
-    return [
-        replace(
-            each,
-            conditions=draw_conditions(
-                model, config, each.candidate, each.standoff_index, each.child
-            ),
-        )
-        for each in centred(model, load_hand(config.hand_source), attempts)
-    ]
+    """Return an attempt by its identity in a dataset, with its conditions."""
+    return list_attempts(prepared, range(candidate, candidate + 1), config)[standoff_index]
 
 
 def predict_attempts(setup: TrialSetup, attempts: Sequence[Attempt]) -> list[Prediction | None]:
@@ -193,47 +169,11 @@ def try_attempt(
 ) -> TrialRecord:
     """Run the trial of one attempt; replace the scene if Drake failed in it."""
     X_TO = setup.prepared.resting_poses[attempt.resting]
-    is_visible = partial(_is_visible, setup, attempt, X_TO)
-    record = run_attempt(
-        setup.scene_of(attempt), X_TO, attempt, setup.config, prediction, is_visible=is_visible
-    )
-    return _without_failed(setup, record)
-
-
-def lift_scraped(setup: TrialSetup, attempt: Attempt, record: TrialRecord) -> TrialRecord:
-    """Lift the hand of a trial that `try_attempt` ended because it scraped the table.
-
-    See `lift_on`.
-    """
-    is_visible = partial(_is_visible, setup, attempt, record.X_TO)
-    lifted = lift_on(setup.scene_of(attempt), record, attempt, setup.config, is_visible=is_visible)
-    return _without_failed(setup, lifted)
-
-
-def _without_failed(setup: TrialSetup, record: TrialRecord) -> TrialRecord:
-    """Return the record; if Drake failed, replace the scenes."""
+    record = run_attempt(setup.scene_of(attempt), X_TO, attempt, setup.config, prediction)
     if record.outcome is Outcome.SOLVER_ERROR:
         forget_scenes()
         setup.renew_scene()
     return record
-
-
-def _is_visible(setup: TrialSetup, attempt: Attempt, X_TO: Array) -> bool:
-    """Return whether the otm depth image of an attempt has enough variance for a lift.
-
-    Raises:
-        MachineError: If the renderer fails, which is not a failure of the grasp.
-    """
-    least = setup.config.lift.least_depth_variance
-    if least == 0.0:
-        return True
-    try:
-        depth = _seen(setup, attempt, X_TO, "otm")["image_otm"][3]
-    except MachineError:
-        raise
-    except (RuntimeError, SystemExit) as error:
-        raise MachineError(f"{setup.prepared.model.name}: cannot render: {error}") from None
-    return bool(depth.astype(float).var() >= least)
 
 
 # Rows of a shard

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from drakegrasp.config import Config, continued
+from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.assembly.split import rank_in_split
 from drakegrasp.dataset.assembly.survey import own_filters
@@ -64,7 +64,7 @@ from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
 from drakegrasp.simulation.attempts import Attempts, misfits
-from drakegrasp.simulation.candidates import found_sampler
+from drakegrasp.simulation.candidates import sampler_class
 from drakegrasp.simulation.drive import drive_of
 
 #: Margin of ranks at the border of a split, which depends on which objects have samples.
@@ -181,7 +181,7 @@ def refuse_unusable(config: Config) -> None:
     """
     refuse_two_ends(config)
     for name in config.candidates.methods:
-        found_sampler(name, config.candidates)
+        sampler_class(name, config.candidates)
     own_filters(config.filters)
 
 
@@ -233,7 +233,6 @@ def build_locked(
         known = claim_directory(out, config)
         if known is not None:
             refuse_missing(known, [source.name for source in sources], out)
-            config = continued(config, known.config)
         config = carry_hand(out, config, known.config.hand if known else None)
 
         notices = [] if dead is None else [f"the lock of a dead build was taken over: {dead}"]
@@ -510,13 +509,12 @@ class _Build:
         self, headers: Iterable[ShardHeader], manifest: Manifest, counts: Counts
     ) -> None:
         """Run work units, and count their results."""
-        spared, tested = _spared(manifest), _likely_tested(manifest)
+        tested = _likely_tested(manifest)
         units = (
             WorkUnit(
                 out=self._out,
                 header=header,
                 config=manifest.config,
-                refined=header.object_name not in spared,
                 likely_tested=header.object_name in tested,
                 restartable=self._pool is not None,
             )
@@ -588,15 +586,6 @@ def _known_entry(
                 return None
             return entry
     return None
-
-
-def _spared(manifest: Manifest) -> set[str]:
-    """Return the names of the objects whose palm poses are not refined."""
-    # The choice depends on the object's name, as the shard does. A group would not do, because it
-    # can be changed later.
-    share, seed = manifest.config.refine.spared, manifest.config.seed
-    names = (entry.name for entry in manifest.objects)
-    return {name for name in names if rank_in_split(name, seed) < share}
 
 
 def _likely_tested(manifest: Manifest) -> set[str]:

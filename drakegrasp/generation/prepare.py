@@ -178,7 +178,7 @@ def prepare(source: MeshSource, config: Config, postures: Attempts | None = None
         _ = model.field
     poses = np.array([pose.X_TO for pose in resting])
     if postures is None:
-        candidates = sample_candidates(model, poses, config.candidates, config.seed)
+        candidates = sample_candidates(model, poses, config)
     else:
         X_OM = file_frame(source) if postures.frame == "mesh" else np.eye(4)
         candidates = given_candidates(model, poses, postures, X_OM, config)

@@ -121,12 +121,9 @@ def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
         DataError: If the dataset or the trial is not there.
         OSError: If the file cannot be written.
     """
-    stored, prepared, attempt, config = _stored_trial(Path(out), trial_id)
+    _, prepared, attempt, config = _stored_trial(Path(out), trial_id)
     X_TO = prepared.resting_poses[attempt.resting]
-    # If the hand was not lifted because of its image, it is not lifted here; nothing is rendered.
-    lifted = stored["outcome"] != Outcome.NOT_LIFTED
-    found = record_attempt(prepared.model, X_TO, attempt, config, Path(path), is_visible=lifted)
-    return found.outcome
+    return record_attempt(prepared.model, X_TO, attempt, config, Path(path)).outcome
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -163,7 +160,7 @@ def trace_trial(out: str | Path, trial_id: int) -> TracedTrial | None:
     Raises:
         DataError: If the dataset or the trial is not there.
     """
-    stored, prepared, attempt, config = _stored_trial(Path(out), trial_id)
+    _, prepared, attempt, config = _stored_trial(Path(out), trial_id)
     setup = TrialSetup(
         prepared=prepared,
         config=config,
@@ -171,10 +168,9 @@ def trace_trial(out: str | Path, trial_id: int) -> TracedTrial | None:
     )
     scene, X_TO = setup.scene_of(attempt), prepared.resting_poses[attempt.resting]
     (prediction,) = predict_attempts(setup, [attempt])
-    lifted = stored["outcome"] != Outcome.NOT_LIFTED
 
     def run(watched: Scene) -> TrialRecord:
-        return run_attempt(watched, X_TO, attempt, config, prediction, is_visible=lambda: lifted)
+        return run_attempt(watched, X_TO, attempt, config, prediction)
 
     record, trace = traced(scene, load_hand(config.hand_source), run)
 
@@ -206,8 +202,8 @@ def _stored_trial(
     manifest, row = read_manifest(out), Trials(out).trial(trial_id)
     config = manifest.config_of(row["object_name"])
     prepared = load_prepared(out, row["object_name"], config)
-    candidate, standoff, child = (int(row[key]) for key in ("candidate", "standoff_index", "child"))
-    return row, prepared, find_attempt(prepared, candidate, standoff, child, config), config
+    candidate, standoff = (int(row[key]) for key in ("candidate", "standoff_index"))
+    return row, prepared, find_attempt(prepared, candidate, standoff, config), config
 
 
 def _difference(a: np.ndarray, b: np.ndarray) -> float:

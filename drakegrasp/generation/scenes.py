@@ -151,13 +151,10 @@ def _with_scenes(config: Config, overrides: Sequence[str]) -> Config:
 def _tasks(out: Path, manifest: Manifest, trials: Trials) -> Iterator[SceneTask]:
     """Yield one task per object, in the order of the dataset."""
     columns = trials.columns(("object", "outcome", "time_close"))
-    weights = np.full(len(trials), np.nan)
     sample_split = np.full(len(trials), len(SPLITS))
     with open_samples(out / DATA_FILES["oto"]) as file:
         for number, split in enumerate(SPLITS):
-            ids = file[split]["trial_id"][:]
-            weights[ids] = file[split]["grasp_props/weight"][:]
-            sample_split[ids] = number
+            sample_split[file[split]["trial_id"][:]] = number
 
     # Use all hands that closed, with any outcome, except those for which the simulator failed.
     failed = [outcome for outcome in Outcome if outcome.inconclusive]
@@ -176,7 +173,7 @@ def _tasks(out: Path, manifest: Manifest, trials: Trials) -> Iterator[SceneTask]
             config=manifest.config_of(entry.name),
             joints=manifest.joints,
             trials={**trials[ids].columns(GRASPS_FOLLOW_FROM)},
-            weights=weights[ids],
+            samples=sample_split[ids] < len(SPLITS),
         )
 
 
@@ -274,7 +271,7 @@ class SceneTask:
         config: Configuration of the object.
         joints: Names of the hand's joints, in the order of the files.
         trials: Columns GRASPS_FOLLOW_FROM of trials.hdf5 (n rows) of the object's closed hands.
-        weights: (n,), weights of the rows that are samples; NaN for other rows.
+        samples: (n,), which of these rows are samples.
     """
 
     out: Path
@@ -283,7 +280,7 @@ class SceneTask:
     config: Config
     joints: Sequence[str]
     trials: Columns
-    weights: Array
+    samples: AnyArray
 
     def reads(self) -> dict[str, Path]:
         """Return the files of the prepared object and the hand, see `FileTask`."""
@@ -446,22 +443,13 @@ def _grasps(task: SceneTask, prepared: PreparedObject, X_TO: Array) -> Columns:
     order = np.argsort(task.trials["resting"], kind="stable")
     trials = {name: values[order] for name, values in task.trials.items()}
     scene = trials["resting"]
-    columns = grasps_of_trials(trials, X_TO[scene], task.weights[order])
+    columns = grasps_of_trials(trials, X_TO[scene], task.samples[order])
     stored = {f.name for f in stored_fields(SCENE_GRASP_FIELDS, certified=task.config.certified)}
     return {name: values for name, values in columns.items() if name in stored} | {
         "scene": scene.astype(np.int64),
         "object": np.zeros(len(scene), dtype=np.int64),
-        "family": _families(scene, trials),
         "q_open": _open_hands(task, prepared, trials),
     }
-
-
-def _families(scene: AnyArray, trials: Columns) -> npt.NDArray[np.int64]:
-    """Return the number (n,) of each attempt's family in its scene."""
-    keys = np.column_stack([scene, trials["candidate"], trials["standoff_index"]])
-    known, family = np.unique(keys, axis=0, return_inverse=True)
-    first = np.searchsorted(known[:, 0], np.arange(known[:, 0].max(initial=0) + 1))
-    return np.asarray(family.ravel() - first[scene])
 
 
 def _open_hands(task: SceneTask, prepared: PreparedObject, trials: Columns) -> Array:
@@ -481,7 +469,7 @@ def _open_hands(task: SceneTask, prepared: PreparedObject, trials: Columns) -> A
 
 
 #: Columns that identify an attempt of an object.
-_IDENTITY = ("candidate", "standoff_index", "child")
+_IDENTITY = ("candidate", "standoff_index")
 
 
 def _given_start(

@@ -1,7 +1,5 @@
 """Work units: each runs the attempts at a range of one object's candidates and writes a shard.
 
-Refined palm poses are tried in the same unit as their parents, so no unit waits for another.
-
 A work unit is plain data, so it can be sent to another process. The content of its shard depends
 only on its header and the configuration. It does not depend on the process that runs the unit, on
 earlier units, or on how often the process died (see `drakegrasp.runtime.journal`).
@@ -36,9 +34,7 @@ from drakegrasp.filters import Removal
 from drakegrasp.generation.attempts import (
     TrialSetup,
     judge_sample,
-    lift_scraped,
     list_attempts,
-    list_children,
     look_at,
     predict_attempts,
     trial_rows,
@@ -61,8 +57,8 @@ from drakegrasp.runtime.journal import (
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.robustness import certify, is_drawn
 from drakegrasp.simulation.screen import Prediction
-from drakegrasp.simulation.trial import TrialRecord, has_only_scraped
-from drakegrasp.table import AnyArray, Table, join
+from drakegrasp.simulation.trial import TrialRecord
+from drakegrasp.table import AnyArray, Table
 
 #: An attempt hangs if it takes this many times its limit of computing time; an attempt that does
 #: not hang checks the limit itself.
@@ -71,9 +67,9 @@ HANG_FACTOR = 1.5
 STAGE_SECONDS = 600.0
 #: A certificate hangs if it takes this many times the limit of all its simulations.
 CERTIFY_FACTOR = 2.0
-#: Filters for parents of refined palm poses and for samples that are certified: all default filters
-#: except that of outliers, which needs all grasps of an object.
-PARENT_FILTERS = FilterConfig(outlier_sigma=0.0)
+#: Filters for the samples that are certified: all default filters except that of outliers, which
+#: needs all grasps of an object.
+CERTIFY_FILTERS = FilterConfig(outlier_sigma=0.0)
 #: Descriptions of the steps that are not attempts, for error messages.
 _STEPS = {
     "build": "building its scene",
@@ -92,7 +88,6 @@ class WorkUnit:
         out: Directory of the dataset, as a path of the process that runs the task.
         header: Object and range of candidates.
         config: Configuration of the dataset.
-        refined: Whether refined palm poses are tried, if the configuration has any.
         likely_tested: Whether samples may be used for test or validation, see
             `certify.share_tested`.
         restartable: Whether the process that runs the unit is restarted when it dies. If so, a
@@ -102,7 +97,6 @@ class WorkUnit:
     out: Path
     header: ShardHeader
     config: Config
-    refined: bool = True
     likely_tested: bool = False
     restartable: bool = False
 
@@ -175,10 +169,7 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
 
 
 class _Experiment:
-    """The attempts of a unit, round after round, with the journal and the times of its steps.
-
-    Rows are numbered through all rounds of the unit.
-    """
+    """The attempts of a unit, with the journal and the times of its steps."""
 
     def __init__(self, unit: WorkUnit, journal: Journal) -> None:
         """Build the object's scene, or use that of the previous unit, and list the attempts.
@@ -202,41 +193,22 @@ class _Experiment:
             self._attempts = list_attempts(self._setup.prepared, indices, self._config)
 
     def run(self) -> UnitSummary:
-        """Run round after round, and write the shard, either completely or not at all."""
-        # Run the attempts, then the attempts near the samples among them, and so on.
-        header, rules = self._unit.header, self._config.refine
-        attempts, trials, looks = self._attempts, list[Table](), list[Table]()
-        refines = self._unit.refined and rules.children > 0
-        while attempts:
-            first = sum(table.count for table in trials)
-            has_children = refines and len(trials) < rules.generations
-            records, scraping = self._try_all(attempts, first, lift_scraping=has_children)
-            with self._stage("measure"):
-                rows = trial_rows(self._setup, attempts, records)
-            looks.append(self._looks(attempts, records, first))
-            certified = self._config.certified
-            samples = self._samples(rows, looks[-1]) if has_children or certified else []
-            if certified:
-                with timed(self._seconds, "certify"):
-                    rows |= self._certify(attempts, rows, looks[-1], samples, first)
-            trials.append(Table(rows))
-
-            # Most palm poses near that of a hand that only scraped the table do not scrape it.
-            parents = sorted({*samples, *scraping}) if has_children else []
-            with timed(self._seconds, "try"):
-                attempts = [
-                    child
-                    for row in parents
-                    for child in list_children(self._setup.prepared, attempts[row], self._config)
-                ]
+        """Run the attempts, and write the shard, either completely or not at all."""
+        header = self._unit.header
+        records = self._try_all()
+        with self._stage("measure"):
+            trials = trial_rows(self._setup, self._attempts, records)
+        looks = self._looks(records)
+        if self._config.certified:
+            with timed(self._seconds, "certify"):
+                trials |= self._certify(trials, looks)
 
         with self._stage("write"):
-            whole = join(trials)
-            shard = Shard(header=header, trials={**whole}, looks={**join(looks)})
+            shard = Shard(header=header, trials=trials, looks={**looks})
             write_shard(self._unit.out, shard)
         return UnitSummary(
             header=header,
-            outcomes=count_outcomes(whole["outcome"]),
+            outcomes=count_outcomes(trials["outcome"]),
             seconds=self._seconds,
             errors=dict(self._errors),
         )
@@ -273,32 +245,26 @@ class _Experiment:
             name = header.object_name
             raise DataError(f"{name}: Drake cannot build its scene: {error}") from None
 
-    def _try_all(
-        self, attempts: Sequence[Attempt], first: int, *, lift_scraping: bool
-    ) -> tuple[list[TrialRecord], list[int]]:
-        """Return the records of attempts, and which would be samples if scraping were allowed.
+    def _try_all(self) -> list[TrialRecord]:
+        """Return the records of the attempts; attempts that geometry decides are not simulated.
 
-        Attempts that geometry decides are not simulated. The first attempt is in row `first`.
         Attempts in which an earlier process died, and that have no verdict yet, run first, so that
-        an attempt that crashes is found at once. Hands that only scrape are lifted while they are
-        still closed.
+        an attempt that crashes is found at once.
         """
+        attempts = self._attempts
         with timed(self._seconds, "try"):
             # The first call computes the object's distance field.
             with self._step("predict"):
                 inject_fault(self._unit.header.object_name, "predict")
                 predictions = predict_attempts(self._setup, attempts)
-            steps = [f"{ATTEMPT} {first + row}" for row in range(len(attempts))]
+            steps = [f"{ATTEMPT} {row}" for row in range(len(attempts))]
             unresolved = set(self._journal.unresolved)
-            records, scraping = dict[int, TrialRecord](), list[int]()
+            records = dict[int, TrialRecord]()
             for row in sorted(range(len(steps)), key=lambda row: steps[row] not in unresolved):
-                attempt = attempts[row]
-                records[row] = self._try(attempt, predictions[row], steps[row])
-                if lift_scraping and self._only_scrapes(attempt, records[row], first + row):
-                    scraping.append(row)
+                records[row] = self._try(attempts[row], predictions[row], steps[row])
         ordered = [records[row] for row in range(len(attempts))]
         self._errors.update(record.message for record in ordered if record.message)
-        return ordered, scraping
+        return ordered
 
     def _try(self, attempt: Attempt, prediction: Prediction | None, step: str) -> TrialRecord:
         verdict = self._journal.verdict(step)
@@ -311,70 +277,43 @@ class _Experiment:
             inject_fault(name, attempt.candidate, attempt.standoff_index)
             return try_attempt(self._setup, attempt, prediction)
 
-    def _only_scrapes(self, attempt: Attempt, record: TrialRecord, row: int) -> bool:
-        """Return whether a trial is not a sample only because the hand scraped the table.
-
-        The hand is lifted to find this out. If an earlier process died in the lift, the answer is
-        no, and the attempt gets no children.
-        """
-        step = f"lift {row}"
-        if not has_only_scraped(record) or self._journal.verdict(step) is not None:
-            return False
-        with self._journal.step(step, HANG_FACTOR * self._config.attempt_seconds):
-            lifted = lift_scraped(self._setup, attempt, record)
-        return self._is_sample(lifted)
-
-    def _is_sample(self, trial: TrialRecord, *, views: bool = True) -> bool:
-        """Return whether a trial is a sample by the default filters, see `judge_sample`."""
-        rules = self._config.model_copy(update={"filters": PARENT_FILTERS})
-        return judge_sample(self._setup.prepared.model, trial, rules, views=views) is Removal.KEPT
-
-    def _looks(
-        self, attempts: Sequence[Attempt], records: Sequence[TrialRecord], first: int
-    ) -> Table:
+    def _looks(self, records: Sequence[TrialRecord]) -> Table:
         """Return the rows of `/looks`, with the images of both cameras of every success."""
         rows = [i for i, record in enumerate(records) if record.outcome is Outcome.SUCCESS]
         looks = {f.name: f.empty(len(rows), self._setup.sizes) for f in LOOK_FIELDS}
         with timed(self._seconds, "look"):
             for k, row in enumerate(rows):
-                looks["row"][k] = first + row
-                with self._step(f"look {first + row}"):
-                    look = look_at(self._setup, attempts[row], records[row].X_TO)
+                looks["row"][k] = row
+                with self._step(f"look {row}"):
+                    look = look_at(self._setup, self._attempts[row], records[row].X_TO)
                 for name, value in look.items():
                     looks[name][k] = value
         return Table(looks)
 
     def _samples(self, trials: dict[str, AnyArray], looks: Table) -> list[int]:
-        """Return the indices of the attempts of a round that are samples by the default filters."""
+        """Return the rows of the attempts that are samples by the default filters."""
         rows = np.flatnonzero(trials["outcome"] == Outcome.SUCCESS)
         found = Table({name: values[rows] for name, values in trials.items()})
         found = found.with_columns(looks, depth_otm=looks["image_otm"][:, 3])
-        removal = judge_successes(successes_of(found, self._config.camera), PARENT_FILTERS)
+        removal = judge_successes(successes_of(found, self._config.camera), CERTIFY_FILTERS)
         return rows[removal == Removal.KEPT].tolist()
 
-    def _certify(
-        self,
-        attempts: Sequence[Attempt],
-        trials: dict[str, AnyArray],
-        looks: Table,
-        samples: Sequence[int],
-        first: int,
-    ) -> dict[str, AnyArray]:
-        """Certify the lifts of a round that are drawn for it, and return the columns of results.
+    def _certify(self, trials: dict[str, AnyArray], looks: Table) -> dict[str, AnyArray]:
+        """Certify the lifts that are drawn for it, and return the columns of results.
 
         The least friction of a success is written to its row of `/looks`.
         """
-        rules, known = self._config.certify, set(samples)
+        rules, known = self._config.certify, set(self._samples(trials, looks))
         tested = rules.share_tested if self._unit.likely_tested else 0.0
-        of_samples = max(rules.share or 0.0, tested)
-        holds = {field.name: field.empty(len(attempts), {}) for field in HOLD_FIELDS}
-        look_of = {row - first: k for k, row in enumerate(looks["row"].tolist())}
+        of_samples = max(rules.share, tested)
+        holds = {field.name: field.empty(len(self._attempts), {}) for field in HOLD_FIELDS}
+        look_of = {row: k for k, row in enumerate(looks["row"].tolist())}
         for row in np.flatnonzero(np.isfinite(trials["time_lift"])).tolist():
             probability = of_samples if row in known else rules.share_others
-            if not is_drawn(attempts[row], probability):
+            if not is_drawn(self._attempts[row], probability):
                 continue
             held = row in look_of
-            found = self._certificate(attempts[row], first + row, held=held)
+            found = self._certificate(row, held=held)
             holds["p_hold_probability"][row] = probability
             for name in found.keys() & holds.keys():
                 holds[name][row] = found[name]
@@ -384,9 +323,10 @@ class _Experiment:
         self._setup.renew_scene()
         return holds
 
-    def _certificate(self, attempt: Attempt, row: int, *, held: bool) -> dict[str, float]:
+    def _certificate(self, row: int, *, held: bool) -> dict[str, float]:
         """Return the results of `certify` for an attempt; empty if a process died in this step."""
         step, config, prepared = f"certify {row}", self._config, self._setup.prepared
+        attempt = self._attempts[row]
         if self._journal.verdict(step) is not None:
             return {}
         simulations = config.certify.repeats + config.certify.friction_steps + 1
@@ -396,9 +336,14 @@ class _Experiment:
                 prepared.resting_poses[attempt.resting],
                 attempt,
                 config,
-                lambda trial: self._is_sample(trial, views=False),
+                self._is_sample,
                 held=held,
             )
+
+    def _is_sample(self, trial: TrialRecord) -> bool:
+        """Return whether the trial of a repeat is a sample by the default filters."""
+        rules = self._config.model_copy(update={"filters": CERTIFY_FILTERS})
+        return judge_sample(self._setup.prepared.model, trial, rules, views=False) is Removal.KEPT
 
 
 def count_outcomes(outcomes: AnyArray) -> dict[Outcome, int]:

@@ -41,7 +41,6 @@ from drakegrasp.hand.file_format import (
 )
 from drakegrasp.hand.files import find_packages, hand_file
 from drakegrasp.hand.folder import hand_folder
-from drakegrasp.hand.lift_chance import LiftChance, read_lift_chance
 from drakegrasp.hand.parsing import (
     KEPT_HANDS,
     Chain,
@@ -86,7 +85,6 @@ class Hand:
     joint_limits: Array  # (n, 2), lower and upper limits [rad or m]
     chains: tuple[Chain, ...]  # one per finger, to its fingertip
     link_chains: dict[str, Chain]  # one per link of the palm's tree, including the palm
-    lift_chance: LiftChance | None  # predicts samples from the closed hand; most hands have none
     #: The hand in each of its preshapes; each of these hands has only the fingers that close in it.
     preshapes: tuple[Hand, ...] = ()
     preshape_names: tuple[str, ...] = ()
@@ -244,7 +242,6 @@ def load_hand(source: HandSource = "barrett") -> Hand:
                 raise HandError(f"preshapes.{i}: {error}") from None
         names = tuple(preshape.name for preshape in described.preshapes)
         hand = replace(hand, preshapes=tuple(shaped), preshape_names=names)
-        hand = replace(hand, lift_chance=read_lift_chance(path))
         _refuse_empty_pads(hand)
     except HandError as error:
         raise HandError(f"{path}: {error}") from None
@@ -349,7 +346,6 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         joint_limits=limits,
         chains=tuple(chains),
         link_chains={name: carried[name] for name in bodies if name in carried},
-        lift_chance=None,
     )
 
 

@@ -57,18 +57,6 @@ def refuse_outside(path: Path, folder: Path) -> None:
         raise HandError(f"{path}: must be a file in {folder}, got a link or no file")
 
 
-def chance_file(source: HandSource) -> Path:
-    """Return the path of the weights by which lifts are chosen; few hands have this file.
-
-    It lies next to the hand file: `<name>_chance.yaml` next to `<name>_hand.yaml`.
-
-    Raises:
-        HandError: If there is no such hand.
-    """
-    path = hand_file(source)
-    return path.with_name(f"{path.stem.removesuffix('_hand')}_chance.yaml")
-
-
 def find_packages(folder: Path, model: str, packages: Mapping[str, str]) -> dict[str, Path]:
     """Return the folder of each package whose files a hand's model may name.
 
@@ -116,13 +104,6 @@ _NAMED = re.compile(
 #: References in Wavefront files: materials, and their textures at the end of a line.
 _MATERIALS = re.compile(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t\r]*$", re.MULTILINE)
 _TEXTURES = re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|norm)[ \t](?:.*[ \t])?(\S+)[ \t\r]*$", re.M)
-
-
-def model_references(model: bytes) -> Iterator[tuple[str, bool]]:
-    """Yield each reference in a model and whether it is geometry; other references are textures."""
-    for match in _NAMED.finditer(model):
-        kind = str(match.lastgroup)
-        yield unescape(match[kind].decode(errors="surrogateescape")), kind in ("uri", "mesh")
 
 
 def rewritten(model: bytes, place: Callable[[str, bool], str]) -> bytes:

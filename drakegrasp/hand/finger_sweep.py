@@ -360,15 +360,21 @@ def find_pinch(hand: Hand, width: float) -> Pinch | None:
 
 def reach(hand: Hand, direction: Array) -> float:
     """Return the largest coordinate of the closing hand along a direction (3,) in {G} [m]."""
-    surfaces, closing, farthest = link_points(hand), closing_path(hand, STEPS), -np.inf
-    for link in hand.link_chains:
-        if not len(surfaces[link]):
-            continue
-        X_GL = link_poses(hand, link, spread=0.0, closing=closing)
-        along = multiply(np.swapaxes(X_GL[:, :3, :3], -1, -2), direction)
-        heights = multiply(along, surfaces[link].T) + multiply(X_GL[:, :3, 3], direction)[:, None]
-        farthest = max(farthest, float(heights.max()))
-    return farthest
+    return float(dot(_swept_corners(hand), direction).max())
+
+
+@lru_cache(maxsize=KEPT_HANDS)
+def _swept_corners(hand: Hand) -> Array:
+    """Return the corners (n, 3) in {G} of the convex hull of everything the closing hand sweeps."""
+    surfaces, closing, corners = link_points(hand), closing_path(hand, STEPS), []
+    for link, points in surfaces.items():
+        if len(points):
+            X_GL = link_poses(hand, link, spread=0.0, closing=closing)
+            swept = multiply(points, np.swapaxes(X_GL[:, :3, :3], -1, -2)) + X_GL[:, None, :3, 3]
+            swept = swept.reshape(-1, 3)
+            corners.append(swept[ConvexHull(swept).vertices])
+    found = np.concatenate(corners)
+    return found[ConvexHull(found).vertices]
 
 
 def closing_path(hand: Hand, steps: int) -> Array:

@@ -30,12 +30,10 @@ from drakegrasp.hand.files import (
     MODEL_SUFFIXES,
     MODELS,
     PACKAGE,
-    chance_file,
     file_of,
     find_packages,
     hand_file,
     mesh_references,
-    model_references,
     refuse_outside,
     rewritten,
 )
@@ -68,18 +66,6 @@ def hand_digest(source: HandSource) -> str:
     return hand_folder(source).digest
 
 
-def is_hand(source: HandSource, digest: str | None) -> bool:
-    """Return whether a hand's files have the given digest.
-
-    Version 0.2 computed the digest from the model and the hand file before they are rewritten.
-
-    Raises:
-        HandError: As `hand_folder`.
-    """
-    folder = hand_folder(source)
-    return digest in (folder.digest, _plain_digest(hand_file(source)))
-
-
 def hand_folder(source: HandSource, name: str | None = None) -> HandFolder:
     """Return the content of a folder with all files of a hand.
 
@@ -102,15 +88,13 @@ def hand_folder(source: HandSource, name: str | None = None) -> HandFolder:
     moved = place != posixpath.normpath(model)
     found.texts[name] = _with_model(path, place) if moved or packages else path.read_bytes()
 
-    # The model, the weights (few hands have them), and licences.
+    # The model, and licences.
     if found.has(path.parent / model):
         found.add_model(place, path.parent / model, packages, found.uris)
-    chance = f"{Path(name).stem.removesuffix('_hand')}_chance.yaml"
-    found.add(chance, chance_file(source))
     folders = dict.fromkeys([path.parent, (path.parent / model).parent, *packages.values()])
     found.licences = found.add_licences(list(folders), path.stem.removesuffix("_hand"))
     uris = (found.uris[uri] for uri in sorted(found.uris))
-    found.counted = (name, place, chance, *uris, *found.parts.values())
+    found.counted = (name, place, *uris, *found.parts.values())
     return found
 
 
@@ -149,7 +133,7 @@ class HandFolder:
 
     @property
     def digest(self) -> str:
-        """A hash (16 hex digits) of hand file, model, weights and meshes, independent of paths."""
+        """A hash (16 hex digits) of hand file, model and meshes, independent of paths."""
         return _digest(map(self.content, self.counted))
 
     def place_of(self, reference: str, base: str) -> str | None:
@@ -318,17 +302,6 @@ def _with_model(path: Path, place: str) -> bytes:
     except (yaml.YAMLError, UnicodeDecodeError):
         same = False
     return text.encode() if same else yaml.safe_dump(keys, sort_keys=False).encode()
-
-
-def _plain_digest(path: Path) -> str:
-    """Return the digest of a hand's files as version 0.2 computed it, see `is_hand`."""
-    described, packages = _described(path), _packages(path)
-    model = path.parent / str(described.get("model", ""))
-    text = model.read_bytes() if model.is_file() else b""
-    named = {uri for uri, is_geometry in model_references(text) if is_geometry}
-    meshes = [file_of(uri, model.parent, packages) for uri in sorted(named)]
-    files = (path, model, chance_file(path), *meshes)
-    return _digest(file.read_bytes() if file.is_file() else b"" for file in files)
 
 
 def _digest(contents: Iterable[bytes]) -> str:

@@ -128,7 +128,7 @@ class Attempts(Gallery):
         )
         numbers = {name: i for i, name in enumerate(snapshot.names)}
         wanted = {
-            (numbers[key.object], key.candidate, key.standoff_index, key.child)
+            (numbers[key.object], key.candidate, key.standoff_index)
             for key in keys
             if key.object in numbers
         }
@@ -241,8 +241,7 @@ def name_of(snapshot: Snapshot, i: int) -> str:
     trial, key = snapshot.trial_id(i), snapshot.key(i)
     if trial is not None:
         return f"trial {trial}"
-    refined = f", refined {key.child}" if key.child else ""
-    return f"pose {key.candidate}, stand-off {key.standoff_index}{refined}"
+    return f"pose {key.candidate}, stand-off {key.standoff_index}"
 
 
 def _text(snapshot: Snapshot, name: str, i: int) -> str:
@@ -258,8 +257,6 @@ def words_of(snapshot: Snapshot, i: int) -> list[str]:
         words.append("stable" if table.stable[i] else "precision" if table.precision[i] else "held")
     if table.outcome[i] == Outcome.MOVED:
         words.append("lift ended, not judged")
-    if table.outcome[i] == Outcome.NOT_LIFTED:
-        words.append("not lifted, not judged")
     if table.split[i] != NONE:
         words.append(SPLITS[table.split[i]])
     if table.removal[i] not in (NONE, Removal.KEPT):

@@ -47,7 +47,7 @@ Found = TypeVar("Found")
 EXTRA = ("suspicion", "force", "p_hold")
 FEATURES = (*EXTRA, *(part.name for part in PARTS))
 #: Columns that identify an attempt.
-IDENTITY = ("object", "candidate", "standoff_index", "child")
+IDENTITY = ("object", "candidate", "standoff_index")
 #: Further columns from which features are computed.
 _READ = ("closed_f_Q_O", "p_hold_samples", "p_hold_repeats")
 #: Columns that the table of attempts copies, and their types.
@@ -55,7 +55,6 @@ _KEPT: dict[str, type[np.generic]] = {
     "object": np.int32,
     "candidate": np.int32,
     "standoff_index": np.uint8,
-    "child": np.int32,
     "outcome": np.uint8,
     "removal": np.uint8,
     "split": np.uint8,
@@ -207,32 +206,28 @@ class Snapshot:
     def label(self, i: int) -> str:
         """Return the ID of an attempt as used in URLs, e.g. `9f86d081884c-345-2`.
 
-        A refined attempt has its number in the family at the end: `9f86d081884c-345-2-7`. An
-        attempt keeps its ID when the files change, and no other attempt gets this ID.
+        An attempt keeps its ID when the files change, and no other attempt gets this ID.
         """
         key, code = self.key(i), self.codes[self.table.object[i]]
-        return f"{code}-{key.candidate}-{key.standoff_index}" + f"-{key.child}" * bool(key.child)
+        return f"{code}-{key.candidate}-{key.standoff_index}"
 
     def find(self, label: str) -> int | None:
         """Return the index of the attempt with a label, or None if there is none."""
         code, *numbers = label.split("-")
-        if len(numbers) not in (2, 3) or not all(n.isascii() and n.isdecimal() for n in numbers):
+        if len(numbers) != 2 or not all(n.isascii() and n.isdecimal() for n in numbers):
             return None
         return self._place(self.numbers.get(code), *map(int, numbers))
 
     def find_key(self, key: AttemptKey) -> int | None:
         """Return the index of an attempt by its identity, or None if it does not exist."""
         number = self.names.index(key.object) if key.object in self.names else None
-        return self._place(number, key.candidate, key.standoff_index, key.child)
+        return self._place(number, key.candidate, key.standoff_index)
 
-    def _place(
-        self, number: int | None, candidate: int, standoff_index: int, child: int = 0
-    ) -> int | None:
+    def _place(self, number: int | None, candidate: int, standoff_index: int) -> int | None:
         table = self.table
         (found,) = np.nonzero(
             (table.candidate == candidate)
             & (table.standoff_index == standoff_index)
-            & (table.child == child)
             & (table.object == (-1 if number is None else number))
         )
         return int(found[0]) if len(found) else None

@@ -142,7 +142,7 @@ def _shard_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
         trials, looks = file["trials"], file["looks"]
         here = trials["candidate"][:] == key.candidate
         here &= trials["standoff_index"][:] == key.standoff_index
-        (rows,) = np.nonzero(here & (trials["child"][:] == key.child))
+        (rows,) = np.nonzero(here)
         (found,) = np.nonzero(looks["row"][:] == rows[0])
         if not len(found):
             return None

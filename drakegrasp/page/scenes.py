@@ -187,7 +187,6 @@ class Scenes(Gallery):
                     "href": f"/grasp/{self.snapshot.label(trial)}",
                     "holds": self._holds(row),
                     "outcome": ", ".join([*words, *["sample"] * bool(sample)]),
-                    "weight": f"{float(table['weight'][row]):.2f}" if sample else "–",
                     "seen": views,
                 }
             )

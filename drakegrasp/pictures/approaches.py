@@ -131,7 +131,7 @@ class ObjectApproaches:
 
 
 def read_approaches(out: Path, name: str, config: Config) -> ObjectApproaches:
-    """Return an object's approaches of the first round, in the resting pose with most successes.
+    """Return an object's approaches in the resting pose with most successes.
 
     Args:
         out: Directory of the dataset.
@@ -143,10 +143,10 @@ def read_approaches(out: Path, name: str, config: Config) -> ObjectApproaches:
     """
     # A picture shows one resting pose: that with the most held grasps.
     prepared = load_prepared(out, name, config)
-    first = Trials(out).where(object_name=name, refined=False)
-    resting, held = first["resting"], first["outcome"] == Outcome.SUCCESS
+    trials = Trials(out).where(object_name=name)
+    resting, held = trials["resting"], trials["outcome"] == Outcome.SUCCESS
     pose = int(np.bincount(resting[held], minlength=1).argmax())
-    own = first[resting == pose].columns(
+    own = trials[resting == pose].columns(
         ("outcome", "X_OG", "standoff_index", "precision", "stable")
     )
     outcome, packed, standoff, precision, stable = own.values()

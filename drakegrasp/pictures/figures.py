@@ -162,12 +162,12 @@ def write_figures(
 
 
 def read_held(out: Path) -> HeldGrasps:
-    """Return the successes of a dataset's first round.
+    """Return the successes of a dataset.
 
     Raises:
         DataError: If trials.hdf5 is missing or damaged.
     """
-    held = Trials(out).where(outcome=Outcome.SUCCESS, refined=False)
+    held = Trials(out).where(outcome=Outcome.SUCCESS)
     columns = held.columns(COLUMNS)
 
     degrees = np.rad2deg(1.0)
@@ -227,8 +227,6 @@ def _hold(held: HeldGrasps, funnel: Funnel) -> Drawn:
     removals = funnel.removals.sum(axis=0)
     numbers = {name: int(group.sum()) for name, group in held.groups.items()}
     numbers["samples"] = int(funnel.samples.sum())
-    if refined := int(funnel.refined[:, 2].sum()):
-        numbers["of these refined"] = refined
     colours = [*GROUPS.values(), *[SAMPLES_COLOUR] * (len(numbers) - len(GROUPS))]
     for removal in Removal:
         if removals[removal] and removal is not Removal.KEPT:

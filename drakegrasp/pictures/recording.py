@@ -61,7 +61,6 @@ def record_attempt(
     *,
     p_OQ: Array | None = None,
     nhat_Q_O: Array | None = None,
-    is_visible: bool = True,
     caption: str = "",
 ) -> TrialRecord:
     """Return the result of `trial.run_attempt`, and write a recording of the attempt.
@@ -74,7 +73,6 @@ def record_attempt(
         path: Path of the HTML file.
         p_OQ: (k, 3), predicted contacts to draw on the object, in {O} [m].
         nhat_Q_O: (k, 3), outward unit normals of the contacts in {O}.
-        is_visible: Whether the images of the grasp would make a sample.
         caption: Text in a corner.
 
     Raises:
@@ -88,7 +86,7 @@ def record_attempt(
         q = None if attempt.path is None else attempt.path[0]
         pose = attempt.X_OG, attempt.spread, attempt.closing
         show_start(meshcat, scene, X_TO, config, *pose, q=q)
-        record = run_attempt(scene, X_TO, attempt, config, is_visible=lambda: is_visible)
+        record = run_attempt(scene, X_TO, attempt, config)
         draw_predicted(meshcat, p_OQ, nhat_Q_O)
         return record
 

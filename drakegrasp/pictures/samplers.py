@@ -166,8 +166,9 @@ def palm_rays(candidates: Candidates, standoff: float, count: int) -> Array:
 
 def _draw(prepared: PreparedObject, config: Config, method: str) -> Candidates:
     """Return as many palm poses of a method as a dataset with this method would try."""
-    changed = config.candidates.model_copy(update={"method": method})
-    return sample_candidates(prepared.model, prepared.X_TO, changed, config.seed)
+    rules = config.candidates.model_copy(update={"method": method})
+    changed = config.model_copy(update={"candidates": rules})
+    return sample_candidates(prepared.model, prepared.X_TO, changed)
 
 
 def _cover(prepared: PreparedObject) -> tuple[int, int, float]:

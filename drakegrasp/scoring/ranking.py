@@ -2,9 +2,9 @@
 
 Input: grasps that anybody proposes, and an object's visible points in {T}, where the table is z =
 0. Output: a score of each. Nothing is simulated. The points become solids (`mesh.cloud`), and the
-hand's geometry determines where each finger stops (`hand.finger_sweep`). A score is a mean over the
-solids and over small moves of the palm, or the chance that a learned `scoring.judge` computes from
-all of them. `scoring.proposals` proposes grasps.
+hand's geometry determines where each finger stops (`simulation.closing`). A score is a mean over
+the solids and over small moves of the palm, or the chance that a learned `scoring.judge` computes
+from all of them. `scoring.proposals` proposes grasps.
 """
 
 from __future__ import annotations
@@ -16,44 +16,24 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import Array, dot, multiply, norm
-from drakegrasp.errors import GraspError, HandError
+from drakegrasp.arithmetic import Array, multiply
+from drakegrasp.errors import GraspError
 from drakegrasp.frames import read_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.finger_sweep import FingerPath, HandPaths, hand_paths
 from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.mesh.cloud import Solid, column_solid, hull_solid, read_cloud
 from drakegrasp.scoring.judge import Judge, features_of, load_judge
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.closing import close_on
 from drakegrasp.simulation.posture import start_of
-from drakegrasp.simulation.screen import PointLookup, points_at
 from drakegrasp.table import Table
 
 #: Moves of the palm along its axes [m] over which a score is averaged; the first is no move.
 MOVES = 0.005 * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]])
 #: Spreads are rounded to multiples of this [rad], because the paths of a hand take half a second.
 SPREAD_STEP = np.deg2rad(2.5)
-#: Strides of the points that are used: of a pad, and of the rest of the hand.
-PAD_STRIDE, STRIDE = 2, 4
-#: A finger stops closer than this to an obstacle [m]; largest number of steps of the search.
-TOUCH, STEPS = 2e-4, 60
-#: Larger distances are cut to this [m].
-FAR = 0.02
-#: A pad touches if it is closer than this when its finger stops [m].
-PAD_GAP = 0.003
-#: The open hand is free unless it is deeper than this in object or table [m]; the solids are rough.
-DEEP = 0.003
-#: Lever arm by which a moment is divided to be compared with a force [m].
-LEVER = 0.05
-#: Rounds and rate of the search for the fractions of force of the fingers.
-ROUNDS, RATE = 100, 1.0
-#: Logistic weights of `push`, `opposition`, `arm` [1/m] and `gap` [1/m], and the constant. They
-#: were fitted to lifts of the Barrett Hand at 24 built-in objects, see "The fixed weights" in
-#: docs/results/choice.md.
-WEIGHTS = {"push": 4.0, "opposition": 2.0, "arm": -20.0, "gap": -50.0}
-CONSTANT = -3.0
 #: Scores that are equal to this number of decimals keep the order of their rows.
 DECIMALS = 9
 #: Columns of a ranking, see `Ranking`.
@@ -204,24 +184,6 @@ def chosen_hand(hand: Hand | str | None) -> Hand:
     return load_hand() if hand is None else load_hand(hand)
 
 
-def closed_on(points: Array, hand: Hand, X_TG: Array, spread: float) -> Array:
-    """Return closing positions (n, k) of a hand that is open at palm poses and closes on a cloud.
-
-    Args:
-        points: (n, 3), see `read_cloud`.
-        hand: The hand in one of its preshapes.
-        X_TG: (n, 4, 4), palm poses.
-        spread: Spread angle [rad].
-
-    Raises:
-        GraspError: If the points lie in a vertical plane.
-        HandError: If several fingers move one link.
-    """
-    paths = _paths(hand, spread)
-    lookup = PointLookup(hull_solid(points).field, np.eye(4), X_TG)
-    return _places(hand, paths, lookup, np.zeros((len(X_TG), hand.num_fingers))) * _steps(paths)
-
-
 def _starts(proposals: Attempts | Array, hand: Hand, spread: float) -> dict[int, Attempt]:
     """Return the start of each valid proposal, by its index, with {T} as its object's frame."""
     if not isinstance(proposals, Attempts):
@@ -254,158 +216,9 @@ def _closed(
     closing = np.array([opened if s.closing is None else s.closing for s in starts])
     closing = np.repeat(closing, len(MOVES), axis=0)
 
-    paths = _paths(hand, spread)
-    found = [_features(solid, hand, paths, moved, closing) for solid in solids]
+    found = [close_on(solid, hand, spread, moved, closing=closing) for solid in solids]
     shape = len(solids), len(starts), len(MOVES)
     return {
         name: np.reshape([each[name] for each in found], (*shape, *values.shape[1:]))
         for name, values in found[0].items()
     }
-
-
-def _features(
-    solid: Solid, hand: Hand, paths: HandPaths, X_TG: Array, closing: Array
-) -> dict[str, Array]:
-    """Return score and features of poses (n, 4, 4) with initial closings (n, k) [rad or m]."""
-    # The open hand.
-    lookup, rows = PointLookup(solid.field, np.eye(4), X_TG), np.arange(len(X_TG))
-    starts = closing / _steps(paths)
-    opened = [points_at(path, at) for path, at in zip(paths.fingers, starts.T, strict=True)]
-    parts = [paths.still, *opened]
-    clearance = np.min([lookup.distances(rows, p, FAR).min(axis=1) for p in parts], axis=0)
-    table = np.min([lookup.heights(rows, p).min(axis=1) for p in parts], axis=0)
-
-    # The pads, in the places where the fingers stop.
-    places = _places(hand, paths, lookup, starts)
-    pads = [
-        _pad(solid, lookup, path, X_TG, at)
-        for path, at in zip(paths.fingers, places.T, strict=True)
-    ]
-    gaps, p_TQ, n_T, push = (np.stack(each, axis=1) for each in zip(*pads, strict=True))
-
-    # The features of the contacts.
-    touch, needed = gaps < PAD_GAP, hand.required
-    opposition, middle = _opposition(p_TQ, n_T, touch)
-    free = np.minimum(clearance, table) > -DEEP
-    features = {
-        "clearance": np.minimum(clearance, FAR),
-        "table": np.minimum(table, FAR),
-        "touch": touch.astype(float),
-        "gap": gaps[:, needed].max(axis=1),
-        "push": push[:, needed].min(axis=1),
-        "opposition": opposition,
-        "arm": norm((middle - solid.middle)[:, :2]),
-        "robust": free & touch[:, needed].all(axis=1),
-        "free": free,
-        "gaps": gaps,
-        "pushes": push,
-        "closed": places / [len(path.angles) - 1 for path in paths.fingers],
-        "heights": p_TQ[:, :, 2],
-        "above": (middle - solid.middle)[:, 2],
-        "width": norm(p_TQ - middle[:, None]).max(axis=1),
-    }
-    logit = CONSTANT + sum(weight * features[name] for name, weight in WEIGHTS.items())
-    return {"score": free / (1.0 + np.exp(-logit)), **features}
-
-
-def _places(hand: Hand, paths: HandPaths, lookup: PointLookup, starts: Array) -> Array:
-    """Return the places (n, k) on their paths, in steps, at which fingers stop."""
-    fingers = zip(paths.fingers, starts.T, strict=True)
-    steps = _steps(paths)
-    closing = np.column_stack([_stop(lookup, path, at) for path, at in fingers]) * steps
-
-    # Fingers that share a motor close together: the first finger to stop stops them all.
-    for ratio in hand.closing_ratio.T:
-        own = ratio > 0.0
-        closing[:, own] = ratio[own] * (closing[:, own] / ratio[own]).min(axis=1, keepdims=True)
-    return closing / steps
-
-
-def _stop(lookup: PointLookup, path: FingerPath, start: Array) -> Array:
-    """Return the place (n,) on a path, in steps, at which a finger meets the object or the table.
-
-    No point moves by more than the largest `travel` per step, so the smallest distance limits the
-    number of free steps (sphere tracing; Hart 1996).
-    """
-    rate, end = float(path.travel.max()), len(path.angles) - 1
-    place, active = start.astype(float), np.arange(len(lookup))
-    for _ in range(STEPS):
-        points = points_at(path, place[active])
-        least = lookup.distances(active, points, FAR).min(axis=1)
-        least = np.minimum(least, lookup.heights(active, points).min(axis=1))
-        going = (least > TOUCH) & (place[active] < end)
-        active = active[going]
-        if not len(active):
-            break
-        place[active] = np.minimum(place[active] + least[going] / rate, end)
-    return place
-
-
-def _pad(
-    solid: Solid, lookup: PointLookup, path: FingerPath, X_TG: Array, place: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Return the point of a pad that is closest to the object, at places (n,) on its path.
-
-    Returns:
-        Its distance (n,), 0 to `FAR` [m]; the point p_TQ (n, 3) [m]; the object's inward normal
-        (n, 3) there, in {T}; and the cosine (n,) between the pad's motion and that normal.
-    """
-    rows, points = np.arange(len(X_TG)), points_at(path, place)[:, : path.pad]
-    distances = lookup.distances(rows, points, FAR)
-    nearest = distances.argmin(axis=1)
-    before = np.clip(place, 0, len(path.points) - 2).astype(np.int64)
-    motion = (path.points[before + 1, nearest] - path.points[before, nearest]).astype(float)
-    R_TG = X_TG[:, :3, :3]
-    p_TQ = dot(points[rows, nearest].astype(float)[:, None], R_TG) + X_TG[:, :3, 3]
-    inward = -solid.normals(p_TQ)
-    motion = dot(motion[:, None], R_TG) / norm(motion)[:, None]
-    return np.clip(distances[rows, nearest], 0.0, FAR), p_TQ, inward, dot(motion, inward)
-
-
-def _opposition(p_TQ: Array, n_T: Array, touch: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return how well contacts balance (n,), and their centre (n, 3) [m].
-
-    Each touching finger presses along its normal, with the fraction of force that minimises the
-    total force and the moment about the contacts' mean. The balance is 1 minus this minimum: 1 if
-    forces and moments cancel, and 0 for one finger. The centre is the mean weighted by these
-    fractions.
-
-    Args:
-        p_TQ: (n, k, 3), contacts [m].
-        n_T: (n, k, 3), unit normals into the object.
-        touch: (n, k), whether each finger touches; if no finger touches, all are used.
-    """
-    counted = (touch | ~touch.any(axis=1, keepdims=True)).astype(float)
-    shares: Array = counted / counted.sum(axis=1, keepdims=True)
-    mean = np.einsum("nk,nka->na", shares, p_TQ)
-    moments = np.cross(p_TQ - mean[:, None], n_T) / LEVER
-    wrenches = np.concatenate([n_T, moments], axis=2)
-    products = np.einsum("nia,nja->nij", wrenches, wrenches)
-
-    # Exponentiated gradient keeps the fractions positive (Kivinen and Warmuth 1997).
-    for _ in range(ROUNDS):
-        shares = shares * np.exp(-RATE * np.einsum("nij,nj->ni", products, shares))
-        shares /= shares.sum(axis=1)[:, None]
-    left = np.sqrt(np.einsum("ni,nij,nj->n", shares, products, shares).clip(0.0, 1.0))
-    opposition = np.where(touch.sum(axis=1) > 1, 1.0 - left, 0.0)
-    return opposition, np.einsum("nk,nka->na", shares, p_TQ)
-
-
-def _steps(paths: HandPaths) -> Array:
-    """Return the closing (k,) from one place of each path to the next [rad or m]."""
-    return np.array([path.angles[1] for path in paths.fingers])
-
-
-def _paths(hand: Hand, spread: float) -> HandPaths:
-    """Return the paths of a hand's fingers with fewer points; points of a pad still come first."""
-    paths = hand_paths(hand, spread)
-    if paths is None:
-        raise HandError(f"hand must be one whose fingers share no link, got {hand.name}")
-    fingers = []
-    for path in paths.fingers:
-        kept = np.r_[0 : path.pad : PAD_STRIDE, path.pad : len(path.travel) : STRIDE]
-        pad = int(np.count_nonzero(kept < path.pad))
-        points, travel = np.ascontiguousarray(path.points[:, kept]), path.travel[kept]
-        tip = int(np.count_nonzero(kept < path.tip))
-        fingers.append(replace(path, points=points, travel=travel, pad=pad, tip=tip))
-    return replace(paths, still=paths.still[::STRIDE], fingers=tuple(fingers))

@@ -20,17 +20,16 @@ class Source(IntEnum):
 
     ROTATIONS = 0
     NORMALS = 1
-    REFINE = 2
-    OWN = 3  # any other sampler: `above`, one of another package, or a user-defined one
+    OWN = 3  # any other sampler: one of another package, or a user-defined one
     POSTURES = 4  # no sampler: the posture comes from outside
+    CLOSING = 5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Attempt:
     """The start of a trial, and the numbers by which a dataset identifies it.
 
-    A first-round attempt is a candidate at a stand-off. It is number 0 of its family; the children
-    of number n have the numbers n c + 1 to n c + c, where c is `refine.children`.
+    In a dataset, an attempt is a candidate at a stand-off.
 
     Attributes:
         X_OG: Pose of the palm (4, 4) before the fingers close; the candidate's pose if its ray
@@ -40,7 +39,6 @@ class Attempt:
             hand.
         ray_hits: Whether the palm ray meets the object; true if no ray places the palm.
         conditions: Friction, mass, appearance and cameras; None for the usual conditions.
-        audited: Whether the closed hand is lifted regardless of its chance and its image.
         path: Positions (3, j) of all joints [rad or m], in the plant's order, for a posture that
             spread and closing cannot describe: where the trial begins, where the fingers hold the
             object, and where separate motors then move to and press.
@@ -50,14 +48,10 @@ class Attempt:
         unused: Fingers that the preshape leaves out, see `Hand.unused_in`.
         candidate: Index of the candidate of its object.
         standoff_index: Index into `candidates.standoffs`.
-        standoff: Distance of the palm from the surface point along -Gz [m], for the family's first
-            attempt.
+        standoff: Distance of the palm from the surface point along -Gz [m].
         seed: Seed from which `spread` was drawn.
         resting: Index of the object's resting pose.
         source: The sampler.
-        log_density: Logarithm of the density of the draw, see the schema.
-        child, parent: Numbers of the attempt and of its parent in the family; 0 for the first.
-        generation: Number of ancestors.
         posture_row: Row of a posture in its file; NaN for a palm pose of a sampler.
     """
 
@@ -66,7 +60,6 @@ class Attempt:
     closing: Array | None = None
     ray_hits: bool = True
     conditions: Conditions | None = None
-    audited: bool = False
     path: Array | None = None
     own_motors: bool = False
     preshape: int | None = None
@@ -77,8 +70,4 @@ class Attempt:
     seed: int = 0
     resting: int = 0
     source: Source = Source.ROTATIONS
-    log_density: float = np.nan
-    child: int = 0
-    parent: int = 0
-    generation: int = 0
     posture_row: float = np.nan

@@ -34,7 +34,7 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.attempt import Attempt, Source
-from drakegrasp.simulation.candidates import Candidates, is_audited
+from drakegrasp.simulation.candidates import Candidates
 from drakegrasp.simulation.posture import (
     BESIDE_GRASP,
     Posture,
@@ -61,7 +61,7 @@ UNIT_TOLERANCE = 1e-3
 #: others and from the meshes; a build draws its own conditions.
 _DECIDING = (
     *("objects", "resting", "X_TO", "X_FG", "q_grasp", "q_pregrasp", "q_squeeze", "frame", "X_TC"),
-    *("scale", "log_density", "said", "preshape", "row"),
+    *("scale", "said", "preshape", "row"),
 )
 #: Attributes of a table that apply to all its rows together.
 _OF_ALL = ("frame", "link", "file", "sha256", "without_rows")
@@ -88,7 +88,6 @@ class Attempts:
         frame: One of `TABLE_FRAMES`.
         X_TC: (n, 4, 4), pose of the camera in {T}, for the frame "camera".
         scale: (n,), metres per unit of length of the posture's mesh file; NaN for any scale.
-        log_density: (n,), logarithm of the density of the draw; NaN if unknown.
         said: (n,), origin of each row, in words.
         preshape: (n,), name of the hand's preshape; empty if all fingers close; or `EACH`.
         conditions: (n, 3), the `CONDITIONS` under which the grasp held; NaN if unknown.
@@ -119,7 +118,6 @@ class Attempts:
     frame: str = "object"
     X_TC: Array | None = None
     scale: Array
-    log_density: Array
     said: tuple[str, ...]
     preshape: tuple[str, ...]
     conditions: Array
@@ -324,7 +322,6 @@ def make_attempts(
     frame: str = "object",
     X_TC: npt.ArrayLike | None = None,
     scale: npt.ArrayLike | None = None,
-    log_density: npt.ArrayLike | None = None,
     said: Sequence[str] | None = None,
     invalid: Sequence[str] | None = None,
     preshape: Sequence[str | None] | None = None,
@@ -353,7 +350,6 @@ def make_attempts(
         frame: One of `TABLE_FRAMES`.
         X_TC: (n, 4, 4), with the frame "camera".
         scale: (n,), metres per unit of length of the mesh file.
-        log_density: (n,), log-densities of the draws.
         said: (n,), origin of each row, in words.
         invalid: (n,), reason why a row is known to be invalid, or empty.
         preshape: (n,), names of the hand's preshapes; empty if all fingers close. A palm pose alone
@@ -399,7 +395,6 @@ def make_attempts(
         frame=frame,
         X_TC=None if X_TC is None else _poses(X_TC, count, "X_TC", bad),
         scale=_numbers(scale, (count,), "scale", bad, some=True),
-        log_density=_numbers(log_density, (count,), "log_density", bad, some=True),
         said=("",) * count if said is None else tuple(said),
         preshape=names,
         conditions=under,
@@ -751,7 +746,8 @@ def given_candidates(
         distance=np.full(count, np.nan),
         resting=resting,
         source=np.full(count, Source.POSTURES, dtype=np.int64),
-        log_density=table.log_density,
+        spread=np.full(count, np.nan),
+        preshape_index=np.full(count, -1),
         combinations=count,
         valid=count,
         distinct=count,
@@ -790,7 +786,5 @@ def posture_attempts(
             seed=Stream(seed, object_key(name), i).key,
             resting=int(candidates.resting[i]),
             source=Source.POSTURES,
-            log_density=float(candidates.log_density[i]),
             posture_row=float(given.row[i]),
-            audited=is_audited(seed, object_key(name), i, 0, 0),
         )

@@ -1,13 +1,14 @@
 """Stage "sample": palm poses around an object, and the attempts that follow from them.
 
-Input: the object's box and mesh, and its resting poses. Output: up to `candidates.max` palm poses
-X_OG and, for each, its resting pose and the distance along its palm ray to the object.
+Input: an object and its resting poses. Output: palm poses X_OG and, for each, its resting pose and
+the distance along its palm ray to the object.
 
-A sampler of the registry yields a sequence of poses at a resting pose. Resting poses and samplers
-take turns. The first n poses are the same for every `candidates.max` of at least n, so a dataset
-can grow. The paper's method (`rotations`) multiplies a first palm pose with global and local
-rotations. `normals` is the baseline of the paper's Figure 2. A user-defined class may be another
-sampler. `children` draws poses around the palm pose of a grasp that holds.
+A sampler yields the palm poses of one resting pose. Resting poses and samplers take turns. The
+first n poses are the same however many follow, so a dataset can grow. The paper's method
+(`rotations`) multiplies a first palm pose with global and local rotations. `normals` is the
+baseline of the paper's Figure 2; its palms, too, are moved along their ray to each stand-off.
+`closing` (see `closing_sampler`) places the palm and chooses the spread. A user-defined class may
+be another sampler.
 
 Nothing here needs Drake. Poses are bitwise equal on every machine: sums, products and square roots
 have a fixed order (`arithmetic`), limits are inclusive by more than rounding, poses are compared
@@ -16,27 +17,26 @@ as rounded integers, and random numbers come from `seeding`.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Protocol
+from itertools import count, islice
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import trimesh
 
 from drakegrasp import registry
-from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
-from drakegrasp.config import CandidateConfig, RefineConfig, is_own_class
+from drakegrasp.arithmetic import Array, norm, sin_cos_deg
+from drakegrasp.config import CandidateConfig, Config, is_own_class
 from drakegrasp.errors import ConfigError
-from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.mesh.crossings import first_hits
 from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.attempt import Attempt, Source
+from drakegrasp.simulation.palms import Shape
 from drakegrasp.simulation.samplers import (
     OwnPoses,
     above_table,
@@ -46,18 +46,14 @@ from drakegrasp.simulation.samplers import (
 )
 from drakegrasp.table import Table
 
+#: The samplers of the package, whose `Source` has their name.
+OURS = ("rotations", "normals", "closing")
 #: Number of surface points that `normals` draws together; another number changes the draw.
 BLOCK = 1000
 #: Palms farther than this from the object must face it [m]; no hand is so large.
 FAR = 1.0
-#: Log-densities are rounded to multiples of this: the last bits of a logarithm depend on the
-#: machine.
-_DENSITY_GRID = 2.0**-32
-#: Last numbers of the places of streams: for a sampler at a resting pose, for a child, and for the
-#: draw of audited attempts.
-_SAMPLER, _CHILD, _AUDIT = 2, 1, 3
-#: One of this many attempts is lifted regardless of its chance of a sample and its image.
-AUDIT = 10
+#: Last number of the place of the stream of a sampler at a resting pose.
+_SAMPLER = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,7 +66,10 @@ class Candidates:
             if the palm ray misses the object.
         resting: (n,), index of each pose's resting pose.
         source: (n,), `Source` of each pose.
-        log_density: (n,), logarithm of the density of each draw, see the schema.
+        spread: (n,), spread with which each palm is tried [rad]; NaN if the palm is moved along its
+            ray to each stand-off, with drawn spreads.
+        preshape_index: (n,), index of the preshape of each palm; -1 if there is none, or it is
+            drawn.
         combinations: Number of combinations of rotations, or of surface points drawn.
         valid: Number of combinations above the table whose palm ray meets the bounding box.
         distinct: Number of different poses among the valid ones.
@@ -82,7 +81,8 @@ class Candidates:
     distance: Array
     resting: npt.NDArray[np.int64]
     source: npt.NDArray[np.int64]
-    log_density: Array
+    spread: Array
+    preshape_index: npt.NDArray[np.int64]
     combinations: int
     valid: int
     distinct: int
@@ -92,42 +92,38 @@ class Candidates:
         return len(self.X_OG)
 
 
+#: The shape of a palm whose spread and preshape are drawn for each attempt.
+DRAWN = Shape(None, np.nan)
+#: The resting pose and the sampler of a palm.
+Place: TypeAlias = tuple[int, str]
+#: What a sampler may take; only those of the package take the last one.
+ARGUMENTS = ("model", "X_TO", "stream", "config")
+#: A palm pose X_OG (4, 4) that is moved along its ray to each stand-off, with drawn spreads; or one
+#: that is tried as it is, with the shape of the hand.
+Palm: TypeAlias = Array | tuple[Array, Shape]
+
+
 class Sampler(Protocol):
-    """A sequence of palm poses of an object at a resting pose; it does not depend on its length.
+    """The palms of an object at a resting pose."""
 
-    Attributes:
-        log_density: Log-density of the draw of each pose, see the schema.
-    """
-
-    log_density: float
-
-    @property
-    def limit(self) -> int | None:
-        """Number of available poses; None means unlimited."""
-
-    def poses(self, count: int) -> Array:
-        """Return the first poses (count, 4, 4)."""
-
-    def counts(self, count: int) -> tuple[int, int, int]:
-        """Return how many combinations, valid and distinct ones the first poses were drawn from."""
+    def poses(self) -> Iterator[Palm]:
+        """Yield the palms; they do not depend on how many are taken."""
 
 
 class Rotations:
     """The distinct poses of the paper's rotations in random order, see `rotation_candidates`."""
 
-    def __init__(
-        self, model: ObjectModel, X_TO: Array, config: CandidateConfig, stream: Stream
-    ) -> None:
+    def __init__(self, model: ObjectModel, X_TO: Array, stream: Stream, config: Config) -> None:
         """Enumerate and shuffle the poses."""
-        poses, combinations, valid = rotation_candidates(model.half_extents, X_TO, config, stream)
+        poses, combinations, valid = rotation_candidates(
+            model.half_extents, X_TO, config.candidates, stream
+        )
         self._poses = poses[stream.permutation(len(poses))]
         self._counts = combinations, valid, len(poses)
-        self.limit: int | None = len(poses)
-        self.log_density = rounded_density(-math.log(max(len(poses), 1)))
 
-    def poses(self, count: int) -> Array:
-        """Return the first poses (count, 4, 4)."""
-        return self._poses[:count]
+    def poses(self) -> Iterator[Array]:
+        """Yield the poses."""
+        yield from self._poses
 
     def counts(self, count: int) -> tuple[int, int, int]:
         """Return the numbers of all combinations, valid and distinct ones."""
@@ -137,64 +133,63 @@ class Rotations:
 class Normals:
     """Poses above the table that look at random surface points, see `normal_candidates`."""
 
-    def __init__(
-        self, model: ObjectModel, X_TO: Array, config: CandidateConfig, stream: Stream
-    ) -> None:
-        """Draw nothing yet; `config` is not used."""
+    def __init__(self, model: ObjectModel, X_TO: Array, stream: Stream) -> None:
+        """Draw nothing yet."""
         self._model, self._X_TO, self._stream = model, X_TO, stream
-        self._poses, self._numbers, self._drawn = np.zeros((0, 4, 4)), np.zeros(0, dtype=int), 0
-        self.limit: int | None = None
-        self.log_density = rounded_density(-math.log(model.visual.area * 2.0 * math.pi))
+        self._numbers: list[int] = []
 
-    def poses(self, count: int) -> Array:
-        """Return the first poses (count, 4, 4)."""
+    def poses(self) -> Iterator[Array]:
+        """Yield the poses without end."""
         # A solid has faces that look up, and palms above these faces are above the table.
-        while len(self._poses) < count:
+        for first in count(0, BLOCK):
             poses = normal_candidates(self._model, BLOCK, self._stream)
-            above = np.flatnonzero(above_table(poses[:, :3, 3], self._X_TO))
-            self._poses = np.concatenate([self._poses, poses[above]])
-            self._numbers = np.concatenate([self._numbers, self._drawn + above])
-            self._drawn += BLOCK
-        return self._poses[:count]
+            for i in np.flatnonzero(above_table(poses[:, :3, 3], self._X_TO)).tolist():
+                self._numbers.append(first + i)
+                yield poses[i]
 
     def counts(self, count: int) -> tuple[int, int, int]:
         """Return the number of surface points up to the last pose; number of poses, twice."""
-        return int(self._numbers[count - 1]) + 1 if count else 0, count, count
+        return self._numbers[count - 1] + 1 if count else 0, count, count
 
 
 def sample_candidates(
-    model: ObjectModel, X_TO: npt.ArrayLike, config: CandidateConfig, seed: int
+    model: ObjectModel, X_TO: npt.ArrayLike, config: Config, most: int | None = None
 ) -> Candidates:
-    """Return the palm poses of an object, drawn with the seed, with their palm rays.
+    """Return the first palm poses of an object, drawn with the seed, with their palm rays.
 
     Args:
         model: The object.
         X_TO: Resting poses in the table-top frame, (r, 4, 4), or one pose (4, 4).
-        config: Samplers, rotations and number of poses.
-        seed: Seed of the dataset.
+        config: Samplers, hand and seed.
+        most: Largest number of palm poses; None for `candidates.max`.
 
     Raises:
         ConfigError: If a user-defined sampler cannot be run, or all its poses are far away.
+        HandError: If a sampler cannot be used with the hand.
     """
-    # One sampler for each method at each resting pose; they take turns.
+    # One sampler for each method at each resting pose; a method that is named twice has two turns.
+    rules = config.candidates
     resting = np.asarray(X_TO, dtype=float).reshape(-1, 4, 4)
-    places = [(k, method) for method in config.methods for k in range(len(resting))]
+    places = [(k, method) for method in rules.methods for k in range(len(resting))]
     samplers = {
-        (k, method): found_sampler(method, config)(
-            model, resting[k], config, _sampler_stream(model.name, seed, k, method)
+        (k, method): found_sampler(
+            method, config, model, resting[k], _sampler_stream(model.name, config.seed, k, method)
         )
         for k, method in dict.fromkeys(places)
     }
-    turns = _turns(places, {place: s.limit for place, s in samplers.items()}, config.max)
+    turns = list(islice(_turns(places, samplers), rules.max if most is None else most))
 
-    # The poses of each sampler, in the order of the turns.
+    # The poses, and the numbers of combinations from which they come.
     used = Counter(place for place, _ in turns)
-    drawn = {place: sampler.poses(used[place]) for place, sampler in samplers.items()}
-    poses = np.array([drawn[place][i] for place, i in turns]).reshape(-1, 4, 4)
-    counts = [sampler.counts(used[place]) for place, sampler in samplers.items()]
+    counts = [
+        sampler.counts(used[place]) if hasattr(sampler, "counts") else (used[place],) * 3
+        for place, sampler in samplers.items()
+    ]
     combinations, valid, distinct = (sum(numbers) for numbers in zip(*counts, strict=True))
+    palms = [palm if isinstance(palm, tuple) else (palm, DRAWN) for _, palm in turns]
+    poses = np.array([X_OG for X_OG, _ in palms]).reshape(-1, 4, 4)
     distance = palm_ray_distance(model.collision, poses)
-    for method in {each for each in config.methods if _source(each) is Source.OWN}:
+    for method in {each for each in rules.methods if _source(each) is Source.OWN}:
         of_method = [of == method for (_, of), _ in turns]
         _refuse_far(method, model, poses[of_method], distance[of_method])
     return Candidates(
@@ -202,7 +197,10 @@ def sample_candidates(
         distance=distance,
         resting=np.array([k for (k, _), _ in turns], dtype=np.int64),
         source=np.array([_source(method) for (_, method), _ in turns], dtype=np.int64),
-        log_density=np.array([samplers[place].log_density for place, _ in turns], dtype=float),
+        spread=np.array([shape.spread for _, shape in palms], dtype=float),
+        preshape_index=np.array(
+            [-1 if shape.preshape is None else shape.preshape for _, shape in palms], dtype=np.int64
+        ),
         combinations=combinations,
         valid=valid,
         distinct=distinct,
@@ -226,31 +224,41 @@ def _refuse_far(method: str, model: ObjectModel, poses: Array, distance: Array) 
         )
 
 
-def found_sampler(
-    method: str, config: CandidateConfig
-) -> Callable[[ObjectModel, Array, CandidateConfig, Stream], Sampler]:
-    """Return the sampler of a name: a registered or a user-defined sampler.
-
-    Another package may register a class with the signature of user-defined samplers,
-    (model, X_TO, stream).
+def sampler_class(method: str, config: CandidateConfig) -> Callable[..., Sampler]:
+    """Return the class of a sampler: a registered or a user-defined one.
 
     Raises:
-        ConfigError: If the sampler cannot be imported or has another signature.
+        ConfigError: If it cannot be imported or has another signature.
     """
     if is_own_class(method):
-        return partial(OwnPoses, method, own_sampler(method, config.code))
-    found = registry.find("samplers", method)
-    if registry.accepts(found, ("model", "X_TO", "stream")):
-        return partial(OwnPoses, method, found)
-    if not registry.accepts(found, ("model", "X_TO", "config", "stream")):
+        return own_sampler(method, config.code)
+    found: Callable[..., Sampler] = registry.find("samplers", method)
+    if not registry.accepts(found, ARGUMENTS[:-1]) and not registry.accepts(found, ARGUMENTS):
         raise ConfigError(f"{method}: must take (model, X_TO, stream), got other arguments")
-    sampler: Callable[[ObjectModel, Array, CandidateConfig, Stream], Sampler] = found
-    return sampler
+    return found
+
+
+def found_sampler(
+    method: str, config: Config, model: ObjectModel, X_TO: Array, stream: Stream
+) -> Sampler:
+    """Return the sampler of a name at a resting pose X_TO (4, 4).
+
+    A class takes the model, X_TO and the stream, and if it wants to, the configuration.
+
+    Raises:
+        ConfigError: If a user-defined sampler cannot be run.
+        HandError: If the sampler cannot be used with the hand.
+    """
+    found = sampler_class(method, config.candidates)
+    if _source(method) is not Source.OWN:
+        wants = (config,) if registry.accepts(found, ARGUMENTS) else ()
+        return found(model, X_TO, stream, *wants)
+    return OwnPoses(method, found, model, X_TO, stream)
 
 
 def _source(method: str) -> Source:
     """Return the `Source` that is stored for a sampler."""
-    return {"rotations": Source.ROTATIONS, "normals": Source.NORMALS}.get(method, Source.OWN)
+    return Source[method.upper()] if method in OURS else Source.OWN
 
 
 def _sampler_stream(name: str, seed: int, resting: int, method: str) -> Stream:
@@ -266,27 +274,17 @@ def _sampler_stream(name: str, seed: int, resting: int, method: str) -> Stream:
 
 
 def _turns(
-    places: Sequence[tuple[int, str]], limits: Mapping[tuple[int, str], int | None], count: int
-) -> list[tuple[tuple[int, str], int]]:
-    """Return the place of each pose's sampler and the pose's index there, until none has more.
-
-    Args:
-        places: The places that take turns; a place that is named twice has two turns.
-        limits: Number of poses of each place; None for any number.
-        count: Number of turns.
-    """
-    turns: list[tuple[tuple[int, str], int]] = []
-    taken = dict.fromkeys(places, 0)
-    while len(turns) < count:
-        begun = len(turns)
-        for place in places:
-            limit = limits[place]
-            if len(turns) < count and (limit is None or taken[place] < limit):
-                turns.append((place, taken[place]))
-                taken[place] += 1
-        if len(turns) == begun:
-            break
-    return turns
+    places: Sequence[Place], samplers: Mapping[Place, Sampler]
+) -> Iterator[tuple[Place, Palm]]:
+    """Yield a palm of each place in turn, until no sampler yields another one."""
+    palms, left = {place: sampler.poses() for place, sampler in samplers.items()}, list(places)
+    while left:
+        for place in list(left):
+            palm = next(palms[place], None)
+            if palm is None:
+                left = [other for other in left if other != place]
+            else:
+                yield place, palm
 
 
 def normal_candidates(model: ObjectModel, count: int, stream: Stream) -> Array:
@@ -320,7 +318,7 @@ def palm_ray_distance(mesh: trimesh.Trimesh, X_OG: Array) -> Array:
     return np.where(np.isfinite(distance), distance, np.nan)
 
 
-def standoff_attempts(
+def palm_attempts(
     candidates: Candidates,
     indices: range,
     config: CandidateConfig,
@@ -330,6 +328,8 @@ def standoff_attempts(
     preshapes: int = 0,
 ) -> Iterator[Attempt]:
     """Yield the attempts of a range of an object's candidates; each is a row of the dataset.
+
+    A palm with a spread is tried once, as it is. Any other is tried at each stand-off.
 
     Args:
         candidates: Candidates of the object.
@@ -343,91 +343,36 @@ def standoff_attempts(
     for i in indices:
         # Each candidate has its own stream, so ranges do not depend on each other.
         stream = Stream(seed, object_key(name), i)
-        drawn = stream.integers(len(spreads), len(standoffs))
-        shapes = stream.integers(preshapes, len(standoffs)) if preshapes else None
+        distance = float(candidates.distance[i])
+        attempt = Attempt(
+            candidate=i,
+            standoff=distance,
+            spread=float(candidates.spread[i]),
+            X_OG=candidates.X_OG[i],
+            seed=stream.key,
+            resting=int(candidates.resting[i]),
+            source=Source(candidates.source[i]),
+            preshape=None
+            if candidates.preshape_index[i] < 0
+            else int(candidates.preshape_index[i]),
+        )
+        if np.isfinite(attempt.spread):
+            yield attempt
+            continue
 
         # Move the palm along its ray to each stand-off from the surface.
-        distance = candidates.distance[i]
+        drawn = stream.integers(len(spreads), len(standoffs))
+        shapes = stream.integers(preshapes, len(standoffs)) if preshapes else None
         for j, standoff in enumerate(standoffs):
-            X_OG = candidates.X_OG[i].copy()
+            X_OG = attempt.X_OG.copy()
             if np.isfinite(distance):
                 X_OG[:3, 3] += (distance - standoff) * X_OG[:3, 2]
-            yield Attempt(
-                candidate=i,
+            yield replace(
+                attempt,
                 standoff_index=j,
                 standoff=standoff,
                 spread=float(spreads[drawn[j]]),
                 X_OG=X_OG,
                 ray_hits=bool(np.isfinite(distance)),
-                seed=stream.key,
-                resting=int(candidates.resting[i]),
-                source=Source(candidates.source[i]),
-                log_density=float(candidates.log_density[i]),
-                audited=is_audited(seed, object_key(name), i, j, 0),
                 preshape=None if shapes is None else int(shapes[j]),
             )
-
-
-def children(parent: Attempt, config: RefineConfig, *, name: str, seed: int) -> list[Attempt]:
-    """Return the attempts around the palm pose of an attempt that holds.
-
-    Args:
-        parent: The attempt that holds; if it is of the last generation, it has no children.
-        config: Number of children, and their distances.
-        name: The object's name.
-        seed: Seed of the dataset.
-    """
-    if parent.generation >= config.generations:
-        return []
-    first = parent.child * config.children + 1
-    return [
-        _child(parent, number, config, name=name, seed=seed)
-        for number in range(first, first + config.children)
-    ]
-
-
-def _child(parent: Attempt, number: int, config: RefineConfig, *, name: str, seed: int) -> Attempt:
-    place = parent.candidate, parent.standoff_index, number
-    stream = Stream(seed, object_key(name), *place, _CHILD)
-    numbers = stream.normal(6)
-    X_GH = palm_motion(numbers, config.shift, np.deg2rad(config.turn_deg))
-
-    # The density of six normal numbers, for three lengths [m] and three angles [rad].
-    scale = config.shift * math.radians(config.turn_deg)
-    density = -0.5 * float(dot(numbers, numbers)) - 3.0 * math.log(2.0 * math.pi * scale)
-    return replace(
-        parent,
-        X_OG=multiply(parent.X_OG, X_GH),
-        ray_hits=True,
-        seed=stream.key,
-        source=Source.REFINE,
-        log_density=rounded_density(density),
-        child=number,
-        parent=parent.child,
-        generation=parent.generation + 1,
-        audited=is_audited(seed, object_key(name), *place),
-    )
-
-
-def is_audited(seed: int, *place: int) -> bool:
-    """Return whether an attempt is audited, given its object, candidate, stand-off and child."""
-    return int(Stream(seed, *place, _AUDIT).integers(AUDIT, 1)[0]) == 0
-
-
-def palm_motion(numbers: Array, shift: float, turn: float) -> Array:
-    """Return a random pose (4, 4) of a palm in its frame before the motion.
-
-    Args:
-        numbers: (6,), normal random numbers: along the axes, then about the axes.
-        shift: Standard deviation along each axis [m].
-        turn: Standard deviation of each component of the rotation vector [rad].
-    """
-    vector = turn * numbers[3:]
-    angle = float(norm(vector))
-    axis = vector / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
-    return make_pose(rotation_about(axis, angle), shift * numbers[:3])
-
-
-def rounded_density(log_density: float) -> float:
-    """Return a log-density without the last bits, which depend on the machine."""
-    return round(log_density / _DENSITY_GRID) * _DENSITY_GRID

@@ -104,7 +104,7 @@ _PLACE = 0
 
 
 def draw_conditions(
-    model: ObjectModel, config: Config, candidate: int, standoff_index: int, child: int = 0
+    model: ObjectModel, config: Config, candidate: int, standoff_index: int
 ) -> Conditions:
     """Return the conditions of an attempt; values that are not drawn are the usual ones.
 
@@ -113,10 +113,8 @@ def draw_conditions(
         config: What is drawn, and the seed.
         candidate: Index of the attempt's candidate.
         standoff_index: Index of the attempt's stand-off.
-        child: Number of the attempt in the family of that first-round attempt.
     """
-    place = (candidate, standoff_index, child) if child else (candidate, standoff_index)
-    stream = Stream(config.seed, object_key(model.name), *place, _PLACE)
+    stream = Stream(config.seed, object_key(model.name), candidate, standoff_index, _PLACE)
     return conditions_from(stream, model, config)
 
 

@@ -27,8 +27,8 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.candidates import palm_motion
 from drakegrasp.simulation.conditions import Conditions, usual_conditions
+from drakegrasp.simulation.palms import palm_motion
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.screen import Prediction, centred, predict
 from drakegrasp.simulation.trial import TrialRecord, run_attempt

@@ -12,10 +12,9 @@ docs/explanation/sampling.md has an example.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
-from itertools import islice
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -230,12 +229,7 @@ def own_sampler(stored: str, code: Mapping[str, str]) -> type[Any]:
 
 
 class OwnPoses:
-    """The poses that a user-defined sampler yields, in their order.
-
-    Attributes:
-        log_density: Log-density of the class; 0 if it has none.
-        limit: Number of yielded poses, up to `candidates.max`.
-    """
+    """The poses that a user-defined sampler yields, in their order."""
 
     def __init__(
         self,
@@ -243,40 +237,35 @@ class OwnPoses:
         found: Callable[[ObjectModel, Array, Stream], Any],
         model: ObjectModel,
         X_TO: Array,
-        config: CandidateConfig,
         stream: Stream,
     ) -> None:
-        """Draw the poses.
+        """Make the sampler.
 
         Args:
             stored: Name of the sampler in the configuration.
             found: The class.
             model: The object.
             X_TO: Resting pose of the object, (4, 4).
-            config: Number of poses.
             stream: Random numbers of the sampler.
+
+        Raises:
+            ConfigError: If the sampler cannot be run.
+        """
+        self._stored, self._sampler = stored, run_own(stored, found, model, X_TO, stream)
+
+    def poses(self) -> Iterator[Array]:
+        """Yield the poses.
 
         Raises:
             ConfigError: If the sampler cannot be run, or yields something other than poses.
         """
-        name = stored.partition("@")[0]
-        sampler = run_own(stored, found, model, X_TO, stream)
-        made = run_own(stored, lambda: list(islice(sampler.poses(), config.max)))
-        self._poses = np.array([_pose(f"{name}: pose {i}", X) for i, X in enumerate(made)]).reshape(
-            -1, 4, 4
-        )
-        self.limit: int | None = len(self._poses)
-        self.log_density = getattr(sampler, "log_density", 0.0)
-        if not isinstance(self.log_density, float) or not math.isfinite(self.log_density):
-            raise ConfigError(f"{name}: log_density must be a finite float, got {self.log_density}")
-
-    def poses(self, count: int) -> Array:
-        """Return the first poses (count, 4, 4)."""
-        return self._poses[:count]
-
-    def counts(self, count: int) -> tuple[int, int, int]:
-        """Return the number of poses three times: poses that were not yielded are unknown."""
-        return count, count, count
+        name = self._stored.partition("@")[0]
+        poses = run_own(self._stored, lambda: iter(self._sampler.poses()))
+        for i in count():
+            X_OG = run_own(self._stored, next, poses, None)
+            if X_OG is None:
+                return
+            yield _pose(f"{name}: pose {i}", X_OG)
 
 
 def _pose(name: str, X_OG: npt.ArrayLike) -> Array:

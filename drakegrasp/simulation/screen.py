@@ -366,23 +366,34 @@ def centred(model: ObjectModel, hand: Hand, attempts: Sequence[Attempt]) -> list
         if attempt.ray_hits and attempt.closing is None and not given:
             groups.setdefault((attempt.preshape, attempt.spread), []).append(row)
 
-    # Move the palms for each motor that moves several fingers.
     for (preshape, spread), rows in groups.items():
-        shaped = hand.at(preshape)
-        shared = [np.flatnonzero(row) for row in shaped.closing_ratio.T > 0.0]
-        shared = [fingers for fingers in shared if len(fingers) > 1]
-        paths = hand_paths(shaped, spread) if shared else None
-        if paths is None:
-            continue
-        X_OG = np.stack([found[row].X_OG for row in rows])
-        for fingers in shared:
-            own = [paths.fingers[i] for i in fingers]
-            ratio = shaped.closing_ratio[fingers].max(axis=1)
-            for _ in range(MOVES):
-                X_OG[:, :3, 3] += _move(model, X_OG, own, ratio)
+        X_OG = centre(model, hand.at(preshape), spread, np.stack([found[row].X_OG for row in rows]))
         for row, X in zip(rows, X_OG, strict=True):
             found[row] = replace(found[row], X_OG=X)
     return found
+
+
+def centre(model: ObjectModel, hand: Hand, spread: float, X_OG: Array) -> Array:
+    """Return palm poses (n, 4, 4) at which fingers that share a motor meet the object together.
+
+    Args:
+        model: The object.
+        hand: The hand in one of its preshapes.
+        spread: Spread [rad].
+        X_OG: (n, 4, 4), palm poses.
+    """
+    shared = [np.flatnonzero(row) for row in hand.closing_ratio.T > 0.0]
+    shared = [fingers for fingers in shared if len(fingers) > 1]
+    paths = hand_paths(hand, spread) if shared else None
+    if paths is None:
+        return X_OG
+    X_OG = X_OG.copy()
+    for fingers in shared:
+        own = [paths.fingers[i] for i in fingers]
+        ratio = hand.closing_ratio[fingers].max(axis=1)
+        for _ in range(MOVES):
+            X_OG[:, :3, 3] += _move(model, X_OG, own, ratio)
+    return X_OG
 
 
 def _move(model: ObjectModel, X_OG: Array, paths: Sequence[FingerPath], ratio: Array) -> Array:

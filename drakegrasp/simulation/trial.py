@@ -7,7 +7,6 @@ A failure of the physics is an outcome, not an exception. So is an error in Drak
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -16,9 +15,8 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
-from drakegrasp.errors import MachineError, first_line
+from drakegrasp.errors import first_line
 from drakegrasp.frames import X_WT, Array
-from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.conditions import Materials, usual_materials
@@ -87,7 +85,6 @@ class TrialRecord:
         X_TO, X_OG: Resting pose of the object and start pose of the palm, (4, 4).
         closed: How the fingers closed.
         lift: How the lift ended.
-        chance: Chance of a sample for a closed hand that may lift; NaN if unknown.
         message: First line of the error for `solver_error`, else empty.
     """
 
@@ -96,7 +93,6 @@ class TrialRecord:
     X_OG: Array
     closed: Closed | None = None
     lift: Lift | None = None
-    chance: float = np.nan
     message: str = field(default="")
 
     @property
@@ -120,8 +116,6 @@ def run_attempt(
     attempt: Attempt,
     config: Config,
     prediction: Prediction | None = None,
-    *,
-    is_visible: Callable[[], bool] = lambda: True,
 ) -> TrialRecord:
     """Simulate one attempt to grasp and lift the object, and return its record.
 
@@ -134,12 +128,9 @@ def run_attempt(
         config: The rules.
         prediction: Result of `predict` for the attempt, if the caller already has it; the record is
             the same without it.
-        is_visible: Returns whether the images of a grasp would make a sample; called for hands that
-            may lift, unless they are audited.
 
     Raises:
         ConfigError: If the hand cannot have the drive that the configuration requests.
-        MachineError: If `is_visible` cannot render.
         MemoryError: If the machine runs out of memory.
         OSError: If a file of the hand cannot be read.
     """
@@ -206,10 +197,14 @@ def run_attempt(
         if verdict != Outcome.SUCCESS:
             return replace(record, outcome=Outcome(int(verdict)))
 
-        return _lift_closed(scene, record, attempt, config, limits, is_visible)
+        return _lift_closed(scene, record, config, limits)
+    except TrialTimeout:
+        return replace(start, outcome=Outcome.TIMEOUT)
+    except (MemoryError, OSError):
+        raise
     # A failed assertion in Drake arrives as SystemExit, everything else as RuntimeError.
     except (Exception, SystemExit) as error:
-        return _failed(start, error)
+        return replace(start, outcome=Outcome.SOLVER_ERROR, message=first_line(error))
 
 
 def _scene_for(scene: Scene, attempt: Attempt) -> Scene:
@@ -219,70 +214,10 @@ def _scene_for(scene: Scene, attempt: Attempt) -> Scene:
     return scene
 
 
-def has_only_scraped(record: TrialRecord) -> bool:
-    """Return whether a hand would have been lifted if it had not scraped the table."""
-    if record.outcome is not Outcome.TABLE_CONTACT or record.closed is None or record.lift:
-        return False
-    # The rule of the table is the last of the rules for closed hands.
-    touched = record.closed.contacts
-    return not touched.hand_on_table
-
-
-def lift_on(
-    scene: Scene,
-    record: TrialRecord,
-    attempt: Attempt,
-    config: Config,
-    *,
-    is_visible: Callable[[], bool] = lambda: True,
-) -> TrialRecord:
-    """Continue an attempt whose hand only scraped the table, as if `scrape_depth` were not set.
-
-    The hand is still closed in the scene: nothing else may have run there since `run_attempt`.
-
-    Args:
-        scene: The scene given to `run_attempt`.
-        record: The record returned by `run_attempt`, see `has_only_scraped`.
-        attempt: See `run_attempt`.
-        config: See `run_attempt`.
-        is_visible: See `run_attempt`.
-
-    Returns:
-        The record with the verdict of the lift.
-    """
-    scene = _scene_for(scene, attempt)
-    close = config.close.model_copy(update={"scrape_depth": None})
-    rules = config.model_copy(update={"close": close})
-    try:
-        return _lift_closed(scene, record, attempt, rules, start_limits(rules), is_visible)
-    except (Exception, SystemExit) as error:
-        return _failed(record, error)
-
-
-def _failed(start: TrialRecord, error: BaseException) -> TrialRecord:
-    """Return the record of an attempt whose simulation failed; raise failures of the machine."""
-    if isinstance(error, TrialTimeout):
-        return replace(start, outcome=Outcome.TIMEOUT)
-    if isinstance(error, MachineError | MemoryError | OSError):
-        raise error
-    return replace(start, outcome=Outcome.SOLVER_ERROR, message=first_line(error))
-
-
 def _lift_closed(
-    scene: Scene,
-    record: TrialRecord,
-    attempt: Attempt,
-    config: Config,
-    limits: TrialLimits,
-    is_visible: Callable[[], bool],
+    scene: Scene, record: TrialRecord, config: Config, limits: TrialLimits
 ) -> TrialRecord:
     """Run an attempt whose closed hand may lift up to its verdict, and return its record."""
-    assert record.closed is not None
-    # Decide from what is known now whether a lift is worthwhile; audited attempts always lift.
-    record = replace(record, chance=_chance(scene, record.X_TO, attempt, record.closed.contacts))
-    if not attempt.audited and (record.chance < config.lift.least_chance or not is_visible()):
-        return replace(record, outcome=Outcome.NOT_LIFTED)
-
     # Lift: object and wrist are free, and the wrist moves to its target.
     end = lift(scene, limits, config)
     record = replace(record, lift=end)
@@ -319,20 +254,6 @@ def start_meetings(scene: Scene, X_TO: Array, attempt: Attempt) -> dict[str, lis
 def _predict(scene: Scene, X_TO: Array, attempt: Attempt, config: Config) -> Prediction | None:
     (prediction,) = predict(scene.model, scene.hand, X_TO, [attempt], config.screen)
     return prediction
-
-
-def _chance(scene: Scene, X_TO: Array, attempt: Attempt, closed: Contacts) -> float:
-    """Return the chance that lifting a closed hand yields a sample; NaN without a model."""
-    model = scene.hand.lift_chance
-    if model is None:
-        return np.nan
-    grasp = ClosedGrasp(
-        **{name: getattr(closed, name) for name in GRASP_CONTACTS},
-        X_TO=X_TO,
-        p_OOcm=scene.model.p_OOcm,
-        friction_hand=np.array(_materials(scene, attempt).friction_hand),
-    )
-    return float(model.of(grasp))
 
 
 def _materials(scene: Scene, attempt: Attempt) -> Materials:

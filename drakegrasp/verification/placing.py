@@ -31,7 +31,7 @@ from drakegrasp.frames import (
     unpack_pose,
 )
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.folder import hand_digest, is_hand
+from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.settings import override_config
 from drakegrasp.simulation.attempts import (
     CONDITIONS,
@@ -71,9 +71,8 @@ class PlacedGrasp:
         stands: The object in its resting pose; in each of its resting poses for a posture that
             names none.
         method: "hand" or "forces" for contacts, "posture" for postures.
-        config: Hand, physics, lift and rules. Settings that end or avoid lifts (`lift.stop_when`,
-            `lift.least_chance`, `lift.least_depth_variance`) have no effect, because the verdict is
-            that of a whole lift.
+        config: Hand, physics, lift and rules. The setting that ends lifts (`lift.stop_when`) has no
+            effect, because the verdict is that of a whole lift.
         snap_points: Whether to move contact points to the surface.
         cameras: Poses X_TC (4, 4) of cameras in whose frames the grasp could be, by the names of
             these frames.
@@ -240,10 +239,10 @@ def dataset_config(
     used = used if hand is None else override_config(used, [], hand=str(hand))
     refuse_other_objects(used, known, "as in the dataset, whose objects are prepared")
     own = hand is None and used.hand == known.hand and digest is not None
-    if own and not is_hand(used.hand_source, digest):
+    if own and (found := hand_digest(used.hand_source)) != digest:
         raise HandError(
             f"{used.hand}: files of the hand must be those of the dataset ({digest}), got others "
-            f"({hand_digest(used.hand_source)}); name the hand to verify with it as it is now"
+            f"({found}); name the hand to verify with it as it is now"
         )
     return used
 

@@ -80,7 +80,6 @@ def read_grasps(
         q_pregrasp=nothing,
         q_squeeze=nothing,
         scale=np.full(count, np.nan),
-        log_density=np.full(count, np.nan),
         said=("",) * count,
         preshape=("",) * count,
         conditions=np.full((count, len(CONDITIONS)), np.nan),

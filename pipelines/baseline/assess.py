@@ -2,10 +2,9 @@
 
   python pipelines/baseline/assess.py classifier.pt OUT/scenes.hdf5 reliability.png
 
-The script judges each grasp of the first round that was lifted to a verdict once, from one view of
-its scene. Refined palm poses near a held grasp are left out: they are never tested, so they cannot
-be samples. The script prints JSON with the AUC and its interval over objects, the Brier score and
-the reliability curve, and draws this curve.
+The script judges each grasp that was lifted to a verdict once, from one view of its scene. It
+prints JSON with the AUC and its interval over objects, the Brier score and the reliability curve,
+and draws this curve.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ from train import judged
 
 import drakegrasp as dg
 from drakegrasp.errors import DrakegraspError
-from drakegrasp.simulation.attempt import Source
 
 #: The two questions that the classifier answers.
 LABELS = ("held", "sample")
@@ -75,13 +73,11 @@ def judge(checkpoint: Path, path: Path, split: str) -> tuple[np.ndarray, np.ndar
 
     # The first view of each scene; `grasps_in` returns all grasps, and only the lifted ones count.
     data = dg.SceneDataset(path, split=split, negatives="tested", positives="held", balance="view")
-    scenes, table = data.tables["views"]["scene"][data.views], data.tables["grasps"]
+    scenes = data.tables["views"]["scene"][data.views]
     chances, labels, objects = [], [], []
     for index in np.unique(scenes, return_index=True)[1].tolist():
         item, grasps = data[index], data.grasps_in(int(data.views[index]))
-        lifted = grasps["tested"] & (
-            table["source"][table["scene"] == scenes[index]] != Source.REFINE
-        )
+        lifted = grasps["tested"]
         batch = {"points": object_points(item["points"], item["on_object"])[None]}
         batch |= {k: grasps[k][lifted][None] for k in ("q", *LABELS)}
         batch["X_TG"] = grasps["X_AG"][lifted][None].astype(np.float32)

@@ -58,7 +58,7 @@ from drakegrasp.simulation.placement import PlacedObject, place_object
 from drakegrasp.simulation.posture import start_of
 from drakegrasp.simulation.scene_cache import cached_scene
 from drakegrasp.simulation.settle import settle
-from drakegrasp.simulation.trial import has_only_scraped, lift_on, run_attempt
+from drakegrasp.simulation.trial import run_attempt
 
 Array = npt.NDArray[np.float64]
 #: Seed of the objects and of all other draws of the data.
@@ -87,8 +87,6 @@ def placed_object(item: BuiltinObject) -> PlacedObject:
         "objects.mass": MASSES[int(u[0] * len(MASSES))],
         "physics.friction_hand": friction,
         "physics.friction_table": friction,
-        "lift.least_chance": 0,
-        "lift.least_depth_variance": 0,
         "lift.stop_when": "never",
     }
     config = dg.load_config("fast", [f"{key}={value}" for key, value in values.items()])
@@ -117,9 +115,17 @@ def tried(placed: PlacedObject, posture: dg.Posture) -> list[bool]:
     start = start_of(posture, load_hand(config.hand_source))
     scene = cached_scene(placed.model, config.physics, config.hand_source, start.preshape)
     trial = run_attempt(scene, placed.X_TO_simulated, start, config)
-    scraped = has_only_scraped(trial)
+    # A hand that only scraped the table while it closed is lifted all the same.
+    scraped = (
+        trial.outcome is Outcome.TABLE_CONTACT
+        and trial.lift is None
+        and trial.closed is not None
+        and not trial.closed.contacts.hand_on_table
+    )
     if scraped:
-        trial = lift_on(scene, trial, start, config)
+        close = config.close.model_copy(update={"scrape_depth": None})
+        rules = config.model_copy(update={"close": close})
+        trial = run_attempt(scene, placed.X_TO_simulated, start, rules)
     removal = judge_sample(placed.model, trial, config)
     return [trial.outcome is Outcome.SUCCESS, removal is Removal.KEPT, scraped]
 

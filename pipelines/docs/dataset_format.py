@@ -42,7 +42,7 @@ images, and `o` is the number of objects in a scene. Frames are explained in
 ```
 OUT/
   manifest.json            configuration, its hash, seed, versions, objects, rejected meshes
-  hand/                    the hand: hand file, model, meshes, weights of lifts, licences
+  hand/                    the hand: hand file, model, meshes, licences
   objects/NAME.npz         an object: meshes, mass, centre of mass, inertia
   objects/NAME.plan.h5     its resting pose and palm poses
   shards/NAME/RANGE.h5     results of one work unit; immutable
@@ -70,8 +70,8 @@ Only the data files, `grasping_*.hdf5`, are needed to train. With `objects/`, `h
 `hand/` is copied when a build begins, and read by workers and by every later command. Files in or
 below the folder of the hand file keep their places and bytes. If a model names files by an absolute
 path, by a path that leads out of its folder, or by `package://`, the model is rewritten, and these
-files are stored in `hand/files/`. `versions` in the manifest contains a digest of hand file, model,
-weights and meshes without their paths. A build continues with a hand of the same digest, wherever
+files are stored in `hand/files/`. `versions` in the manifest contains a digest of hand file, model
+and meshes without their paths. A build continues with a hand of the same digest, wherever
 the hand is and whatever the name of its file; `merge` requires the same digest, and `check`
 compares it. Datasets of version 0.2 and before have no `hand/`: a hand of the package is then the
 installed one, a hand file is read at its path, and a build that continues adds the folder.
@@ -104,11 +104,8 @@ rests on the table then, and the forces of the fingertips need not balance.
 ## Versions of the schema
 
 Files with the `schema_version` above can be read. Any other version is rejected with a message that
-names the file and both versions: build the dataset again, in another directory. Version 4 added
-resting poses, sampler, refined palm poses, weights, chance and audit. Version 2 had no conditions
-of an attempt, and no mass, density, friction, scale and axis of each object. Version 1 also had
-other labels: it counted fingers that the object pushed open, and contacts anywhere on a fingertip's
-link.
+names the file and both versions: build the dataset again, in another directory. The
+[changelog](../../CHANGELOG.md) states what each version changed.
 
 ## Seals
 

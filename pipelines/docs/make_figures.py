@@ -63,9 +63,7 @@ def draw_candidates(prepared: PreparedObject, rays: int, png: Path) -> None:
     for method, title in METHODS.items():
         overrides = [f"candidates.method={method}", f"candidates.max={10 * rays}"]
         config = load_config(None, overrides)
-        candidates = sample_candidates(
-            prepared.model, prepared.X_TO, config.candidates, config.seed
-        )
+        candidates = sample_candidates(prepared.model, prepared.X_TO, config)
         drawn[title] = palm_rays(candidates, max(config.candidates.standoffs), rays)
     model = prepared.model
     save_figure(palm_poses_figure(model.visual_vertices, model.visual_faces, drawn), png, dpi=130)

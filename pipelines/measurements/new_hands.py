@@ -1,9 +1,9 @@
 """Draft hands from the models of dex-urdf, build a small dataset with each, and try it again.
 
 Input: a checkout of dexsuite/dex-urdf and a folder of meshes in metres. Output: a table in
-Markdown, which reports the results of the first palm poses and of those refined about samples, and
-how many samples hold again if their palm poses and joints are passed back as postures. Steps whose
-results already exist are skipped. HAND may also be a hand of the package.
+Markdown, which reports the results, and how many samples hold again if their palm poses and joints
+are passed back as postures. Steps whose results already exist are skipped. HAND may also be a hand
+of the package.
 
     python pipelines/measurements/new_hands.py DEX_URDF MESHES [HAND...] --out FOLDER
 """
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.statistics import count_funnel, count_splits
+from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.filters import Removal
@@ -43,7 +43,7 @@ HANDS = {
 MASS, MOST_AGAIN = 0.3, 40
 HEADS = (
     *("hand", "attempts", "held", "precision", "stable", "samples"),
-    *("with refinement: attempts", "held", "samples", "in effect", "held again as postures"),
+    "held again as postures",
 )
 
 
@@ -78,8 +78,8 @@ def measure(name: str, arguments: argparse.Namespace) -> list[str]:
         _run("build", *build, "--candidates", arguments.candidates, "--out", folder / "data")
         again = "-"
         if count := write_postures(folder / "data", folder / "samples.npz"):
-            given = ["--postures", folder / "samples.npz", "--set", "refine.children=0"]
-            _run("build", *build, *given, "--out", folder / "again")
+            given = ["--postures", folder / "samples.npz", "--out", folder / "again"]
+            _run("build", *build, *given)
             outcomes = Trials(folder / "again")["outcome"]
             again = f"{np.count_nonzero(outcomes == Outcome.SUCCESS)} of {count}"
         return [*_counts(folder / "data"), again]
@@ -88,20 +88,16 @@ def measure(name: str, arguments: argparse.Namespace) -> list[str]:
 
 
 def _counts(out: Path) -> list[str]:
-    """Return the results of a dataset's first palm poses, and of all its palm poses."""
+    """Return the results of a dataset."""
     funnel = count_funnel(out)
-    first = (
+    counts = (
         funnel.outcomes.sum(),
         funnel.outcomes[:, Outcome.SUCCESS].sum(),
         funnel.precision.sum(),
         funnel.stable.sum(),
-        funnel.removals[:, Removal.KEPT].sum(),
+        funnel.samples.sum(),
     )
-    attempts, held, samples = (
-        first[i] + funnel.refined[:, j].sum() for i, j in ((0, 0), (1, 1), (4, 2))
-    )
-    effective = sum(s.effective for s in count_splits(out) if s.samples)
-    return [f"{int(n):,}" for n in (*first, attempts, held, samples)] + [f"{effective:.0f}"]
+    return [f"{int(n):,}" for n in counts]
 
 
 def write_postures(out: Path, path: Path) -> int:

@@ -125,8 +125,8 @@ def try_again(
     """
     row = Trials(out).trial(trial_id)
     model = prepared(row["object_name"])
-    candidate, standoff, child = (int(row[k]) for k in ("candidate", "standoff_index", "child"))
-    attempt = find_attempt(model, candidate, standoff, child, stored)
+    candidate, standoff = (int(row[k]) for k in ("candidate", "standoff_index"))
+    attempt = find_attempt(model, candidate, standoff, stored)
     known = attempt.conditions or usual_conditions(model.model, stored.physics)
     X_TO = model.resting_poses[attempt.resting]
     hand = load_hand(stored.hand_source)
@@ -141,13 +141,12 @@ def try_again(
         return {"change": change, **told, "seconds": spent, **measured(hand, record)}
 
     if other is not None:
-        # Every hand that may lift does so, whatever its chance, because verdicts are compared.
         # Friction and mass are those of the requested settings.
         asked = {"physics": other.physics, "randomize": other.randomize}
         rules = stored.model_copy(update=asked)
-        again = find_attempt(model, candidate, standoff, child, rules)
+        again = find_attempt(model, candidate, standoff, rules)
         both = ((STORED, attempt, stored), (SET, again, other))
-        return [once(name, replace(each, audited=True), by) for name, each, by in both]
+        return [once(name, each, by) for name, each, by in both]
     whole = with_whole_lifts(stored)
     half = {"time_step": whole.physics.time_step / 2.0, "coarse_steps": 1}
     finer = whole.model_copy(update={"physics": whole.physics.model_copy(update=half)})

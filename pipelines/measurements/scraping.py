@@ -109,17 +109,17 @@ def summarise(rows: list[dict[str, Any]], limit: float) -> dict[str, Any]:
 
 def measure(out: Path, trials: list[int]) -> Iterator[dict[str, Any]]:
     """Yield the computed and stored heights of each trial [m], by "close" and "lift"."""
-    manifest, names = read_manifest(out), ("object", "candidate", "standoff_index", "child")
+    manifest, names = read_manifest(out), ("object", "candidate", "standoff_index")
     with h5py.File(out / TRIALS_FILE, "r") as file:
         objects = file["objects/name"].asstr()[:]
         stored = {f"clearance_{w}": file[f"trials/clearance_{w}"][:] for w in ("close", "lift")}
         keys = np.column_stack([file[f"trials/{name}"][:] for name in names])
     for trial in trials:
-        k, candidate, standoff, child = keys[trial].tolist()
+        k, candidate, standoff = keys[trial].tolist()
         name = str(objects[k])
         config = manifest.config_of(name)
         prepared = load_prepared(out, name, config)
-        attempt = find_attempt(prepared, candidate, standoff, child, config)
+        attempt = find_attempt(prepared, candidate, standoff, config)
         hand = load_hand(config.hand_source)
         if drive.drive_of(hand, config.lift) != "worm":
             raise click.UsageError("the hand must have worm drives")

@@ -79,7 +79,7 @@ def repeated(prepared: PreparedObject, name: str, count: int) -> PreparedObject:
     """Return an object under another name, whose palm poses are repeated up to a number."""
     candidates = prepared.candidates
     rows = np.arange(count) % len(candidates)
-    columns = ("X_OG", "distance", "resting", "source", "log_density")
+    columns = ("X_OG", "distance", "resting", "source")
     return replace(
         prepared,
         model=replace(prepared.model, name=name),

@@ -23,10 +23,7 @@ def make_funnel(outcomes: np.ndarray, *names: str, **counts: np.ndarray) -> Funn
         "precision": none,
         "stable": none,
         "removals": np.zeros((len(names), 1 + max(Removal)), dtype=np.int64),
-        "refined": np.zeros((len(names), 3), dtype=np.int64),
-        "untested": none,
-        "audited": np.zeros((len(names), 4), dtype=np.int64),
-        "preshapes": np.zeros((256, 5), dtype=np.int64),
+        "preshapes": np.zeros((256, 4), dtype=np.int64),
     }
     return Funnel(
         names=names,
@@ -61,25 +58,13 @@ def test_hold_table_tells_what_share_of_the_held_ones_is_stable() -> None:
     assert ["1_mug", "1,200", "20", "12", "9", "45%", "12"] in cells(text)
     assert ["2_[box]", "7", "0", "0", "0", "-", "0"] in cells(text)
     assert ["all", "1,207", "20", "12", "9", "45%", "12"] in cells(text)
-    assert "lower bound" not in text and "audit" not in text
+    assert "lower bound" not in text
 
     # What was ended might have been held.
     outcomes[1, Outcome.MOVED] = 1234
     text = printed(hold_table(funnel))
     assert "lower bound" in text
     assert "1,234 lifts ended early" in " ".join(text.split())
-
-
-def test_share_of_stable_ones_is_that_of_audited_lifts_where_lifts_were_chosen() -> None:
-    outcomes = np.zeros((1, 1 + max(Outcome)), dtype=np.int64)
-    outcomes[0, [Outcome.SUCCESS, Outcome.NOT_LIFTED]] = 20, 100
-    held = {"precision": np.array([12]), "stable": np.array([9])}
-    funnel = make_funnel(outcomes, "1_mug", audited=np.array([[11, 5, 4, 3]]), **held)
-    text = printed(hold_table(funnel))
-    assert ["1_mug", "120", "20", "12", "9", "4", "of", "5,", "80%", "0"] in cells(text)
-    text = " ".join(text.split())
-    assert "audit: one attempt in ten, drawn at random, is lifted" in text
-    assert "100 closed hands did not lift" in text and "11 lifts of the audit" in text
 
 
 @pytest.mark.parametrize("compact", [False, True])
@@ -110,7 +95,7 @@ def test_columns_of_the_funnel_add_up_to_the_attempts(compact: bool) -> None:
 
 
 def test_preshape_table_has_a_row_of_each_and_says_which_is_of_none() -> None:
-    counts = [PreshapeCount("[red]", 1200, 7, 5, 0, 4), PreshapeCount(NO_NAME, 3, 1, 0, 0, 0)]
+    counts = [PreshapeCount("[red]", 1200, 7, 5, 4), PreshapeCount(NO_NAME, 3, 1, 0, 0)]
     text = printed(preshape_table(counts))
     assert ["[red]", "1,200", "7", "5", "4"] in cells(text)
     assert [NO_NAME, "3", "1", "0", "0"] in cells(text)

@@ -55,11 +55,9 @@ SAMPLE = [
     "scenes.when=assembled",
     "scenes.views=1",
 ]
-#: Every kind of step of a unit: also a palm pose about that of the sample, and certificates.
+#: Every kind of step of a unit: also certificates.
 EVERY_STEP = [
     *SAMPLE,
-    "refine.children=1",
-    "refine.generations=1",
     "certify.repeats=1",
     "certify.share=1",
 ]
@@ -255,7 +253,6 @@ def test_every_kind_of_task_gives_the_same_bytes(
     assert_same_files(here, out)
     with h5py.File(out / "trials.hdf5") as file:
         assert file["trials/outcome"][0] == Outcome.SUCCESS
-        assert (file["trials/child"][:] > 0).any() == bool(config.refine.children)
 
 
 @pytest.mark.nightly

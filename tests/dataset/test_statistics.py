@@ -63,15 +63,7 @@ def test_words_of_a_build_that_runs_are_those_of_its_shards(out: Path) -> None:
     assert not unfinished.funnel.removals[:, Removal.KEPT].any()
 
 
-def test_audited_attempts_of_the_first_round_are_counted(out: Path) -> None:
-    """Of the first object a sample, a lost lift and a missed one; the fourth is refined."""
-    for row in (SUCCESS, SLIPPED, MISSING, 3):
-        change(out, TRIALS, "trials/audited", row, lambda _: True)
-    change(out, TRIALS, "trials/generation", 3, lambda _: 1)
-    assert count_funnel(out).audited.tolist() == [[2, 1, 1, 1], [0] * 4, [0] * 4]
-
-
-def test_attempts_of_the_first_round_are_counted_by_preshape(out: Path, tmp_path: Path) -> None:
+def test_attempts_are_counted_by_preshape(out: Path, tmp_path: Path) -> None:
     """Of the second preshape a success that is stable and one that is not, and a missed attempt."""
     for row in (SUCCESS, 3, MISSING):
         change(out, TRIALS, "trials/preshape", row, lambda _: 1)
@@ -81,30 +73,21 @@ def test_attempts_of_the_first_round_are_counted_by_preshape(out: Path, tmp_path
     hand = write_with_preshapes(tmp_path, all="F1 F2 F3", pair="F1 F3")
     counts = preshapes_of(funnel, load_config(overrides=[f"hand={hand}"]))
     assert counts == [
-        PreshapeCount("all", 32, 7, 7, 0, 7),
-        PreshapeCount("pair", 3, 2, 1, 0, 2),
-        PreshapeCount(NO_NAME, 1, 0, 0, 0, 0),
+        PreshapeCount("all", 32, 7, 7, 7),
+        PreshapeCount("pair", 3, 2, 1, 2),
+        PreshapeCount(NO_NAME, 1, 0, 0, 0),
     ]
     assert preshapes_of(funnel, load_config()) == []
-    change(out, TRIALS, "trials/generation", 3, lambda _: 1)
-    refined = preshapes_of(count_funnel(out), load_config(overrides=[f"hand={hand}"]))[1]
-    assert refined == PreshapeCount("pair", 2, 1, 1, 1, 2)
 
 
 def test_samples_are_as_many_wherever_they_are_counted(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two of the first object's and one of the third's are refined."""
-
     def leave_out(*_: object) -> None:
         raise DataError("it counts no samples")
 
     for name in ("_phases", "_approaches", "_classes", "_distributions"):
         monkeypatch.setattr(f"drakegrasp.pictures.figures.{name}", leave_out)
-    with h5py.File(out / TRIALS) as file:
-        rows, objects = file["successes/trial_id"][:], file["trials/object"][:]
-    for row in (*rows[objects[rows] == 0][:2], rows[objects[rows] == 2][0]):
-        change(out, TRIALS, "trials/generation", int(row), lambda _: 1)
 
     # The data file says which are samples.
     found: Counter[str] = Counter()
@@ -112,7 +95,6 @@ def test_samples_are_as_many_wherever_they_are_counted(
         data = GraspDataset(out / "grasping_oto.hdf5", split=split)
         found.update(map(str, data.column("object_props/object_name")))
     funnel = count_funnel(out)
-    assert funnel.refined[:, 2].tolist() == [2, 0, 1]
     assert dict(zip(funnel.names, funnel.samples.tolist(), strict=True)) == found
     total = found.total()
     assert sum(row.samples for row in count_splits(out)) == total
@@ -131,7 +113,7 @@ def test_samples_are_as_many_wherever_they_are_counted(
     write_figures(out, tmp_path / "figures")
     numbers = json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())
     assert {name: row["samples"] for name, row in numbers["objects"].items()} == found
-    assert (numbers["hold"]["samples"], numbers["hold"]["of these refined"]) == (total, 3)
+    assert numbers["hold"]["samples"] == total
     assert np.count_nonzero(Catalog(out).current().table.split != NONE) == total
 
 
@@ -217,18 +199,17 @@ def test_advice_names_no_way_that_was_gone_already() -> None:
     assert "filters.min_depth_variance=0`" in why_no_sample(tried, removed, config).advice
 
 
-def test_refined_samples_are_samples(sound: Path) -> None:
+def test_objects_without_samples_are_named(sound: Path) -> None:
     funnel = count_funnel(sound)
+    assert not objects_without_samples(funnel, load_config())
     funnel.removals[1, Removal.KEPT] = 0
     assert list(objects_without_samples(funnel, load_config())) == [funnel.names[1]]
-    funnel.refined[1, 2] = 1
-    assert not objects_without_samples(funnel, load_config())
 
 
 def counts(train: int, valid: int, test: int) -> list[SplitCount]:
     numbers = {"train": train, "valid": valid, "test": test}
     return [
-        SplitCount(split=name, samples=n, effective=float(n), objects=min(n, 1), classes=1)
+        SplitCount(split=name, samples=n, objects=min(n, 1), classes=1)
         for name, n in numbers.items()
     ]
 
@@ -248,22 +229,3 @@ def test_split_that_is_not_as_asked_is_told() -> None:
     assert "no sample is in valid." in split_shortfall(counts(4, 0, 2), "class", config)
     assert "no sample is for training" in split_shortfall(counts(0, 0, 9), "class", config)
     assert split_shortfall(counts(0, 0, 0), "class", config) == ""
-
-
-def test_refined_grasps_that_no_split_has_are_the_reason(out: Path) -> None:
-    """Of a tested object of which the first round has no sample."""
-    with h5py.File(out / TRIALS) as file:
-        rows, objects = file["successes/trial_id"][:], file["trials/object"][:]
-    own = np.flatnonzero(objects[rows] == 2)
-    for success, row in zip(own.tolist(), rows[own].tolist(), strict=True):
-        change(out, TRIALS, "trials/generation", row, lambda _: 1)
-        change(out, TRIALS, "successes/removal", success, lambda _: Removal.REFINED_TEST)
-    found = {}
-    for few in ("null", "1"):
-        config = load_config(overrides=[f"samples_per_object={few}"])
-        found[few] = objects_without_samples(count_funnel(out), config)
-    name = count_funnel(out).names[2]
-    assert list(found["1"]) == [name]
-    begin = f"{len(own)} refined grasps would be samples"
-    assert len(own) > 1 and found["1"][name].reason.startswith(begin)
-    assert ["--samples-per-object" in found[few][name].advice for few in found] == [False, True]

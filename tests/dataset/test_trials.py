@@ -85,8 +85,6 @@ def test_what_is_derived_is_that_of_the_other_groups_and_files(sound: Path) -> N
         ),
         ({"object_name": "2_box_b"}, "object", [1]),
         ({"class_name": "box"}, "object", [0, 1]),
-        ({"refined": False}, "generation", [0]),
-        ({"refined": True}, "generation", []),
     ],
     ids=str,
 )

@@ -49,7 +49,6 @@ def arrays() -> dict[str, Any]:
         "q_squeeze": SQUEEZE[:, ::-1],
         "joints": np.array(ORDER[::-1]),
         "resting": np.array([0, 2]),
-        "log_density": np.array([-1.0, np.nan]),
         "source": np.array(["net 7", ""]),
     }
 
@@ -76,7 +75,7 @@ def columns() -> dict[str, list[Any]]:
     for stage, q in (("grasp", GRASP), ("pregrasp", PREGRASP), ("squeeze", SQUEEZE)):
         for joint, values in zip(ORDER, q.T, strict=True):
             table[f"{stage}_{joint}"] = values.tolist()
-    return table | {"resting": [0, 2], "log_density": [-1.0, None], "source": ["net 7", ""]}
+    return table | {"resting": [0, 2], "source": ["net 7", ""]}
 
 
 def test_a_file_for_a_score_is_built_by_the_objects_that_it_names(tmp_path):
@@ -156,7 +155,6 @@ def test_own_layouts_say_the_same(tmp_path, write):
     np.testing.assert_array_equal(table.q_grasp, GRASP)
     np.testing.assert_array_equal(table.q_pregrasp, PREGRASP)
     np.testing.assert_array_equal(table.q_squeeze, SQUEEZE)
-    np.testing.assert_array_equal(table.log_density, [-1.0, np.nan])
 
 
 def test_all_that_is_known_is_written(tmp_path):
@@ -168,7 +166,6 @@ def test_all_that_is_known_is_written(tmp_path):
         **{f"q_{stage}": q + 0.01 * i for i, stage in enumerate(("grasp", "pregrasp", "squeeze"))},
         "X_TO": np.tile(make_pose(np.eye(3), [0.0, 0.0, 0.1]), (3, 1, 1)),
         "scale": np.array([1.0, np.nan, 0.01]),
-        "log_density": np.array([0.0, -1.0, np.nan]),
         **{name: np.array([0.5, np.nan, 0.2]) for name in CONDITIONS},
         "confidence": np.array([0.9, 0.5, 0.1]),
     }
@@ -423,7 +420,6 @@ def test_joints_before_a_grasp_without_joints_are_refused(tmp_path):
         ({"q_grasp": [np.nan, 1.0]}, "q_grasp must be finite numbers, got others"),
         ({"X_FG": [2.0, 1.0]}, "the palm's pose must have 0 0 0 1 as its last row"),
         ({"resting": np.array([0.5, 2.0])}, "resting must be the index of a resting pose, got 0.5"),
-        ({"log_density": np.array([np.inf, 0.0])}, "log_density must be finite numbers"),
     ],
 )
 def test_bad_row_of_arrays_has_its_reason_and_spoils_no_other(tmp_path, changes, reason):

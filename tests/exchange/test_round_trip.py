@@ -44,7 +44,7 @@ from drakegrasp.simulation.posture import joint_order
 NAME, HAND = "1_brick_a", "allegro_four"
 #: What decides verdicts and is in no file that was exported.
 RULES = (
-    *("refine.children=0", "camera.size=32", f"hand={HAND}", "lift.stop_when=never"),
+    *("camera.size=32", f"hand={HAND}", "lift.stop_when=never"),
     *("lift.max_speed=1", "lift.max_acceleration=4", "lift.hold_time=0.1"),
 )
 #: What decides the objects; --object has other values.
@@ -57,7 +57,6 @@ SAMPLES = (
     "filters.min_camera_height=-1",
     "filters.max_surface_distance=1",
     "filters.max_normal_angle_deg=null",
-    *("lift.least_chance=0", "lift.least_depth_variance=0"),
 )
 
 #: Formats of an export that only go out: contacts, meshes, pictures, scenes, or episodes, from

@@ -327,7 +327,7 @@ def test_replay_gives_the_same_bits(small_dataset: Path, stage: str) -> None:
 
 def test_replay_says_what_differs(out: Path) -> None:
     """In every column, but for those that say which attempt it is."""
-    names = {f.name for f in trial_columns()} - {"candidate", "standoff_index", "child"}
+    names = {f.name for f in trial_columns()} - {"candidate", "standoff_index"}
     with h5py.File(out / "trials.hdf5", "r+") as file:
         number = int(np.flatnonzero(file["trials/outcome"][:] == Outcome.SUCCESS)[0])
         names &= set(file["trials"])
@@ -342,12 +342,6 @@ def test_replay_says_what_differs(out: Path) -> None:
     assert again.differences["spread"] == again.differences["outcome"] == pytest.approx(1.0)
     with pytest.raises(DataError, match="trial must be 0 to 143, got 144"):
         replay_trial(out, 144)
-
-    # Nothing was refined here.
-    with h5py.File(out / "trials.hdf5", "r+") as file:
-        file["trials/child"][number] = 1
-    with pytest.raises(DataError, match="child must be 0 to 0, got 1"):
-        replay_trial(out, number)
 
 
 def test_wrong_use_of_workers_is_refused(tmp_path: Path, small_meshes: Path) -> None:

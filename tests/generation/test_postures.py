@@ -90,7 +90,6 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Attempts:
         [attempt.X_OG, attempt.X_OG, inside, below],
         [coupled, bent, coupled, coupled],
         q_pregrasp=[opened, bent - 0.3 * (bent - opened), nothing, nothing],
-        log_density=[-2.0, np.nan, np.nan, np.nan],
         said=["mine", "", "", ""],
     )
 
@@ -116,7 +115,6 @@ def test_each_row_is_an_attempt_with_its_outcome(dataset):
         (Outcome.START_COLLISION, 2, 0, 2.0, False, Source.POSTURES),
         (Outcome.BELOW_TABLE, 3, 0, 3.0, False, Source.POSTURES),
     ]
-    np.testing.assert_array_equal(trials["log_density"], [-2.0, np.nan, np.nan, np.nan])
 
 
 def test_dataset_is_sound(dataset):

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +16,7 @@ from drakegrasp.errors import DiskFullError, HandError
 from drakegrasp.hand import folder as carrying
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import MODELS
-from drakegrasp.hand.folder import carry_hand, hand_digest, hand_folder, is_hand
-from drakegrasp.hand.lift_chance import read_lift_chance
+from drakegrasp.hand.folder import carry_hand, hand_digest, hand_folder
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.shapes import link_shapes
 
@@ -73,7 +70,6 @@ def test_the_copy_loads_by_itself_as_the_same_hand(layout: str, tmp_path: Path) 
     shapes = link_shapes(known.model)
     copy = carried_source(tmp_path / "out", load_config(hand=str(path)))
     assert copy.digest == digest == hand_digest(copy)
-    assert is_hand(copy, digest) and is_hand(path, digest)
 
     assert copy.path.read_text().startswith("# Measured by hand.\n")
 
@@ -116,16 +112,6 @@ def test_materials_textures_and_licences_come_along(tmp_path: Path) -> None:
     assert (copied.parent / "skin.png").read_bytes() == b"a picture"
     assert (folder / "LICENSE.txt").read_text() == "\nMIT License\n"
     assert (folder / "LICENSE-mentioned.txt").read_text() == "README.md: Licence: Apache-2.0\n"
-
-
-def test_the_digest_of_older_datasets_is_known(tmp_path: Path) -> None:
-    """It was taken of the model as it is, also where the copy's is rewritten."""
-    path = write_layout(tmp_path, "package")
-    files = path, path.parent / "../vendor/urdf/pincer.sdf", tmp_path / "vendor/meshes/palm.obj"
-    older = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
-    assert older != hand_digest(path)
-    assert is_hand(path, older)
-    assert not is_hand(path, older[::-1])
 
 
 def change(path: Path, before: str, after: str) -> None:
@@ -230,14 +216,3 @@ def test_an_include_in_a_model_comes_along(tmp_path: Path) -> None:
     (tmp_path / "part.sdf").write_text("<sdf/>")
     folder = hand_folder(path)
     assert folder.content("part.sdf") == b"<sdf/>" and folder.digest != before
-
-
-def test_weights_of_a_hand_are_copied_and_counted(tmp_path: Path) -> None:
-    """The copy of the Barrett Hand knows the chance of a lift; other weights are another hand."""
-    folder = hand_folder("barrett")
-    assert folder.files["barrett_chance.yaml"] == MODELS / "barrett_chance.yaml"
-    copy = carried_source(tmp_path / "out", load_config())
-    known = read_lift_chance("barrett")
-    assert known is not None and read_lift_chance(copy) == known
-    chance = replace(folder, files=folder.files | {"barrett_chance.yaml": MODELS / "table.urdf"})
-    assert chance.digest != folder.digest

@@ -98,7 +98,6 @@ def test_preshapes_are_drawn_after_the_spreads() -> None:
         distance=np.ones(count),
         resting=np.zeros(count, dtype=np.int64),
         source=np.zeros(count, dtype=np.int64),
-        log_density=np.zeros(count),
         combinations=count,
         valid=count,
         distinct=count,

@@ -24,10 +24,9 @@ from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import DIGEST, Manifest, installed_versions, write_manifest
 from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.prepared_objects import PreparedObject, save_prepared
-from drakegrasp.dataset.schema import LOOK_FIELDS, TRIAL_FIELDS, sizes
+from drakegrasp.dataset.schema import LOOK_FIELDS, sizes
 from drakegrasp.dataset.shards import Shard, ShardHeader, trial_columns, write_shard
 from drakegrasp.frames import Array, invert_pose, make_pose, pack_pose, rotation_about, unpack_pose
-from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp, read_lift_chance
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
@@ -157,7 +156,6 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
         "standoff_index": number % 3,
         "spread": 0.1,
         "seed": 7,
-        "log_density": 0.0,
         "outcome": outcome,
         "X_TO": pack_pose(X_TO),
         "X_OG": pack_pose(invert_pose(X_TO) @ X_TG),
@@ -173,14 +171,13 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
         row |= {"closed_other_links": outcome is Outcome.HAND_CONTACT}
         row["closed_hand_on_table"] = outcome is Outcome.TABLE_CONTACT and not after_lift
     if stage >= Stage.LIFTED:
-        row["chance"] = chance_of(model, row)
-    if stage >= Stage.LIFTED:
         touch = touch & (outcome is not Outcome.DROPPED)
         touch[0] &= outcome is not Outcome.SLIPPED
         row |= {f"lifted_{k}": v for k, v in contacts(model, touch, SLIP, 1.25).items()}
         row["lifted_q"] = np.full(SIZES["j"], 0.6)
         row |= {"time_lift": 1.0, "clearance_lift": clearance}
-        row["lifted_object_on_table"] = after_lift
+        # A grasp that slipped holds nothing; in the air it would be partly held.
+        row["lifted_object_on_table"] = after_lift or outcome is Outcome.SLIPPED
         row |= {"surface_distance": np.zeros(3), "normal_angle": np.zeros(3), **hold(row)}
         raised = make_pose(np.eye(3), [0.0, 0.0, 0.25]) @ X_TG
         row["X_TO_lifted"] = pack_pose(raised @ invert_pose(unpack_pose(row["X_OG_lifted"])))
@@ -197,16 +194,6 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
     return {**told, **row} if stage > Stage.PLACED else row
 
 
-def chance_of(model: ObjectModel, row: dict[str, Any]) -> float:
-    """Return the chance of a sample of a hand that has closed as a row of `/trials` says."""
-    known = read_lift_chance("barrett")
-    assert known is not None
-    closed = {name: row[f"closed_{name}"] for name in GRASP_CONTACTS}
-    X_TO, friction = unpack_pose(row["X_TO"]), np.array(row["friction_hand"])
-    grasp = ClosedGrasp(**closed, X_TO=X_TO, p_OOcm=model.p_OOcm, friction_hand=friction)
-    return float(known.of(grasp))
-
-
 def make_shard(model: ObjectModel, header: ShardHeader, X_TO: Array, config: Config) -> Shard:
     camera = config.camera
     numbers = range(3 * header.start, 3 * header.stop)
@@ -215,8 +202,6 @@ def make_shard(model: ObjectModel, header: ShardHeader, X_TO: Array, config: Con
     for i, row in enumerate(rows):
         for name, value in row.items():
             trials[name][i] = value
-    if config.close.scrape_depth is None:  # shards of versions without it lack the columns
-        trials = {n: values for n, values in trials.items() if not n.startswith("clearance_")}
     hits = [i for i, row in enumerate(rows) if row["outcome"] is Outcome.SUCCESS]
     looks = {f.name: f.empty(len(hits), SIZES) for f in LOOK_FIELDS}
     for k, i in enumerate(hits):
@@ -242,7 +227,6 @@ def resting(model: ObjectModel, X_TO: Array) -> PreparedObject:
         distance=np.full(4, np.nan),
         resting=np.zeros(4, dtype=np.int64),
         source=np.zeros(4, dtype=np.int64),
-        log_density=np.zeros(4),
         combinations=4,
         valid=4,
         distinct=4,
@@ -319,16 +303,6 @@ def end_lift(out: Path, row: int, slip: float) -> None:
         X_OG = unpack_pose(trials["X_OG"][row])
         trials["X_OG_lifted"][row] = pack_pose(X_OG @ invert_pose(turn))
         trials["slip"][row], trials["outcome"][row] = slip, Outcome.MOVED
-
-
-def leave_closed(out: Path, row: int) -> None:
-    """Let the hand of a row of /trials have closed and lifted nothing."""
-    with h5py.File(out / TRIALS, "r+") as file:
-        trials = file["trials"]
-        for field in TRIAL_FIELDS:
-            if field.stage is Stage.LIFTED and field.name in trials:
-                trials[field.name][row] = field.empty(1, SIZES)[0]
-        trials["outcome"][row] = Outcome.NOT_LIFTED
 
 
 Edit = Callable[[np.ndarray], Any]

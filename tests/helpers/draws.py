@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from drakegrasp.simulation.above import Above
 from threadpoolctl import threadpool_info
 
 from drakegrasp.config import BuiltinConfig, SplitConfig
@@ -28,9 +29,9 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.seeding import Stream
 from drakegrasp.shapes.catalog import export_builtin
-from drakegrasp.simulation.above import Above
-from drakegrasp.simulation.candidates import normal_candidates, palm_motion, standoff_attempts
+from drakegrasp.simulation.candidates import normal_candidates, standoff_attempts
 from drakegrasp.simulation.conditions import draw_conditions
+from drakegrasp.simulation.palms import palm_motion
 from drakegrasp.simulation.robustness import _noise_factor
 from drakegrasp.simulation.samplers import rotation_candidates
 from drakegrasp.simulation.screen import predict
@@ -98,7 +99,7 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     yield "conditions", digest(*(np.array([d[name] for d in drawn]) for name in drawn[0]))
     yield "normals", digest(normal_candidates(model, 1000, Stream(7)))
     above = Above(model, make_pose(R_WO, [0.1, 0.2, 0.3]), config.candidates, Stream(7))
-    yield "above", digest(above.poses(1000), np.array(above.log_density))
+    yield "above", digest(above.poses(1000))
     predictions = predict(model, hand, prepared.X_TO, attempts[:PREDICTED], config.screen)
     yield (
         "predictions",

@@ -36,10 +36,8 @@ from drakegrasp.shapes.catalog import builtin_sources
 #: Arrays by name: "build/trials/slip", "score/sets/...".
 Pins: TypeAlias = dict[str, np.ndarray]
 
-#: Objects of the dataset of which scenes, verdicts and a score are made, palm poses of each, and
-#: fewer children of samples than the preset has.
+#: Objects of the dataset of which scenes, verdicts and a score are made, and palm poses of each.
 OBJECTS, CANDIDATES = ("24_carton_1", "33_boot_1"), 16
-FEW_CHILDREN = ("--set", "refine.children=1", "--set", "refine.generations=1")
 #: The presets with the palm poses of their one work unit.
 UNITS = {"paper": 6, "randomized": 12, "released": 6}
 UNIT_OBJECT = "4_wineglass_1"
@@ -108,7 +106,7 @@ def leaves(value: Any, name: str) -> Pins:
 def everything(folder: Path) -> Pins:
     """Return all pins; `folder` is empty."""
     out = folder / "fast"
-    found = build(out, "fast", CANDIDATES, OBJECTS, FEW_CHILDREN)
+    found = build(out, "fast", CANDIDATES, OBJECTS)
     command("scenes", out, "--workers", 1, "--quiet")
     found |= arrays(out / "scenes.hdf5", "scenes")
     split = most_samples(out)
@@ -122,9 +120,7 @@ def everything(folder: Path) -> Pins:
 def few(folder: Path) -> Pins:
     """Return a few pins in seconds, of one work unit of preset `fast`; `folder` is empty."""
     rules = ["candidates.max=2", "unit_candidates=2", "objects.resting_poses=1"]
-    rules += [
-        f"{name}=1" for name in ("builtin.per_class", "refine.children", "refine.generations")
-    ]
+    rules.append("builtin.per_class=1")
     config, out = drakegrasp.load_config("fast", overrides=rules), folder / "out"
     sources = builtin_sources(folder / "meshes", config.builtin, only=OBJECTS[:1])
     build_here(sources, out, config, run_here, show=False)
@@ -135,15 +131,13 @@ def few(folder: Path) -> Pins:
     return dataset(out, "few") | calls(out, split) | leaves(card, "score")
 
 
-def build(
-    out: Path, preset: str, candidates: int, objects: Sequence[str], more: Sequence[str] = ()
-) -> Pins:
+def build(out: Path, preset: str, candidates: int, objects: Sequence[str]) -> Pins:
     """Build a dataset of built-in objects by a preset; return its arrays."""
     only = [word for name in objects for word in ("--only", name)]
     units = ("--set", "unit_candidates=20", "--set", "objects.resting_poses=2")
     size = ("--candidates", candidates, "--per-class", 1, "--workers", 1)
     source = ("--objects", "builtin", "--config", preset, "--out", out)
-    command("build", *source, *only, *size, *units, *more, "--quiet")
+    command("build", *source, *only, *size, *units, "--quiet")
     return dataset(out, preset)
 
 

@@ -15,7 +15,6 @@ def good(count: int) -> Table:
         object=np.zeros(count, dtype=np.int32),
         candidate=np.arange(count, dtype=np.int32),
         standoff_index=np.zeros(count, dtype=np.uint8),
-        child=np.zeros(count, dtype=np.int32),
         resting=np.zeros(count, dtype=np.uint8),
         X_OG=np.tile(np.eye(4), (count, 1, 1)),
         grasp_T=rng.normal(size=(count, 18)),

@@ -195,7 +195,6 @@ def test_rays_end_on_the_surface(sound: Path) -> None:
         distance=np.array([0.25, np.nan, 0.45]),
         resting=np.zeros(3, dtype=np.int64),
         source=np.zeros(3, dtype=np.int64),
-        log_density=np.zeros(3),
         combinations=3,
         valid=3,
         distinct=3,

@@ -12,8 +12,8 @@ from helpers.hands import write_with_preshapes
 import drakegrasp as dg
 from drakegrasp.frames import invert_pose, make_pose, rotation_about
 from drakegrasp.mesh.cloud import column_solid, hull_solid, read_cloud
-from drakegrasp.scoring.proposals import SAME
 from drakegrasp.simulation.attempts import make_attempts
+from drakegrasp.simulation.palms import SAME
 
 #: Half extents of a box on the table, whose long side, along Tx, no hand spans [m].
 HALF = np.array([0.18, 0.03, 0.04])

@@ -13,10 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
-from scipy.stats import norm
 
-from drakegrasp.config import CandidateConfig, RefineConfig
+from drakegrasp.config import CandidateConfig
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel, prepare_object
@@ -25,7 +23,6 @@ from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.attempt import Attempt, Source
 from drakegrasp.simulation.candidates import (
     Candidates,
-    children,
     normal_candidates,
     palm_ray_distance,
     sample_candidates,
@@ -360,7 +357,7 @@ def test_smaller_number_of_turns_is_a_prefix(box: ObjectModel, method: str, most
         for n in (most, 40)
     )
     assert (len(many), len(few)) == (most, 40)
-    for name in ("X_OG", "distance", "resting", "source", "log_density"):
+    for name in ("X_OG", "distance", "resting", "source"):
         np.testing.assert_array_equal(getattr(many, name)[:40], getattr(few, name))
     if method == "rotations":
         counts = [(drawn.combinations, drawn.valid, drawn.distinct) for drawn in (many, few)]
@@ -375,56 +372,6 @@ def test_turns_go_on_without_a_sampler_that_has_no_more(box: ObjectModel) -> Non
     turns = np.resize([Source.ROTATIONS, Source.NORMALS], 2 * distinct)
     np.testing.assert_array_equal(drawn.source[: 2 * distinct], turns)
     assert np.all(drawn.source[2 * distinct :] == Source.NORMALS)
-    # Each rotation is one of those that there are; a normal one of the area and the circle.
-    densities = [-np.log(distinct), -np.log(box.visual.area * 2.0 * np.pi)]
-    np.testing.assert_allclose(drawn.log_density[:2], densities, atol=1e-9)
-
-
-def test_children_are_drawn_about_their_parent() -> None:
-    rules = RefineConfig(children=50, generations=2, shift=0.01, turn_deg=5.0)
-    (parent, *_) = attempts(range(4, 5))
-    born = children(parent, rules, name="thing", seed=0)
-    assert [child.child for child in born] == list(range(1, 51))
-    assert {(c.generation, c.parent, c.source) for c in born} == {(1, 0, Source.REFINE)}
-    assert {(c.candidate, c.standoff_index, c.spread) for c in born} == {
-        (parent.candidate, parent.standoff_index, parent.spread)
-    }
-
-    # Four standard deviations of those of 150 numbers.
-    X_GH = np.stack([np.linalg.inv(parent.X_OG) @ child.X_OG for child in born])
-    turns = Rotation.from_matrix(X_GH[:, :3, :3]).as_rotvec(degrees=True)
-    for moved, sigma in ((X_GH[:, :3, 3], 0.01), (turns, 5.0)):
-        assert moved.std() == pytest.approx(sigma, rel=4 / np.sqrt(2 * 150))
-        assert np.abs(moved.mean(axis=0)).max() < 4 * sigma / np.sqrt(50)
-
-    # The density is that of the draw, in metres and radians.
-    sigmas = np.repeat([0.01, np.deg2rad(5.0)], 3)
-    vector = np.hstack([X_GH[:, :3, 3], np.deg2rad(turns)])
-    expected = norm.logpdf(vector, scale=sigmas).sum(axis=1)
-    np.testing.assert_allclose([c.log_density for c in born], expected, atol=1e-6)
-
-
-def test_one_attempt_in_ten_is_audited_whatever_is_tried_with_it() -> None:
-    """A child draws for itself."""
-    rules, made, born = RefineConfig(children=1), [], []
-    for seed in range(40):
-        first = attempts(range(30), seed=seed)
-        made += [each.audited for each in first]
-        born += [children(each, rules, name="thing", seed=seed)[0].audited for each in first]
-    assert [each.audited for each in attempts(range(10, 20))] == made[30:60]
-    assert np.flatnonzero(made[:65]).tolist() == [5, 7, 22, 59, 64]  # draws are for ever
-    for audited, share in ((made, 0.1), (born, 0.1), (np.array(made) & born, 0.01)):
-        assert np.mean(audited) == pytest.approx(share, abs=4 * np.sqrt(share / len(made)))
-
-
-def test_numbers_of_a_family_say_who_is_whose_child() -> None:
-    rules = RefineConfig(children=3, generations=2)
-    (parent, *_) = attempts(range(4, 5))
-    first = children(parent, rules, name="thing", seed=0)
-    second = children(first[1], rules, name="thing", seed=0)
-    assert [child.child for child in second] == [7, 8, 9]
-    assert children(second[0], rules, name="thing", seed=0) == []
-    assert [(child.child, child.parent) for child in first] == [(1, 0), (2, 0), (3, 0)]
 
 
 def test_enough_room_keeps_every_distinct_pose(box: ObjectModel) -> None:
@@ -535,7 +482,6 @@ def some_candidates(n: int = 30) -> Candidates:
         distance=distance,
         resting=np.zeros(n, dtype=np.int64),
         source=np.zeros(n, dtype=np.int64),
-        log_density=np.zeros(n),
         combinations=n,
         valid=n,
         distinct=n,

@@ -18,14 +18,12 @@ from drakegrasp.hand.settings import override_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.contacts import Way
 from drakegrasp.simulation.scene import Scene
-from drakegrasp.simulation.trial import has_only_scraped, lift_on, run_attempt
+from drakegrasp.simulation.trial import run_attempt
 
 pytestmark = pytest.mark.sim
 
 #: Stand-offs at which the tips pass 1 mm below the table's top and end above it, and 1 mm above.
 SCRAPES, PASSES = 0.042, 0.044
-#: And one at which they end on the table.
-ENDS_ON = 0.041
 
 
 def record_heights(scene: Scene) -> list[tuple[float, float]]:
@@ -105,18 +103,3 @@ def test_hand_that_scrapes_the_table_on_its_way_is_refused(scene, cube, config) 
     for stage in ("closed", "lift"):
         one, other = (getattr(r, stage).contacts for r in (allowed, lifted))
         assert pickle.dumps(one) == pickle.dumps(other)
-
-
-def test_hand_that_only_scraped_goes_on_as_if_it_had_not(scene, cube, config) -> None:
-    """Lifted from where it closed, it ends to the bit as in a trial that allows it to scrape."""
-    attempt = from_above(cube, SCRAPES)
-    record = run_attempt(scene, standing(cube), attempt, config)
-    assert has_only_scraped(record)
-    went_on = lift_on(scene, record, attempt, config)
-    before = override_config(config, ["close.scrape_depth=null"])
-    allowed = run_attempt(scene, standing(cube), attempt, before)
-    assert (went_on.outcome, allowed.outcome) == (Outcome.SUCCESS, Outcome.SUCCESS)
-    assert pickle.dumps(went_on.lift) == pickle.dumps(allowed.lift)
-    on_table = run_attempt(scene, standing(cube), from_above(cube, ENDS_ON), config)
-    assert on_table.outcome is Outcome.TABLE_CONTACT
-    assert not any(map(has_only_scraped, (went_on, allowed, on_table)))

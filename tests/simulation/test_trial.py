@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -19,7 +18,6 @@ from helpers.objects import (
     standing,
 )
 
-from drakegrasp.errors import BlankImageError
 from drakegrasp.frames import X_WT, invert_pose, make_pose, transform_points
 from drakegrasp.hand.file_format import PAD_BAND
 from drakegrasp.hand.settings import load_config, override_config
@@ -58,64 +56,6 @@ GRAVITY = 9.81
 def held(scene, cube, config) -> TrialRecord:
     """The cube grasped across its faces."""
     return run_attempt(scene, standing(cube), from_above(cube, STANDOFF), config)
-
-
-def test_closed_hand_with_a_smaller_chance_is_not_lifted(scene, cube, held):
-    attempt = from_above(cube, STANDOFF)
-    records = []
-    for least in (held.chance, np.nextafter(held.chance, 1.0)):
-        rules = load_config(overrides=[f"lift.least_chance={float(least)!r}"])
-        records.append(run_attempt(scene, standing(cube), attempt, rules))
-        audited = run_attempt(scene, standing(cube), replace(attempt, audited=True), rules)
-        assert pickle.dumps(audited) == pickle.dumps(held)
-    at, below = records
-    assert pickle.dumps(at) == pickle.dumps(held)
-    assert below.outcome is Outcome.NOT_LIFTED
-    assert pickle.dumps(below.closed.contacts) == pickle.dumps(held.closed.contacts)
-    assert below.lift is None
-    assert below.chance == held.chance
-
-
-def test_closed_hand_whose_image_is_of_no_use_is_not_lifted(scene, cube, config, held):
-    def no() -> bool:
-        asked.append(True)
-        return False
-
-    asked: list[bool] = []
-    attempt = from_above(cube, STANDOFF)
-    record = run_attempt(scene, standing(cube), attempt, config, is_visible=no)
-    assert record.outcome is Outcome.NOT_LIFTED
-    assert pickle.dumps(record.closed) == pickle.dumps(held.closed)
-    assert record.lift is None
-    assert asked == [True]
-    # An audited hand is lifted, and of one that may not lift no image is needed.
-    audited = replace(attempt, audited=True)
-    lifted = run_attempt(scene, standing(cube), audited, config, is_visible=no)
-    assert pickle.dumps(lifted) == pickle.dumps(held)
-    closed = run_attempt(scene, standing(cube), from_above(cube, 0.041), config, is_visible=no)
-    assert closed.outcome is Outcome.TABLE_CONTACT
-    assert asked == [True]
-    # Nor of one whose chance is too small.
-    unlikely = load_config(overrides=["lift.least_chance=0.99"])
-    run_attempt(scene, standing(cube), attempt, unlikely, is_visible=no)
-    assert asked == [True]
-
-
-def test_image_that_cannot_be_rendered_is_no_outcome(scene, cube, config):
-    def fail():
-        raise BlankImageError("nothing")
-
-    with pytest.raises(BlankImageError):
-        run_attempt(scene, standing(cube), from_above(cube, STANDOFF), config, is_visible=fail)
-
-
-def test_hand_without_weights_lifts_all_that_it_may(scene, cube, held):
-    hand = replace(scene.hand, lift_chance=None)
-    bare = replace(scene, hand=hand)
-    rules = load_config(overrides=["lift.least_chance=0.99"])
-    record = run_attempt(bare, standing(cube), from_above(cube, STANDOFF), rules)
-    assert record.outcome is Outcome.SUCCESS
-    assert np.isnan(record.chance)
 
 
 def test_resting_cube_presses_on_the_table_with_its_weight(cube, config):

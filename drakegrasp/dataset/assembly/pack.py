@@ -42,7 +42,6 @@ from drakegrasp.dataset.schema import (
 from drakegrasp.dataset.shards import open_shard, read_field, trial_columns
 from drakegrasp.frames import (
     X_WT,
-    Array,
     invert_pose,
     pack_pose,
     rotate_vectors,
@@ -80,7 +79,6 @@ class PackTask:
         slices: The shards that have rows in the range, in order.
         ids: For each split the ids of the trials in the range that are samples, in rising order.
         firsts: For each split the row of the first of these samples.
-        weights: For each split the weights of these samples.
         sizes: Lengths of the letters in the shapes of the fields.
         certified: Whether the files have HOLD_FIELDS.
     """
@@ -92,7 +90,6 @@ class PackTask:
     slices: tuple[ShardSlice, ...]
     ids: Mapping[str, npt.NDArray[np.int64]]
     firsts: Mapping[str, int]
-    weights: Mapping[str, Array]
     sizes: Mapping[str, int]
     certified: bool
 
@@ -101,7 +98,6 @@ def pack_tasks(out: Path, decisions: Decisions, *, certified: bool) -> Iterator[
     """Yield the tasks that pack the rows, from the first to the last."""
     shards, ids = decisions.shards, decisions.ids
     slices, firsts = shards.slices, [piece.first for piece in shards.slices]
-    weights = {split: decisions.weights[rows] for split, rows in decisions.splits.items()}
     for start in range(0, shards.count, TASK_ROWS):
         stop = min(start + TASK_ROWS, shards.count)
         # From the shard in which the range begins to the shard in which it ends.
@@ -115,7 +111,6 @@ def pack_tasks(out: Path, decisions: Decisions, *, certified: bool) -> Iterator[
             slices=tuple(within),
             ids={split: ids[split][a:b] for split, (a, b) in bounds.items()},
             firsts={split: int(a) for split, (a, _) in bounds.items()},
-            weights={split: weights[split][a:b] for split, (a, b) in bounds.items()},
             sizes=shards.sizes,
             certified=certified,
         )
@@ -268,7 +263,6 @@ def _add_samples(
             trial = {name: values[row] for name, values in trials.items()}
             look = {name: values[k] for name, values in poses.items()}
             known = {"object": piece.object, "trial_id": trial_id}
-            known["grasp_props/weight"] = task.weights[split][i]
             for camera in CAMERAS:
                 for name, value in (sample_values(model, trial, look, camera) | known).items():
                     records[split, camera][name][i] = value

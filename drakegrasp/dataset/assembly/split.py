@@ -7,13 +7,13 @@ own; the rule by class would put all of these into the test split.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import dot, norm
+from drakegrasp.arithmetic import dot
 from drakegrasp.config import SplitConfig
 from drakegrasp.frames import Array
 from drakegrasp.seeding import Stream, object_key
@@ -167,30 +167,8 @@ def _shares(count: int, config: SplitConfig) -> tuple[int, int]:
     return tested, valid
 
 
-#: Two palms are near if their distance [m] and angle [rad] are within these limits.
-NEAR_SHIFT, NEAR_TURN = 0.010, float(np.deg2rad(15.0))
-#: Number of samples whose distances from all others of their group are computed together.
-BLOCK = 256
-
-
-def weigh_samples(groups: npt.ArrayLike, X_OG: Array) -> Array:
-    """Return the weight (n,) of each sample: 1 / the number of near samples in its group.
-
-    Args:
-        groups: (n,) or (n, m), equal for samples of the same object and resting pose.
-        X_OG: (n, 4, 4), palm poses.
-    """
-    count = np.ones(len(X_OG))
-    for rows in _rows_by_group(np.asarray(groups)):
-        p, R = X_OG[rows, :3, 3], X_OG[rows, :3, :3].reshape(-1, 9)
-        for start in range(0, len(rows), BLOCK):
-            part = slice(start, start + BLOCK)
-            # The trace of R_A^T R_B is 1 + 2 cos(angle).
-            shift = norm(p[part, None] - p[None])
-            cosine = (dot(R[part, None], R[None]) - 1.0) / 2.0
-            near = (shift <= NEAR_SHIFT) & (cosine >= np.cos(NEAR_TURN))
-            count[rows[part]] = near.sum(axis=1)
-    return 1.0 / count
+#: Resting poses of different seeds are one if their upward directions are within this angle [rad].
+NEAR_TURN = float(np.deg2rad(15.0))
 
 
 def number_poses(meshes: Sequence[str], up: Sequence[npt.ArrayLike]) -> list[npt.NDArray[np.int64]]:
@@ -219,16 +197,3 @@ def number_poses(meshes: Sequence[str], up: Sequence[npt.ArrayLike]) -> list[npt
             known[mesh] = np.concatenate([theirs, directions]), np.concatenate([indices, own])
         numbers.append(own)
     return numbers
-
-
-def effective_number(weights: npt.ArrayLike) -> float:
-    """Return the effective number of samples, (sum w)^2 / sum w^2 (Kish 1965), of weights (n,)."""
-    w = np.asarray(weights, dtype=float)
-    return float(w.sum() ** 2 / (w * w).sum()) if len(w) else 0.0
-
-
-def _rows_by_group(groups: npt.NDArray[np.generic]) -> Iterator[npt.NDArray[np.int64]]:
-    _, numbers = np.unique(groups, axis=0, return_inverse=True)
-    order = np.argsort(numbers.ravel(), kind="stable")
-    starts = np.flatnonzero(np.diff(numbers.ravel()[order])) + 1
-    yield from np.split(order, starts)

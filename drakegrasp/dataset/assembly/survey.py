@@ -3,8 +3,8 @@
 A task surveys the shards of one object: it verifies their seals, counts the rows of each, and
 collects for each success the values that the filters need. From the surveys of all objects follows
 which successes are samples (by the rules of `filters`, user-defined filters, outliers and
-rejections), in which split each sample is, and its weight. `assembly.pack` packs the rows
-accordingly, and `assemble` writes them; `checks` decides again and compares.
+rejections), and in which split each sample is. `assembly.pack` packs the rows accordingly, and
+`assemble` writes them; `checks` decides again and compares.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from drakegrasp import registry
 from drakegrasp.config import CameraConfig, Config, FilterConfig, is_own_class
-from drakegrasp.dataset.assembly.split import split_samples, weigh_samples
+from drakegrasp.dataset.assembly.split import split_samples
 from drakegrasp.dataset.hdf5 import AnyArray, read_column
 from drakegrasp.dataset.manifest import Manifest, origin_attributes
 from drakegrasp.dataset.quality import COLUMNS, suspicion
@@ -294,7 +294,7 @@ _DERIVED = (
 _COPIED = tuple(
     dict.fromkeys(
         name
-        for name in ("candidate", "standoff_index", "child", "resting", "slip", "turn", *NEEDED)
+        for name in ("candidate", "standoff_index", "resting", "slip", "turn", *NEEDED)
         if not any(name in names for names, *_ in _DERIVED)
     )
 )
@@ -384,13 +384,11 @@ class Decisions:
         shards: Rows and successes of the dataset's shards.
         removal: (n,) uint8, the `Removal` of each success.
         splits: Indices of the samples of each split among the successes, in rising order.
-        weights: (n,), weight of each sample; NaN for a success that is not a sample.
     """
 
     shards: Shards
     removal: AnyArray
     splits: Mapping[str, npt.NDArray[np.int64]]
-    weights: Array
 
     @cached_property
     def ids(self) -> dict[str, npt.NDArray[np.int64]]:
@@ -426,7 +424,7 @@ def number_rows(surveys: Sequence[Survey], manifest: Manifest) -> Shards:
 
 def keys_of(manifest: Manifest, successes: Table) -> dict[AttemptKey, int]:
     """Return the trial id of each success, by the identity of its attempt."""
-    names = ("object", "candidate", "standoff_index", "child", "trial_id")
+    names = ("object", "candidate", "standoff_index", "trial_id")
     rows = zip(*(successes[name].tolist() for name in names), strict=True)
     return {AttemptKey(manifest.objects[i].name, *key): t for i, *key, t in rows}
 
@@ -434,7 +432,7 @@ def keys_of(manifest: Manifest, successes: Table) -> dict[AttemptKey, int]:
 def decide(
     manifest: Manifest, shards: Shards, removed_by_own: npt.NDArray[np.bool_] | None = None
 ) -> Decisions:
-    """Decide which successes are samples, and the split and weight of each sample.
+    """Decide which successes are samples, and the split of each sample.
 
     Args:
         manifest: Manifest of the dataset, with filters, split and rejected attempts.
@@ -447,41 +445,18 @@ def decide(
     rejected = [known[key] for key in manifest.rejected if key in known]
     removal = judge_successes(successes, manifest.config.filters, rejected, removed_by_own)
 
-    # Only first-round attempts are tested: refined palm poses are drawn around held ones.
-    splits = _split_successes(manifest, successes, removal)
-    refined = successes["child"][splits["test"]] > 0
-    removal[splits["test"][refined]] = Removal.REFINED_TEST
-    splits["test"] = splits["test"][~refined]
-
-    # Weigh each sample among all samples.
+    # Split the samples.
     kept = np.flatnonzero(removal == Removal.KEPT)
-    weights = np.full(len(removal), np.nan)
-    numbers = manifest.pose_numbers()
-    rows = zip(successes["object"][kept], successes["resting"][kept], strict=True)
-    poses = np.array([numbers[i][k] for i, k in rows], dtype=np.int64)
-    weights[kept] = weigh_samples(poses, successes["X_OG"][kept])
-    return Decisions(shards=shards, removal=removal, splits=splits, weights=weights)
-
-
-def _split_successes(
-    manifest: Manifest, successes: Table, removal: AnyArray
-) -> dict[str, npt.NDArray[np.int64]]:
-    """Return which successes are samples of each split, in rising order."""
-    # A first-round attempt and all attempts that were refined from it are in one split.
-    kept = np.flatnonzero(removal == Removal.KEPT)
-    names = ("object", "candidate", "standoff_index")
-    keys = np.column_stack([successes[name][kept] for name in names])
-    _, first, family = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-
     split = split_samples(
-        successes["object"][kept[first]],
+        successes["object"][kept],
         [entry.mesh_name for entry in manifest.objects],
         [entry.class_name for entry in manifest.objects],
         manifest.groups,
         manifest.config.split,
         manifest.config.seed,
     )
-    return {name: kept[np.isin(family.ravel(), families)] for name, families in split.items()}
+    splits = {name: kept[rows] for name, rows in split.items()}
+    return Decisions(shards=shards, removal=removal, splits=splits)
 
 
 def object_columns(manifest: Manifest) -> dict[str, AnyArray]:

@@ -190,9 +190,7 @@ def follow_trials(grasps: Batch, place: Batch, trials: Trials) -> Iterator[Viola
         return
     own = trials[grasps["trial_id"]].columns([*GRASPS_FOLLOW_FROM, "removal"])
     X_TO = np.tile(place.pose("X_TO")[0, 0], (len(grasps), 1, 1))
-    # The weight of a sample is only in the data files.
-    weights = np.where(own["removal"] == Removal.KEPT, grasps["weight"], np.nan)
-    due = grasps_of_trials(own, X_TO, weights)
+    due = grasps_of_trials(own, X_TO, own["removal"] == Removal.KEPT)
     yield from grasps.follow(due, "its trial and the pose of the object")
 
 

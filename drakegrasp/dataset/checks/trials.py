@@ -3,8 +3,8 @@
 Input: the file, with the dataset around it if there is one. Output: tasks, each of which judges a
 range of attempts. `run` first compares the attempts with their shards. The rules here also apply to
 a single file: verdict and motion follow from contacts and poses, by the functions with which a
-trial decides. With the dataset, conditions, resting pose and chance follow from the functions with
-which a build draws and computes them.
+trial decides. With the dataset, conditions and resting pose follow from the functions with which
+a build draws them.
 """
 
 from __future__ import annotations
@@ -34,11 +34,9 @@ from drakegrasp.dataset.checks.rows import (
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.schema import CONDITION_FIELDS, NO_PRESHAPE
-from drakegrasp.errors import HandError
+from drakegrasp.filters import Removal
 from drakegrasp.frames import invert_pose
 from drakegrasp.grasp import unused_fingers
-from drakegrasp.hand.folder import is_hand
-from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp, read_lift_chance
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.simulation.attempt import Source
@@ -61,8 +59,6 @@ MOTION_TOLERANCE = 1e-4
 PULL = 0.05
 #: With more friction, a force may leave the object's side of a mean normal: a cone of 45 degrees.
 MAX_FRICTION = 1.0
-#: Chances are rounded to about a millionth.
-CHANCE_TOLERANCE = 1e-5
 #: Number of attempts that are searched for successes at once.
 BLOCK = 16_384
 
@@ -82,13 +78,11 @@ def trial_rules(trials: CheckedFile, dataset: Dataset | None) -> list[list[Rule]
         most = np.array([entry.candidates for entry in manifest.objects])
         finite.append(partial(resting_poses, manifest=manifest))
         finite.append(partial(conditions, manifest=manifest, model=model))
-        if trials.config is not None:
-            sound.append(partial(chances, manifest=manifest, model=model))
     return [[partial(numbers, candidates=most)], [complete_stages, ranges, repeats], finite, sound]
 
 
 def numbers(batch: Batch, candidates: AnyArray | None) -> Iterator[Violation]:
-    """The numbers of a trial are valid, and a refined palm pose has a parent.
+    """The numbers of a trial are valid.
 
     Args:
         batch: Rows of `/trials`.
@@ -109,29 +103,18 @@ def numbers(batch: Batch, candidates: AnyArray | None) -> Iterator[Violation]:
         ("object", "rows of /objects", objects),
         ("candidate", "candidates of its object", most),
         ("standoff_index", "stand-offs", len(config.candidates.standoffs) if config else np.inf),
-        ("child", "numbers in a family", np.inf),
     ):
         bad = (batch[name] < 0) | (batch[name] >= limit)
         yield from batch.broken(f"{name} must be one of the {of}", bad, batch[name])
 
-    # The first attempt of a family has no parent. Only a posture from outside may have an unknown
-    # density or no preshape.
-    child, source, preshape = batch["child"], batch["source"], batch["preshape"]
-    refined, given = child > 0, source == Source.POSTURES
-    first = (batch["generation"] > 0) != refined
-    drawn = ((source == Source.REFINE) != refined) | (source > max(Source))
-    dense = ~np.isfinite(batch["log_density"]) & ~given
-    shape = (preshape == NO_PRESHAPE) & (~given | (batch["unused"] > 0))
+    # Only a posture from outside may have no preshape.
+    source, preshape = batch["source"], batch["preshape"]
+    shape = (preshape == NO_PRESHAPE) & ((source != Source.POSTURES) | (batch["unused"] > 0))
     for name, bad, must in (
-        ("generation", first, "0 for the first of a family and positive for others"),
-        ("source", drawn, "2 (refine) for a refined palm pose, and 0, 1, 3 or 4 for another"),
-        ("log_density", dense, "finite but for postures"),
+        ("source", ~np.isin(source, list(Source)), "0, 1, 3 or 4"),
         ("preshape", shape, "255 of postures only, which use all fingers"),
     ):
         yield from batch.broken(f"{name} must be {must}", bad, batch[name])
-    if config is not None:
-        parent = np.where(refined, (child - 1) // max(config.refine.children, 1), 0)
-        yield from batch.follows("parent", parent, "child")
 
 
 def complete_stages(batch: Batch) -> Iterator[Violation]:
@@ -163,7 +146,7 @@ def repeats(batch: Batch) -> Iterator[Violation]:
 
 
 def verdicts(batch: Batch) -> Iterator[Violation]:
-    """The outcome follows from contacts, motion and chance (`simulation.verdict`)."""
+    """The outcome follows from contacts and motion (`simulation.verdict`)."""
     outcome, closed = batch["outcome"], judged_closed(batch)
     due = judge_lifted(
         batch["lifted_touching"],
@@ -172,31 +155,21 @@ def verdicts(batch: Batch) -> Iterator[Violation]:
         required=required_of(batch),
         scraped=_scraped(batch, "lift"),
     )
-    # Older versions used the outcome `slipped` for what is now `partly held`.
-    older = (outcome == Outcome.SLIPPED) & (due == Outcome.PARTLY_HELD)
-    due = np.where(older, Outcome.SLIPPED.value, due)
 
-    # A lift that was ended early has a reason instead of a verdict; so has an unlifted closed hand.
-    ended, left = outcome == Outcome.MOVED, outcome == Outcome.NOT_LIFTED
-    must_stay = np.zeros(len(batch), dtype=np.bool_)
+    # A lift that was ended early has a reason instead of a verdict.
+    ended = outcome == Outcome.MOVED
     if batch.of.config is not None:
-        lift = batch.config.lift
-        ended &= is_lost_sample(batch["slip"], batch["turn"], lift)
-        must_stay = (batch["chance"] < lift.least_chance) & ~batch["audited"]
-        # The trial does not store whether its image is flat, so this reason cannot be excluded.
-        left &= must_stay | ((lift.least_depth_variance > 0.0) & ~batch["audited"])
+        ended &= is_lost_sample(batch["slip"], batch["turn"], batch.config.lift)
     due = np.where(ended, Outcome.MOVED.value, due)
-    due = np.where(left | must_stay, Outcome.NOT_LIFTED.value, due)
 
     # A hand that may not lift has no second verdict.
     due = np.where(closed != Outcome.SUCCESS, closed, due)
     yield from batch.broken(
-        "outcome must follow from the contacts, the clearance, the motion and the chance",
+        "outcome must follow from the contacts, the clearance and the motion",
         (_stages(batch) >= Stage.CLOSED) & (due != outcome),
         lambda i: (
             f"{Outcome(int(outcome[i])).label} where these say {Outcome(int(due[i])).label}: slip "
-            f"{batch['slip'][i]:.4g} m, turn {batch['turn'][i]:.4g} rad, chance "
-            f"{batch['chance'][i]:.4g}"
+            f"{batch['slip'][i]:.4g} m, turn {batch['turn'][i]:.4g} rad"
         ),
     )
 
@@ -291,46 +264,17 @@ def resting_poses(batch: Batch, manifest: Manifest) -> Iterator[Violation]:
 def conditions(batch: Batch, manifest: Manifest, model: LoadModel) -> Iterator[Violation]:
     """Friction, mass, looks, cameras and noise are those that the seed draws, or the defaults."""
     due = {f.name: np.array(batch[f.name]) for f in CONDITION_FIELDS}
-    identity = ("candidate", "standoff_index", "child")
+    identity = ("candidate", "standoff_index")
     for name, known, rows in _by_object(batch, manifest, model):
         own = manifest.config_of(name)
         # If nothing is drawn, all attempts of an object have the same conditions.
         same = own.randomize == RandomizeConfig()
         for chosen in [rows] if same else rows[:, None]:
-            numbers = [0, 0, 0] if same else [int(batch[key][chosen[0]]) for key in identity]
+            numbers = [0, 0] if same else [int(batch[key][chosen[0]]) for key in identity]
             for key, value in draw_conditions(known, own, *numbers).values().items():
                 due[key][chosen] = value
     for key, values in due.items():
         yield from batch.follows(key, values, "what the seed gives the attempt", 0.0)
-
-
-def chances(batch: Batch, manifest: Manifest, model: LoadModel) -> Iterator[Violation]:
-    """A closed hand that may lift has the lift chance that its sound contacts yield."""
-    # Other files of the hand may have other weights.
-    try:
-        if not is_hand(manifest.config.hand_source, manifest.versions.get("hand")):
-            return
-        chance = read_lift_chance(manifest.config.hand_source)
-    except HandError:
-        return
-
-    # A hand that was never closed has no `time_close`.
-    lifts = judged_closed(batch) == Outcome.SUCCESS
-    lifts &= np.isfinite(batch["time_close"])
-    due = np.where(lifts & (chance is not None), batch["chance"], np.nan)
-    for _, known, rows in _by_object(batch, manifest, model):
-        # The chance of a grasp with fewer fingers follows from their contacts alone.
-        own = rows[lifts[rows] & (batch["unused"][rows] == 0)]
-        if chance is not None and len(own):
-            closed = batch.where(np.isin(np.arange(len(batch)), own))
-            grasp = ClosedGrasp(
-                **{name: closed[f"closed_{name}"] for name in GRASP_CONTACTS},
-                X_TO=closed.pose("X_TO"),
-                p_OOcm=known.p_OOcm,
-                friction_hand=closed["friction_hand"],
-            )
-            due[own] = chance.of(grasp)
-    yield from batch.follows("chance", due, "the contacts after closing", CHANCE_TOLERANCE)
 
 
 def _by_object(
@@ -360,4 +304,7 @@ def successes(trials: CheckedFile) -> Iterator[Violation]:
         different = sorted(set(batch["trial_id"].tolist()) ^ set(due.tolist()))
         got = f"differences at trials {different[:5]}" if different else "another order"
         yield of_file(trials.name, "trial_id must list the successes of /trials", got, "/successes")
+    known, removal = [r.value for r in Removal], batch["removal"]
+    what = f"removal must be one of {', '.join(map(str, known))}"
+    yield from batch.broken(what, ~np.isin(removal, known), removal)
     yield from ranges(batch)

@@ -1,0 +1,264 @@
+"""The sampler `closing`: palms that close well on the object's surface, from all sides.
+
+At a resting pose the first palms are the fixed ones of `palms.Palms`. Then palms are drawn in
+rounds: from the same family, with random places, heights, turns and slants; near palms that close
+well; and at surface points, for rims and handles of what is too wide for the hand. Geometry closes
+the hand on the surface (`closing.close_on`), and palms that close much worse than the best ones are
+left out. Palms from above, slanted and from the side take turns. Palms near an earlier one are left
+out, until there is no other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import chain
+from typing import NamedTuple
+
+import numpy as np
+
+from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
+from drakegrasp.config import Config
+from drakegrasp.frames import invert_pose, make_pose, rotation_about, transform_points
+from drakegrasp.hand.description import load_hand
+from drakegrasp.mesh.cloud import Solid
+from drakegrasp.mesh.surfaces import even_points, on_faces
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.seeding import Stream
+from drakegrasp.simulation.closing import close_on
+from drakegrasp.simulation.palms import DEEPER, Palms, Shape, palm_motion
+from drakegrasp.simulation.screen import centre
+
+#: Number of surface points around which palms are made.
+POINTS = 2048
+#: A palm is good if its score is at least this fraction of the score of the best few; and the least
+#: score of a good palm.
+GOOD, BEST, LEAST = 0.75, 5, 0.25
+#: Palms are near if they are closer than both limits [m, degree], those of the number of distinct
+#: grasps.
+NEAR = 0.020, 30.0
+#: Least downward component of the approach of palms from above and of slanted ones: the sines of
+#: 60 and 30 degrees. Palms with more than the last one, the cosine of 14 degrees, are left out:
+#: their camera sees a flat image, which is no sample.
+ABOVE, SLANTED, FLAT = float(np.sqrt(0.75)), 0.5, 0.97
+#: While palms from other sides close well, at most so many palms from above for each of these.
+MOST_ABOVE = 1.5
+#: Number of rounds in a row in vain after which a side counts as not free; if no side has had a
+#: palm, the sampler ends.
+PATIENCE = 3
+#: Numbers of palms drawn in a round.
+ROUND = {"above": 16, "slanted": 12, "beside": 12, "near": 12, "surface": 12}
+#: Random numbers of a palm; the first chooses preshape and spread.
+NUMBERS = 7
+#: Ranges of the draws: turns from the axes, tilts and slants from the vertical [degree], places
+#: along the long side and heights, as fractions of half of it and of the object's height.
+YAW, TILT, SLANTS = 20.0, (15.0, 35.0), {"slanted": (30.0, 60.0), "beside": (60.0, 100.0)}
+ALONG, HEIGHTS = 0.6, (0.25, 0.75)
+#: Standard deviations of palms near good ones [m, degree].
+SHIFT, TURN = 0.012, 15.0
+#: Largest distance of palms at surface points beyond the smallest stand-off [m]; largest upward
+#: component of their approach.
+FARTHER, UPWARD = 0.03, 0.17
+#: Grids of the upward direction and of the height [m] at which the object rests. These are
+#: simulated, so their last bits differ between machines, and draws must not.
+UP_GRID, HEIGHT_GRID = 2.0**-10, 2.0**-14
+
+
+class Palm(NamedTuple):
+    """A palm pose X_LG (4, 4), the hand's shape, and the score with which it closes."""
+
+    X_LG: Array
+    shape: Shape
+    score: float
+
+    @property
+    def side(self) -> int:
+        """From where it approaches: 0 from above, 1 slanted, 2 from the side."""
+        down = -float(self.X_LG[2, 2])
+        return 0 if down >= ABOVE else 1 if down >= SLANTED else 2
+
+
+class Closing:
+    """The palms of one resting pose."""
+
+    def __init__(self, model: ObjectModel, X_TO: Array, stream: Stream, config: Config) -> None:
+        """Find the object's sides, and the fixed palms that close well.
+
+        Raises:
+            HandError: If several of the hand's fingers move one link.
+        """
+        self._model, self._hand, self._stream = model, load_hand(config.hand_source), stream
+
+        # Points of the surface in {L}, with outward normals.
+        self._X_LO = level_pose(X_TO)
+        self._points, self._normals = _surface(model, self._X_LO)
+        inside = np.argwhere(model.field.values < 0.0)
+        middle = inside.mean(axis=0) * model.field.spacing + model.field.origin
+        self._solid = Solid(field=model.field, middle=middle)
+
+        # The palms of each preshape.
+        preshapes = range(len(self._hand.preshapes)) if self._hand.preshapes else [None]
+        self._palms = {i: Palms(self._points, self._hand.at(i)) for i in preshapes}
+        self._shapes = [Shape(i, s) for i, palms in self._palms.items() for s in palms.spreads]
+        fixed = [
+            (palm.X_TG, Shape(i, palm.spread))
+            for i, palms in self._palms.items()
+            for palm in palms.fixed()
+        ]
+
+        # The order, the good palms of each side that wait for their turn, and the best scores.
+        self._order: list[Palm] = []
+        self._waiting: list[list[Palm]] = [[], [], []]
+        self._best: list[float] = []
+
+        # Rounds in a row in vain, for each side, and what counts as near, as a fraction of `NEAR`.
+        self._vain, self._near = [0, 0, 0], 1.0
+        self._add(fixed)
+
+    def poses(self) -> Iterator[tuple[Array, Shape]]:
+        """Yield palm poses X_OG (4, 4) and the shape of the hand, as long as palms close well."""
+        X_OL = invert_pose(self._X_LO)
+        while True:
+            palm = self._next()
+            if palm is not None:
+                self._order.append(palm)
+                yield multiply(X_OL, palm.X_LG), palm.shape
+            elif min(self._vain) < PATIENCE:
+                self._add(self._draw())
+            else:
+                return
+
+    def _next(self) -> Palm | None:
+        """Return the next palm of the order, or None if more must be drawn first."""
+        counts = np.bincount([palm.side for palm in self._order], minlength=3)
+        free = [side for side in range(3) if self._vain[side] < PATIENCE or self._waiting[side]]
+        ready = [side for side in free if self._waiting[side]]
+        if not ready:
+            return None
+
+        # The side with the fewest palms comes next, and those from above do not outnumber others.
+        side = min(ready, key=lambda side: (counts[side], -side))
+        others = counts[1] + counts[2]
+        if side == 0 and len(free) > 1 and counts[0] >= MOST_ABOVE * (others + 1):
+            return None
+        return self._waiting[side].pop(0)
+
+    def _add(self, drawn: Sequence[tuple[Array, Shape]]) -> None:
+        """Close the hand at palms, and let the good ones wait for their turn."""
+        fresh = [
+            (X_LG, shape) for X_LG, shape in drawn if -X_LG[2, 2] < FLAT and not self._is_near(X_LG)
+        ]
+        palms = sorted(self._closed(fresh), key=lambda palm: -palm.score)
+        self._best = sorted([*self._best, *(palm.score for palm in palms)])[-BEST:]
+        least = max(LEAST, GOOD * self._best[0])
+        good = [palm for palm in palms if palm.score >= least]
+
+        # Of palms that are near each other, the best waits.
+        before = [len(waiting) for waiting in self._waiting]
+        for palm in good:
+            if not self._is_near(palm.X_LG):
+                self._waiting[palm.side].append(palm)
+        for side, waiting in enumerate(self._waiting):
+            self._vain[side] = 0 if len(waiting) > before[side] else self._vain[side] + 1
+
+        # Where the best palms are near each other already, others may be nearer.
+        if min(self._vain) >= PATIENCE and (self._order or any(self._waiting)):
+            self._near, self._vain = self._near / 2.0, [0, 0, 0]
+
+    def _is_near(self, X_LG: Array) -> bool:
+        """Return whether a palm is near one in the order or one that waits."""
+        others = [*self._order, *chain(*self._waiting)]
+        X = np.reshape([other.X_LG for other in others], (-1, 4, 4))
+        shift = norm(X[:, :3, 3] - X_LG[:3, 3])
+        cosine = (dot(X[:, :3, :3].reshape(-1, 9), X_LG[:3, :3].ravel()) - 1.0) / 2.0
+        closer = cosine >= sin_cos_deg(self._near * NEAR[1])[1]
+        return bool((closer & (shift <= self._near * NEAR[0])).any())
+
+    def _closed(self, drawn: Sequence[tuple[Array, Shape]]) -> list[Palm]:
+        """Return palms with their scores."""
+        palms, X_OL = list[Palm](), invert_pose(self._X_LO)
+        for shape in self._shapes:
+            own = [X_LG for X_LG, other in drawn if other == shape]
+            if own:
+                hand = self._hand.at(shape.preshape)
+                X_OG = centre(self._model, hand, shape.spread, multiply(X_OL, np.array(own)))
+                found = close_on(self._solid, hand, shape.spread, X_OG, X_TS=self._X_LO)
+                rows = zip(multiply(self._X_LO, X_OG), found["score"].tolist(), strict=True)
+                palms += [Palm(X_LG, shape, score) for X_LG, score in rows]
+        return palms
+
+    def _draw(self) -> list[tuple[Array, Shape]]:
+        """Return the palms of a round, as far as the table leaves room for them."""
+        count = sum(ROUND.values())
+        numbers = self._stream.uniform(NUMBERS * count).reshape(count, NUMBERS)
+        normal = self._stream.normal(6 * ROUND["near"]).reshape(-1, 6)
+        drawn: list[tuple[Array, Shape]] = []
+        kinds = [kind for kind, number in ROUND.items() for _ in range(number)]
+        parents = sorted(self._order, key=lambda palm: -palm.score)
+        for kind, (first, *u) in zip(kinds, numbers.tolist(), strict=True):
+            shape = self._shapes[int(first * len(self._shapes))]
+            palms, X = self._palms[shape.preshape], None
+            if kind == "above":
+                turn = 90.0 * int(4.0 * u[0]) + YAW * (2.0 * u[1] - 1.0)
+                X = palms.above(
+                    turn,
+                    DEEPER * (2.0 * u[2] - 1.0),
+                    aside=ALONG * (2.0 * u[3] - 1.0),
+                    tilt=TILT[0] + u[4] * (TILT[1] - TILT[0]),
+                    towards=360.0 * u[5],
+                )
+            elif kind in SLANTS:
+                low, high = SLANTS[kind]
+                turn = 180.0 * int(2.0 * u[2]) + YAW * (2.0 * u[3] - 1.0)
+                height = HEIGHTS[0] + u[4] * (HEIGHTS[1] - HEIGHTS[0])
+                X = palms.beside(low + u[0] * (high - low), 360.0 * u[1], turn, height=height)
+            elif kind == "surface":
+                X = self._at_surface(u)
+            elif parents:
+                parent = parents[int(u[0] * (len(parents) + 1) / 2)]
+                motion = palm_motion(normal[len(drawn) % len(normal)], SHIFT, np.deg2rad(TURN))
+                X, shape = multiply(parent.X_LG, motion), parent.shape
+            if X is not None:
+                drawn.append((X, shape))
+        return drawn
+
+    def _at_surface(self, u: Sequence[float]) -> Array | None:
+        """Return a palm that looks at a surface point against its normal; None from below."""
+        i = int(u[0] * len(self._points))
+        z = -self._normals[i]
+        if z[2] > UPWARD:
+            return None
+        helper = np.array([1.0, 0.0, 0.0] if abs(z[0]) < 0.9 else [0.0, 1.0, 0.0])
+        x = np.cross(helper, z)
+        x = x / norm(x)
+        R = multiply(np.column_stack([x, np.cross(z, x), z]), _turned(360.0 * u[1]))
+        least = min(self._hand.standoffs)
+        return make_pose(R, self._points[i] - (least + FARTHER * u[2]) * z)
+
+
+def level_pose(X_TO: Array) -> Array:
+    """Return X_LO (4, 4), an object's resting pose without its yaw, on coarse grids.
+
+    {L} is {T} turned about the vertical. Resting poses that differ by rounding have one X_LO, but
+    for rare ones between two grid points.
+    """
+    up_O = np.rint(X_TO[2, :3] / UP_GRID) * UP_GRID
+    z = up_O / norm(up_O)
+    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [0.0, 0.0, 1.0], z)
+    x = x / norm(x)
+    height = float(np.rint(X_TO[2, 3] / HEIGHT_GRID) * HEIGHT_GRID)
+    return make_pose(np.stack([x, np.cross(z, x), z]), [0.0, 0.0, height])
+
+
+def _surface(model: ObjectModel, X_LO: Array) -> tuple[Array, Array]:
+    """Return points (n, 3) that cover the surface evenly, not below the table, and normals."""
+    vertices, faces = model.visual_vertices, model.visual_faces.astype(np.int64)
+    points, face = on_faces(vertices, faces, even_points(POINTS))
+    a, b, c = np.moveaxis(vertices[faces[face]], 1, 0)
+    outward = np.cross(b - a, c - a)
+    outward = outward / norm(outward)[:, None]
+    p_LQ = np.maximum(transform_points(X_LO, points), [-np.inf, -np.inf, 0.0])
+    return p_LQ, multiply(outward, X_LO[:3, :3].T)
+
+
+def _turned(degrees: float) -> Array:
+    return rotation_about([0.0, 0.0, 1.0], np.deg2rad(degrees))
