@@ -587,12 +587,12 @@ class Config(_Section):
     scenes: Annotated[ScenesConfig, NO_SHARD, _told_unless(ScenesConfig())] = ScenesConfig()
     # Number of successes of an object after which it is no longer tried.
     max_grasps: Annotated[Count | None, NO_SHARD] = None
-    # Number of samples, before the filter of outliers, after which a build stops: of all objects
-    # together, which contribute in turns, and of each object. An object may have fewer.
+    # Number of samples after which a build stops: of all objects together, which contribute evenly,
+    # and of each object. An object may have fewer.
     samples: Annotated[Count | None, NO_SHARD] = None
     samples_per_object: Annotated[Count | None, NO_SHARD] = None
     # Number of consecutive palm poses without a sample after which an object is given up, if a
-    # number of samples is set.
+    # number of samples or grasps is set.
     samples_patience: Annotated[Count, NO_SHARD] = 400
     filters: Annotated[FilterConfig, NO_SHARD] = FilterConfig()
     split: Annotated[SplitConfig, NO_SHARD] = SplitConfig()
@@ -644,8 +644,8 @@ class Config(_Section):
 
     @property
     def has_target(self) -> bool:
-        """Whether a number of samples is set after which a build stops."""
-        return self.samples is not None or self.samples_per_object is not None
+        """Whether a number of samples or grasps is set after which a build stops."""
+        return (self.samples, self.samples_per_object, self.max_grasps) != (None, None, None)
 
     @property
     def code(self) -> Mapping[str, str]:

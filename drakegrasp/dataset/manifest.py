@@ -129,7 +129,8 @@ class ObjectEntry:
         distinct: Number of different palm poses among the valid ones.
         notes: What was repaired in the mesh.
         licence: Identifier of the mesh's licence; None: not stated.
-        tried: Number of palm poses after which a target of samples was met; None: all.
+        tried: Number of palm poses that the dataset takes, because a target was met; None: all.
+        ended: Whether the samplers have no more palm poses.
         group: Name shared by objects of the same mesh, which stay in one split; None: the object's
             name.
         seed: Seed of the object's draws, in a merged dataset; None: the configuration's seed.
@@ -154,6 +155,7 @@ class ObjectEntry:
     notes: tuple[str, ...]
     licence: Licence | None = None
     tried: Whole | None = None
+    ended: bool = False
     group: Name | None = None
     seed: Seed | None = None
     drawn_as: Name | None = None

@@ -43,6 +43,8 @@ _OF_MODEL = (
 )
 #: Fields of the entry that come from the object's candidates.
 _COUNTS = ("combinations", "valid", "distinct")
+#: Fields of the entry that change when more palm poses are drawn.
+DRAWN_FACTS = (*_COUNTS, "candidates", "ended")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,6 +59,8 @@ class PreparedObject:
         stopped: (r,) bool, whether the object would have rolled on and was stopped, see
             `settle.settle`.
         candidates: Palm poses and their rays.
+        asked: Number of palm poses for which the samplers were asked; if there are fewer, there are
+            no more.
     """
 
     model: ObjectModel
@@ -65,6 +69,7 @@ class PreparedObject:
     table_force: Array
     stopped: npt.NDArray[np.bool_]
     candidates: Candidates
+    asked: int
 
     @property
     def X_TO(self) -> Array:
@@ -84,6 +89,7 @@ class PreparedObject:
             **{name: getattr(self.model, name) for name in _OF_MODEL},
             resting=resting,
             candidates=len(self.candidates),
+            ended=len(self.candidates) < self.asked,
             **{name: getattr(self.candidates, name) for name in _COUNTS},
         )
 
@@ -102,7 +108,7 @@ def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
         file.attrs["model_sha256"] = model_file_sha256(out, model.name)
         file.attrs["config_hash"] = config.simulation_hash()
         file.attrs["mesh_sha256"] = model.mesh_sha256
-        file.attrs["max"] = config.candidates.max
+        file.attrs["asked"] = prepared.asked
         for name in _COUNTS:
             file.attrs[name] = getattr(candidates, name)
         arrays = {**vars(candidates), **vars(prepared), "X_TO": prepared.resting_poses}
@@ -127,8 +133,7 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
     """Return an object that `save_prepared` wrote.
 
     Raises:
-        DataError: If its files are missing or damaged, or belong to another configuration or
-            another number of palm poses.
+        DataError: If its files are missing or damaged, or belong to another configuration.
         MeshError: If the file of its meshes has another version.
     """
     path = plan_path(out, name)
@@ -140,12 +145,9 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
         resting, palms = ({f.name: file[f.name][:] for f in fields} for fields in PLAN_TABLES)
         names = [field.name for field in (*POSTURE_FIELDS, *POSTURE_TEXTS)]
         given = {name: file[name][:] for name in names if name in file}
-    for key, of, due in (
-        ("config_hash", "configuration", config.simulation_hash()),
-        ("max", "candidates.max", config.candidates.max),
-    ):
-        if attributes[key] != due:
-            raise DataError(f"{path}: must be of {of} {due}, got {attributes[key]}")
+    due = config.simulation_hash()
+    if attributes["config_hash"] != due:
+        raise DataError(f"{path}: must be of configuration {due}, got {attributes['config_hash']}")
     counts: dict[str, Any] = {name: int(attributes[name]) for name in _COUNTS}
     return PreparedObject(
         model=load_object(model_path(out, name)),
@@ -156,6 +158,7 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
             **counts,
             postures=_given_postures(given, path),
         ),
+        asked=int(attributes["asked"]),
     )
 
 

@@ -143,6 +143,22 @@ def is_assembled(out: Path, *, verify_shards: bool = False, execute: Executor = 
     return True
 
 
+def palms_in_files(out: Path) -> dict[str, int]:
+    """Return the number of palm poses of each object in the files; empty if there are none.
+
+    Raises:
+        DataError: If trials.hdf5 is damaged.
+    """
+    if not os.path.lexists(out / TRIALS_FILE):
+        return {}
+    with open_trials(out / TRIALS_FILE) as file:
+        names = read_names(file["objects/name"])
+        objects, candidates = (file[f"trials/{name}"][:] for name in ("object", "candidate"))
+    palms = np.zeros(len(names), dtype=np.int64)
+    np.maximum.at(palms, objects, candidates + 1)
+    return dict(zip(names, palms.tolist(), strict=True))
+
+
 def _refuse_broken_files(out: Path) -> None:
     """Raise an error if an existing file cannot be read, since a build would overwrite it.
 

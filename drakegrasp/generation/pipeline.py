@@ -9,16 +9,26 @@ from __future__ import annotations
 import socket
 import sys
 import time
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Protocol
+
+import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.assembly.split import rank_in_split
-from drakegrasp.dataset.assembly.survey import own_filters
+from drakegrasp.dataset.assembly.survey import (
+    headers_by_object,
+    judge_successes,
+    number_rows,
+    own_filters,
+    survey_object,
+    survey_tasks,
+)
 from drakegrasp.dataset.card import write_card
 from drakegrasp.dataset.lock import BuildLog, Holder, build_lock
 from drakegrasp.dataset.manifest import (
@@ -32,9 +42,9 @@ from drakegrasp.dataset.manifest import (
     write_manifest,
 )
 from drakegrasp.dataset.paths import SCENES_FILE
-from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.prepared_objects import DRAWN_FACTS, load_prepared
 from drakegrasp.dataset.shards import ShardHeader
-from drakegrasp.dataset.statistics import is_assembled
+from drakegrasp.dataset.statistics import is_assembled, palms_in_files
 from drakegrasp.errors import (
     ConfigError,
     DataError,
@@ -44,13 +54,22 @@ from drakegrasp.errors import (
     listed,
     printable,
 )
+from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.generation.cautions import nothing_trains, too_heavy
 from drakegrasp.generation.counts import Counts, refuse_two_ends
-from drakegrasp.generation.prepare import PrepareTask, prepare_one
+from drakegrasp.generation.prepare import (
+    DrawTask,
+    PrepareTask,
+    draw_palms,
+    first_palms,
+    prepare_one,
+)
 from drakegrasp.generation.request import Part
 from drakegrasp.generation.scenes import make_scenes_locked
+from drakegrasp.generation.target import Target
 from drakegrasp.generation.work_unit import (
+    UnitSummary,
     WorkUnit,
     find_tasks,
     find_units,
@@ -60,7 +79,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import carry_hand
 from drakegrasp.hand.parsing import position_order
 from drakegrasp.objects.sources import MeshSource, source_sha256
-from drakegrasp.runtime.executor import Executor, WorkerPool
+from drakegrasp.runtime.executor import Executor, WorkerPool, in_order
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
 from drakegrasp.simulation.attempts import Attempts, misfits
@@ -193,7 +212,8 @@ def refuse_part(part: Part | None, config: Config) -> None:
     """
     if part is not None and config.has_target:
         raise ConfigError(
-            "part must be left out with samples and samples_per_object, which need all units"
+            "part must be left out with samples, samples_per_object and max_grasps, which need all "
+            "units (null switches a preset's off, and candidates.max limits the palm poses)"
         )
 
 
@@ -233,6 +253,7 @@ def build_locked(
         known = claim_directory(out, config)
         if known is not None:
             refuse_missing(known, [source.name for source in sources], out)
+            config = _grown(config, known.config)
         config = carry_hand(out, config, known.config.hand if known else None)
 
         notices = [] if dead is None else [f"the lock of a dead build was taken over: {dead}"]
@@ -251,6 +272,19 @@ def build_locked(
             raise
 
 
+def _grown(config: Config, known: Config) -> Config:
+    """Return a configuration with no fewer palm poses than the dataset has: it only grows."""
+    most = max(config.candidates.max, known.candidates.max)
+    rules = config.candidates.model_copy(update={"max": most})
+    return config.model_copy(update={"candidates": rules})
+
+
+class _Add(Protocol):
+    """Counts a completed unit; if `reused`, an earlier build completed it."""
+
+    def __call__(self, summary: UnitSummary, *, reused: bool = False) -> None: ...
+
+
 class _Build:
     """The steps of a build and their common data; `log` writes events, see `BuildLog`."""
 
@@ -267,6 +301,8 @@ class _Build:
         self._out, self._execute, self._pool = out, execute, pool
         self._part, self._left = part, 0
         self._postures, self._show, self.log = postures, show, BuildLog(out)
+        self._floors: dict[str, int] = {}
+        self._warnings: list[str] = []
 
     def run(
         self,
@@ -305,10 +341,10 @@ class _Build:
                 notices.append(told)
 
         # Simulate the missing work units; remove the temporary files of killed workers.
-        with self._progress("simulate", "attempts") as report:
+        with self._progress("simulate", "samples" if config.has_target else "palms") as report:
             counts, manifest = self._run_all(manifest, report)
         write_manifest(manifest, out)
-        notices += [] if counts.target is None else counts.target.shortfall()
+        notices += self._warnings
         if self._pool is not None:
             sweep_temporary(out)
 
@@ -440,6 +476,7 @@ class _Build:
         # If a mesh has changed, its rejected grasps no longer exist.
         before = {entry.name: entry.mesh_sha256 for entry in manifest.objects}
         same = {entry.name for entry in ordered if before.get(entry.name) == entry.mesh_sha256}
+        self._floors = {name: n for name, n in palms_in_files(self._out).items() if name in same}
         objects = (entry for entry in ordered if isinstance(entry, ObjectEntry))
         return replace(
             manifest,
@@ -455,11 +492,14 @@ class _Build:
         """Run the missing work units.
 
         Returns:
-            The counts of all units, and the manifest. With a target of samples, the manifest has
-            the number of palm poses that were tried for each object.
+            The counts of all units, and the manifest. With a target, the manifest has the number of
+            palm poses that the dataset takes of each object.
         """
+        config = manifest.config
         every = replace(manifest, objects=tuple(replace(e, tried=None) for e in manifest.objects))
-        counts = Counts(every, self._pool, report)
+        floors = {entry.name: self._floors.get(entry.name, 0) for entry in manifest.objects}
+        target = Target(config, floors) if config.has_target else None
+        counts = Counts(every, target, self._pool, report)
 
         # The progress bar shows the number of workers as it changes.
         if self._pool is not None:
@@ -471,42 +511,99 @@ class _Build:
             self._pool.on_change = change
 
         # Count the units of earlier builds, which are reused.
+        rejected = {(key.object, key.candidate, key.standoff_index) for key in manifest.rejected}
+        if target is not None:
+            _set_units(target, every)
+
+        def add(summary: UnitSummary, *, reused: bool = False) -> None:
+            if target is not None:
+                name = summary.header.object_name
+                hits = [c for c, s in summary.hits if (name, c, s) not in rejected]
+                target.add(summary.header, hits)
+            counts.add(summary, reused=reused)
+
         done = set[ShardHeader]()
-        find = partial(find_units, every.config)
+        find = partial(find_units, config)
         for units, damaged in self._execute(find, find_tasks(self._out, every)):
             for summary in units:
                 done.add(summary.header)
-                counts.add(summary, reused=True)
+                add(summary, reused=True)
             for path, reason in damaged:
                 counts.damaged.append(path)
                 self.log("damaged shard", reason=reason)
         counts.show()  # the first unit may take a minute
 
-        target = counts.target
-        if target is None:
-            # An object may have enough grasps before a worker is free for its next unit.
-            def due(*, mine: bool) -> Iterator[ShardHeader]:
-                for unit, header in enumerate(every.headers()):
-                    is_mine = self._part is None or self._part.has(unit)
-                    if is_mine == mine and counts.needs(header) and header not in done:
-                        yield header
+        if target is not None:
+            return counts, self._meet(target, every, add)
+        due = [header for header in every.headers() if header not in done]
+        part = self._part
+        mine = due if part is None else [h for i, h in enumerate(every.headers()) if part.has(i)]
+        self._run_units((header for header in mine if header not in done), every, add)
+        self._left = len({*due} - {*mine})
+        return counts, every
 
-            self._run_units(due(mine=True), every, counts)
-            self._left = sum(1 for _ in due(mine=False))
-            return counts, every
+    def _meet(self, target: Target, every: Manifest, add: _Add) -> Manifest:
+        """Run units until a target is met or cannot be met.
 
-        # Run round after round until the target is met.
-        while (plan := target.plan())[2]:
-            self._run_units(target.next_units(), every, counts)
-        tried = {
-            name: units[taken - 1].stop if (taken := plan[0][name]) else 0
-            for name, units in target.units.items()
-        }
-        objects = tuple(replace(e, tried=tried.get(e.name, 0)) for e in every.objects)
-        return counts, replace(every, objects=objects)
+        Returns:
+            The manifest with the number of palm poses that the dataset takes of each object.
+        """
+        while True:
+            self._run_units(target.next_units(), every, add)
+            if dry := target.dry():
+                every = self._draw_more(dry, every)
+                _set_units(target, every)
+            elif None not in (taken := target.taken()).values():
+                met = tuple(replace(e, tried=taken[e.name]) for e in every.objects)
+                manifest = replace(every, objects=met)
+                if not target.lose(self._outliers(manifest)):
+                    self._warnings = target.warnings()
+                    return manifest
+
+    def _draw_more(self, names: Sequence[str], manifest: Manifest) -> Manifest:
+        """Return the manifest with twice as many palm poses of some objects."""
+        config = manifest.config
+        tasks = [
+            DrawTask(
+                out=self._out,
+                name=entry.name,
+                config=manifest.config_of(entry.name),
+                count=min(2 * entry.candidates, config.candidates.max),
+            )
+            for entry in manifest.objects
+            if entry.name in names
+        ]
+        drawn = dict(self._execute(draw_palms, tasks))
+        objects = tuple(
+            replace(
+                entry,
+                **{name: getattr(drawn[entry.name], name) for name in DRAWN_FACTS},
+            )
+            if entry.name in drawn
+            else entry
+            for entry in manifest.objects
+        )
+        return replace(manifest, objects=objects)
+
+    def _outliers(self, manifest: Manifest) -> dict[str, int]:
+        """Return how many samples of each object the filter of outliers removes."""
+        config, names = manifest.config, [entry.name for entry in manifest.objects]
+        if config.filters.outlier_sigma == 0.0 or config.max_grasps is not None:
+            return {}
+        tasks = survey_tasks(self._out, manifest)
+        surveys = list(in_order(self._execute)(survey_object, tasks))
+        if not surveys:
+            return {}
+        successes = number_rows(surveys, manifest).successes
+        lost = judge_successes(successes, config.filters) == Removal.OUTLIER
+        counts = np.bincount(successes["object"][lost], minlength=len(names))
+        return dict(zip(names, counts.tolist(), strict=True))
 
     def _run_units(
-        self, headers: Iterable[ShardHeader], manifest: Manifest, counts: Counts
+        self,
+        headers: Iterable[ShardHeader],
+        manifest: Manifest,
+        add: _Add,
     ) -> None:
         """Run work units, and count their results."""
         tested = _likely_tested(manifest)
@@ -523,7 +620,7 @@ class _Build:
 
         # Count and log each unit when it is done.
         for summary in self._execute(run_unit, units):
-            counts.add(summary)
+            add(summary)
             self.log(
                 "unit done",
                 object=summary.header.object_name,
@@ -533,6 +630,16 @@ class _Build:
                 seconds={stage: round(seconds, 4) for stage, seconds in summary.seconds.items()},
                 errors=summary.errors,
             )
+
+
+def _set_units(target: Target, manifest: Manifest) -> None:
+    """State the work units of each object, but no part of a unit that may still grow."""
+    most = manifest.config.candidates.max
+    for entry, headers in zip(manifest.objects, headers_by_object(manifest), strict=True):
+        endless = not entry.ended and entry.candidates < most
+        whole = {unit.stop for unit in manifest.config.unit_ranges(most)}
+        units = [h for h in headers if not endless or h.stop in whole]
+        target.set_units(entry.name, units, endless=endless)
 
 
 def _refused(postures: Attempts, manifest: Manifest) -> str:
@@ -581,10 +688,10 @@ def _known_entry(
         known = (entry.name, entry.class_name, entry.mesh_sha256)
         if known == (source.name, source.class_name, digest):
             try:
-                load_prepared(out, source.name, manifest.config)
+                prepared = load_prepared(out, source.name, manifest.config)
             except DrakegraspError:
                 return None
-            return entry
+            return entry if prepared.asked >= first_palms(manifest.config) else None
     return None
 
 

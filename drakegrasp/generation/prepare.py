@@ -32,6 +32,8 @@ from drakegrasp.simulation.attempts import Attempts, given_candidates
 from drakegrasp.simulation.candidates import sample_candidates
 from drakegrasp.simulation.settle import find_resting_poses
 
+#: Smallest number of palm poses that a build with a target draws first.
+FIRST_PALMS = 64
 #: Computing time after which the preparation of a mesh is considered to hang [s].
 PREPARE_SECONDS = 1800.0
 
@@ -81,6 +83,56 @@ class PrepareTask:
     def _mesh_place(self) -> str:
         # Messages name the file, so the copy keeps its name.
         return f"meshes/{self.mesh_sha256[:16]}/{self.source.path.name}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawTask:
+    """The input of a task that draws more palm poses of a prepared object, as plain data.
+
+    Attributes:
+        out: Directory of the dataset, as a path of the process that runs the task.
+        name: Name of the object.
+        config: Configuration of the dataset.
+        count: Number of palm poses, with those that are drawn already.
+    """
+
+    out: Path
+    name: str
+    config: Config
+    count: int
+
+    def reads(self) -> dict[str, Path]:
+        """Return the files of the object and the hand, see `FileTask`."""
+        files = object_files(self.out, self.name)
+        return {**hand_places(self.config), **places(self.out, *files)}
+
+    def writes(self) -> tuple[str, ...]:
+        """Return the paths of the object's files, relative to the dataset."""
+        files = object_files(self.out, self.name)
+        return tuple(path.relative_to(self.out).as_posix() for path in files)
+
+    def moved(self, folder: Path) -> DrawTask:
+        """Return the task in a directory with copies of the files."""
+        return replace(self, out=folder, config=moved_hand(self.config, folder))
+
+
+@one_thread
+def draw_palms(task: DrawTask) -> tuple[str, ObjectEntry]:
+    """Draw palm poses of a prepared object, and return its name and its entry in the manifest.
+
+    Raises:
+        DataError: If the object's files are missing or damaged.
+        DiskFullError: If there is no space for the object's files.
+    """
+    out, config = task.out, task.config
+    with disk_full_named(out):
+        prepared = load_prepared(out, task.name, config)
+        if prepared.asked < task.count:
+            poses = prepared.resting_poses
+            drawn = sample_candidates(prepared.model, poses, config, task.count)
+            prepared = replace(prepared, candidates=drawn, asked=task.count)
+            save_prepared(prepared, out, config)
+    return task.name, prepared.entry()
 
 
 @one_thread
@@ -134,7 +186,7 @@ def _entry_there(task: PrepareTask) -> ObjectEntry | None:
         return None
     model = prepared.model
     same = (model.class_name, model.mesh_sha256) == (task.source.class_name, task.mesh_sha256)
-    return prepared.entry() if same else None
+    return prepared.entry() if same and prepared.asked >= first_palms(task.config) else None
 
 
 def _prepared_entry(task: PrepareTask) -> ObjectEntry | RefusedMesh:
@@ -177,8 +229,9 @@ def prepare(source: MeshSource, config: Config, postures: Attempts | None = None
         inject_fault(source.name, "distances")
         _ = model.field
     poses = np.array([pose.X_TO for pose in resting])
+    asked = first_palms(config)
     if postures is None:
-        candidates = sample_candidates(model, poses, config)
+        candidates = sample_candidates(model, poses, config, asked)
     else:
         X_OM = file_frame(source) if postures.frame == "mesh" else np.eye(4)
         candidates = given_candidates(model, poses, postures, X_OM, config)
@@ -189,4 +242,16 @@ def prepare(source: MeshSource, config: Config, postures: Attempts | None = None
         table_force=np.array([pose.table_force for pose in resting]),
         stopped=np.array([pose.stopped for pose in resting]),
         candidates=candidates,
+        asked=asked,
     )
+
+
+def first_palms(config: Config) -> int:
+    """Return the number of palm poses that are drawn when an object is prepared.
+
+    A build with a target draws a few, and more when it needs them.
+    """
+    most = config.candidates.max
+    if not config.has_target or config.candidates.postures is not None:
+        return most
+    return next((u.stop for u in config.unit_ranges(most) if u.stop >= FIRST_PALMS), most)

@@ -20,7 +20,7 @@ import numpy as np
 from drakegrasp.config import Config, FilterConfig
 from drakegrasp.dataset.assembly.survey import (
     SurveyTask,
-    count_samples,
+    find_hits,
     judge_successes,
     successes_of,
     survey_tasks,
@@ -125,14 +125,15 @@ class UnitSummary:
         seconds: Wall-clock time by stage (`build`, `try`, `measure`, `look`, `certify` if there are
             repeats, `write`) [s]; for logs only. Empty if the shard existed already.
         errors: Number of solver errors by message.
-        samples: Number of samples, see `count_samples`; None if there is no target of samples.
+        hits: Candidates and stand-offs of the attempts that count for the target, see `find_hits`;
+            empty without a target.
     """
 
     header: ShardHeader
     outcomes: dict[Outcome, int]
     seconds: dict[str, float]
     errors: dict[str, int]
-    samples: int | None = None
+    hits: tuple[tuple[int, int], ...] = ()
 
 
 #: Only one unit runs at a time, because two threads in one scene would mix up their results.
@@ -165,7 +166,7 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
             summary = _Experiment(unit, NO_JOURNAL).run()
         header.journal_path(out).unlink(missing_ok=True)
         trim_memory()
-        return _with_samples(out, summary, unit.config)
+        return _with_hits(out, summary, unit.config)
 
 
 class _Experiment:
@@ -356,7 +357,7 @@ def count_outcomes(outcomes: AnyArray) -> dict[Outcome, int]:
 
 
 def _find_unit(out: Path, header: ShardHeader) -> UnitSummary | None:
-    """Return the summary of a completed unit without its samples, or None if it has no shard.
+    """Return the summary of a completed unit without its hits, or None if it has no shard.
 
     Raises:
         DataError: If the shard is damaged or belongs to another unit.
@@ -368,11 +369,11 @@ def _find_unit(out: Path, header: ShardHeader) -> UnitSummary | None:
     return UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={})
 
 
-def _with_samples(out: Path, summary: UnitSummary, config: Config) -> UnitSummary:
-    """Return a summary with its number of samples, if there is a target of samples."""
+def _with_hits(out: Path, summary: UnitSummary, config: Config) -> UnitSummary:
+    """Return a summary with its hits, if there is a target."""
     if not config.has_target:
         return summary
-    return replace(summary, samples=count_samples(out, summary.header, config))
+    return replace(summary, hits=tuple(find_hits(out, summary.header, config)))
 
 
 def find_tasks(out: Path, manifest: Manifest) -> Iterator[SurveyTask]:
@@ -387,7 +388,7 @@ def find_tasks(out: Path, manifest: Manifest) -> Iterator[SurveyTask]:
 
 
 def find_units(config: Config, task: SurveyTask) -> tuple[list[UnitSummary], list[tuple[str, str]]]:
-    """Find an object's completed units in a dataset, up to the last requested grasp.
+    """Find an object's completed units in a dataset.
 
     The folder is listed once, and the seals of its shards are verified. A build that continues runs
     this in all its workers.
@@ -398,12 +399,7 @@ def find_units(config: Config, task: SurveyTask) -> tuple[list[UnitSummary], lis
     """
     out, done, damaged = Path(task.out), list[UnitSummary](), list[tuple[str, str]]()
     names = set(os.listdir(shards_folder(out, task.headers[0].object_name)))
-    grasps, unbroken = 0, True
     for header in task.headers:
-        # No other unit is needed if the units before the first gap have enough grasps.
-        if task.wanted is not None and grasps >= task.wanted:
-            break
-
         # Open only files that are listed.
         try:
             found = _find_unit(out, header) if header.file_name in names else None
@@ -411,12 +407,10 @@ def find_units(config: Config, task: SurveyTask) -> tuple[list[UnitSummary], lis
             damaged.append((str(header.path(out).relative_to(out)), str(error)))
             found = None
         if found is None:
-            unbroken = False
             continue
 
         # A process may have died after writing the shard and before removing the journal.
         if header.journal_path(out).name in names:
             header.journal_path(out).unlink(missing_ok=True)
-        done.append(_with_samples(out, found, config))
-        grasps += found.outcomes.get(Outcome.SUCCESS, 0) * unbroken
+        done.append(_with_hits(out, found, config))
     return done, damaged

@@ -124,21 +124,6 @@ def _columns_of(columns: Mapping[str, AnyArray]) -> Kept:
     return table, Table(features, place=closed.astype(np.int32))
 
 
-def _wanted_rows(table: Table, wanted: int | None) -> tuple[int, int | None]:
-    """Return how many attempts of a shard an object needs, and how many grasps it wants after them.
-
-    Assembly takes the same rows: with `max_grasps` they end with the last wanted grasp.
-
-    Args:
-        table: Attempts of the shard.
-        wanted: Number of grasps that the object still wants; None for all.
-    """
-    (hits,) = np.nonzero(table.held)
-    if wanted is None or len(hits) < wanted:
-        return table.count, wanted and wanted - len(hits)
-    return int(hits[wanted - 1]) + 1 if wanted else 0, 0
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Snapshot:
     """One state of a dataset's files.
@@ -338,16 +323,13 @@ class Catalog:
         self._parts = parts
 
         # The number of an object is its position in this manifest, which may have grown.
-        wanted: dict[str, int | None] = dict.fromkeys(numbers, manifest.config.max_grasps)
-        cut, rows = [], []
+        own, rows = [], []
         for header, (part, (table, closed)) in parts.items():
-            name = header.object_name
-            count, wanted[name] = _wanted_rows(table, wanted[name])
-            number = np.full(count, numbers[name], dtype=np.int32)
-            cut.append(replace(part, count=count, object=numbers[name]))
-            kept = table[:count].with_columns(object=number)
-            rows.append((kept, closed[closed.place < count]))
-        trials = Trials.of_parts(self.out, objects, cut)
+            number = numbers[header.object_name]
+            own.append(replace(part, object=number))
+            column = np.full(table.count, number, dtype=np.int32)
+            rows.append((table.with_columns(object=column), closed))
+        trials = Trials.of_parts(self.out, objects, own)
         table, closed = _join(rows) if rows else read_attempts(trials)
 
         missing = [
@@ -473,19 +455,16 @@ def _own_hashes(manifest: Manifest | None) -> dict[str, str]:
 
 def _count_newer(state: Snapshot, manifest: Manifest) -> int:
     """Return the number of finished work units that are not in the assembled files."""
-    # Each object's last palm pose in the files, and whether it has all the grasps that it wants.
-    table, count = state.table, len(state.names)
-    last = np.full(count, -1, dtype=np.int32)
+    # Each object's last palm pose in the files.
+    table = state.table
+    last = np.full(len(state.names), -1, dtype=np.int32)
     np.maximum.at(last, table.object, table.candidate)
-    grasps = np.bincount(table.object[table.held], minlength=count)
-    wanted = manifest.config.max_grasps
-    full = np.zeros(count, dtype=bool) if wanted is None else grasps >= wanted
 
     numbers = {key: i for i, key in enumerate(zip(state.names, state.meshes, strict=True))}
     newer = 0
     for header in _done_headers(state.out, manifest):
         number = numbers.get((header.object_name, header.mesh_sha256))
-        newer += number is None or (header.start > last[number] and not full[number])
+        newer += number is None or header.start > last[number]
     return newer
 
 

@@ -1,135 +1,166 @@
-"""A target of samples: its rounds, its shares, and what a larger one adds."""
+"""A target of samples: even shares, exhausted objects, and what a larger one adds."""
 
 from __future__ import annotations
 
-from itertools import pairwise
+from collections.abc import Mapping
 
 import pytest
 
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import ConfigError
-from drakegrasp.generation.counts import Target, refuse_two_ends
+from drakegrasp.generation.counts import refuse_two_ends
+from drakegrasp.generation.target import Target
 from drakegrasp.hand.settings import load_config
 
-
-def units(name: str, count: int) -> list[ShardHeader]:
-    return [
-        ShardHeader(config_hash="c", mesh_sha256="m", object_name=name, start=i, stop=i + 1)
-        for i in range(count)
-    ]
-
-
-#: Samples of the units of each object: one gives many, one few, one none and one has few units.
-YIELDS = {
-    "rich": [4] * 50,
-    "poor": [0, 1] * 25,
-    "barren": [0] * 50,
-    "short": [1, 2],
+#: Palm poses in a unit, and in all.
+UNIT, PALMS = 4, 400
+#: The palm poses of the hits of each object: many, one in ten, none, and few before it ends.
+HITS = {
+    "rich": range(PALMS),
+    "poor": range(5, PALMS, 10),
+    "barren": range(0),
+    "short": (1, 2, 7),
 }
+#: The number of palm poses of each object; the samplers of one have no more.
+DRAWN = {**dict.fromkeys(HITS, PALMS), "short": 10}
 
 
-def make_target(samples: int | None, per_object: int | None = None, patience: int = 1000) -> Target:
-    by_object = {name: units(name, len(found)) for name, found in YIELDS.items()}
-    config = load_config(samples=samples, samples_per_object=per_object, samples_patience=patience)
-    return Target(config=config, units=by_object)
-
-
-def run(target: Target, workers: int = 1) -> tuple[dict[str, int], dict[str, int]]:
-    """Run a target as a build does; return how many units and samples belong to it."""
-    while target.plan()[2]:
-        in_flight: list[ShardHeader] = []
-        for header in target.next_units():
-            in_flight.append(header)
-            if len(in_flight) >= workers:
-                # The last that began ends first.
-                done = in_flight.pop()
-                target.found[done] = YIELDS[done.object_name][done.start]
-        for header in in_flight:
-            target.found[header] = YIELDS[header.object_name][header.start]
-    taken, counts, _ = target.plan()
-    return taken, counts
-
-
-def test_target_is_met_by_the_round_that_reaches_it() -> None:
-    assert run(make_target(4)) == run(make_target(5))
-    taken, counts = run(make_target(5))
-    assert (set(taken.values()), sum(counts.values())) == ({1}, 5)
-    assert sum(run(make_target(6))[1].values()) >= 6
-
-
-def test_objects_share_a_target_in_turns() -> None:
-    taken, counts = run(make_target(40))
-    # Who has a share waits while the others catch up, and takes over what they cannot give.
-    assert counts == {"rich": 20, "poor": 17, "barren": 0, "short": 3}
-    assert (taken["rich"], taken["poor"], taken["short"]) == (5, 34, 2)
-
-
-def test_object_that_is_tried_in_vain_is_given_up() -> None:
-    taken, counts = run(make_target(40, patience=3))
-    assert (taken["barren"], counts["barren"]) == (3, 0)
-    # One sample in two units is enough to go on.
-    assert counts["poor"] > 10
-
-
-def test_what_is_out_of_reach_ends_with_the_units() -> None:
-    taken, counts = run(make_target(10_000))
-    assert taken == {name: len(found) for name, found in YIELDS.items()}
-    assert counts == {name: sum(found) for name, found in YIELDS.items()}
-
-
-def test_each_object_has_its_own_target() -> None:
-    taken, counts = run(make_target(None, per_object=6))
-    assert (counts["rich"], counts["poor"], counts["short"]) == (8, 6, 3)
-    assert taken["barren"] == 50
-
-
-@pytest.mark.parametrize("workers", [1, 2, 7])
-def test_units_of_a_target_do_not_depend_on_the_workers(workers: int) -> None:
-    assert run(make_target(40), workers) == run(make_target(40), 1)
-
-
-def test_workers_have_work_while_a_round_ends() -> None:
-    target = make_target(40)
-    coming = target.next_units()
-    first = [next(coming) for _ in YIELDS]
-    assert {header.start for header in first} == {0}
-    target.found[first[0]] = 4
-    ahead = next(coming)
-    assert (ahead.object_name, ahead.start) == ("rich", 1)
-    # But by one round only.
-    target.found[ahead] = 4
-    assert next(coming, None) is None
-
-
-def test_a_smaller_target_is_part_of_a_larger_one() -> None:
-    reached = [run(make_target(samples))[0] for samples in range(1, 120, 7)]
-    for fewer, more in pairwise(reached):
-        assert all(fewer[name] <= more[name] for name in YIELDS)
-
-
-def test_target_that_is_met_lacks_nothing() -> None:
-    target = make_target(40)
-    run(target)
-    assert target.shortfall() == []
-
-
-def test_shortfall_names_what_was_tried_to_its_end() -> None:
-    """The short object has two units; the barren one is given up after ten of its fifty."""
-    target = make_target(None, per_object=5, patience=10)
-    run(target)
-    assert target.shortfall() == [
-        "too few samples, given up after 10 palm poses without a sample: barren (0)",
-        "too few samples, all palm poses were tried, --candidates allows more: short (3)",
+def units(name: str, palms: int) -> list[ShardHeader]:
+    return [
+        ShardHeader(
+            config_hash="c",
+            mesh_sha256="m",
+            object_name=name,
+            start=start,
+            stop=min(start + UNIT, palms),
+        )
+        for start in range(0, palms, UNIT)
     ]
 
 
-def test_shortfall_tells_how_many_there_are_of_a_total() -> None:
-    target = make_target(1000)
+def make_target(floors: Mapping[str, int] | None = None, **ends: int) -> Target:
+    config = load_config(**{"samples_patience": 60, **ends})
+    target = Target(config, floors or dict.fromkeys(HITS, 0))
+    for name in floors or HITS:
+        target.set_units(name, units(name, DRAWN[name]), endless=False)
+    # What the dataset has is counted first.
+    for name, palms in (floors or {}).items():
+        for unit in units(name, -(-palms // UNIT) * UNIT):
+            end(target, unit)
+    return target
+
+
+def end(target: Target, unit: ShardHeader) -> None:
+    target.add(unit, [h for h in HITS[unit.object_name] if unit.start <= h < unit.stop])
+
+
+def run(target: Target, workers: int = 1) -> dict[str, int]:
+    """Run a target as a build does; return the palm poses that the dataset takes."""
+    while None in (taken := target.taken()).values():
+        running: list[ShardHeader] = []
+        for unit in target.next_units():
+            running.append(unit)
+            if len(running) >= workers:
+                end(target, running.pop())  # the last that began ends first
+        for unit in running:
+            end(target, unit)
+    return {name: palms for name, palms in taken.items() if palms is not None}
+
+
+def samples(taken: Mapping[str, int]) -> dict[str, int]:
+    return {name: sum(hit < palms for hit in HITS[name]) for name, palms in taken.items()}
+
+
+@pytest.mark.parametrize("wanted", [1, 2, 3, 7, 40])
+def test_number_that_was_asked_for_is_the_number(wanted: int) -> None:
+    found = samples(run(make_target(samples=wanted)))
+    assert sum(found.values()) == wanted
+    # Three objects can contribute, one of them three at most.
+    assert found["barren"] == 0
+    assert found["rich"] - found["poor"] in (0, 1)
+    assert found["short"] == 3 or abs(found["short"] - found["poor"]) <= 1
+
+
+def test_samples_are_spread_evenly() -> None:
+    found = samples(run(make_target(samples=40)))
+    assert found == {"rich": 19, "poor": 18, "barren": 0, "short": 3}
+
+
+def test_result_does_not_depend_on_the_number_of_workers() -> None:
+    alone = run(make_target(samples=25))
+    assert [run(make_target(samples=25), workers) for workers in (2, 3, 8)] == 3 * [alone]
+
+
+def test_each_object_has_the_number_of_each() -> None:
+    target = make_target(samples_per_object=5)
+    assert samples(run(target)) == {"rich": 5, "poor": 5, "barren": 0, "short": 3}
+    given_up, spent = target.warnings()
+    assert "given up after 60 palm poses" in given_up
+    assert "barren (0)" in given_up
+    assert "all palm poses were tried" in spent
+    assert "short (3)" in spent
+
+
+def test_object_is_given_up_after_its_patience_and_stays_so() -> None:
+    taken = run(make_target(samples_per_object=5))
+    assert taken["barren"] == 60
+    assert run(make_target(taken, samples_per_object=5)) == taken
+
+
+def test_larger_target_takes_nothing_out() -> None:
+    first = run(make_target(samples=12))
+    more = run(make_target(first, samples=30))
+    assert sum(samples(more).values()) == 30
+    assert all(more[name] >= palms for name, palms in first.items())
+
+
+def test_smaller_target_keeps_what_is_there() -> None:
+    first = run(make_target(samples=30))
+    assert run(make_target(first, samples=12)) == first
+
+
+def test_new_object_fills_up_while_others_stay() -> None:
+    old = {"rich": 30, "poor": 0}
+    found = samples(run(make_target(old, samples=35)))
+    assert found == {"rich": 30, "poor": 5}
+
+
+def test_one_object_that_makes_up_for_others_is_told() -> None:
+    target = make_target(samples=100)
+    found = samples(run(target))
+    assert sum(found.values()) == 100
+    (line,) = target.warnings()
+    assert line.startswith("more than twice their share of 25 samples, because the other objects ")
+    assert "rich (57)" in line
+
+
+def test_target_that_cannot_be_met_is_told() -> None:
+    target = make_target(samples=1000)
     run(target)
-    assert target.shortfall()[0] == "228 of 1,000 samples were found"
+    assert target.warnings()[0] == "443 of 1,000 samples were found"
 
 
-def test_grasps_and_samples_are_not_both_an_end() -> None:
-    refuse_two_ends(load_config(max_grasps=3))
+def test_object_without_more_drawn_palms_is_dry_until_more_are_drawn() -> None:
+    target = Target(load_config(samples=6), {"poor": 0})
+    target.set_units("poor", units("poor", 12), endless=True)
+    for unit in target.next_units():
+        end(target, unit)
+    assert target.dry() == ["poor"]
+    target.set_units("poor", units("poor", PALMS), endless=True)
+    assert target.dry() == []
+    assert run(target) == {"poor": 56}
+
+
+def test_samples_that_the_filter_of_outliers_removes_are_made_up_for() -> None:
+    target = make_target(samples=12)
+    run(target)
+    assert target.lose({"rich": 2})
+    found = samples(run(target))
+    assert sum(found.values()) == 14
+    assert not target.lose({"rich": 1})
+
+
+def test_grasps_and_samples_cannot_both_end_a_build() -> None:
+    config = load_config(max_grasps=3, samples=4)
     with pytest.raises(ConfigError, match="max_grasps must be null with samples"):
-        refuse_two_ends(load_config(max_grasps=3, samples_per_object=2))
+        refuse_two_ends(config)

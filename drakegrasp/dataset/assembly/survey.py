@@ -39,7 +39,6 @@ from drakegrasp.dataset.shards import (
     ShardHeader,
     open_shard,
     read_field,
-    read_trials,
     trial_columns,
 )
 from drakegrasp.errors import ConfigError, listed
@@ -62,14 +61,14 @@ class SurveyTask:
         out: Directory of the dataset.
         object: Row of the object in /objects.
         headers: The object's work units, in the order of their candidates.
-        wanted: Number of grasps after which the object's rows end; None for all rows.
+        tried: Number of palm poses after which the object's rows end; None for all rows.
         camera: Camera that sees the grasps.
     """
 
     out: str
     object: int
     headers: tuple[ShardHeader, ...]
-    wanted: int | None
+    tried: int | None
     camera: CameraConfig
 
 
@@ -80,7 +79,7 @@ class Survey:
     Attributes:
         object: Row of the object in /objects.
         rows: Number of rows that the dataset takes from each shard, counted from the first; shards
-            after the last wanted grasp are not listed.
+            after the last palm pose that the dataset takes are not listed.
         seals: Hash of the seals of these shards.
         successes: Successes in these rows, with the columns of `successes_of`; `trial_id` counts
             from the object's first row.
@@ -96,15 +95,14 @@ class Survey:
 
 def survey_tasks(out: Path, manifest: Manifest) -> Iterator[SurveyTask]:
     """Yield the task of each object that has a palm pose."""
-    config = manifest.config
     for i, headers in enumerate(headers_by_object(manifest)):
         if headers:
             yield SurveyTask(
                 out=str(out),
                 object=i,
                 headers=headers,
-                wanted=config.max_grasps,
-                camera=config.camera,
+                tried=manifest.objects[i].tried,
+                camera=manifest.config.camera,
             )
 
 
@@ -122,19 +120,17 @@ def survey_object(task: SurveyTask) -> Survey:
     Raises:
         DataError: If a shard is missing or damaged.
     """
-    out, first, left = Path(task.out), 0, task.wanted
+    out, first = Path(task.out), 0
     rows, parts, digest = list[int](), list[Table](), hashlib.sha256()
     letters: Mapping[str, int] = {}
     for header in task.headers:
-        if left == 0:
-            break
         with open_shard(header.path(out), header) as (file, _):
-            # The rows end with the last wanted grasp. So a dataset does not depend on how many more
-            # attempts the workers had begun when there were enough grasps.
-            outcome = read_column(file["trials"], "outcome")
-            hits = np.flatnonzero(outcome == Outcome.SUCCESS)[:left]
-            left = None if left is None else left - len(hits)
-            count = int(hits[-1]) + 1 if left == 0 else len(outcome)
+            # The rows end with the last palm pose that the dataset takes. So a dataset does not
+            # depend on how many more attempts the workers had begun.
+            palm = read_column(file["trials"], "candidate")
+            count = len(palm) if task.tried is None else int(np.count_nonzero(palm < task.tried))
+            outcome = read_column(file["trials"], "outcome")[:count]
+            hits = np.flatnonzero(outcome == Outcome.SUCCESS)
 
             own = (f for f in trial_columns() if f.name in TRIAL_COLUMNS)
             found = {f.name: read_field(file["trials"], f)[hits] for f in own}
@@ -186,14 +182,9 @@ def join_seals(digests: Mapping[int, bytes]) -> str:
 
 def _read_seals(task: SurveyTask) -> tuple[int, bytes]:
     """Return the row of an object and its `Survey.seals`; the seals are not verified."""
-    out, left, digest = Path(task.out), task.wanted, hashlib.sha256()
+    digest = hashlib.sha256()
     for header in task.headers:
-        if left is not None and left <= 0:
-            break
-        digest.update(read_seal(header.path(out)))
-        if left is not None:
-            rows = read_trials(header.path(out), header, ("outcome",), verify_seal=False)
-            left -= int(np.count_nonzero(rows["outcome"] == Outcome.SUCCESS))
+        digest.update(read_seal(header.path(Path(task.out))))
     return task.object, digest.digest()
 
 
@@ -410,8 +401,7 @@ def number_rows(surveys: Sequence[Survey], manifest: Manifest) -> Shards:
     for survey in surveys:
         ids = survey.successes["trial_id"] + first
         parts.append(survey.successes.with_columns(trial_id=ids))
-        # Shards after the last wanted grasp have no rows here.
-        for header, rows in zip(headers[survey.object], survey.rows, strict=False):
+        for header, rows in zip(headers[survey.object], survey.rows, strict=True):
             slices.append(ShardSlice(header=header, object=survey.object, first=first, rows=rows))
             first += rows
     return Shards(
@@ -593,13 +583,19 @@ def _removed_by_own(config: FilterConfig, successes: Table) -> Flags:
     return removed
 
 
-def count_samples(out: Path, header: ShardHeader, config: Config) -> int:
-    """Return how many successes of a shard pass all filters except the one of outliers.
+def find_hits(out: Path, header: ShardHeader, config: Config) -> list[tuple[int, int]]:
+    """Return the candidates and stand-offs of a shard's attempts that count for a target.
+
+    These are the successes with `max_grasps`, and otherwise those that pass all filters except the
+    one of outliers, which needs all grasps of an object.
 
     Raises:
         DataError: If the shard is missing or damaged.
     """
+    task = SurveyTask(out=str(out), object=0, headers=(header,), tried=None, camera=config.camera)
+    found = survey_object(task).successes
     filters = config.filters.model_copy(update={"outlier_sigma": 0.0})
-    task = SurveyTask(out=str(out), object=0, headers=(header,), wanted=None, camera=config.camera)
-    removal = judge_successes(survey_object(task).successes, filters)
-    return int(np.count_nonzero(removal == Removal.KEPT))
+    kept = judge_successes(found, filters) == Removal.KEPT
+    rows = np.arange(len(kept)) if config.max_grasps is not None else np.flatnonzero(kept)
+    places = (found[name][rows].tolist() for name in ("candidate", "standoff_index"))
+    return list(zip(*places, strict=True))

@@ -78,7 +78,6 @@ from drakegrasp.filters import Removal
 from drakegrasp.foreign_files import read_json
 from drakegrasp.hand.folder import HAND_FOLDER, hand_digest
 from drakegrasp.objects.model import load_object
-from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.files import refuse_half_replaced
 from drakegrasp.runtime.progress import Report, silent
@@ -333,20 +332,16 @@ def _as_written(out: Path, name: str) -> Iterator[Violation]:
 
 
 def _broken_shards(task: SurveyTask) -> Iterator[Violation]:
-    """The shards exist and are complete, up to the last wanted grasp."""
-    out, left = Path(task.out), np.inf if task.wanted is None else task.wanted
+    """The shards exist and are complete."""
+    out = Path(task.out)
     for header in task.headers:
-        if left <= 0:
-            return
         path = header.path(out)
         try:
-            outcome = read_trials(path, header, ("outcome",), complete=True)["outcome"]
+            read_trials(path, header, ("outcome",), complete=True)
         except DataError as error:
             what = "the shard must be there, whole and of its work unit"
             got = str(error).rpartition(", got ")[2] if path.exists() else "none"
             yield of_file(str(path.relative_to(out)), what, got)
-            continue
-        left -= int((outcome == Outcome.SUCCESS).sum())
 
 
 # What is decided again

@@ -1,0 +1,249 @@
+"""The target of a build: how many palm poses of each object the dataset takes.
+
+A target is a number of samples in all (`samples`), of each object (`samples_per_object`), or of
+grasps of each object (`max_grasps`). Input: the palm poses whose attempts were hits (samples, or
+grasps), as work units end, in any order. Output: the units that are still needed, and in the end
+the number of palm poses of each object after which its rows end.
+
+The samples are spread evenly: every object contributes up to one level, which rises where others
+are exhausted. The result follows from the hits alone, not from the order or the number of units
+that were done beyond it. What a dataset already has is never taken out of it.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import inf
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.errors import listed
+
+#: An object has much more than its share if it has more than this multiple of it.
+MUCH = 2
+
+
+@dataclass(eq=False)
+class _Object:
+    """What is known of an object's palm poses.
+
+    Attributes:
+        floor: Number of palm poses that the dataset already has.
+        units: Its work units, in order.
+        endless: Whether more palm poses can be drawn than those of the units.
+        found: The palm poses of the hits of each completed unit, by its first palm pose.
+        known: Number of palm poses before the first unit that is not done.
+        hits: Palm poses of the hits among these, ascending.
+    """
+
+    floor: int
+    units: Sequence[ShardHeader]
+    endless: bool
+    found: dict[int, tuple[int, ...]] = field(default_factory=dict)
+    known: int = 0
+    hits: list[int] = field(default_factory=list)
+
+    def add(self, unit: ShardHeader, hits: Sequence[int]) -> None:
+        """Note a completed unit."""
+        self.found[unit.start] = tuple(sorted(hits))
+        stops = {each.start: each.stop for each in self.units}
+        while (own := self.found.get(self.known)) is not None and self.known in stops:
+            self.hits += own
+            self.known = stops[self.known]
+
+    @property
+    def drawn(self) -> int:
+        """Number of palm poses that are drawn."""
+        return self.units[-1].stop if self.units else 0
+
+    def end(self, patience: int) -> int | None:
+        """Return the number of palm poses after which the object is exhausted; None if unknown.
+
+        It is exhausted after `patience` palm poses in a row without a hit, or after the last one.
+        """
+        last = 0
+        for hit in self.hits:
+            if hit - last >= patience:
+                break
+            last = hit + 1
+        if self.known - last >= patience:
+            return max(last + patience, self.floor)
+        return self.known if self.known == self.drawn and not self.endless else None
+
+    def within(self, palms: int) -> int:
+        """Return the number of hits among the first palm poses."""
+        return bisect_left(self.hits, palms)
+
+    def taken(self, hits: int, patience: int) -> int | None:
+        """Return the palm poses that yield a number of hits; None if more must be tried."""
+        if self.known < self.floor:
+            return None
+        if hits <= self.within(self.floor):
+            return self.floor
+        if hits <= len(self.hits):
+            return self.hits[hits - 1] + 1
+        return self.end(patience)
+
+
+class Target:
+    """The target of a build, and what is known of each object."""
+
+    def __init__(self, config: Config, floors: Mapping[str, int]) -> None:
+        """Begin without any palm poses.
+
+        Args:
+            config: Configuration, whose `samples`, `samples_per_object`, `max_grasps` and
+                `samples_patience` define the target.
+            floors: Number of palm poses of each object that the dataset already has, by name.
+        """
+        self._config, self._patience = config, config.samples_patience
+        self._objects = {name: _Object(floor, (), True) for name, floor in floors.items()}
+        self._lost = dict.fromkeys(floors, 0)
+
+    def set_units(self, name: str, units: Sequence[ShardHeader], *, endless: bool) -> None:
+        """State an object's work units, and whether more palm poses can be drawn."""
+        item = self._objects[name]
+        item.units, item.endless = units, endless
+
+    def add(self, unit: ShardHeader, hits: Sequence[int]) -> None:
+        """Note the palm poses of the hits of a completed unit."""
+        self._objects[unit.object_name].add(unit, hits)
+
+    def lose(self, lost: Mapping[str, int]) -> bool:
+        """State how many hits of each object are no samples after all; return whether more are."""
+        before = dict(self._lost)
+        self._lost |= {name: max(count, before[name]) for name, count in lost.items()}
+        return self._lost != before
+
+    @property
+    def wanted(self) -> int:
+        """Number of hits at which the build ends, if every object yields its share."""
+        each = self._config.samples_per_object or self._config.max_grasps
+        of_all = inf if each is None else each * len(self._objects)
+        return int(min(of_all, inf if self._config.samples is None else self._config.samples))
+
+    @property
+    def found(self) -> int:
+        """Number of hits so far, up to the wanted number of each object."""
+        shares = self._shares()
+        hits = {name: sum(map(len, item.found.values())) for name, item in self._objects.items()}
+        return sum(min(count, shares[name]) for name, count in hits.items())
+
+    def taken(self) -> dict[str, int | None]:
+        """Return the palm poses of each object in the dataset; None where more must be tried."""
+        shares = self._shares()
+        return {
+            name: item.taken(shares[name], self._patience) for name, item in self._objects.items()
+        }
+
+    def dry(self) -> list[str]:
+        """Return the objects that need more palm poses than are drawn."""
+        return [
+            name
+            for name, taken in self.taken().items()
+            if taken is None and self._objects[name].known == self._objects[name].drawn
+        ]
+
+    def next_units(self) -> Iterator[ShardHeader]:
+        """Yield units that are needed, and as long as others run, units that may be.
+
+        A unit that turns out not to be needed costs time, but does not change the result.
+        """
+        given: dict[str, list[ShardHeader]] = {name: [] for name in self._objects}
+        while True:
+            shares, best = self._shares(), None
+            for name, taken in self.taken().items():
+                item = self._objects[name]
+                if taken is not None:
+                    continue
+                running = [unit for unit in given[name] if unit.start not in item.found]
+                free = [
+                    unit
+                    for unit in item.units
+                    if unit.start not in item.found and unit not in running
+                ]
+                # The units that run are expected to yield as many hits as those before.
+                rate = (len(item.hits) + 1) / (item.known + 2)
+                expected = len(item.hits) + rate * sum(unit.stop - unit.start for unit in running)
+                due = free and (not running or expected < shares[name])
+                if due and (best is None or len(running) < best[0]):
+                    best = len(running), free[0]
+            if best is None:
+                return
+            given[best[1].object_name].append(best[1])
+            yield best[1]
+
+    def warnings(self) -> list[str]:
+        """Return lines that state which part of the target was not reached, and what is uneven."""
+        config, lines = self._config, list[str]()
+        each = config.samples_per_object or config.max_grasps
+        what = "grasps" if config.max_grasps is not None else "samples"
+        counts, spent, vain = dict[str, int](), list[str](), list[str]()
+        shares = self._shares()
+        for name, taken in self.taken().items():
+            item = self._objects[name]
+            counts[name] = item.within(taken or 0) - self._lost[name]
+            if item.within(taken or 0) < shares[name]:
+                is_spent = taken == item.drawn and not item.endless
+                (spent if is_spent else vain).append(name)
+        total = sum(counts.values())
+        if config.samples is not None and total < config.samples:
+            lines.append(f"{total:,} of {config.samples:,} {what} were found")
+        if config.samples is None or total < config.samples:
+            for names, why in (
+                (vain, f"given up after {self._patience} palm poses without one"),
+                (spent, "all palm poses were tried"),
+            ):
+                if names:
+                    said = listed([f"{name} ({counts[name]:,})" for name in names])
+                    lines.append(f"too few {what}, {why}: {said}")
+
+        # A few objects may have to make up for the others.
+        share = self.wanted / max(len(counts), 1)
+        large = [name for name, count in counts.items() if count > MUCH * share]
+        if large:
+            said = listed([f"{name} ({counts[name]:,})" for name in large])
+            lines.append(
+                f"more than twice their share of {share:.3g} {what}, because the other objects "
+                f"yielded no more: {said}"
+            )
+        return lines
+
+    def _shares(self) -> dict[str, int]:
+        """Return the number of hits for which each object is tried, as even as possible.
+
+        An exhausted object has fewer.
+        """
+        wanted = self._config.samples
+        each = self._config.samples_per_object or self._config.max_grasps or wanted or 0
+        shares = {name: each + lost for name, lost in self._lost.items()}
+        if wanted is None:
+            return shares
+
+        # Every object contributes what the dataset has, or up to a level, or what it has at most.
+        least = {name: item.within(item.floor) for name, item in self._objects.items()}
+        most = dict(shares)
+        for name, item in self._objects.items():
+            if (end := item.end(self._patience)) is not None:
+                most[name] = min(most[name], item.within(end))
+
+        def contributed(level: int, name: str) -> int:
+            return max(least[name], min(level + self._lost[name], most[name]))
+
+        # The highest level at which the objects together have at most the wanted number; the first
+        # ones contribute one more.
+        rest = wanted + sum(self._lost.values())
+        low, high = 0, rest + 1
+        while high - low > 1:
+            middle = (low + high) // 2
+            total = sum(contributed(middle, name) for name in shares)
+            low, high = (middle, high) if total <= rest else (low, middle)
+        rest -= sum(contributed(low, name) for name in shares)
+        for name in shares:
+            more = contributed(low + 1, name) - contributed(low, name) if rest > 0 else 0
+            level = low + 1 if rest > 0 else low
+            shares[name] = min(level + self._lost[name], shares[name])
+            rest -= more
+        return shares
