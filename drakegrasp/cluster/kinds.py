@@ -38,6 +38,8 @@ from drakegrasp.cluster.connect import (
 )
 from drakegrasp.errors import ConfigError, MachineError, counted
 
+#: Largest number of workers or cores, more than any cluster has.
+MOST = 1_000_000
 #: Options of a cluster on other machines.
 REMOTE = ("workers", "cores", "memory", "host", "interface")
 #: Maximum memory of a worker [B], more than any machine has.
@@ -101,6 +103,8 @@ class Local:
                 raise ConfigError(f"--{name} must not be given with --cluster {self.kind}")
             if name in ("workers", "cores") and value is not None and value < 1:
                 raise ConfigError(f"{name} must be at least 1, got {value}")
+            if name in ("workers", "cores") and value is not None and value > MOST:
+                raise ConfigError(f"{name} must be at most {MOST:,}, got {value}")
         chosen_security(self.tls, self.tls_files, elsewhere=type(self) is not Local)
         if self.memory is not None:
             memory_bytes(self.memory)
