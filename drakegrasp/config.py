@@ -267,6 +267,10 @@ def _own_filters(value: Any, info: ValidationInfo) -> tuple[str, ...]:
     return tuple(names)
 
 
+#: Largest number of palm poses of an object, unless another one is stated (paper).
+MOST_PALMS = 10_000
+
+
 class CandidateConfig(_ExtensibleSection):
     """The palm poses to try."""
 
@@ -275,7 +279,7 @@ class CandidateConfig(_ExtensibleSection):
     method: Annotated[str | tuple[str, ...], BeforeValidator(_samplers)] = "rotations"
     # Palm poses per object; if there are more, they are thinned at random with the seed (paper). A
     # dataset may grow.
-    max: Annotated[Count, NO_SHARD] = 10_000
+    max: Annotated[Count, NO_SHARD] = MOST_PALMS
     global_x_deg: Angles = tuple(range(0, 181, 30))  # paper, Table II
     global_y_deg: Angles = tuple(range(0, 360, 30))
     global_z_deg: Angles = tuple(range(0, 360, 45))
@@ -500,9 +504,10 @@ else:
 class SplitConfig(_Section):
     """How the samples are split for training, validation and test; docs/reference/outcomes.md."""
 
-    # class: the paper's rule. object: whole objects are drawn. auto: by object if each class has
-    # one mesh and `train_classes` names no class, otherwise by class.
-    by: Literal["auto", "class", "object"] = "auto"
+    # object: whole objects are drawn, and stay in their split. class: the paper's rule.
+    by: Literal["object", "class"] = "object"
+    # Of the draw of whole objects; datasets that are merged must have the same.
+    seed: Seed = 0
     # Fraction of the objects; without effect in a split by class, which tests one object of each
     # class.
     test_fraction: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.15
@@ -516,8 +521,8 @@ class SplitConfig(_Section):
     @model_validator(mode="after")
     def _of_one_rule(self) -> SplitConfig:
         if self.by == "object" and self.train_classes is not None:
-            raise ValueError("by must be class or auto where train_classes is given, got object")
-        if self.by != "class" and self.test_fraction + self.valid_fraction >= 1.0:
+            raise ValueError("by must be class where train_classes is given, got object")
+        if self.by == "object" and self.test_fraction + self.valid_fraction >= 1.0:
             raise ValueError(
                 "test_fraction and valid_fraction together must be less than 1, unless by is "
                 f"class, got {self.test_fraction} and {self.valid_fraction}"
@@ -693,6 +698,10 @@ class Config(_Section):
 
 #: Keys of the configuration that change no shard.
 POSTPROCESSING_KEYS = tuple(k for k, v in Config.model_fields.items() if NO_SHARD in v.metadata)
+
+
+#: The preset of a build without a configuration.
+BUILD_PRESET = "fast"
 
 
 def preset_names() -> list[str]:

@@ -15,7 +15,7 @@ from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.connect import Workers, dashboard_line, has_dashboard, joined
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.cluster.wire import by_wire
-from drakegrasp.config import Config
+from drakegrasp.config import BUILD_PRESET, Config
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import claim_directory, release_directory
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
@@ -26,6 +26,7 @@ from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.generation.pipeline import (
     BuildReport,
     build_locked,
+    ended,
     posture_config,
     refuse_missing,
     refuse_part,
@@ -76,7 +77,8 @@ def build_dataset(
         objects: Directory of meshes, or "builtin" for the built-in objects, whose number
             `config.builtin` specifies.
         out: Directory of the dataset. Files travel over the network if a worker does not see it.
-        config: All the rules; None for the defaults.
+        config: All the rules; None for the preset `fast`. If it draws any number of palm poses and
+            states no end, each object ends with 20 samples.
         units: Unit of length of the meshes: m, cm or mm.
         manifest: YAML file with units and classes per mesh, if it is not in their folder.
         only: Names of the objects to build; all if empty.
@@ -102,7 +104,7 @@ def build_dataset(
             the same call continues when that is fixed.
     """
     cluster = joined(client, workers)
-    out, config = Path(out).absolute(), config or load_config()
+    out, config = Path(out).absolute(), config or load_config(BUILD_PRESET)
     hand = load_hand(config.hand_source)
     drive_of(hand, config.lift)
     if isinstance(postures, str | Path):
@@ -167,6 +169,8 @@ def build_on(
         MachineError: If a worker would give other results than this machine.
     """
     refuse_unusable(config)
+    if part is None:
+        config = ended(config, postures)
     refuse_part(part, config)
     config = posture_config(config, postures)
     only, postures = _chosen(_names(sources, config), only, postures)

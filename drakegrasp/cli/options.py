@@ -242,14 +242,14 @@ def _shared(
         --only NAME: Build this object only; may be given several times.
         --out DIR: Directory of the dataset. The same command continues an interrupted build.
         --config YAML|PRESET: Configuration: a file, or the preset paper, fast, randomized or
-            released. [default: paper, but with split.by=auto]
+            released. [default: fast]
         --set KEY=VALUE (overrides): Change one setting, e.g. lift.hold_time=1; may be given several
             times.
-        --candidates N: Number of palm poses per object. [default: 10000]
+        --candidates N: Largest number of palm poses per object. [default: 10000]
         --max-grasps N: Stop an object after N successes. [default: no limit]
         --samples N: Stop when all objects together have N samples; a larger N continues the build.
-            [default: no limit]
-        --samples-per-object N: Stop an object when it has N samples. [default: no limit]
+        --samples-per-object N: Stop an object when it has N samples. [default: 20, with fast and
+            without --samples, --max-grasps and --candidates]
         --certify K: Repeat the lift of each sample K times with disturbances, and store how many
             hold. [default: 0]
         --seed S: Seed of all random draws. [default: 0]
@@ -362,12 +362,13 @@ def parse_request(options: Mapping[str, Any]) -> BuildRequest:
         HandError: If the hand's file cannot be read.
     """
     # Loading pydantic takes a while, and `--help` must answer immediately.
+    from drakegrasp.config import BUILD_PRESET
     from drakegrasp.hand.settings import load_config
 
     return BuildRequest(
         objects=options["objects"],
         out=options["out"].absolute(),
-        config=load_config(options["config"], chosen_settings(options)),
+        config=load_config(options["config"] or BUILD_PRESET, chosen_settings(options)),
         units=options["units"],
         manifest=options["manifest"],
         only=options["only"],

@@ -407,7 +407,7 @@ def print_stats(out: Path) -> None:
     console.print(table)
     console.print(hold_table(funnel))
     manifest = read_manifest(out)
-    config, rule = manifest.config, manifest.split_rule
+    config, rule = manifest.config, manifest.config.split.by
     if preshapes := preshapes_of(funnel, config):
         console.print(preshape_table(preshapes))
     console.print()

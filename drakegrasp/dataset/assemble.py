@@ -92,7 +92,8 @@ def assemble(
 
     Args:
         out: Directory of the dataset.
-        overrides: `key=value` strings that change the filters or the split of the dataset.
+        overrides: `key=value` strings that change the filters or the split of the dataset. If the
+            split changes, all objects are drawn anew.
         rejected: Trials that an inspection rejects, as ids or identities; they do not become
             samples.
         execute: Executor of the tasks; the files do not depend on it.
@@ -109,8 +110,12 @@ def assemble(
     if not out.is_dir():
         read_manifest(out)
     with build_lock(out):
-        manifest = read_manifest(out)
-        manifest = with_postprocessing(manifest, overrides)
+        before = read_manifest(out)
+        manifest = with_postprocessing(before, overrides)
+        if manifest.config.split != before.config.split:
+            manifest = replace(
+                manifest, objects=tuple(replace(e, split=None) for e in manifest.objects)
+            )
         return assemble_locked(out, manifest, rejected=rejected, execute=execute, progress=progress)
 
 
@@ -141,6 +146,7 @@ def assemble_locked(
             known = keys_of(manifest, shards.successes)
             manifest = replace(manifest, rejected=find_keys(rejected, known, out))
         decisions = decide(manifest, shards)
+        manifest = decisions.manifest
         certified = manifest.config.certified
 
         # Write the small tables, and allocate all rows.

@@ -34,7 +34,7 @@ from drakegrasp.config import (
     Share,
     parse_stored,
 )
-from drakegrasp.dataset.assembly.split import Rule, number_poses, split_rule
+from drakegrasp.dataset.assembly.split import Home, number_poses
 from drakegrasp.dataset.json_files import Name, read_mapping, stated, validated
 from drakegrasp.dataset.lock import FOLDERS, LOCK_FILE, LOG_FILE, unwritable
 from drakegrasp.dataset.paths import FILE_NAME
@@ -131,6 +131,7 @@ class ObjectEntry:
         licence: Identifier of the mesh's licence; None: not stated.
         tried: Number of palm poses that the dataset takes, because a target was met; None: all.
         ended: Whether the samplers have no more palm poses.
+        split: Split of the object in a split by object, once it has samples; None before.
         group: Name shared by objects of the same mesh, which stay in one split; None: the object's
             name.
         seed: Seed of the object's draws, in a merged dataset; None: the configuration's seed.
@@ -156,6 +157,7 @@ class ObjectEntry:
     licence: Licence | None = None
     tried: Whole | None = None
     ended: bool = False
+    split: Home | None = None
     group: Name | None = None
     seed: Seed | None = None
     drawn_as: Name | None = None
@@ -246,14 +248,8 @@ class Manifest:
 
     @property
     def groups(self) -> list[str]:
-        """Group of each object, see `split.split_rule`."""
+        """Group of each object, equal for objects of the same mesh, e.g. its morphs."""
         return [entry.group or entry.mesh_name for entry in self.objects]
-
-    @property
-    def split_rule(self) -> Rule:
-        """The rule that `split.by` of the configuration selects for these objects."""
-        classes = [entry.class_name for entry in self.objects]
-        return split_rule(self.config.split, classes, self.groups)
 
     def pose_numbers(self) -> list[npt.NDArray[np.int64]]:
         """Return a number for each resting pose (r,) of each object, see `number_poses`."""
@@ -342,7 +338,7 @@ def _content(manifest: Manifest) -> dict[str, Any]:
         "config_hash": manifest.config.simulation_hash(),
         "seed": manifest.config.seed,
         "config": manifest.config.to_dict(),
-        "split_by": manifest.split_rule,
+        "split_by": manifest.config.split.by,
         "versions": manifest.versions,
         "fingers": manifest.fingers,
         **({"joints": list(manifest.joints)} if manifest.joints else {}),
@@ -404,7 +400,7 @@ class _Stored(BaseModel):
     config_hash: Hex
     seed: int
     config: dict[str, Any]
-    split_by: Rule | None = None
+    split_by: str
     versions: dict[str, str]
     fingers: dict[str, bool] = {}
     joints: tuple[Text, ...] = ()
@@ -423,8 +419,8 @@ def _contradictions(stored: _Stored, manifest: Manifest) -> Iterator[str]:
     ):
         if said != must:
             yield f"{key} must be {must}, that of its config, got {said}"
-    if stored.split_by not in (None, manifest.split_rule):
-        yield f"split_by must be {manifest.split_rule} with its objects, got {stored.split_by}"
+    if stored.split_by != config.split.by:
+        yield f"split_by must be {config.split.by}, that of its config, got {stored.split_by}"
 
     for name, count in Counter(entry.name for entry in stored.objects).items():
         if count > 1:

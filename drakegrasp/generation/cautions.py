@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from drakegrasp.config import SplitConfig
-from drakegrasp.dataset.assembly.split import may_train, split_rule
+from drakegrasp.dataset.assembly.split import may_train
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.errors import listed
 from drakegrasp.hand.description import load_hand
@@ -21,7 +21,7 @@ def nothing_trains(sources: Sequence[MeshSource], split: SplitConfig) -> str:
     if split.train_classes == ():
         return ""
     classes = [source.class_name for source in sources]
-    if split_rule(split, classes, [source.group or source.name for source in sources]) == "object":
+    if split.by == "object":
         return ""
     counts = Counter(classes)
     if any(may_train(name, count, split) for name, count in counts.items()):

@@ -117,8 +117,7 @@ def _refuse_missing(manifest: Manifest, folder: Path, parts: Sequence[Path]) -> 
         DataError: If a work unit is missing.
     """
     missing = [header for header in manifest.headers() if not header.path(folder).exists()]
-    # With `max_grasps`, units after the last requested grasp may be missing.
-    if parts and missing and manifest.config.max_grasps is None:
+    if parts and missing:
         first = missing[0]
         raise DataError(
             f"{parts[0]}: must be a complete dataset, or given with all other parts of its build, "
@@ -182,6 +181,18 @@ def _parts(manifests: Mapping[Path, Manifest]) -> list[_Part]:
                     f"{getattr(known, key)}, got {getattr(entry, key)}"
                 )
 
+    # An object keeps its split, so it must not have two.
+    homes = dict[str, tuple[Path, str]]()
+    for out, entry, _, _ in entries:
+        if entry.split is not None:
+            first, split = homes.setdefault(entry.group or entry.mesh_name, (out, entry.split))
+            if split != entry.split:
+                raise DataError(
+                    f"{out}: {entry.mesh_name} must be in one split of all datasets, got it in "
+                    f"{entry.split}, and in {split} of {first}; `drakegrasp assemble` with --set "
+                    "split.seed=... draws the splits of a dataset anew"
+                )
+
     # A mesh keeps its name with the first seed, or if it has only one seed.
     parts = list[_Part]()
     for out, entry, headers, own in entries:
@@ -209,8 +220,8 @@ def _merged_manifest(manifests: Mapping[Path, Manifest], parts: Iterable[_Part])
         known = objects.setdefault(merged.name, merged)
         untold = None in (known.tried, merged.tried)
         tried = None if untold else max(known.tried or 0, merged.tried or 0)
-        longer = replace(known, tried=tried)
-        if longer != replace(merged, tried=tried):
+        longer = replace(known, tried=tried, split=known.split or merged.split)
+        if longer != replace(merged, tried=tried, split=longer.split):
             theirs, ours = known.to_json(), merged.to_json()
             keys = [key for key in {**theirs, **ours} if theirs.get(key) != ours.get(key)]
             raise DataError(

@@ -18,7 +18,7 @@ from typing import Protocol
 
 import numpy as np
 
-from drakegrasp.config import Config
+from drakegrasp.config import MOST_PALMS, Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.assembly.split import rank_in_split
 from drakegrasp.dataset.assembly.survey import (
@@ -86,6 +86,8 @@ from drakegrasp.simulation.attempts import Attempts, misfits
 from drakegrasp.simulation.candidates import sampler_class
 from drakegrasp.simulation.drive import drive_of
 
+#: Number of samples of each object that a build makes if nothing else ends it.
+SAMPLES_PER_OBJECT = 20
 #: Margin of ranks at the border of a split, which depends on which objects have samples.
 NEAR_BORDER = 0.05
 
@@ -171,6 +173,17 @@ def build(
             pool=pool,
             show=show,
         )
+
+
+def ended(config: Config, postures: Attempts | None) -> Config:
+    """Return the configuration of a build that ends.
+
+    Without a target and a number of palm poses, samplers without an end would go on for hours.
+    """
+    endless = "closing" in config.candidates.methods and postures is None
+    if config.has_target or not endless or config.candidates.max < MOST_PALMS:
+        return config
+    return config.model_copy(update={"samples_per_object": SAMPLES_PER_OBJECT})
 
 
 def posture_config(config: Config, postures: Attempts | None) -> Config:
@@ -701,9 +714,9 @@ def _likely_tested(manifest: Manifest) -> set[str]:
     The split depends on which objects have samples. The fractions are slightly larger here, so that
     hardly any object is missed.
     """
-    rules, config = manifest.config.split, manifest.config
+    rules = manifest.config.split
     ranks = {
-        entry.name: rank_in_split(group, config.seed)
+        entry.name: rank_in_split(group, rules.seed)
         for entry, group in zip(manifest.objects, manifest.groups, strict=True)
     }
     low, high = rules.test_fraction + NEAR_BORDER, 1.0 - rules.valid_fraction - NEAR_BORDER

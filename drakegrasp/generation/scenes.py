@@ -190,9 +190,9 @@ def split_objects(manifest: Manifest, present: Sequence[set[int]]) -> list[int]:
         manifest: Manifest of the dataset.
         present: For each object, the splits that have samples of it.
     """
-    config, seed = manifest.config.split, manifest.config.seed
+    config, seed = manifest.config.split, manifest.config.split.seed
     train, valid, test = range(len(SPLITS))
-    groups, by_class = manifest.groups, manifest.split_rule == "class"
+    groups, by_class = manifest.groups, config.by == "class"
     found = {group: set[int]() for group in groups}
     for group, splits in zip(groups, present, strict=True):
         found[group] |= splits

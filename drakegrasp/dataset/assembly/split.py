@@ -1,14 +1,14 @@
 """Postprocessing: which samples are for training, validation and test, by class or by object.
 
 Pure functions of names and numbers. The rule by class is that of the paper (Veres et al.): one
-object of each class is for testing. The rule by object is for meshes that are each a class of their
-own; the rule by class would put all of these into the test split.
+object of each class is for testing. By object, whole objects are drawn among those that have
+samples, and once an object is in a split, it stays there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Literal
+from collections.abc import Collection, Mapping, Sequence
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -18,26 +18,10 @@ from drakegrasp.config import SplitConfig
 from drakegrasp.frames import Array
 from drakegrasp.seeding import Stream, object_key
 
-Rule = Literal["class", "object"]
+#: A split, and the splits in the order of the files.
+Home: TypeAlias = Literal["train", "valid", "test"]
+SPLIT_NAMES: tuple[Home, ...] = get_args(Home)
 Rows = npt.NDArray[np.int64]
-
-
-def split_rule(config: SplitConfig, classes: Sequence[str], groups: Sequence[str]) -> Rule:
-    """Return the rule of the split: that of the configuration, or the rule that `auto` selects.
-
-    `auto` selects the rule by object if no class has objects of two groups and `train_classes` is
-    not given. Objects without samples count as well, so that the rule does not depend on which
-    grasps held.
-
-    Args:
-        config: Configuration of the split.
-        classes: Classes of the objects.
-        groups: Group of each object, equal for objects of the same mesh, e.g. its morphs.
-    """
-    if config.by != "auto":
-        return config.by
-    one_each = len(set(zip(classes, groups, strict=True))) == len(set(classes))
-    return "object" if one_each and config.train_classes is None else "class"
 
 
 def may_train(class_name: str, count: int, config: SplitConfig) -> bool:
@@ -52,6 +36,7 @@ def split_samples(
     names: Sequence[str],
     classes: Sequence[str],
     groups: Sequence[str],
+    homes: Mapping[str, Home],
     config: SplitConfig,
     seed: int,
 ) -> dict[str, Rows]:
@@ -61,13 +46,15 @@ def split_samples(
         objects: (n,), row of /objects of each sample.
         names: Names of the objects' meshes, by row; a mesh with several seeds counts as one object.
         classes: Classes of the objects, by row.
-        groups: Groups of the objects, by row, see `split_rule`.
+        groups: Groups of the objects, by row, equal for objects of the same mesh, e.g. its morphs.
+        homes: Split of each group of a split by object, see `find_homes`.
         config: The rule and the fractions of the splits.
-        seed: Seed of the dataset.
+        seed: Seed of the dataset, which draws the split by class.
     """
-    if split_rule(config, classes, groups) == "object":
-        return _split_by_object(objects, groups, config, seed)
-    return _split_by_class(objects, names, classes, config, seed)
+    if config.by == "class":
+        return _split_by_class(objects, names, classes, config, seed)
+    members = {split: [g for g, home in homes.items() if home == split] for split in SPLIT_NAMES}
+    return {split: _rows_of(objects, groups, chosen) for split, chosen in members.items()}
 
 
 def _split_by_class(
@@ -124,24 +111,32 @@ def rank_in_split(group: str, seed: int) -> float:
     return float(Stream(seed, object_key(group), 0, 2).uniform(1)[0])
 
 
-def _split_by_object(
-    objects: npt.NDArray[np.int32], groups: Sequence[str], config: SplitConfig, seed: int
-) -> dict[str, Rows]:
-    """Return the indices of the samples of each split by object.
+def find_homes(
+    present: Collection[str], known: Mapping[str, Home], config: SplitConfig
+) -> dict[str, Home]:
+    """Return the split of each group of objects that has samples, in a split by object.
 
-    Each group of objects draws a number from the seed and its own name. The groups with samples are
-    ordered by this number: the first ones are for testing, the last ones for validation, and those
-    between for training. An additional group therefore moves at most one other group across each of
-    the two borders, and none from test to validation or back.
+    A group that is in a split stays there. The others fill up the fractions of the groups: each
+    draws a number from its name, the lowest are for testing and the highest for validation.
+
+    Args:
+        present: Groups that have samples.
+        known: Splits of groups that have been in a split before.
+        config: The fractions, and the seed of the draw.
     """
-    # The groups that have samples, in the order of their numbers.
-    present = {groups[i] for i in np.unique(objects).tolist()}
-    ordered = sorted(present, key=lambda group: (rank_in_split(group, seed), group))
+    homes = {group: known[group] for group in present if group in known}
+    new = sorted(set(present) - set(homes), key=lambda g: (rank_in_split(g, config.seed), g))
+    splits = list(homes.values())
 
-    tested, valid = _shares(len(ordered), config)
-    last = len(ordered) - valid
-    members = {"train": ordered[tested:last], "valid": ordered[last:], "test": ordered[:tested]}
-    return {name: _rows_of(objects, groups, chosen) for name, chosen in members.items()}
+    # At least one group is for training before any other is tested or validates.
+    tested, valid = _shares(len(present), config)
+    room = len(new) - ("train" not in splits)
+    tested = max(0, min(tested - splits.count("test"), room))
+    valid = max(0, min(valid - splits.count("valid"), room - tested))
+    last = len(new) - valid
+    for i, group in enumerate(new):
+        homes[group] = "test" if i < tested else "valid" if i >= last else "train"
+    return homes
 
 
 def _rows_of(objects: npt.NDArray[np.int32], texts: Sequence[str], chosen: Sequence[str]) -> Rows:

@@ -10,8 +10,8 @@ rejections), and in which split each sample is. `assembly.pack` packs the rows a
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from drakegrasp import registry
 from drakegrasp.config import CameraConfig, Config, FilterConfig, is_own_class
-from drakegrasp.dataset.assembly.split import split_samples
+from drakegrasp.dataset.assembly.split import Home, find_homes, split_samples
 from drakegrasp.dataset.hdf5 import AnyArray, read_column
 from drakegrasp.dataset.manifest import Manifest, origin_attributes
 from drakegrasp.dataset.quality import COLUMNS, suspicion
@@ -372,11 +372,14 @@ class Decisions:
     """What is decided about the n successes of a dataset.
 
     Attributes:
+        manifest: Manifest of the dataset, in which each object that has samples has its split, if
+            whole objects are split.
         shards: Rows and successes of the dataset's shards.
         removal: (n,) uint8, the `Removal` of each success.
         splits: Indices of the samples of each split among the successes, in rising order.
     """
 
+    manifest: Manifest
     shards: Shards
     removal: AnyArray
     splits: Mapping[str, npt.NDArray[np.int64]]
@@ -437,16 +440,45 @@ def decide(
 
     # Split the samples.
     kept = np.flatnonzero(removal == Removal.KEPT)
+    manifest = _with_homes(manifest, set(successes["object"][kept].tolist()))
     split = split_samples(
         successes["object"][kept],
         [entry.mesh_name for entry in manifest.objects],
         [entry.class_name for entry in manifest.objects],
         manifest.groups,
+        {group: home for group, home in _homes(manifest).items() if home is not None},
         manifest.config.split,
         manifest.config.seed,
     )
     splits = {name: kept[rows] for name, rows in split.items()}
-    return Decisions(shards=shards, removal=removal, splits=splits)
+    return Decisions(manifest=manifest, shards=shards, removal=removal, splits=splits)
+
+
+def _homes(manifest: Manifest) -> dict[str, Home | None]:
+    """Return the split of each group of objects; None for one that never had samples."""
+    homes = dict[str, Home | None]()
+    for group, entry in zip(manifest.groups, manifest.objects, strict=True):
+        homes[group] = homes.get(group) or entry.split
+    return homes
+
+
+def _with_homes(manifest: Manifest, present: Collection[int]) -> Manifest:
+    """Return a manifest with the splits of its objects.
+
+    Args:
+        manifest: The manifest.
+        present: Rows in /objects of the objects that have samples.
+    """
+    rules, groups = manifest.config.split, manifest.groups
+    if rules.by == "class":
+        return manifest
+    known = {group: home for group, home in _homes(manifest).items() if home is not None}
+    homes = {**known, **find_homes({groups[i] for i in present}, known, rules)}
+    objects = tuple(
+        replace(entry, split=homes.get(group))
+        for group, entry in zip(groups, manifest.objects, strict=True)
+    )
+    return replace(manifest, objects=objects)
 
 
 def object_columns(manifest: Manifest) -> dict[str, AnyArray]:
@@ -469,7 +501,7 @@ def file_attributes(manifest: Manifest, seals: str, camera: str = "") -> dict[st
         seals: Hash of the seals of the shards, hexadecimal.
         camera: `oto` or `otm`; empty for the trials.
     """
-    own = {"camera": camera, "split_by": manifest.split_rule} if camera else {}
+    own = {"camera": camera, "split_by": manifest.config.split.by} if camera else {}
     return {
         **origin_attributes(manifest.config, manifest.versions, manifest.fingers, manifest.joints),
         **lens_attributes(manifest.config.camera),

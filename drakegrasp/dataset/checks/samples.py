@@ -509,7 +509,7 @@ def splits(data: CheckedFile, entries: Mapping[str, ObjectEntry]) -> Iterator[Vi
     meshes = [entries[name].mesh_name if name in entries else name for name in names]
     config = data.config.split.model_copy(update={"by": "class"})
     numbers, classes = np.arange(len(names), dtype=np.int32), [kinds[name] for name in names]
-    drawn = split_samples(numbers, meshes, classes, meshes, config, data.config.seed)
+    drawn = split_samples(numbers, meshes, classes, meshes, {}, config, data.config.seed)
     due = {names[i] for i in drawn["test"].tolist()}
     for split, members in objects.items():
         for name in sorted(members):
@@ -520,6 +520,6 @@ def splits(data: CheckedFile, entries: Mapping[str, ObjectEntry]) -> Iterator[Vi
 
 
 def group_of(entries: Mapping[str, ObjectEntry], name: str) -> str:
-    """Return the group of an object, see `split_rule`; its name if the object is unknown."""
+    """Return the group of an object, see `Manifest.groups`; its name if it is unknown."""
     entry = entries.get(name)
     return name if entry is None else entry.group or entry.mesh_name
