@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, with_config
 
 from drakegrasp.config import (
@@ -34,7 +33,7 @@ from drakegrasp.config import (
     Share,
     parse_stored,
 )
-from drakegrasp.dataset.assembly.split import Rule, number_poses, split_rule
+from drakegrasp.dataset.assembly.split import Rule, split_rule
 from drakegrasp.dataset.json_files import Name, read_mapping, stated, validated
 from drakegrasp.dataset.lock import FOLDERS, LOCK_FILE, LOG_FILE, unwritable
 from drakegrasp.dataset.paths import FILE_NAME
@@ -252,12 +251,6 @@ class Manifest:
         """The rule that `split.by` of the configuration selects for these objects."""
         classes = [entry.class_name for entry in self.objects]
         return split_rule(self.config.split, classes, self.groups)
-
-    def pose_numbers(self) -> list[npt.NDArray[np.int64]]:
-        """Return a number for each resting pose (r,) of each object, see `number_poses`."""
-        # The third row of X_TO is the table's normal in {O}, and the height.
-        up = [[pose.X_TO[8:11] for pose in entry.resting] for entry in self.objects]
-        return number_poses([entry.mesh_name for entry in self.objects], up)
 
     def signature(self) -> str:
         """Return a hash of everything that determines a row of the dataset, hexadecimal."""
