@@ -16,6 +16,7 @@ from rich.table import Table
 
 from drakegrasp.cli.console import say
 from drakegrasp.config import Config
+from drakegrasp.dataset.distinct import BANDS
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
 from drakegrasp.dataset.quality import holding_lines, holding_of
@@ -99,15 +100,11 @@ def _table_of_objects(
 ) -> Table:
     """Return a table with a row per object and a row for all objects.
 
-    `row` returns the cells for a range of objects. The last column is the number of samples.
+    `row` returns the cells for a range of objects.
     """
-
-    def cells(name: str, objects: slice) -> list[str]:
-        return [name, *row(objects), _count(funnel.samples[objects].sum())]
-
-    heads = ("object", *heads, "samples")
-    rows = (cells(name, slice(i, i + 1)) for i, name in enumerate(funnel.names))
-    return make_table(title, heads, rows, [cells("all", slice(None))], caption=caption)
+    rows = ([name, *row(slice(i, i + 1))] for i, name in enumerate(funnel.names))
+    total = ["all", *row(slice(None))]
+    return make_table(title, ("object", *heads), rows, [total], caption=caption)
 
 
 def _head(outcome: Outcome) -> str:
@@ -132,16 +129,18 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
         groups = {name: [o for o in _FUNNEL if o.group == name] for name in GROUPS}
         groups = {h: g for h, g in groups.items() if h != "moved" or there[g].any()}
     heads = ["poses", "attempts", *groups]
-    heads += [f"- {r.label}".replace("_", "\n") for r in removed]
+    heads += [f"- {r.label}".replace("_", "\n") for r in removed] + ["samples", "distinct"]
 
     def row(objects: slice) -> list[str]:
         outcomes = funnel.outcomes[objects].sum(axis=0).tolist()
         cells = [funnel.candidates[objects].sum(), sum(outcomes)]
         cells += [sum(outcomes[o] for o in group) for group in groups.values()]
         cells += [funnel.removals[objects, r].sum() for r in removed]
+        cells += [funnel.samples[objects].sum(), funnel.distinct[objects].sum()]
         return list(map(_count, cells))
 
-    return _table_of_objects("From palm poses to samples", heads, funnel, row)
+    caption = "distinct: samples whose palms are within 20 mm and 30° of each other count as one"
+    return _table_of_objects("From palm poses to samples", heads, funnel, row, caption)
 
 
 def hold_table(funnel: Funnel) -> Table:
@@ -156,11 +155,12 @@ def hold_table(funnel: Funnel) -> Table:
 
     def row(objects: slice) -> list[str]:
         counts = (funnel.outcomes.sum(axis=1), held, funnel.precision, stable)
+        samples = _count(funnel.samples[objects].sum())
         all_held, all_stable = int(held[objects].sum()), int(stable[objects].sum())
         share = f"{all_stable / all_held:.0%}" if all_held else "-"
-        return [*(_count(count[objects].sum()) for count in counts), share]
+        return [*(_count(count[objects].sum()) for count in counts), share, samples]
 
-    heads = ["attempts", "held", "precision", "stable", "stable\nof held"]
+    heads = ["attempts", "held", "precision", "stable", "stable\nof held", "samples"]
     return _table_of_objects("How well the hand holds", heads, funnel, row, "\n".join(notes))
 
 
@@ -175,9 +175,21 @@ def preshape_table(counts: Sequence[PreshapeCount]) -> Table:
 
 def split_table(counts: Sequence[SplitCount]) -> Table:
     """Return the paper's Table III with an additional column of objects."""
-    heads = ("split", "samples", "objects", "classes")
+    heads = ("split", "samples", "distinct", "objects", "classes")
     rows = ([c.split, *(_count(getattr(c, name)) for name in heads[1:])] for c in counts)
     return make_table("Samples by split", heads, rows)
+
+
+def approach_line(funnel: Funnel) -> str:
+    """Return how many grasps are distinct, and from where their palms approach; "" if none is."""
+    distinct = int(funnel.distinct.sum())
+    if not distinct:
+        return ""
+    found = counted(distinct, "distinct grasp")
+    cells = counted(int(funnel.cells.sum()), "approach cell")
+    bands = zip(BANDS, funnel.elevations.sum(axis=0).tolist(), strict=True)
+    shares = ", ".join(f"{low}-{high}° {number / distinct:.0%}" for (low, high), number in bands)
+    return f"{found} in {cells}; above the table they come from {shares}"
 
 
 def split_line(rule: str, funnel: Funnel, counts: Sequence[SplitCount]) -> str:
@@ -415,6 +427,8 @@ def print_stats(out: Path) -> None:
         splits = count_splits(out)
         console.print(split_table(splits))
         say(split_line(rule, funnel, splits))
+        if line := approach_line(funnel):
+            say(line)
         for line in barren_lines(funnel, config):
             say(line)
         if (holding := holding_of(Trials(out))) is not None:

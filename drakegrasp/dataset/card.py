@@ -19,7 +19,7 @@ import numpy as np
 
 from drakegrasp.arithmetic import norm
 from drakegrasp.config import CarriedHand, Config
-from drakegrasp.dataset.hdf5 import read_names
+from drakegrasp.dataset.hdf5 import AnyArray, read_names
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
 from drakegrasp.dataset.opening import open_samples
 from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, SCENES_FILE, TRIALS_FILE
@@ -28,6 +28,8 @@ from drakegrasp.dataset.scenes import SceneDataset, count_scenes, refuse_other_s
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, SPLITS
 from drakegrasp.dataset.statistics import (
     Funnel,
+    by_band,
+    distinct_samples,
     funnel_of,
     held_note,
     splits_of,
@@ -118,9 +120,9 @@ def card_counts(out: Path) -> dict[str, Any]:
     Raises:
         DataError: If one of the files is missing or damaged.
     """
-    funnel = funnel_of(Trials(out, any_name=True))
+    attempts = Trials(out, any_name=True)
     with open_samples(out / DATA_FILES["oto"]) as file:
-        return _counts(file, funnel)
+        return _counts(file, funnel_of(attempts), distinct_samples(attempts))
 
 
 def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
@@ -139,7 +141,8 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
     funnel, holding, hand = funnel_of(attempts), holding_of(attempts), _known_hand(config)
     entries = [entry for entry in manifest.objects if entry.name in funnel.names]
     with open_samples(data) as file:
-        rule, counts = str(file.attrs.get("split_by", "class")), _counts(file, funnel)
+        rule = str(file.attrs.get("split_by", "class"))
+        counts = _counts(file, funnel, distinct_samples(attempts))
         # Optional entries of the card, which most datasets lack.
         more = {"fingertip_loads": _loads(file, hand and rated_load(hand[0]))}
     if holding is not None:
@@ -249,7 +252,7 @@ def _loads(file: h5py.File, rated: float | None) -> dict[str, Any] | None:
     return loads
 
 
-def _counts(file: h5py.File, funnel: Funnel) -> dict[str, Any]:
+def _counts(file: h5py.File, funnel: Funnel, distinct: AnyArray) -> dict[str, Any]:
     """Return the numbers of attempts, grasps and samples: in total, by class, object and split."""
     samples = {
         split: Counter(read_names(file[split]["object_props/object_name"])) for split in SPLITS
@@ -265,13 +268,13 @@ def _counts(file: h5py.File, funnel: Funnel) -> dict[str, Any]:
         "removed": {
             r.label: int(removals[r]) for r in Removal if r is not Removal.KEPT and removals[r]
         },
+        "approaches": {
+            "cells": int(funnel.cells.sum()),
+            "elevations": by_band(funnel.elevations.sum(axis=0)),
+        },
         "splits": {
-            row.split: {
-                "samples": row.samples,
-                "objects": row.objects,
-                "classes": row.classes,
-            }
-            for row in splits_of(file)
+            row.split: {key: value for key, value in asdict(row).items() if key != "split"}
+            for row in splits_of(file, distinct)
         },
         "classes": {
             name: {"objects": len(places), **_row(funnel, samples, places)}
@@ -294,6 +297,7 @@ def _row(
         "precision": funnel.precision,
         "stable": funnel.stable,
         "samples": funnel.samples,
+        "distinct": funnel.distinct,
     }
     return {
         **{name: int(values[objects].sum()) for name, values in counts.items()},
@@ -401,13 +405,22 @@ def _how_many(content: Mapping[str, Any]) -> str:
     classes.append(("**all**", len(counts["objects"]), *counts["all"].values()))
     objects = [(name, *row.values()) for name, row in counts["objects"].items()]
 
+    # The share of the distinct grasps by the elevation of the approach.
+    distinct, (cells, elevations) = counts["all"]["distinct"], counts["approaches"].values()
+    approaches = [
+        (f"{band}°", number, f"{number / distinct:.0%}")
+        for band, number in elevations.items()
+        if distinct
+    ]
+
     # Tables that would be empty are left out.
     tables = [
         (
             f"Samples by split, which is by {content['split_by']}",
-            ("split", "samples", "objects", "classes"),
+            ("split", "samples", "distinct", "objects", "classes"),
             splits,
         ),
+        ("From where the palm comes", ("above the table", "distinct", "share"), approaches),
         ("By class", ("class", "objects", *names), classes),
         ("By object", ("object", "class", *names), objects),
         ("Outcomes of the attempts", ("outcome", "attempts"), list(counts["outcomes"].items())),
@@ -415,11 +428,14 @@ def _how_many(content: Mapping[str, Any]) -> str:
         ("Meshes that were refused", ("mesh", "reason"), list(content["refused"].items())),
     ]
     parts = [f"### {head}\n\n{_table(heads, rows)}" for head, heads, rows in tables if rows]
-    head = """## How many
+    head = f"""## How many
 
 *Held* are the attempts that lifted the object and kept it in the hand; *precision* grasps are those
 of them that the fingertips held alone; *stable* those of these in which the object moved by less
-than 5 mm and 5 degrees in the hand; *samples* those that passed all filters."""
+than 5 mm and 5 degrees in the hand; *samples* those that passed all filters; *distinct* those
+samples whose palm is not within 20 mm and 30 degrees of that of another distinct one of the same
+object in the same resting pose, in the order of the rows. Seen from their objects, the palms of the
+samples come from {cells:,} cells, of 42 directions each."""
     return "\n\n".join([head, *parts])
 
 

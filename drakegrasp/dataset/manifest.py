@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, with_config
 
 from drakegrasp.config import (
@@ -34,7 +33,7 @@ from drakegrasp.config import (
     Share,
     parse_stored,
 )
-from drakegrasp.dataset.assembly.split import Home, number_poses
+from drakegrasp.dataset.assembly.split import Home
 from drakegrasp.dataset.json_files import Name, read_mapping, stated, validated
 from drakegrasp.dataset.lock import FOLDERS, LOCK_FILE, LOG_FILE, unwritable
 from drakegrasp.dataset.paths import FILE_NAME
@@ -250,12 +249,6 @@ class Manifest:
     def groups(self) -> list[str]:
         """Group of each object, equal for objects of the same mesh, e.g. its morphs."""
         return [entry.group or entry.mesh_name for entry in self.objects]
-
-    def pose_numbers(self) -> list[npt.NDArray[np.int64]]:
-        """Return a number for each resting pose (r,) of each object, see `number_poses`."""
-        # The third row of X_TO is the table's normal in {O}, and the height.
-        up = [[pose.X_TO[8:11] for pose in entry.resting] for entry in self.objects]
-        return number_poses([entry.mesh_name for entry in self.objects], up)
 
     def signature(self) -> str:
         """Return a hash of everything that determines a row of the dataset, hexadecimal."""

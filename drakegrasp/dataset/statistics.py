@@ -17,8 +17,15 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import Config, SplitConfig, ways_to_grasps
 from drakegrasp.dataset.assembly.survey import shards_sha256
+from drakegrasp.dataset.distinct import (
+    BANDS,
+    approach_cells,
+    distinct_grasps,
+    elevation_bands,
+)
 from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_names
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.opening import open_samples, open_trials
@@ -28,6 +35,7 @@ from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
 from drakegrasp.dataset.trials import NONE, Trials, shard_part
 from drakegrasp.errors import DataError, HandError, counted
 from drakegrasp.filters import Removal
+from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
 from drakegrasp.outcomes import Outcome, Stage
@@ -48,14 +56,14 @@ class Funnel:
 
     Attributes:
         names, classes: (m,), names and classes of the objects.
-        candidates: (m,), palm poses that were tried or are to be tried, drawn from the distinct
-            ones.
-        distinct: (m,), different palm poses among the valid ones.
-        valid: (m,), combinations of rotations above the table whose palm ray meets the object.
+        candidates: (m,), palm poses that were tried or are to be tried.
         outcomes: (m, 1 + max(Outcome)), attempts by object and outcome.
         precision, stable: (m,), successes that are precision grasps, and those that are also
             stable.
         removals: (m, 1 + max(Removal)), successes by object and reason of removal.
+        elevations: (m, 3), distinct grasps among the samples, see `distinct_samples`, by object and
+            by the band of `BANDS` from which the palm approaches.
+        cells: (m,), approach cells in which the object has a sample, see `approach_cells`.
         preshapes: (256, 4), by index of the preshape: attempts, successes, stable grasps and
             samples.
     """
@@ -63,18 +71,23 @@ class Funnel:
     names: tuple[str, ...]
     classes: tuple[str, ...]
     candidates: npt.NDArray[np.int64]
-    distinct: npt.NDArray[np.int64]
-    valid: npt.NDArray[np.int64]
     outcomes: npt.NDArray[np.int64]
     precision: npt.NDArray[np.int64]
     stable: npt.NDArray[np.int64]
     removals: npt.NDArray[np.int64]
+    elevations: npt.NDArray[np.int64]
+    cells: npt.NDArray[np.int64]
     preshapes: npt.NDArray[np.int64]
 
     @property
     def samples(self) -> npt.NDArray[np.int64]:
         """(m,), samples of each object."""
         return self.removals[:, Removal.KEPT]
+
+    @property
+    def distinct(self) -> npt.NDArray[np.int64]:
+        """(m,), distinct grasps among the samples of each object."""
+        return self.elevations.sum(axis=1)
 
 
 @dataclass(frozen=True)
@@ -96,10 +109,11 @@ class PreshapeCount:
 
 @dataclass(frozen=True, kw_only=True)
 class SplitCount:
-    """A row of the paper's Table III: numbers of samples, objects and classes of a split."""
+    """A row of the paper's Table III: samples, distinct ones, objects and classes of a split."""
 
     split: str
     samples: int
+    distinct: int
     objects: int
     classes: int
 
@@ -194,8 +208,7 @@ def count_unfinished(out: Path) -> Unfinished | None:
         with suppress(DataError):
             parts.append(shard_part(out, header, numbers[header.object_name], _COUNTED))
     objects = {
-        key: np.array([getattr(entry, key) for entry in entries])
-        for key in ("name", "class_name", "distinct", "valid")
+        key: np.array([getattr(entry, key) for entry in entries]) for key in ("name", "class_name")
     }
     funnel = funnel_of(Trials.of_parts(out, objects, parts))
 
@@ -225,12 +238,12 @@ def funnel_of(trials: Trials) -> Funnel:
         names=tuple(objects["name"].tolist()),
         classes=tuple(objects["class_name"].tolist()),
         candidates=zeros(count),
-        distinct=objects["distinct"],
-        valid=objects["valid"],
         outcomes=zeros(count, 1 + max(Outcome)),
         precision=zeros(count),
         stable=zeros(count),
         removals=zeros(count, 1 + max(Removal)),
+        elevations=zeros(count, len(BANDS)),
+        cells=zeros(count),
         preshapes=zeros(1 + NO_PRESHAPE, 4),
     )
     for block in trials.blocks(_COUNTED):
@@ -250,7 +263,50 @@ def funnel_of(trials: Trials) -> Funnel:
         chosen = every, held, held & stable, sample
         for column, own in zip(funnel.preshapes.T, chosen, strict=True):
             _count(column, preshape[own])
+
+    # From where the palms of the samples approach.
+    samples = _samples(trials)
+    cells = np.unique(np.column_stack([samples.objects, approach_cells(samples.X_OG)]), axis=0)
+    _count(funnel.cells, cells[:, 0])
+    bands = elevation_bands(multiply(samples.X_TO, samples.X_OG))
+    own = samples.distinct
+    _count(funnel.elevations, (samples.objects[own], bands[own]))
     return funnel
+
+
+class _Samples(NamedTuple):
+    """The samples among some attempts.
+
+    Attributes:
+        ids: (n,), trials of the samples.
+        objects: (n,), rows of /objects.
+        X_TO, X_OG: (n, 4, 4), poses of object and palm before the hand closed.
+        distinct: (n,), which of them are distinct grasps.
+    """
+
+    ids: npt.NDArray[np.int64]
+    objects: npt.NDArray[np.int64]
+    X_TO: Array
+    X_OG: Array
+    distinct: npt.NDArray[np.bool_]
+
+
+def _samples(trials: Trials) -> _Samples:
+    kept = trials.where(sample=True)
+    columns = kept.columns(("object", "resting", "X_TO", "X_OG"))
+    X_TO, X_OG = (unpack_pose(columns[name]) for name in ("X_TO", "X_OG"))
+    groups = np.column_stack([columns["object"], columns["resting"]])
+    objects = columns["object"].astype(np.int64)
+    return _Samples(kept.trial_ids, objects, X_TO, X_OG, distinct_grasps(groups, X_OG))
+
+
+def distinct_samples(trials: Trials) -> npt.NDArray[np.int64]:
+    """Return the trials (n,) of the distinct grasps among the samples, see `distinct_grasps`.
+
+    Grasps of an object in one resting pose are compared, in the order of their trials.
+    """
+    samples = _samples(trials)
+    return samples.ids[samples.distinct]
 
 
 def preshapes_of(funnel: Funnel, config: Config) -> list[PreshapeCount]:
@@ -271,6 +327,11 @@ def preshapes_of(funnel: Funnel, config: Config) -> list[PreshapeCount]:
     return counts
 
 
+def by_band(counts: npt.NDArray[np.int64]) -> dict[str, int]:
+    """Return counts (3,) of elevations by the names of their bands, e.g. "30-60"."""
+    return {f"{low}-{high}": int(n) for (low, high), n in zip(BANDS, counts, strict=True)}
+
+
 def _count(counts: npt.NDArray[np.int64], cells: Any) -> None:
     """Add to an array of counts how often each of its cells occurs."""
     flat = np.ravel_multi_index(cells, counts.shape) if counts.ndim > 1 else cells
@@ -288,21 +349,23 @@ def held_note(funnel: Funnel) -> str:
 
 
 def count_splits(out: Path) -> list[SplitCount]:
-    """Return samples, objects and classes of each split.
+    """Return samples, distinct ones, objects and classes of each split.
 
     Raises:
-        DataError: If the data files are missing or damaged.
+        DataError: If a file is missing or damaged.
     """
+    distinct = distinct_samples(Trials(out, any_name=True))
     with open_samples(out / DATA_FILES["oto"]) as file:
-        return splits_of(file)
+        return splits_of(file, distinct)
 
 
-def splits_of(file: h5py.File) -> list[SplitCount]:
-    """Return the counts of a data file's splits, see `count_splits`."""
+def splits_of(file: h5py.File, distinct: npt.NDArray[np.int64]) -> list[SplitCount]:
+    """Return the counts of a data file's splits, see `count_splits` and `distinct_samples`."""
     return [
         SplitCount(
             split=split,
             samples=len(file[split]["grasps"]),
+            distinct=int(np.isin(file[split]["trial_id"][:], distinct).sum()),
             objects=len(set(read_names(file[split]["object_props/object_name"]))),
             classes=len(set(read_names(file[split]["object_props/class_name"]))),
         )
@@ -330,11 +393,12 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
         {
             "name": name,
             "class": funnel.classes[i],
-            **{key: int(getattr(funnel, key)[i]) for key in ("candidates", "distinct", "valid")},
+            "candidates": int(funnel.candidates[i]),
             "outcomes": labelled(Outcome, funnel.outcomes[i]),
             **{key: int(getattr(funnel, key)[i]) for key in ("precision", "stable")},
             "removals": labelled(Removal, funnel.removals[i]),
-            "samples": int(funnel.samples[i]),
+            **{key: int(getattr(funnel, key)[i]) for key in ("samples", "distinct", "cells")},
+            "elevations": by_band(funnel.elevations[i]),
         }
         for i, name in enumerate(funnel.names)
     ]

@@ -23,14 +23,14 @@ def make_funnel(outcomes: np.ndarray, *names: str, **counts: np.ndarray) -> Funn
         "precision": none,
         "stable": none,
         "removals": np.zeros((len(names), 1 + max(Removal)), dtype=np.int64),
+        "elevations": np.zeros((len(names), 3), dtype=np.int64),
+        "cells": none,
         "preshapes": np.zeros((256, 4), dtype=np.int64),
     }
     return Funnel(
         names=names,
         classes=("thing",) * len(names),
         candidates=tried,
-        distinct=tried,
-        valid=tried,
         outcomes=outcomes,
         **{**usual, **counts},
     )

@@ -12,7 +12,7 @@ import pytest
 from helpers.datasets import MISSING, SLIPPED, SUCCESS, TRIALS, change, make_dataset
 from helpers.hands import write_with_preshapes
 
-from drakegrasp.cli.tables import funnel_table, hold_table
+from drakegrasp.cli.tables import approach_line, funnel_table, hold_table
 from drakegrasp.config import SplitConfig
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.card import card_content
@@ -34,6 +34,7 @@ from drakegrasp.dataset.statistics import (
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
+from drakegrasp.frames import invert_pose, make_pose, pack_pose, rotation_about, unpack_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.page.catalog import Catalog
@@ -101,7 +102,10 @@ def test_samples_are_as_many_wherever_they_are_counted(
 
     # Tables, at any width, and `stats --json`.
     for table in (funnel_table(funnel), funnel_table(funnel, compact=True), hold_table(funnel)):
-        last = dict(zip(table.columns[0].cells, table.columns[-1].cells, strict=True))
+        names, samples = (
+            next(c for c in table.columns if c.header == h) for h in ("object", "samples")
+        )
+        last = dict(zip(names.cells, samples.cells, strict=True))
         assert last == {**{name: str(n) for name, n in found.items()}, "all": str(total)}
     counts = counts_as_dict(out)
     assert {each["name"]: each["samples"] for each in counts["objects"]} == found
@@ -139,6 +143,46 @@ def test_outcomes_are_counted_by_object(out: Path) -> None:
     assert outcomes.sum(axis=1).tolist() == [12, 12, 12]
     assert outcomes[:, Outcome.CRASHED].tolist() == [0, 0, 1]
     assert outcomes[2, before] == outcomes[1, before] - 1
+
+
+def test_samples_that_are_distinct_are_counted(out: Path) -> None:
+    """Of the first object one from above, one 15 mm beside it, and one from the side."""
+    with h5py.File(out / TRIALS) as file:
+        rows = file["successes/trial_id"][:]
+        rows = rows[file["trials/object"][:][rows] == 0]
+        X_OT = invert_pose(unpack_pose(file["trials/X_TO"][int(rows[0])]))
+    before = count_funnel(out)
+    from_above, from_the_side = (rotation_about([1, 0, 0], np.deg2rad(a)) for a in (180, 90))
+    for row, R_TG, x in zip(
+        rows, (from_above, from_above, from_the_side), (0, 0.015, 0), strict=True
+    ):
+        X_OG = pack_pose(X_OT @ make_pose(R_TG, [x, 0.0, 0.3]))
+        change(out, TRIALS, "trials/X_OG", int(row), lambda _, to=X_OG: to)
+
+    funnel = count_funnel(out)
+    assert funnel.samples.tolist() == [3, 3, 3]
+    assert funnel.elevations[0].tolist() == [1, 0, 1]
+    assert (funnel.distinct[0], funnel.cells[0]) == (2, 2)
+    assert funnel.elevations[1:].tolist() == before.elevations[1:].tolist()
+    total = int(funnel.distinct.sum())
+
+    # In the table and its line, of each split, in JSON and on the card.
+    table = funnel_table(funnel)
+    assert list(table.columns[-1].cells) == [*map(str, funnel.distinct.tolist()), str(total)]
+    assert approach_line(funnel).startswith(f"{total} distinct grasps in ")
+    assert sum(split.distinct for split in count_splits(out)) == total
+    said = counts_as_dict(out)
+    assert said["objects"][0]["distinct"] == said["objects"][0]["cells"] == 2
+    assert said["objects"][0]["elevations"] == {"0-30": 1, "30-60": 0, "60-90": 1}
+    assert sum(split["distinct"] for split in said["splits"]) == total
+    card = card_content(out)["counts"]
+    assert card["objects"]["1_box_a"]["distinct"] == 2
+    assert card["all"]["distinct"] == sum(card["approaches"]["elevations"].values()) == total
+    assert sum(split["distinct"] for split in card["splits"].values()) == total
+
+    # In another resting pose it is another grasp.
+    change(out, TRIALS, "trials/resting", int(rows[1]), lambda _: 1)
+    assert count_funnel(out).distinct[0] == 3
 
 
 def test_splits_are_counted(out: Path) -> None:
@@ -209,7 +253,7 @@ def test_objects_without_samples_are_named(sound: Path) -> None:
 def counts(train: int, valid: int, test: int) -> list[SplitCount]:
     numbers = {"train": train, "valid": valid, "test": test}
     return [
-        SplitCount(split=name, samples=n, objects=min(n, 1), classes=1)
+        SplitCount(split=name, samples=n, distinct=n, objects=min(n, 1), classes=1)
         for name, n in numbers.items()
     ]
 

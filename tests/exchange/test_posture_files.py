@@ -440,8 +440,8 @@ def test_bad_line_of_a_table_has_its_reason_and_spoils_no_other(tmp_path):
     header, first, second = path.read_text(encoding="utf-8").splitlines()
     words = first.split(",")
     lines = {
-        "the row must have 59 values, got 1": "mug",
-        "the row must have 59 values, got 60": first + ",1",
+        "the row must have 58 values, got 1": "mug",
+        "the row must have 58 values, got 59": first + ",1",
         f"grasp_{ORDER[0]} must be a number, got 'x'": ",".join([*words[:8], "x", *words[9:]]),
         "position and quaternion must be finite, and": ",".join(
             [*words[:4], "0", "0", "0", "0", *words[8:]]

@@ -158,7 +158,7 @@ def test_grasp_without_a_pose_is_not_drawn(spoiled: Path) -> None:
     [
         (damage, "must be the scenes of a dataset, got none"),
         (change("shards", "others"), "must be of the trials in its folder, got other scenes"),
-        (change("grasps/outcome", 250), "/grasps/outcome must be 0 to"),
+        (change("grasps/outcome", 250), "/grasps/outcome must be one of 0, 1"),
         (change("grasps/trial_id", 36), "/grasps/trial_id must be 0 to 35, got 36"),
         (change("objects/name", "3_other"), "must be of objects of"),
         (change("scenes/X_TO", np.nan), "/scenes/X_TO must be finite"),

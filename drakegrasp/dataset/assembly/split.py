@@ -13,9 +13,7 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import dot
 from drakegrasp.config import SplitConfig
-from drakegrasp.frames import Array
 from drakegrasp.seeding import Stream, object_key
 
 #: A split, and the splits in the order of the files.
@@ -160,35 +158,3 @@ def _shares(count: int, config: SplitConfig) -> tuple[int, int]:
         else:
             tested -= 1
     return tested, valid
-
-
-#: Resting poses of different seeds are one if their upward directions are within this angle [rad].
-NEAR_TURN = float(np.deg2rad(15.0))
-
-
-def number_poses(meshes: Sequence[str], up: Sequence[npt.ArrayLike]) -> list[npt.NDArray[np.int64]]:
-    """Return a number for each resting pose (r,) of each object.
-
-    Each pose has a number of its own, with one exception: a mesh with several seeds has drops of
-    each seed, and near poses of different seeds share a number.
-
-    Args:
-        meshes: Names of the objects' meshes.
-        up: For each object (r, 3), the upward directions in {O} in its resting poses.
-    """
-    known: dict[str, tuple[Array, npt.NDArray[np.int64]]] = {}
-    numbers, count = list[npt.NDArray[np.int64]](), 0
-    for mesh, directions in zip(meshes, map(np.asarray, up), strict=True):
-        own = np.arange(count, count + len(directions))
-        count += len(directions)
-        if mesh not in known:
-            known[mesh] = directions, own
-        else:
-            # Use the number of the nearest pose of another seed.
-            theirs, indices = known[mesh]
-            cosine = dot(directions[:, None], theirs[None])
-            near = cosine.max(axis=1) >= np.cos(NEAR_TURN)
-            own = np.where(near, indices[cosine.argmax(axis=1)], own)
-            known[mesh] = np.concatenate([theirs, directions]), np.concatenate([indices, own])
-        numbers.append(own)
-    return numbers

@@ -1,0 +1,163 @@
+"""Which palm poses are distinct, and from where they approach."""
+
+from __future__ import annotations
+
+from itertools import combinations, product
+
+import numpy as np
+import pytest
+
+from drakegrasp.dataset.distinct import (
+    approach_cells,
+    cell_directions,
+    distinct_grasps,
+    elevation,
+    elevation_bands,
+)
+from drakegrasp.frames import make_pose, rotation_about
+
+
+def pose(x: float = 0.0, turn_deg: float = 0.0, axis: tuple[float, ...] = (0, 0, 1)) -> np.ndarray:
+    """A palm at x [m] along Ox, turned about an axis."""
+    return make_pose(rotation_about(axis, np.deg2rad(turn_deg)), [x, 0.1, -0.2])
+
+
+def distinct(*poses: np.ndarray, groups: object = None) -> list[bool]:
+    groups = np.zeros(len(poses), dtype=int) if groups is None else groups
+    return distinct_grasps(groups, np.array(poses)).tolist()
+
+
+def test_a_chain_is_covered_by_every_second_of_its_palms() -> None:
+    """Fifteen millimetres apart; what is covered covers nothing itself."""
+    assert distinct(*(pose(0.015 * k) for k in range(5))) == [True, False, True, False, True]
+
+
+def test_order_decides_how_many_cover_all() -> None:
+    first, middle, last = pose(-0.015), pose(), pose(0.015)
+    assert distinct(first, middle, last) == [True, False, True]
+    assert distinct(middle, first, last) == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("other", "is_distinct"),
+    [
+        (pose(), False),
+        (pose(0.0199), False),
+        (pose(0.020), False),
+        (pose(0.0201), True),
+        (pose(turn_deg=29.0), False),
+        (pose(turn_deg=-30.0), False),
+        (pose(turn_deg=31.0), True),
+        (pose(turn_deg=31.0, axis=(1, 2, 3)), True),
+        (pose(turn_deg=180.0, axis=(1, 0, 0)), True),
+        (pose(0.019, 29.0), False),
+        (pose(0.019, 31.0), True),
+        (pose(0.021, 29.0), True),
+    ],
+)
+def test_palms_are_near_within_both_limits(other: np.ndarray, is_distinct: bool) -> None:
+    assert distinct(pose(), other) == [True, is_distinct]
+    assert distinct(other, pose()) == [True, is_distinct]
+
+
+def test_other_groups_are_never_near() -> None:
+    poses = [pose()] * 6
+    groups = [[0, 0], [0, 1], [1, 0], [0, 0], [1, 0], [1, 1]]
+    assert distinct(*poses, groups=groups) == [True, True, True, False, False, True]
+
+
+def test_nothing_is_distinct_of_nothing() -> None:
+    assert distinct_grasps(np.zeros((0, 2)), np.zeros((0, 4, 4))).shape == (0,)
+    assert approach_cells(np.zeros((0, 4, 4))).shape == (0,)
+
+
+def test_cover_is_that_of_comparing_all_pairs() -> None:
+    """Hundreds of palms in all directions, some of them near."""
+    rng = np.random.default_rng(0)
+    poses = np.array([
+        make_pose(rotation_about(rng.normal(size=3), rng.uniform(0.0, 1.0)), p)
+        for p in rng.uniform(-0.05, 0.05, (600, 3))
+    ])  # fmt: skip
+    groups = rng.integers(2, size=600)
+    kept: list[int] = []
+    for row, (X, group) in enumerate(zip(poses, groups, strict=True)):
+        near = [
+            np.linalg.norm(X[:3, 3] - poses[k][:3, 3]) <= 0.020
+            and (np.trace(X[:3, :3].T @ poses[k][:3, :3]) - 1.0) / 2.0 >= np.sqrt(3.0) / 2.0
+            for k in kept
+            if groups[k] == group
+        ]
+        if not any(near):
+            kept.append(row)
+    found = distinct_grasps(groups, poses)
+    assert 100 < len(kept) < 500
+    assert np.flatnonzero(found).tolist() == kept
+
+
+def test_cells_are_the_vertices_of_an_icosahedron_that_is_subdivided_once() -> None:
+    golden = (1.0 + np.sqrt(5.0)) / 2.0
+    corners = {
+        tuple(np.roll([0.0, a, b * golden], k).round(9))
+        for a, b, k in product((1, -1), (1, -1), range(3))
+    }
+    # Corners of one triangle are at distance two.
+    near = [
+        (a, b)
+        for a, b in combinations(sorted(corners), 2)
+        if np.isclose(np.linalg.norm(np.subtract(a, b)), 2.0)
+    ]
+    middles = {tuple((np.array(a) + b) / 2) for a, b in near}
+    assert (len(corners), len(middles)) == (12, 30)
+    expected = np.array([v / np.linalg.norm(v) for v in map(np.array, [*corners, *middles])])
+    found = cell_directions()
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, rtol=1e-15)
+    nearest = (found @ expected.T).argmax(axis=1)
+    assert sorted(nearest.tolist()) == list(range(42))
+    np.testing.assert_allclose(found, expected[nearest], atol=1e-12)
+
+
+def test_a_palm_is_in_the_cell_of_the_nearest_direction() -> None:
+    rng = np.random.default_rng(0)
+    poses = np.array([make_pose(rotation_about(rng.normal(size=3), a), [0, 0, 0.1])
+                      for a in rng.uniform(0.0, np.pi, 500)])  # fmt: skip
+    found = approach_cells(poses)
+    brute = [int(np.argmin(np.linalg.norm(cell_directions() - X[:3, 2], axis=1))) for X in poses]
+    assert found.tolist() == brute
+    assert len(set(brute)) > 35
+    # A palm at a direction is in its cell, and the first of two equally near ones counts.
+    for k, direction in enumerate(cell_directions()):
+        assert approach_cells(looking(direction)[None])[0] == k
+    between = cell_directions()[0] + cell_directions()[12]
+    assert approach_cells(looking(between / np.linalg.norm(between))[None])[0] == 0
+
+
+def looking(z: np.ndarray) -> np.ndarray:
+    """A palm whose +Gz has a direction; its other axes do not matter here."""
+    X_OG = np.eye(4)
+    X_OG[:3, 2] = z
+    return X_OG
+
+
+@pytest.mark.parametrize(
+    ("tilt_deg", "expected_deg", "band"),
+    [
+        (180.0, 90.0, 2),  # straight from above
+        (150.0, 60.0, 1),
+        (151.0, 61.0, 2),
+        (119.0, 29.0, 0),
+        (120.0, 30.0, 0),
+        (121.0, 31.0, 1),
+        (90.0, 0.0, 0),  # from the side
+        (60.0, -30.0, 0),
+        (0.0, -90.0, 0),  # straight from below
+    ],
+)
+@pytest.mark.parametrize("yaw", [0.0, 77.0])
+def test_elevation_is_the_angle_of_the_approach_above_the_table(
+    tilt_deg: float, expected_deg: float, band: int, yaw: float
+) -> None:
+    turn = rotation_about([0, 0, 1], np.deg2rad(yaw))
+    tilt = rotation_about([1, 0, 0], np.deg2rad(tilt_deg))
+    X_TG = make_pose(turn @ tilt, [0.3, 0.1, 0.2])[None]
+    assert np.rad2deg(elevation(X_TG)) == pytest.approx([expected_deg], abs=1e-5)
+    assert elevation_bands(X_TG).tolist() == [band]
