@@ -106,8 +106,11 @@ Palm: TypeAlias = Array | tuple[Array, Shape]
 class Sampler(Protocol):
     """The palms of an object at a resting pose."""
 
-    def poses(self) -> Iterator[Palm]:
-        """Yield the palms; they do not depend on how many are taken."""
+    def poses(self) -> Iterator[Palm | None]:
+        """Yield the palms; they do not depend on how many are taken.
+
+        None tells that the palms that follow are nearer to each other.
+        """
 
 
 class Rotations:
@@ -276,13 +279,22 @@ def _sampler_stream(name: str, seed: int, resting: int, method: str) -> Stream:
 def _turns(
     places: Sequence[Place], samplers: Mapping[Place, Sampler]
 ) -> Iterator[tuple[Place, Palm]]:
-    """Yield a palm of each place in turn, until no sampler yields another one."""
-    palms, left = {place: sampler.poses() for place, sampler in samplers.items()}, list(places)
+    """Yield a palm of each place in turn, until no sampler yields another one.
+
+    A place whose palms become nearer to each other waits until those of all others are as near.
+    """
+    palms = {place: sampler.poses() for place, sampler in samplers.items()}
+    waits, left = dict.fromkeys(samplers, 0), list(places)
     while left:
-        for place in list(left):
-            palm = next(palms[place], None)
-            if palm is None:
+        first = min(waits[place] for place in left)
+        for place in [place for place in left if waits[place] == first]:
+            try:
+                palm = next(palms[place])
+            except StopIteration:
                 left = [other for other in left if other != place]
+                continue
+            if palm is None:
+                waits[place] += 1
             else:
                 yield place, palm
 

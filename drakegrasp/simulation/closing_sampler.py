@@ -31,10 +31,10 @@ from drakegrasp.simulation.screen import centre
 POINTS = 2048
 #: A palm is good if its score is at least a fraction of the score of the best few: first the first
 #: one, which then falls to the second one in steps of the third one. Least score of a good palm.
-GOOD, BEST, LEAST = (0.95, 0.7, 0.05), 5, 0.25
+GOOD, BEST, LEAST = (0.9, 0.7, 0.1), 5, 0.25
 #: Palms are near if they are closer than both limits [m, degree], those of the number of distinct
-#: grasps; if all good palms are near others, the limits are halved, down to this fraction of them.
-NEAR, NEAREST = (0.020, 30.0), 0.2
+#: grasps; if all good palms are near others, both shrink by a factor, down to a fraction of them.
+NEAR, NEARER, NEAREST = (0.020, 30.0), 0.7, 0.02
 #: Least downward component of the approach of palms from above and of slanted ones: the sines of
 #: 60 and 30 degrees. Palms with more than the last one, the cosine of 14 degrees, are left out:
 #: their camera sees a flat image, which is no sample.
@@ -42,9 +42,9 @@ ABOVE, SLANTED, FLAT = float(np.sqrt(0.75)), 0.5, 0.97
 #: While palms from other sides close well, at most so many palms from above for each of these.
 MOST_ABOVE = 1.5
 #: Number of rounds in a row without a good palm after which a side counts as not free.
-PATIENCE = 2
+PATIENCE = 1
 #: Numbers of palms drawn in a round.
-ROUND = {"above": 16, "slanted": 12, "beside": 12, "near": 12, "surface": 12}
+ROUND = {"above": 16, "slanted": 14, "beside": 14, "near": 4, "surface": 6}
 #: Random numbers of a palm; the first chooses preshape and spread.
 NUMBERS = 7
 #: Ranges of the draws: turns from the axes, tilts and slants from the vertical [degree], places
@@ -112,8 +112,11 @@ class Closing:
         self._good, self._near, self._vain = GOOD[0], 1.0, [0, 0, 0]
         self._add(fixed)
 
-    def poses(self) -> Iterator[tuple[Array, Shape]]:
-        """Yield palm poses X_OG (4, 4) and the shape of the hand, as long as palms close well."""
+    def poses(self) -> Iterator[tuple[Array, Shape] | None]:
+        """Yield palm poses X_OG (4, 4) and the shape of the hand, as long as palms close well.
+
+        None tells that the palms that follow are nearer to those before.
+        """
         X_OL = invert_pose(self._X_LO)
         while self._near >= NEAREST:
             palm = self._next()
@@ -122,12 +125,13 @@ class Closing:
                 yield multiply(X_OL, palm.X_LG), palm.shape
             elif min(self._vain) < PATIENCE:
                 self._add(self._draw())
-            elif not self._order and not any(self._waiting):
-                return
             elif self._good > GOOD[1]:
                 self._good, self._vain = self._good - GOOD[2], [PATIENCE - 1] * 3
+            elif not self._order:
+                return
             else:
-                self._near, self._vain = self._near / 2.0, [0, 0, 0]
+                self._near, self._vain = NEARER * self._near, [0, 0, 0]
+                yield None
 
     def _next(self) -> Palm | None:
         """Return the next palm of the order, or None if more must be drawn first."""

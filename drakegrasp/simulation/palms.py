@@ -79,7 +79,8 @@ class Palms:
         self._axes, self._middle, self._half = smallest_rectangle(points)
         self._top, self._least = float(points[:, 2].max()), min(hand.standoffs)
         self._along = _rotation_to(self._axes[0])
-        self._ahead = multiply(self._along, _rotation_to(across(hand)).T)
+        self._across = _rotation_to(across(hand)).T
+        self._ahead = multiply(self._along, self._across)
         usual = np.deg2rad(hand.spreads_deg) if hand.spread.joints else np.zeros(1)
         self.spreads = tuple(dict.fromkeys((float(usual[0]), float(usual[-1]))))
 
@@ -142,7 +143,7 @@ class Palms:
         # The palm looks along the approach, and the table limits how low it can be.
         y = np.array([-outward[1], outward[0], 0.0])
         R = multiply(np.column_stack([np.cross(y, approach), y, approach]), _rotation_z(turn))
-        R = multiply(R, _rotation_to(across(self._hand)).T)
+        R = multiply(R, self._across)
         raised = max(0.0, reach(self._hand, -R[2]) + TABLE_GAP - origin[2])
         if target[2] + raised > HIGHEST * self._top:
             return None
