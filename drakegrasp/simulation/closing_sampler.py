@@ -45,7 +45,7 @@ MOST_ABOVE = 1.5
 PATIENCE = 1
 #: Numbers of palms drawn in a round.
 ROUND = {"above": 16, "slanted": 14, "beside": 14, "near": 4, "surface": 6}
-#: Random numbers of a palm; the first chooses preshape and spread.
+#: Random numbers of a palm.
 NUMBERS = 7
 #: Ranges of the draws: turns from the axes, tilts and slants from the vertical [degree], places
 #: along the long side and heights, as fractions of half of it and of the object's height.
@@ -106,7 +106,7 @@ class Closing:
         # The order, the palms of each side that wait for their turn, best first; the best scores.
         self._order: list[Palm] = []
         self._waiting: list[list[Palm]] = [[], [], []]
-        self._best: list[float] = []
+        self._best = [0.0] * BEST
 
         # What counts as good and as near, and the rounds in a row without a good palm of each side.
         self._good, self._near, self._vain = GOOD[0], 1.0, [0, 0, 0]
@@ -192,36 +192,37 @@ class Closing:
         """Return the palms of a round, as far as the table leaves room for them."""
         count = sum(ROUND.values())
         numbers = self._stream.uniform(NUMBERS * count).reshape(count, NUMBERS)
-        normal = self._stream.normal(6 * ROUND["near"]).reshape(-1, 6)
-        drawn: list[tuple[Array, Shape]] = []
         kinds = [kind for kind, number in ROUND.items() for _ in range(number)]
-        parents = sorted(self._order, key=lambda palm: -palm.score)
-        for kind, (first, *u) in zip(kinds, numbers.tolist(), strict=True):
-            shape = self._shapes[int(first * len(self._shapes))]
-            palms, X = self._palms[shape.preshape], None
-            if kind == "above":
-                turn = 90.0 * int(4.0 * u[0]) + YAW * (2.0 * u[1] - 1.0)
-                X = palms.above(
-                    turn,
-                    DEEPER * (2.0 * u[2] - 1.0),
-                    aside=ALONG * (2.0 * u[3] - 1.0),
-                    tilt=TILT[0] + u[4] * (TILT[1] - TILT[0]),
-                    towards=360.0 * u[5],
-                )
-            elif kind in SLANTS:
-                low, high = SLANTS[kind]
-                turn = 180.0 * int(2.0 * u[2]) + YAW * (2.0 * u[3] - 1.0)
-                height = HEIGHTS[0] + u[4] * (HEIGHTS[1] - HEIGHTS[0])
-                X = palms.beside(low + u[0] * (high - low), 360.0 * u[1], turn, height=height)
-            elif kind == "surface":
-                X = self._at_surface(u)
-            elif parents:
-                parent = parents[int(u[0] * (len(parents) + 1) / 2)]
-                motion = palm_motion(normal[len(drawn) % len(normal)], SHIFT, np.deg2rad(TURN))
-                X, shape = multiply(parent.X_LG, motion), parent.shape
-            if X is not None:
-                drawn.append((X, shape))
-        return drawn
+        drawn = [self._palm(kind, *row) for kind, row in zip(kinds, numbers.tolist(), strict=True)]
+        return [(X_LG, shape) for X_LG, shape in drawn if X_LG is not None]
+
+    def _palm(self, kind: str, first: float, *u: float) -> tuple[Array | None, Shape]:
+        """Return a palm of a kind of `ROUND`, from numbers in [0, 1); None if there is no room."""
+        if kind == "near" and self._order:
+            # Around one of the better half of the palms so far.
+            better = sorted(self._order, key=lambda palm: -palm.score)
+            parent = better[int(first * (len(better) + 1) / 2.0)]
+            spread = np.sqrt(3.0) * (2.0 * np.array(u) - 1.0)  # of standard deviation 1
+            motion = palm_motion(spread, SHIFT, float(np.deg2rad(TURN)))
+            return multiply(parent.X_LG, motion), parent.shape
+
+        shape = self._shapes[int(first * len(self._shapes))]
+        palms = self._palms[shape.preshape]
+        if kind in SLANTS:
+            low, high = SLANTS[kind]
+            turn = 180.0 * int(2.0 * u[2]) + YAW * (2.0 * u[3] - 1.0)
+            height = HEIGHTS[0] + u[4] * (HEIGHTS[1] - HEIGHTS[0])
+            return palms.beside(low + u[0] * (high - low), 360.0 * u[1], turn, height=height), shape
+        if kind == "surface":
+            return self._at_surface(u), shape
+        X_LG = palms.above(
+            90.0 * int(4.0 * u[0]) + YAW * (2.0 * u[1] - 1.0),
+            DEEPER * (2.0 * u[2] - 1.0),
+            aside=ALONG * (2.0 * u[3] - 1.0),
+            tilt=TILT[0] + u[4] * (TILT[1] - TILT[0]),
+            towards=360.0 * u[5],
+        )
+        return X_LG, shape
 
     def _at_surface(self, u: Sequence[float]) -> Array | None:
         """Return a palm that looks at a surface point against its normal; None from below."""

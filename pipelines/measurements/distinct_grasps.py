@@ -1,8 +1,9 @@
 """Measure what a build is worth: distinct grasps per core-second, beside other builds.
 
-    python pipelines/measurements/distinct_grasps.py --g3db DIR --work DIR \\
-        --build 'new=drakegrasp build --objects {objects} --out {out} --samples-per-object 30' \\
-        --build 'paper=drakegrasp build --objects {objects} --out {out} --config paper --candidates 300'
+    NEW='new=drakegrasp build --objects {objects} --out {out} --samples-per-object 30'
+    OLD='old=/other/version/bin/drakegrasp build --objects {objects} --out {out} --config fast'
+    SCRIPT=pipelines/measurements/distinct_grasps.py
+    python $SCRIPT --g3db DIR --work DIR --build "$NEW" --build "$OLD"
 
 The script lays out the meshes of a list of `mesh_lists.yaml` (by default `reporting`, on which
 nothing was tuned), runs each command with one worker, and prints JSON for each: attempts, samples,
