@@ -16,8 +16,9 @@ from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh
 from drakegrasp.dataset.paths import model_path, object_files, places
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared, save_prepared
 from drakegrasp.errors import DrakegraspError, MachineError, MeshError
+from drakegrasp.frames import Array
 from drakegrasp.hand.folder import hand_places, moved_hand
-from drakegrasp.objects.model import prepare_object
+from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource, file_frame
 from drakegrasp.runtime.environment import one_thread, release_memory
 from drakegrasp.runtime.files import disk_full_named
@@ -29,9 +30,11 @@ from drakegrasp.runtime.journal import (
     open_journal,
 )
 from drakegrasp.simulation.attempts import Attempts, given_candidates
-from drakegrasp.simulation.candidates import sample_candidates
+from drakegrasp.simulation.candidates import Drawing
 from drakegrasp.simulation.settle import find_resting_poses
 
+#: Number of objects whose samplers a process keeps.
+KEPT_DRAWINGS = 16
 #: Smallest number of palm poses that a build with a target draws first.
 FIRST_PALMS = 64
 #: Computing time after which the preparation of a mesh is considered to hang [s].
@@ -128,11 +131,26 @@ def draw_palms(task: DrawTask) -> tuple[str, ObjectEntry]:
     with disk_full_named(out):
         prepared = load_prepared(out, task.name, config)
         if prepared.asked < task.count:
-            poses = prepared.resting_poses
-            drawn = sample_candidates(prepared.model, poses, config, task.count)
+            drawing = _drawing(prepared.model, prepared.resting_poses, config)
+            drawn = drawing.candidates(task.count)
             prepared = replace(prepared, candidates=drawn, asked=task.count)
             save_prepared(prepared, out, config)
     return task.name, prepared.entry()
+
+
+#: The latest drawings of this process, by object and configuration: a process that draws more palm
+#: poses of an object need not begin again.
+_drawings: dict[tuple[str, str, str], Drawing] = {}
+
+
+def _drawing(model: ObjectModel, resting_poses: Array, config: Config) -> Drawing:
+    """Return the drawing of an object, the one of before if there is one."""
+    key = model.name, model.mesh_sha256, config.simulation_hash()
+    drawing = _drawings.pop(key, None) or Drawing(model, resting_poses, config)
+    _drawings[key] = drawing
+    for old in list(_drawings)[:-KEPT_DRAWINGS]:
+        del _drawings[old]
+    return drawing
 
 
 @one_thread
@@ -231,7 +249,7 @@ def prepare(source: MeshSource, config: Config, postures: Attempts | None = None
     poses = np.array([pose.X_TO for pose in resting])
     asked = first_palms(config)
     if postures is None:
-        candidates = sample_candidates(model, poses, config, asked)
+        candidates = _drawing(model, poses, config).candidates(asked)
     else:
         X_OM = file_frame(source) if postures.frame == "mesh" else np.eye(4)
         candidates = given_candidates(model, poses, postures, X_OM, config)

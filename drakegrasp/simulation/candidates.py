@@ -155,59 +155,84 @@ class Normals:
         return self._numbers[count - 1] + 1 if count else 0, count, count
 
 
+class Drawing:
+    """The palm poses of an object that are drawn so far, and its samplers, which can draw more."""
+
+    def __init__(self, model: ObjectModel, X_TO: npt.ArrayLike, config: Config) -> None:
+        """Make the samplers.
+
+        Args:
+            model: The object.
+            X_TO: Resting poses in the table-top frame, (r, 4, 4), or one pose (4, 4).
+            config: Samplers, hand and seed.
+
+        Raises:
+            ConfigError: If a user-defined sampler cannot be run.
+            HandError: If a sampler cannot be used with the hand.
+        """
+        # One sampler for each method at each resting pose; a method that is named twice has two
+        # turns.
+        methods = config.candidates.methods
+        resting = np.asarray(X_TO, dtype=float).reshape(-1, 4, 4)
+        places = [(k, method) for method in methods for k in range(len(resting))]
+        self._model, self._most = model, config.candidates.max
+        self._samplers = {
+            (k, method): found_sampler(
+                method,
+                config,
+                model,
+                resting[k],
+                _sampler_stream(model.name, config.seed, k, method),
+            )
+            for k, method in dict.fromkeys(places)
+        }
+        self._more, self._turns = _turns(places, self._samplers), list[tuple[Place, Palm]]()
+
+    def candidates(self, most: int | None = None) -> Candidates:
+        """Return the first palm poses, drawn with the seed, with their palm rays.
+
+        Args:
+            most: Largest number of palm poses; None for `candidates.max`.
+
+        Raises:
+            ConfigError: If a user-defined sampler cannot be run, or all its poses are far away.
+        """
+        most = self._most if most is None else most
+        self._turns += islice(self._more, max(0, most - len(self._turns)))
+        turns, model = self._turns[:most], self._model
+
+        # The poses, and the numbers of combinations from which they come.
+        used = Counter(place for place, _ in turns)
+        counts = [
+            sampler.counts(used[place]) if hasattr(sampler, "counts") else (used[place],) * 3
+            for place, sampler in self._samplers.items()
+        ]
+        combinations, valid, distinct = (sum(numbers) for numbers in zip(*counts, strict=True))
+        palms = [palm if isinstance(palm, tuple) else (palm, DRAWN) for _, palm in turns]
+        poses = np.array([X_OG for X_OG, _ in palms]).reshape(-1, 4, 4)
+        distance = palm_ray_distance(model.collision, poses)
+        for method in {of for _, of in self._samplers if _source(of) is Source.OWN}:
+            of_method = [of == method for (_, of), _ in turns]
+            _refuse_far(method, model, poses[of_method], distance[of_method])
+        preshapes = [-1 if shape.preshape is None else shape.preshape for _, shape in palms]
+        return Candidates(
+            X_OG=poses,
+            distance=distance,
+            resting=np.array([k for (k, _), _ in turns], dtype=np.int64),
+            source=np.array([_source(method) for (_, method), _ in turns], dtype=np.int64),
+            spread=np.array([shape.spread for _, shape in palms], dtype=float),
+            preshape_index=np.array(preshapes, dtype=np.int64),
+            combinations=combinations,
+            valid=valid,
+            distinct=distinct,
+        )
+
+
 def sample_candidates(
     model: ObjectModel, X_TO: npt.ArrayLike, config: Config, most: int | None = None
 ) -> Candidates:
-    """Return the first palm poses of an object, drawn with the seed, with their palm rays.
-
-    Args:
-        model: The object.
-        X_TO: Resting poses in the table-top frame, (r, 4, 4), or one pose (4, 4).
-        config: Samplers, hand and seed.
-        most: Largest number of palm poses; None for `candidates.max`.
-
-    Raises:
-        ConfigError: If a user-defined sampler cannot be run, or all its poses are far away.
-        HandError: If a sampler cannot be used with the hand.
-    """
-    # One sampler for each method at each resting pose; a method that is named twice has two turns.
-    rules = config.candidates
-    resting = np.asarray(X_TO, dtype=float).reshape(-1, 4, 4)
-    places = [(k, method) for method in rules.methods for k in range(len(resting))]
-    samplers = {
-        (k, method): found_sampler(
-            method, config, model, resting[k], _sampler_stream(model.name, config.seed, k, method)
-        )
-        for k, method in dict.fromkeys(places)
-    }
-    turns = list(islice(_turns(places, samplers), rules.max if most is None else most))
-
-    # The poses, and the numbers of combinations from which they come.
-    used = Counter(place for place, _ in turns)
-    counts = [
-        sampler.counts(used[place]) if hasattr(sampler, "counts") else (used[place],) * 3
-        for place, sampler in samplers.items()
-    ]
-    combinations, valid, distinct = (sum(numbers) for numbers in zip(*counts, strict=True))
-    palms = [palm if isinstance(palm, tuple) else (palm, DRAWN) for _, palm in turns]
-    poses = np.array([X_OG for X_OG, _ in palms]).reshape(-1, 4, 4)
-    distance = palm_ray_distance(model.collision, poses)
-    for method in {each for each in rules.methods if _source(each) is Source.OWN}:
-        of_method = [of == method for (_, of), _ in turns]
-        _refuse_far(method, model, poses[of_method], distance[of_method])
-    return Candidates(
-        X_OG=poses,
-        distance=distance,
-        resting=np.array([k for (k, _), _ in turns], dtype=np.int64),
-        source=np.array([_source(method) for (_, method), _ in turns], dtype=np.int64),
-        spread=np.array([shape.spread for _, shape in palms], dtype=float),
-        preshape_index=np.array(
-            [-1 if shape.preshape is None else shape.preshape for _, shape in palms], dtype=np.int64
-        ),
-        combinations=combinations,
-        valid=valid,
-        distinct=distinct,
-    )
+    """Return the first palm poses of an object, see `Drawing`."""
+    return Drawing(model, X_TO, config).candidates(most)
 
 
 def _refuse_far(method: str, model: ObjectModel, poses: Array, distance: Array) -> None:

@@ -31,7 +31,7 @@ from drakegrasp.simulation.screen import centre
 POINTS = 2048
 #: A palm is good if its score is at least a fraction of the score of the best few: first the first
 #: one, which then falls to the second one in steps of the third one. Least score of a good palm.
-GOOD, BEST, LEAST = (0.9, 0.7, 0.1), 5, 0.25
+GOOD, BEST, LEAST = (0.9, 0.7, 0.1), 5, 0.1
 #: Palms are near if they are closer than both limits [m, degree], those of the number of distinct
 #: grasps; if all good palms are near others, both shrink by a factor, down to a fraction of them.
 NEAR, NEARER, NEAREST = (0.020, 30.0), 0.7, 0.02
