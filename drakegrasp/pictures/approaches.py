@@ -112,7 +112,8 @@ class ObjectApproaches:
         attempts: Number of attempts.
         directions: (a, 3) in {T}, directions of palms that found no grasp, without those whose palm
             ray misses.
-        rays: (s, 2, 3) in {O}, rays of the successes from the palm's origin to the surface [m].
+        rays: (s, 2, 3) in {O}, rays of the successes from the palm's origin to the surface [m]; of
+            length 0 if a palm that was tried as it is does not look at the object.
         successes: (s, 3) in {T}, directions of the successes.
         groups: (s,), index into GROUPS of how each success holds.
     """
@@ -145,16 +146,17 @@ def read_approaches(out: Path, name: str, config: Config) -> ObjectApproaches:
     resting, held = trials["resting"], trials["outcome"] == Outcome.SUCCESS
     pose = int(np.bincount(resting[held], minlength=1).argmax())
     own = trials[resting == pose].columns(
-        ("outcome", "X_OG", "standoff_index", "precision", "stable")
+        ("outcome", "X_OG", "candidate", "standoff_index", "precision", "stable")
     )
-    outcome, packed, standoff, precision, stable = own.values()
+    outcome, packed, candidate, standoff, precision, stable = own.values()
     X_OG = unpack_pose(packed)
 
     # Attempts whose palm ray misses do not approach the object.
     won, approached = outcome == Outcome.SUCCESS, outcome != Outcome.RAY_MISS
     X_TO = prepared.resting_poses[pose]
     directions = approach_directions(X_TO, X_OG)
-    reach = np.array(config.candidates.standoffs)[standoff[won]]
+    standoffs = np.array(config.candidates.standoffs)[standoff[won]]
+    reach = np.nan_to_num(prepared.candidates.palm_distance(candidate[won], standoffs))
     p_OG, z_O = X_OG[won, :3, 3], X_OG[won, :3, 2]
     return ObjectApproaches(
         name=name,

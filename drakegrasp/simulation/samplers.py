@@ -309,7 +309,7 @@ def _shape(name: str, shape: object, hand: Hand) -> Shape:
         index = names.index(preshape)
     known = isinstance(index, Integral) and 0 <= index < len(names) if names else index is None
     if not known:
-        must = f"one of {listed(names)}, or its index" if names else "None"
+        must = f"one of {listed(names)}, or its index," if names else "None"
         raise ConfigError(
             f"{name}: preshape must be {must} for the hand {hand.name}, got {_said(preshape)}"
         )
