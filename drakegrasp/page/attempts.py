@@ -30,6 +30,7 @@ from drakegrasp.page.looks import (
     read_look,
     read_rows,
 )
+from drakegrasp.simulation.attempt import Source
 from drakegrasp.table import AnyArray
 
 #: Features of an attempt for filtering and sorting, with their display.
@@ -302,6 +303,8 @@ def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, s
     standoff = f"{1e3 * standoffs[s]:.0f} mm" if s < len(standoffs) else str(s)
     if rules.postures is not None:
         standoff = "none, a given posture"
+    if row["source"] == Source.CLOSING:
+        standoff = "none, tried as it is"
     in_parts, closed = {part.name for part in PARTS}, np.isfinite(row["time_close"])
     return [
         ("palm pose, stand-off", f"{key.candidate}, {standoff}"),

@@ -297,6 +297,8 @@ class TrialStages:
         model: The object.
         config: Configuration of the dataset.
         row: Fields of the trial in `/trials`, by name.
+        palm_distance: Distance of the palm from the surface along +Gz [m]; NaN if the palm was
+            tried as it is and does not look at the object.
     """
 
     scene: StillScene
@@ -306,6 +308,7 @@ class TrialStages:
     model: ObjectModel
     config: Config
     row: Mapping[str, Any]
+    palm_distance: float
 
     def normals(self, when: Literal["closed", "lifted"]) -> dict[str, tuple[Array, Array]]:
         """Return the tail and tip (3,) in {W} [m] of each contact's normal, by Q and finger."""
@@ -341,7 +344,9 @@ def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> T
     X_WO_lifted = X_WT @ unpack_pose(row["X_TO_lifted"])
     X_WG_lifted = X_WO_lifted @ unpack_pose(row["X_OG_lifted"])
 
-    model = load_prepared(out, name, config).model
+    prepared = load_prepared(out, name, config)
+    model, standoffs = prepared.model, np.array(config.candidates.standoffs)
+    place = np.array([int(row["candidate"])]), standoffs[[int(row["standoff_index"])]]
     scene = StillScene(load_hand(config.hand_source), model, table_size=table_size)
     return TrialStages(
         scene=scene,
@@ -351,6 +356,7 @@ def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> T
         model=model,
         config=config,
         row=row,
+        palm_distance=float(prepared.candidates.palm_distance(*place)[0]),
     )
 
 
@@ -379,8 +385,8 @@ def phases_figure(out: Path, trial_id: int) -> Figure:
     camera = trial.config.camera
     X_TG = multiply(invert_pose(X_WT), trial.place.X_WG)
     X_WC = multiply(X_WT, camera_pose_oto(X_TG, camera, unpack_pose(trial.row["X_C0C"])))
-    standoff = trial.config.candidates.standoffs[int(trial.row["standoff_index"])]
-    end = X_WC[:3, 3] + (camera.distance + standoff) * X_WC[:3, 2]
+    distance = trial.palm_distance
+    end = X_WC[:3, 3] + (camera.distance + np.nan_to_num(distance)) * X_WC[:3, 2]
     strokes = {
         SIGHT: [np.vstack([X_WC[:3, 3], end])],
         FIELD: frustum(X_WC, intrinsics(camera), camera.size, FIELD_DEPTH),
@@ -389,7 +395,9 @@ def phases_figure(out: Path, trial_id: int) -> Figure:
     # The texts of the pictures. The picture of the lift also shows the table's centre.
     force, slip = float(norm(trial.row["closed_f_Q_O"]).max()), 1e3 * float(trial.row["slip"])
     turn, table = np.rad2deg(float(trial.row["turn"])), X_WT[None, :3, 3]
-    start = f"start\npalm {1e3 * standoff:.0f} mm from the surface"
+    start = "start"
+    if np.isfinite(distance):
+        start += f"\npalm {1e3 * distance:.0f} mm from the surface"
     closed = f"closed\nlargest force of a fingertip {force:.0f} N"
     lifted = f"lifted\nslip {slip:.1f} mm, turn {turn:.1f}° in the hand"
 

@@ -28,13 +28,14 @@ from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.filters import Removal
 from drakegrasp.generation.pipeline import build, refuse_unusable
 from drakegrasp.generation.replay import replay_trial
+from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.simulation.attempt import Source
-from drakegrasp.simulation.candidates import Candidates, sample_candidates
+from drakegrasp.simulation.candidates import Candidates, palm_attempts, sample_candidates
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "own-sampler.md"
 
@@ -60,11 +61,34 @@ WRONG_POSES = {
     "NaN": ("yield np.eye(4); yield np.nan * np.eye(4)", r"pose 1 must be finite"),
     "no rotation": ("yield 2 * np.eye(4)", r"pose 0 must have 0 0 0 1 as its last row"),
     "words": ("yield 'up'", r"pose 0 must be a pose, 4 x 4 numbers"),
+    "list": ("yield [np.eye(4), (None, 0.0)]", r"pose 0 must be a pose, 4 x 4 numbers"),
     "no poses": ("return None", r"Mine: must run, got TypeError"),
     "error": (
         "yield 1 / 0",
         r"mine\.py:Mine: must run, got ZeroDivisionError in line 4 \(",
     ),
+}
+#: What a sampler may yield beside a pose otherwise, for which hand, and what is said of it.
+WRONG_SHAPES = {
+    "no pair": (
+        "0.3",
+        "barrett",
+        r"pose 1 must have a shape \(preshape, spread in rad\), got float",
+    ),
+    "no spread": ("('pinch',)", "barrett", r"have a shape \(preshape, spread in rad\), got tuple"),
+    "degrees": ("(None, 22.5)", "barrett", r"pose 1: spread must be 0 to 3\.14 rad .*, got 22\.5$"),
+    "NaN": ("(None, np.nan)", "barrett", r"spread must be 0 to 3\.14 rad .* barrett, got nan$"),
+    "word": ("(None, 'wide')", "barrett", r"spread must be 0 to 3\.14 rad .*, got 'wide'$"),
+    "no spread joints": ("(None, 0.2)", "franka", r"spread must be 0 to 0 rad .*, got 0\.2$"),
+    "no preshapes": ("('pinch', 0)", "barrett", r"preshape must be None .* barrett, got 'pinch'$"),
+    "other preshape": (
+        "('pinch', 0)",
+        "allegro_four",
+        r"preshape must be one of tripod, envelope, or its index, for the hand .*, got 'pinch'$",
+    ),
+    "no preshape": ("(None, 0)", "allegro_four", r"preshape must be one of .*, got None$"),
+    "large index": ("(2, 0)", "allegro_four", r"preshape must be one of .*, got 2$"),
+    "array": ("(np.eye(3), 0)", "allegro_four", r"preshape must be one of .*, got array\("),
 }
 #: What a filter may return otherwise.
 WRONG_FILTERS = {
@@ -97,18 +121,17 @@ def box(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
     return prepare_object(MeshSource(name="box", class_name="box", path=path))
 
 
-def sampler(text: str) -> Config:
+def sampler(text: str, hand: str = "barrett") -> Config:
     """Return the configuration of a sampler with this body of `poses`."""
     lines = ["import numpy as np", "class Mine:", "  def __init__(self, *arguments): pass"]
     Path("mine.py").write_text("\n".join([*lines, f"  def poses(self): {text}"]))
-    return load_config(overrides=["candidates.method=mine.py:Mine"])
+    return load_config(overrides=["candidates.method=mine.py:Mine", f"hand={hand}"])
 
 
 def draw(box: ObjectModel, config: Config, count: int = 20) -> Candidates:
     X_TO = np.eye(4)
     X_TO[2, 3] = box.half_extents[2]
-    rules = config.candidates.model_copy(update={"max": count})
-    return sample_candidates(box, X_TO, rules, config.seed)
+    return sample_candidates(box, X_TO, config, count)
 
 
 def test_the_sampler_of_the_page_looks_at_the_object(own: Path, box: ObjectModel) -> None:
@@ -178,6 +201,51 @@ def test_what_is_no_pose_is_refused_in_one_line(
     text, message = WRONG_POSES[name]
     with pytest.raises(ConfigError, match=message) as caught:
         draw(box, sampler(text))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("hand", "shape", "stored"),
+    [
+        ("barrett", "(None, np.deg2rad(11.25))", (-1, np.deg2rad(11.25))),
+        ("barrett", "(None, 3.1415927)", (-1, np.pi)),  # beyond the limit by rounding
+        ("franka", "(None, 0)", (-1, 0.0)),
+        ("allegro_four", "('envelope', 0.0)", (1, 0.0)),
+        ("allegro_four", "(np.int64(1), 0.0)", (1, 0.0)),
+    ],
+)
+def test_a_palm_with_a_shape_of_the_hand_is_tried_once(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    box: ObjectModel,
+    hand: str,
+    shape: str,
+    stored: tuple[int, float],
+) -> None:
+    """Beside palms without one, which are tried at each stand-off."""
+    monkeypatch.chdir(tmp_path)
+    text = f"X = np.diag([1.0, -1, -1, 1]); X[2, 3] = 0.2; yield X, {shape}; yield X"
+    config = sampler(text, hand)
+    drawn = draw(box, config)
+    assert (drawn.preshape_index[0], drawn.spread[0]) == stored
+    assert (drawn.preshape_index[1], np.isnan(drawn.spread[1])) == (-1, True)
+    place = {"name": "box", "seed": 0, "preshapes": len(load_hand(hand).preshapes)}
+    once, *others = palm_attempts(drawn, range(2), config.candidates, **place)
+    assert (once.candidate, once.spread) == (0, stored[1])
+    assert once.preshape == (None if stored[0] < 0 else stored[0])
+    np.testing.assert_array_equal(once.X_OG, drawn.X_OG[0])
+    assert [a.standoff for a in others] == list(config.candidates.standoffs)
+
+
+@pytest.mark.parametrize("name", WRONG_SHAPES)
+def test_what_is_no_shape_of_the_hand_is_refused_in_one_line(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, box: ObjectModel
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shape, hand, message = WRONG_SHAPES[name]
+    first = "(None, 0.0)" if hand != "allegro_four" else "(0, 0.0)"
+    with pytest.raises(ConfigError, match=message) as caught:
+        draw(box, sampler(f"yield np.eye(4), {first}; yield np.eye(4), {shape}", hand))
     assert "\n" not in str(caught.value)
 
 

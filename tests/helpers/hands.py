@@ -59,6 +59,16 @@ def write_pincer(folder: Path, sdf: str = PINCER_SDF, **changes: object) -> Path
     return path
 
 
+def write_linked(folder: Path) -> Path:
+    """Write a gripper whose first finger carries the second one, and return the YAML's path."""
+    before, after = (
+        f'<joint name="right_hinge" type="revolute"><parent>{link}</parent>'
+        for link in ("palm", "left")
+    )
+    assert before in PINCER_SDF
+    return write_pincer(folder, PINCER_SDF.replace(before, after))
+
+
 def changed_finger(**changes: object) -> list[object]:
     """Return the gripper's fingers, the first one with changes."""
     return [{**PINCER["fingers"][0], **changes}, PINCER["fingers"][1]]

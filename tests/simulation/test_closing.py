@@ -1,0 +1,172 @@
+"""Closing the hand by geometry: jaws on a box and a ball, whose features have closed forms.
+
+The jaws are 80 mm apart and slide by up to 40 mm each along Gy; their tips are 100 mm ahead.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.hands import slider_fingers, write_linked, write_slider
+
+from drakegrasp.errors import HandError
+from drakegrasp.frames import Array, invert_pose, make_pose
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.mesh.cloud import Solid
+from drakegrasp.mesh.distance_field import make_distance_field
+from drakegrasp.simulation.closing import close_on, closed_on
+
+#: Distance of the tips from the palm, and of a jaw from the middle; half the width of the box [m].
+TIPS, JAW, HALF = 0.10, 0.04, 0.02
+#: Height of the palm, whose tips then are 15 mm above the table [m].
+HEIGHT = 0.115
+#: Distances are read from a grid, which ends 5 mm beside a solid; and points of a pad are 3 mm
+#: apart [m].
+BLUR, SPACING = 2e-4, 3e-3
+
+
+def solid(mesh: trimesh.Trimesh) -> Solid:
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.int32)
+    return Solid(field=make_distance_field(vertices, faces), middle=np.asarray(mesh.center_mass))
+
+
+def box(width: float = 2 * HALF, y: float = 0.0) -> trimesh.Trimesh:
+    """Return a box on the table, 60 mm long and 80 mm high."""
+    mesh = trimesh.creation.box([0.06, width, 0.08])
+    return mesh.apply_translation([0.0, y, 0.04])
+
+
+def ball() -> trimesh.Trimesh:
+    """Return a ball of 60 mm, with its middle 50 mm above the table."""
+    return trimesh.creation.icosphere(4, 0.03).apply_translation([0.0, 0.0, 0.05])
+
+
+def down(*, x: float = 0.0, y: float = 0.0, z: float = HEIGHT) -> Array:
+    """Return the pose of a palm that looks down; its Gy is -Ty."""
+    return make_pose(np.diag([1.0, -1.0, -1.0]), [x, y, z])
+
+
+@pytest.fixture(scope="module")
+def jaws(tmp_path_factory: pytest.TempPathFactory) -> Hand:
+    """Two jaws, each with a motor."""
+    return load_hand(write_slider(tmp_path_factory.mktemp("slider")))
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Hand:
+    """Two jaws with one motor."""
+    fingers = slider_fingers(20.0, finger="left")
+    return load_hand(write_slider(tmp_path_factory.mktemp("shared"), fingers=fingers))
+
+
+def test_jaws_stop_at_the_faces_of_a_box(jaws: Hand) -> None:
+    X_TG = np.stack([down(), down(y=0.01)])
+    found = close_on(solid(box()), jaws, 0.0, X_TG)
+    # The second palm is 10 mm beside the middle, and each jaw has its own motor.
+    travel = np.array([[0.02, 0.02], [0.03, 0.01]])
+    np.testing.assert_allclose(found["closed"], travel / JAW, atol=BLUR / JAW)
+    np.testing.assert_allclose(closed_on(solid(box()), jaws, 0.0, X_TG), travel, atol=BLUR)
+    assert (found["gap"] < BLUR).all()
+    assert found["touch"].all() and found["robust"].all() and found["free"].all()
+    np.testing.assert_allclose(found["pushes"], 1.0, atol=1e-3)
+    np.testing.assert_allclose(found["table"], HEIGHT - TIPS, atol=1e-6)
+    # Contacts are on both faces, as high as the jaws reach and the box is.
+    assert (found["width"] > HALF).all()
+    assert found["heights"].min() > HEIGHT - TIPS - 1e-6 and found["heights"].max() < 0.08
+
+
+def test_two_opposed_contacts_balance(jaws: Hand) -> None:
+    """The jaws meet a ball at its equator, where forces and moments cancel."""
+    found = close_on(solid(ball()), jaws, 0.0, down()[None])
+    np.testing.assert_allclose(found["closed"], (JAW - 0.03) / JAW, atol=SPACING / JAW / 4)
+    assert found["push"] > 0.98
+    assert found["opposition"] > 0.9
+    assert found["arm"] < SPACING and abs(found["above"][0]) < SPACING
+    np.testing.assert_allclose(found["width"], 0.03, atol=SPACING / 4)
+    # Beside the middle, the normals point away from it.
+    beside = close_on(solid(ball()), jaws, 0.0, down(x=0.02)[None])
+    assert beside["opposition"] < 0.8 and beside["push"] < found["push"]
+    assert beside["score"] < found["score"]
+
+
+def test_a_jaw_that_ends_before_the_object_has_a_gap(jaws: Hand) -> None:
+    """A wall 4.5 to 14.5 mm beside the middle, which one jaw meets; the other one ends at 0."""
+    found = close_on(solid(box(width=0.01, y=-0.0095)), jaws, 0.0, down()[None])
+    np.testing.assert_allclose(found["closed"], [[1.0, (JAW - 0.0145) / JAW]], atol=BLUR / JAW)
+    np.testing.assert_allclose(found["gaps"], [[0.0045, 0.0]], atol=BLUR)
+    np.testing.assert_allclose(found["gap"], 0.0045, atol=BLUR)
+    assert found["touch"].tolist() == [[0.0, 1.0]]
+    assert found["free"].all() and not found["robust"].any()
+    # One contact balances nothing, and none does, above the wall.
+    above = close_on(solid(box(width=0.01)), jaws, 0.0, down(z=0.25)[None])
+    assert not above["touch"].any()
+    assert found["opposition"] == above["opposition"] == 0.0
+
+
+def test_three_fingers_balance_with_other_fractions_of_force() -> None:
+    """The Barrett Hand's thumb presses as much as both other fingers together."""
+    found = close_on(solid(box()), load_hand("barrett"), 0.0, down(z=0.14)[None])
+    assert found["touch"].all() and found["opposition"] > 0.9
+
+
+def test_jaws_with_one_motor_stop_together(shared: Hand) -> None:
+    """2 mm beside the middle: the first jaw stops after 18 mm, and the other has 4 mm to go."""
+    found = close_on(solid(box()), shared, 0.0, down(y=0.002)[None])
+    np.testing.assert_allclose(found["closed"], 0.018 / JAW, atol=BLUR / JAW)
+    np.testing.assert_allclose(found["gaps"], [[0.004, 0.0]], atol=BLUR)
+
+
+def test_a_hand_within_object_or_table_is_not_free(jaws: Hand) -> None:
+    """A palm in the box; and tips 1 cm below the table, beside the box."""
+    X_TG = np.stack([down(z=0.05), down(x=0.2, z=TIPS - 0.01), down()])
+    found = close_on(solid(box()), jaws, 0.0, X_TG)
+    assert found["free"].tolist() == [False, False, True]
+    assert (found["score"] > 0.0).tolist() == [False, False, True]
+    assert found["clearance"][0] < -0.01 < 0.0 < found["clearance"][1]
+    np.testing.assert_allclose(found["table"], [0.05 - TIPS, -0.01, HEIGHT - TIPS], atol=1e-6)
+    # The table stops the jaws, too.
+    assert found["closed"][1].tolist() == [0.0, 0.0]
+
+
+def test_a_hand_may_begin_to_close_from_other_positions(jaws: Hand) -> None:
+    """At 10 mm it still stops at the faces; at 25 mm the jaws are 5 mm within the box."""
+    starts = np.array([[0.01, 0.01], [0.025, 0.025]])
+    found = close_on(solid(box()), jaws, 0.0, np.stack([down()] * 2), closing=starts)
+    np.testing.assert_allclose(found["closed"][0], 0.5, atol=BLUR / JAW)
+    assert found["free"].tolist() == found["robust"].tolist() == [True, False]
+    np.testing.assert_allclose(found["clearance"][1], -0.005, atol=BLUR)
+
+
+def test_arm_is_the_horizontal_distance_from_the_middle(jaws: Hand) -> None:
+    """Jaws at the end of a beam, the middle of whose solid is stated to be elsewhere."""
+    beam = trimesh.creation.box([0.12, 2 * HALF, 0.006]).apply_translation([0.0, 0.0, 0.06])
+    stated = Solid(field=solid(beam).field, middle=np.full(3, 0.01))
+    at_end = close_on(stated, jaws, 0.0, down(x=0.045, z=0.13)[None])
+    # The contacts are within the 20 mm of the jaws, and on the 6 mm of the beam.
+    assert abs(at_end["arm"][0] - np.hypot(0.035, 0.01)) < 0.010 + SPACING
+    np.testing.assert_allclose(at_end["above"], 0.05, atol=SPACING)
+    np.testing.assert_allclose(at_end["heights"], 0.06, atol=SPACING)
+
+
+def test_features_do_not_depend_on_the_frame_of_the_solid(jaws: Hand) -> None:
+    """An object that lies on its side: its field is in {O}, or it was moved to {T} before."""
+    X_TO = np.array([[0.0, 0, 1, 0.1], [1, 0, 0, -0.2], [0, 1, 0, 0.02], [0, 0, 0, 1]])
+    mesh = trimesh.creation.box([0.06, 2 * HALF, 0.08])
+    mesh = trimesh.util.concatenate([mesh, trimesh.creation.icosphere(3, 0.035)])
+    palms = [down(x=0.1, y=-0.2, z=0.12), down(x=0.115, y=-0.19, z=0.12), down(x=0.1, z=0.12)]
+    X_TG = np.stack(palms)
+    in_O = close_on(solid(mesh), jaws, 0.0, invert_pose(X_TO) @ X_TG, X_TS=X_TO)
+    in_T = close_on(solid(mesh.copy().apply_transform(X_TO)), jaws, 0.0, X_TG)
+    assert in_T["touch"].tolist() == [[1.0, 1.0], [1.0, 1.0], [0.0, 0.0]]
+    assert in_O.keys() == in_T.keys()
+    for name, values in in_T.items():
+        np.testing.assert_allclose(in_O[name], values, atol=5e-3, err_msg=name)
+
+
+def test_a_hand_whose_fingers_share_a_link_is_refused(tmp_path: Path) -> None:
+    hand = load_hand(write_linked(tmp_path))
+    with pytest.raises(HandError, match="must be one whose fingers share no link, got pincer"):
+        close_on(solid(box()), hand, 0.0, down()[None])

@@ -1,0 +1,195 @@
+"""The sampler `closing`: which palms it draws, and that they repeat themselves to the bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import trimesh
+from helpers.hands import write_linked
+from helpers.meshes import write
+from helpers.objects import model_of
+
+from drakegrasp.config import Config
+from drakegrasp.errors import HandError
+from drakegrasp.frames import Array, make_pose, rotation_about
+from drakegrasp.generation.pipeline import build
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import load_config
+from drakegrasp.objects.model import ObjectModel, prepare_object
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.runtime.executor import run_here
+from drakegrasp.shapes import kitchen
+from drakegrasp.simulation.attempt import Source
+from drakegrasp.simulation.candidates import Candidates, palm_attempts, sample_candidates
+
+#: Full extents of a tall box, which leaves all sides free [m].
+TALL = (0.05, 0.06, 0.16)
+#: Palms that are nearer than both are one grasp [m, degree].
+NEAR = 0.020, 30.0
+#: A palm that is less than this from straight above sees a flat image [degree].
+FLAT = 14.0
+
+
+def meshes() -> dict[str, trimesh.Trimesh]:
+    return {
+        "tall": trimesh.creation.box(TALL),
+        "low": trimesh.creation.box([0.05, 0.06, 0.04]),
+        "ball": trimesh.creation.icosphere(3, 0.03),
+        "mug": kitchen.mug(radius=0.04, height=0.10, handle_reach=0.03, handle_radius=0.006),
+        "plate": trimesh.creation.box([0.3, 0.3, 0.004]),
+    }
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], ObjectModel]:
+    """Returns the object of a name."""
+    folder = tmp_path_factory.mktemp("meshes")
+    made = {name: model_of(mesh, folder, f"1_{name}_a") for name, mesh in meshes().items()}
+    return made.__getitem__
+
+
+def closing(hand: str | Path = "barrett", **values: object) -> Config:
+    return load_config(overrides=["candidates.method=closing", f"hand={hand}"], **values)
+
+
+def standing(model: ObjectModel) -> Array:
+    return make_pose(np.eye(3), [0.0, 0.0, model.half_extents[2]])
+
+
+def draw(model: ObjectModel, most: int, config: Config | None = None) -> Candidates:
+    return sample_candidates(model, standing(model), config or closing(), most)
+
+
+def down(model: ObjectModel, drawn: Candidates) -> npt.NDArray[np.float64]:
+    """Return the angles (n,) of the approaches below the horizontal [degree]."""
+    z_T = (standing(model) @ drawn.X_OG)[:, :3, 2]
+    return np.rad2deg(np.arcsin(np.clip(-z_T[:, 2], -1.0, 1.0)))
+
+
+def assert_equal(one: Candidates, two: Candidates) -> None:
+    for name in ("X_OG", "distance", "spread", "preshape_index", "resting", "source"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+
+
+def test_first_palms_are_the_same_for_every_number(model: Callable[[str], ObjectModel]) -> None:
+    many = draw(model("tall"), 90)
+    assert len(many) == 90
+    for most in (1, 8, 60):
+        few = draw(model("tall"), most)
+        assert len(few) == most
+        np.testing.assert_array_equal(few.X_OG, many.X_OG[:most])
+        np.testing.assert_array_equal(few.spread, many.spread[:most])
+
+
+def test_an_object_has_its_palms_wherever_its_mesh_lies(tmp_path: Path) -> None:
+    """Alone in a directory, or after others that are prepared and sampled before."""
+    alone, among = tmp_path / "alone", tmp_path / "among"
+    names = {alone: ["2_tall_a"], among: ["1_ball_a", "2_tall_a"]}
+    drawn = {}
+    for folder, inside in names.items():
+        folder.mkdir()
+        for name in inside:
+            write(folder / f"{name}.obj", meshes()[name.split("_")[1]])
+        for source in find_meshes(folder):
+            drawn[folder] = draw(prepare_object(source), 60)
+    assert_equal(drawn[alone], drawn[among])
+    assert_equal(drawn[alone], draw(prepare_object(find_meshes(alone)[0]), 60))
+    # Draws are of the seed and the name.
+    (source,) = find_meshes(alone)
+    other = draw(prepare_object(source), 60, closing(seed=1))
+    assert (other.X_OG[30:] != drawn[alone].X_OG[30:]).any()
+
+
+def test_rounding_of_the_resting_pose_changes_no_bit(model: Callable[[str], ObjectModel]) -> None:
+    """The pose is simulated; nor do its place and its turn about the vertical matter."""
+    first = draw(model("tall"), 60)
+    for axis, turn in (([1.0, 0.0, 0.0], 0.0), ([0.6, -0.8, 0.0], 1.0)):
+        tilt = make_pose(rotation_about(axis, 1e-9), [0.3 * turn, -turn, 1e-9])
+        yaw = make_pose(rotation_about([0.0, 0.0, 1.0], turn), np.zeros(3))
+        X_TO = tilt @ yaw @ standing(model("tall"))
+        assert (standing(model("tall")) != X_TO).any()
+        assert_equal(sample_candidates(model("tall"), X_TO, closing(), 60), first)
+    # An object on its side has other palms.
+    lying = make_pose([[0, 0, 1], [1, 0, 0], [0, 1, 0]], [0.0, 0.0, TALL[1] / 2])
+    other = sample_candidates(model("tall"), lying, closing(), 60)
+    assert (other.X_OG[:5] != first.X_OG[:5]).any()
+
+
+@pytest.mark.parametrize("hand", ["barrett", "allegro_four"])
+def test_a_palm_is_tried_once_as_it_is(model: Callable[[str], ObjectModel], hand: str) -> None:
+    """With a spread of the hand, and in one of its preshapes if it has some."""
+    config, described = closing(hand), load_hand(hand)
+    drawn = draw(model("low"), 40, config)
+    assert (drawn.source == Source.CLOSING).all()
+    assert set(drawn.spread) <= set(np.deg2rad(described.spreads_deg))
+    assert len(set(drawn.spread)) == min(2, len(described.spreads_deg))
+    preshapes = range(len(described.preshapes)) if described.preshapes else [-1]
+    assert set(drawn.preshape_index) <= set(preshapes)
+
+    count = len(described.preshapes)
+    place = {"name": "1_low_a", "seed": 0, "preshapes": count}
+    tried = list(palm_attempts(drawn, range(40), config.candidates, **place))
+    assert [(a.candidate, a.standoff_index) for a in tried] == [(i, 0) for i in range(40)]
+    for i, attempt in enumerate(tried):
+        np.testing.assert_array_equal(attempt.X_OG, drawn.X_OG[i])
+        assert attempt.spread == drawn.spread[i] and attempt.ray_hits
+        assert (-1 if attempt.preshape is None else attempt.preshape) == drawn.preshape_index[i]
+
+
+def test_sides_take_turns(model: Callable[[str], ObjectModel]) -> None:
+    """Around a tall box, of any first palms at most 60 % come from above."""
+    found = down(model("tall"), draw(model("tall"), 60))
+    sides = np.array([np.count_nonzero(found < 30.0), np.count_nonzero(found >= 60.0)])
+    beside, above = sides
+    assert beside >= 15 and above >= 6 and 60 - beside - above >= 6
+    share = np.cumsum(found >= 60.0) / np.arange(1, 61)
+    assert share[4:].max() <= 0.6
+
+
+def test_first_palms_are_distinct(model: Callable[[str], ObjectModel]) -> None:
+    X = draw(model("tall"), 24).X_OG
+    shift = np.linalg.norm(X[:, None, :3, 3] - X[None, :, :3, 3], axis=2)
+    cosine = (np.einsum("aij,bij->ab", X[:, :3, :3], X[:, :3, :3]) - 1.0) / 2.0
+    turn = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    near = (shift < NEAR[0]) & (turn < NEAR[1])
+    assert near.sum() == len(X)
+
+
+def test_no_palm_comes_from_straight_above(model: Callable[[str], ObjectModel]) -> None:
+    found = down(model("low"), draw(model("low"), 60))
+    assert (found >= 60.0).sum() > 10
+    assert found.max() < 90.0 - FLAT + 0.1
+
+
+@pytest.mark.parametrize("name", ["ball", "mug"])
+@pytest.mark.parametrize("hand", ["barrett", "allegro", "leap", "franka"])
+def test_palms_close_on_small_and_hollow_things(
+    model: Callable[[str], ObjectModel], hand: str, name: str
+) -> None:
+    drawn = draw(model(name), 20, closing(hand))
+    assert len(drawn) == 20
+    p_TG = (standing(model(name)) @ drawn.X_OG)[:, :3, 3]
+    assert (p_TG[:, 2] > 0.0).all()
+    # A hand that closes on something this small is beside it.
+    assert np.linalg.norm(drawn.X_OG[:, :3, 3], axis=1).max() < 0.25
+
+
+def test_where_nothing_closes_there_is_no_palm(model: Callable[[str], ObjectModel]) -> None:
+    drawn = draw(model("plate"), 1000)
+    assert len(drawn) == drawn.combinations == 0
+    # The other sampler goes on.
+    config = load_config(overrides=["candidates.method=[closing, normals]"])
+    assert set(draw(model("plate"), 5, config).source) == {Source.NORMALS}
+
+
+def test_a_hand_whose_fingers_share_a_link_is_refused_before_a_build(tmp_path: Path) -> None:
+    config = closing(write_linked(tmp_path))
+    with pytest.raises(HandError) as caught:
+        build([], tmp_path / "out", config, run_here, show=False)
+    must = "hand must be one whose fingers share no link for the sampler closing, got pincer"
+    assert str(caught.value).startswith(must) and "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
