@@ -50,7 +50,6 @@ NOT_RUN = {
     "drakegrasp build ": "simulates for minutes to hours; tests/generation; a dry run is run",
     "drakegrasp objects export ": "makes hundreds of meshes; tests/shapes/test_shape_catalog.py",
     "drakegrasp inspect ": "serves until Ctrl-C; tests/page/test_serve.py",
-    "drakegrasp figures OUT --compare ": "wants two datasets; tests/pictures/test_picture_files.py",
     "drakegrasp merge ": "wants two datasets; tests/generation/test_merge.py",
     "drakegrasp predict ": "wants a network's input; tests/cli/test_predict.py",
     "drakegrasp score ": "tries hundreds of grasps; tests/cli/test_score_command.py",

@@ -72,8 +72,8 @@ def test_each_part_is_found_by_name() -> None:
 def test_sampler_draws_palms_that_look_down(tmp_path: Path) -> None:
     bar = box_model(tmp_path, np.array([0.10, 0.02, 0.03]))
     X_TO = make_pose(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), [0.0, 0.0, 0.01])
-    rules = load_config("paper", ["candidates.method=down", "candidates.max=8"]).candidates
-    drawn, again = (sample_candidates(bar, X_TO, rules, seed=3) for _ in range(2))
+    config = load_config("paper", ["candidates.method=down", "seed=3"])
+    drawn, again = (sample_candidates(bar, X_TO, config, 8) for _ in range(2))
     np.testing.assert_allclose((X_TO @ drawn.X_OG)[:, 2, 2], -1.0, atol=1e-12)
     np.testing.assert_array_equal(drawn.X_OG, again.X_OG)
     assert len(np.unique(drawn.X_OG[:, 0, 0])) > 1

@@ -162,17 +162,17 @@ def build_on(
         show: Whether to show progress on standard error.
 
     Raises:
-        ConfigError: As `refuse_unusable` of `generation.pipeline`.
+        ConfigError, HandError: As `refuse_unusable` of `generation.pipeline`.
         DataError: If `out` cannot be used, another process builds there, or no mesh can be
             simulated.
         MeshError: If `only` names no object.
         MachineError: If a worker would give other results than this machine.
     """
+    config = posture_config(config, postures)
     refuse_unusable(config)
     if part is None:
         config = ended(config, postures)
     refuse_part(part, config)
-    config = posture_config(config, postures)
     only, postures = _chosen(_names(sources, config), only, postures)
     with build_lock(out) as dead, ExitStack() as stack:
         # A directory that cannot be used is rejected before workers start.
@@ -249,16 +249,15 @@ def known_work(request: BuildRequest, part: str | None = None) -> list[str]:
     Raises:
         MeshError, GraspError, ConfigError: As `build_dataset`.
     """
-    config = request.config
-    refuse_unusable(config)
-    job = None if part is None else read_part(part)
-    refuse_part(job, config)
-    hand = load_hand(config.hand_source)
-    drive_of(hand, config.lift)
+    hand = load_hand(request.config.hand_source)
     postures = None
     if request.postures is not None:
         postures = read_attempts(request.postures, hand, read_as=request.read_as)
-    posture_config(config, postures)
+    config = posture_config(request.config, postures)
+    refuse_unusable(config)
+    job = None if part is None else read_part(part)
+    refuse_part(job, config)
+    drive_of(hand, config.lift)
     names = _names(find_sources(request.objects, request.units, request.manifest), config)
     only, postures = _chosen(names, request.only, postures)
     objects = len(set(only or names))

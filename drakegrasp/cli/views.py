@@ -72,13 +72,10 @@ def figures(
     quiet: bool,
     folder: Path | None = None,
     trial: int | None = None,
-    compare: Path | None = None,
 ) -> None:
     """Draw a dataset: pictures as PNG and SVG, numbers as JSON.
 
     \b
-    palm_poses     palm poses by surface normals and by rotations, and what
-                   they found
     phases         one grasp from the side: start, closed, lifted
     classes        colour, depth and mask of one grasp of each class
     outcomes       how the attempts ended
@@ -91,8 +88,6 @@ def figures(
     Options:
         --out DIR (folder): Folder of the figures. [default: OUT/figures]
         --trial ID: Row of trials.hdf5 with the grasp whose phases are drawn.
-        --compare OTHER: A dataset of the same objects that was built with the other sampler of palm
-            poses (candidates.method).
         --quiet
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.foreign_files import refuse_link
@@ -102,13 +97,7 @@ def figures(
         folder = out / "figures"
         refuse_link(folder)
     with progress_bar("draw", "figures", show=not quiet) as progress:
-        written = write_figures(
-            out,
-            folder,
-            compare=compare,
-            trial_id=trial,
-            progress=progress,
-        )
+        written = write_figures(out, folder, trial_id=trial, progress=progress)
     for name, why in written.left_out.items():
         say(f"{name} is left out: {why}")
     say(f"{counted(len(written.names), 'figure')} in {written.folder}")

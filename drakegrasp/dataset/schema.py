@@ -316,8 +316,8 @@ _LIFTED = _contacts("lifted", "trial.lift", "after the lift")
 _LINEAGE = (
     Field("resting", "", "uint8", "-", "-", "index of the object's resting pose"),
     Field("source", "", "uint8", "-", "-",
-          "sampler of the palm pose: 0 rotations, 1 normals, 3 other; 4 for a posture from a "
-          "file"),
+          "sampler of the palm pose: 0 rotations, 1 normals, 5 closing, 3 other; 4 for a posture "
+          "from a file"),
 )
 #: `preshape` of a posture without one, with which all fingers of a hand with preshapes close.
 NO_PRESHAPE = 255

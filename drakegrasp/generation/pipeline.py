@@ -83,7 +83,7 @@ from drakegrasp.runtime.executor import Executor, WorkerPool, in_order
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
 from drakegrasp.simulation.attempts import Attempts, misfits
-from drakegrasp.simulation.candidates import sampler_class
+from drakegrasp.simulation.candidates import refuse_samplers
 from drakegrasp.simulation.drive import drive_of
 
 #: Number of samples of each object that a build makes if nothing else ends it.
@@ -210,10 +210,11 @@ def refuse_unusable(config: Config) -> None:
     Raises:
         ConfigError: If it limits both the number of grasps and the number of samples, or a
             user-defined class cannot be used.
+        HandError: If a sampler cannot be used with the hand.
     """
     refuse_two_ends(config)
-    for name in config.candidates.methods:
-        sampler_class(name, config.candidates)
+    if config.candidates.postures is None:
+        refuse_samplers(config)
     own_filters(config.filters)
 
 

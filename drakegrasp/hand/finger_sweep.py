@@ -96,14 +96,11 @@ def hand_paths(hand: Hand, spread: float) -> HandPaths | None:
     The result is None if several fingers move one link or a finger's closing has no limit. All
     attempts of such a hand are simulated.
     """
-    # Find the fingers that move each link.
-    closing_gain = {link: chain.gain[:, 1:] for link, chain in hand.link_chains.items()}
-    movers = {link: np.flatnonzero(gain.any(axis=0)) for link, gain in closing_gain.items()}
-    limits = coordinate_limits(hand)[1:, 1]
-    if max(map(len, movers.values())) > 1 or not np.all((limits > 0.0) & np.isfinite(limits)):
+    if not has_paths(hand):
         return None
 
     # Links that no finger moves stay where they are at this spread.
+    movers, limits = _movers(hand), coordinate_limits(hand)[1:, 1]
     surfaces = link_points(hand)
     opened = np.zeros(hand.num_fingers)
     still = [
@@ -122,6 +119,19 @@ def hand_paths(hand: Hand, spread: float) -> HandPaths | None:
         fingers=tuple(fingers),
         gaps=_gaps(hand, fingers, spread),
     )
+
+
+def has_paths(hand: Hand) -> bool:
+    """Return whether no two fingers move one link, and every finger's closing has a limit."""
+    limits = coordinate_limits(hand)[1:, 1]
+    apart = all(len(fingers) <= 1 for fingers in _movers(hand).values())
+    return apart and bool(np.all((limits > 0.0) & np.isfinite(limits)))
+
+
+def _movers(hand: Hand) -> dict[str, npt.NDArray[np.int64]]:
+    """Return the indices of the fingers whose closing moves each link."""
+    closing_gain = {link: chain.gain[:, 1:] for link, chain in hand.link_chains.items()}
+    return {link: np.flatnonzero(gain.any(axis=0)) for link, gain in closing_gain.items()}
 
 
 def _finger_path(

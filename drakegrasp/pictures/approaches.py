@@ -1,4 +1,4 @@
-"""Directions from which palms approach objects: coverage, rays around objects, and maps.
+"""Directions from which palms approached objects: coverage, rays around objects, and maps.
 
 Objects on the table are drawn in parallel projection, in a view {V} whose axes point right, up and
 towards the reader. Input: attempts at some objects. Output: figures. Needs matplotlib, but not
@@ -7,7 +7,7 @@ Drake.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,8 +45,8 @@ AZIMUTH, ELEVATION = np.deg2rad(-55.0), np.deg2rad(20.0)
 #: Direction of the light in the view: from the upper left and from the front.
 LIGHT = np.array([-0.48, 0.6, 0.64])
 OBJECT_COLOUR = np.array([0.70, 0.77, 0.86])
-#: Colours of a palm's approach, as in the paper, and of attempts that failed.
-APPROACH, FAILED = "#7B2FA8", "#B8BDC4"
+#: Colour of attempts that failed.
+FAILED = "#B8BDC4"
 #: Maximum numbers of rays and dots in a panel.
 MAX_RAYS, MAX_DOTS = 300, 3000
 #: Elevations above the table that have a circle on a map [deg].
@@ -55,8 +55,6 @@ CIRCLES_DEG = (60.0, 30.0, 0.0)
 EXTENT = 1.24
 #: Edge of a picture or a map, spaces, caption and head [inch]; number of objects in a row.
 EDGE, GAP, BETWEEN, CAPTION, HEAD, ACROSS = 2.5, 0.05, 0.3, 0.28, 0.24, 2
-#: Width of a panel of rays, space beside it, height of its title and of a line of text [inch].
-PANEL, MARGIN, TITLE, LINE = 3.9, 0.12, 0.34, 0.2
 
 
 def approach_directions(X_TO: Array, X_OG: Array) -> Array:
@@ -221,7 +219,7 @@ def _draw_picture(axes: Axes, item: ObjectApproaches) -> None:
     shown = spread(len(item.rays), MAX_RAYS)
     rays, groups = item.rays[shown] @ R_VO.T, item.groups[shown]
     for number, colour in enumerate(GROUPS.values()):
-        draw_rays(axes, rays[groups == number], colour, width=0.8, opacity=0.85)
+        draw_rays(axes, rays[groups == number], colour)
     draw_object(axes, triangles)
 
     # A square around everything.
@@ -253,56 +251,6 @@ def _draw_map(axes: Axes, item: ObjectApproaches) -> None:
                   markeredgecolor="white", markeredgewidth=0.4, zorder=4)  # fmt: skip
     axes.set(xlim=(-EXTENT, EXTENT), ylim=(-EXTENT, EXTENT), aspect="equal")
     hide_ticks(axes)
-
-
-def palm_poses_figure(
-    vertices: Array,
-    faces: npt.NDArray[np.int32],
-    rays: Mapping[str, Array],
-    *,
-    R_TO: npt.ArrayLike | None = None,
-    captions: Mapping[str, str] | None = None,
-    name: str = "",
-) -> Figure:
-    """Return a figure of the approach rays of palm poses to a mesh, a panel per method.
-
-    Args:
-        vertices: Vertices of the mesh, (n, 3) in {O} [m].
-        faces: Faces of the mesh, (m, 3).
-        rays: Rays (r, 2, 3) by title, from the palm's origin to the surface, in {O} [m].
-        R_TO: (3, 3), orientation in which the object rests; as in its file if None.
-        captions: Text below a panel, by the same titles.
-        name: Object name, shown in the last line.
-    """
-    # One scale for all panels, with which every ray is visible.
-    R_TO = np.eye(3) if R_TO is None else np.asarray(R_TO)
-    triangles = triangles_in_view(vertices, faces, R_TO)
-    seen = {title: ends @ (view_rotation() @ R_TO).T for title, ends in rays.items()}
-    low, high = frame_of([triangles, *seen.values()])
-
-    # The page: panels side by side, above their captions.
-    captions = captions or {}
-    lines = max((text.count("\n") + 1 for text in captions.values()), default=0)
-    foot = LINE if name else 0.0
-    tall = float(PANEL * (high[1] - low[1]) / (high[0] - low[0]))
-    width = len(rays) * (PANEL + MARGIN) + MARGIN
-    height = TITLE + tall + LINE * lines + foot + MARGIN
-    figure = new_page(width, height)
-
-    for k, (title, ends) in enumerate(seen.items()):
-        axes = add_axes(figure, MARGIN + k * (PANEL + MARGIN), TITLE, PANEL, tall)
-        # The object is translucent, as in the paper: rays behind it shine through.
-        draw_rays(axes, ends, APPROACH, width=0.6, opacity=0.6, through=0.25)
-        draw_object(axes, triangles)
-        finish_view(axes, low, high)
-        axes.set_title(title, fontsize=11, color=INK, pad=6)
-        below = {"ha": "center", "va": "top", "linespacing": 1.5}
-        write_beside(axes, 0.5, 0.0, captions.get(title, ""), 9, **below)
-    if name:
-        text = f"{shortened(name, 40)}; rays: from the largest stand-off to the surface"
-        figure.text(MARGIN / width, 0.06 / height, text, fontsize=8, color=INK, va="bottom",
-                    parse_math=False)  # fmt: skip
-    return figure
 
 
 # An object on the table with rays around it, in parallel projection.
@@ -347,28 +295,13 @@ def draw_object(axes: Axes, triangles: Array) -> None:
     )  # fmt: skip
 
 
-def draw_rays(
-    axes: Axes, rays: Array, colour: str, *, width: float, opacity: float, through: float = 0.0
-) -> None:
-    """Draw rays (n, 2, 3) in {V}; rays behind the object's centre are drawn behind the object.
-
-    Args:
-        axes: Axes to draw in.
-        rays: The rays [m].
-        colour: Colour of the rays.
-        width: Width of a ray [points].
-        opacity: Opacity of a ray, 0 to 1.
-        through: Opacity of a ray that shines through the object.
-    """
+def draw_rays(axes: Axes, rays: Array, colour: str) -> None:
+    """Draw rays (n, 2, 3) [m] in {V}; those behind the object's centre are behind the object."""
     behind = rays[:, :, 2].mean(axis=1) < 0.0
-    for part, order, alpha in (
-        (rays[behind], 1.0, opacity),
-        (rays[behind], 2.5, through),
-        (rays[~behind], 3.0, opacity),
-    ):
-        if len(part) and alpha > 0.0:
-            lines = LineCollection(list(part[..., :2]), colors=colour, linewidths=width)
-            lines.set(alpha=alpha, zorder=order)
+    for part, order in ((rays[behind], 1.0), (rays[~behind], 3.0)):
+        if len(part):
+            lines = LineCollection(list(part[..., :2]), colors=colour, linewidths=0.8)
+            lines.set(alpha=0.85, zorder=order)
             axes.add_collection(lines)
 
 

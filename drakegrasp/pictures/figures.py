@@ -38,7 +38,6 @@ from drakegrasp.pictures.charts import (
     draw_objects,
 )
 from drakegrasp.pictures.rendered import phases_figure
-from drakegrasp.pictures.samplers import samplers_figure
 from drakegrasp.pictures.sheets import class_sheets, scene_views
 from drakegrasp.pictures.style import png_bytes, svg_bytes
 from drakegrasp.runtime.files import write_atomic
@@ -94,7 +93,6 @@ def write_figures(
     out: Path,
     folder: Path,
     *,
-    compare: Path | None = None,
     trial_id: int | None = None,
     progress: Report = silent,
 ) -> Written:
@@ -105,12 +103,11 @@ def write_figures(
     Args:
         out: Directory of a dataset.
         folder: Folder to write to; files with the same names are replaced.
-        compare: A dataset of the same objects by the other sampler of palm poses.
         trial_id: The grasp whose phases are drawn; the first of those that hold best if None.
         progress: Called after each figure.
 
     Raises:
-        DataError: If the directory is not a dataset, or if `compare` or `trial_id` does not fit it.
+        DataError: If the directory is not a dataset, or if `trial_id` does not fit it.
         MachineError: If OpenGL failed and `trial_id` was given.
         OSError: If a file cannot be written.
     """
@@ -118,7 +115,6 @@ def write_figures(
     read_manifest(out)  # a damaged manifest must raise an error and not just omit some figures
     funnel = count_funnel(out)
     drawings: dict[str, Callable[[], Drawn]] = {
-        "palm_poses": lambda: samplers_figure(out, compare),
         "phases": lambda: _phases(out, held, trial_id),
         "classes": lambda: _classes(out),
         "outcomes": lambda: draw_codes(funnel.outcomes.sum(axis=0), Outcome.SUCCESS, "attempts"),
@@ -132,8 +128,8 @@ def write_figures(
     if not (out / SCENES_FILE).exists():
         del drawings["views"]  # most datasets have no scenes
 
-    # Figures requested by an option must be drawn; all others only if there are data.
-    asked = {"palm_poses": compare is not None, "phases": trial_id is not None}
+    # The phases of a grasp that was asked for must be drawn; all else only if there are data.
+    asked = {"phases": trial_id is not None}
     written, numbers = Written(folder=folder), {}
     for done, (name, draw) in enumerate(drawings.items(), start=1):
         try:

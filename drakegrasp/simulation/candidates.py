@@ -30,7 +30,9 @@ import trimesh
 from drakegrasp import registry
 from drakegrasp.arithmetic import Array, norm, sin_cos_deg
 from drakegrasp.config import CandidateConfig, Config, is_own_class
-from drakegrasp.errors import ConfigError
+from drakegrasp.errors import ConfigError, HandError
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.finger_sweep import has_paths
 from drakegrasp.mesh.crossings import first_hits
 from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
@@ -233,9 +235,26 @@ def sampler_class(method: str, config: CandidateConfig) -> Callable[..., Sampler
     if is_own_class(method):
         return own_sampler(method, config.code)
     found: Callable[..., Sampler] = registry.find("samplers", method)
-    if not registry.accepts(found, ARGUMENTS[:-1]) and not registry.accepts(found, ARGUMENTS):
+    if method not in OURS and not registry.accepts(found, ARGUMENTS[:-1]):
         raise ConfigError(f"{method}: must take (model, X_TO, stream), got other arguments")
     return found
+
+
+def refuse_samplers(config: Config) -> None:
+    """Reject samplers that cannot be used.
+
+    Raises:
+        ConfigError: See `sampler_class`.
+        HandError: If the sampler `closing` cannot close the hand.
+    """
+    for method in config.candidates.methods:
+        sampler_class(method, config.candidates)
+    hand = load_hand(config.hand_source)
+    if "closing" in config.candidates.methods and not all(map(has_paths, hand.preshapes or [hand])):
+        raise HandError(
+            "hand must be one whose fingers share no link for the sampler closing, got "
+            f"{hand.name}; candidates.method=normals takes any hand"
+        )
 
 
 def found_sampler(
@@ -243,7 +262,8 @@ def found_sampler(
 ) -> Sampler:
     """Return the sampler of a name at a resting pose X_TO (4, 4).
 
-    A class takes the model, X_TO and the stream, and if it wants to, the configuration.
+    A class takes the model, X_TO and the stream, and one of the package, if it wants to, the
+    configuration.
 
     Raises:
         ConfigError: If a user-defined sampler cannot be run.
@@ -253,7 +273,7 @@ def found_sampler(
     if _source(method) is not Source.OWN:
         wants = (config,) if registry.accepts(found, ARGUMENTS) else ()
         return found(model, X_TO, stream, *wants)
-    return OwnPoses(method, found, model, X_TO, stream)
+    return OwnPoses(method, found, model, X_TO, stream, load_hand(config.hand_source))
 
 
 def _source(method: str) -> Source:

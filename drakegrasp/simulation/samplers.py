@@ -6,8 +6,8 @@ its resting pose, and the angles. Relative to the size of the box they are the s
 Without jitter, the hundreds of thousands of combinations are therefore compared only once per
 process.
 
-A class that the user gives as `file.py:Name` yields its own poses, which are checked;
-docs/explanation/sampling.md has an example.
+A class that the user gives as `file.py:Name` yields its own poses, alone or with the shape of the
+hand. Both are checked; docs/how-to/own-sampler.md has an example.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from itertools import count
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -22,11 +23,14 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import dot, multiply, norm, sin_cos_deg
 from drakegrasp.config import CandidateConfig
-from drakegrasp.errors import ConfigError, GraspError
+from drakegrasp.errors import ConfigError, GraspError, listed
 from drakegrasp.frames import Array, read_pose
+from drakegrasp.hand.description import Hand
+from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.registry import own_class, run_own
 from drakegrasp.seeding import Stream
+from drakegrasp.simulation.palms import Shape
 
 #: The first palm's axes in {O}: +Gz points down at the object, Gx = Ox.
 R_OG0 = np.diag([1.0, -1.0, -1.0])
@@ -36,6 +40,11 @@ SAME_POSE = 1e-6
 #: A palm this far below the table, or a palm ray this far beside the bounding box, is still valid
 #: [m]. This distance is far above rounding errors and too small to matter.
 EDGE = 1e-6
+#: A spread may be beyond its limits by this much [rad], and is then moved to the limit. This
+#: distance is above the rounding of angles in files.
+EDGE_SPREAD = 1e-6
+#: Length at which a value in a message is cut.
+LONGEST = 60
 #: Number of combinations whose poses are computed together, which bounds the memory. With
 #: `jitter_deg` it also decides which word of the stream jitters which angle, so another number
 #: changes the draw.
@@ -229,7 +238,7 @@ def own_sampler(stored: str, code: Mapping[str, str]) -> type[Any]:
 
 
 class OwnPoses:
-    """The poses that a user-defined sampler yields, in their order."""
+    """The palms that a user-defined sampler yields, in their order."""
 
     def __init__(
         self,
@@ -238,6 +247,7 @@ class OwnPoses:
         model: ObjectModel,
         X_TO: Array,
         stream: Stream,
+        hand: Hand,
     ) -> None:
         """Make the sampler.
 
@@ -247,25 +257,32 @@ class OwnPoses:
             model: The object.
             X_TO: Resting pose of the object, (4, 4).
             stream: Random numbers of the sampler.
+            hand: The hand, to whose preshapes and limits the shapes are compared.
 
         Raises:
             ConfigError: If the sampler cannot be run.
         """
-        self._stored, self._sampler = stored, run_own(stored, found, model, X_TO, stream)
+        self._stored, self._hand = stored, hand
+        self._sampler = run_own(stored, found, model, X_TO, stream)
 
-    def poses(self) -> Iterator[Array]:
-        """Yield the poses.
+    def poses(self) -> Iterator[Array | tuple[Array, Shape]]:
+        """Yield the palm poses, alone or with the shape of the hand.
 
         Raises:
-            ConfigError: If the sampler cannot be run, or yields something other than poses.
+            ConfigError: If the sampler cannot be run, or yields something other than poses and
+                shapes of the hand.
         """
         name = self._stored.partition("@")[0]
-        poses = run_own(self._stored, lambda: iter(self._sampler.poses()))
+        palms = run_own(self._stored, lambda: iter(self._sampler.poses()))
         for i in count():
-            X_OG = run_own(self._stored, next, poses, None)
-            if X_OG is None:
+            palm = run_own(self._stored, next, palms, None)
+            if palm is None:
                 return
-            yield _pose(f"{name}: pose {i}", X_OG)
+            where = f"{name}: pose {i}"
+            if isinstance(palm, tuple) and len(palm) == 2:
+                yield _pose(where, palm[0]), _shape(where, palm[1], self._hand)
+            else:
+                yield _pose(where, palm)
 
 
 def _pose(name: str, X_OG: npt.ArrayLike) -> Array:
@@ -277,3 +294,36 @@ def _pose(name: str, X_OG: npt.ArrayLike) -> Array:
     if X.shape != (4, 4):
         raise ConfigError(f"{name} must be one pose, 4 x 4 numbers, got {len(X)} of them")
     return X
+
+
+def _shape(name: str, shape: object, hand: Hand) -> Shape:
+    """Return the yielded shape of a hand, with the index of its preshape."""
+    if not isinstance(shape, tuple) or len(shape) != 2:
+        got = type(shape).__name__
+        raise ConfigError(f"{name} must have a shape (preshape, spread in rad), got {got}")
+
+    # A hand with preshapes closes in one of them.
+    preshape, spread = shape
+    names, index = hand.preshape_names, preshape
+    if isinstance(preshape, str) and preshape in names:
+        index = names.index(preshape)
+    known = isinstance(index, Integral) and 0 <= index < len(names) if names else index is None
+    if not known:
+        must = f"one of {listed(names)}, or its index" if names else "None"
+        raise ConfigError(
+            f"{name}: preshape must be {must} for the hand {hand.name}, got {_said(preshape)}"
+        )
+
+    low, high = coordinate_limits(hand.at(index))[0].tolist()
+    if not isinstance(spread, Real) or not low - EDGE_SPREAD <= spread <= high + EDGE_SPREAD:
+        raise ConfigError(
+            f"{name}: spread must be {low:.3g} to {high:.3g} rad for the hand {hand.name}, got "
+            f"{_said(spread)}"
+        )
+    return Shape(None if index is None else int(index), float(np.clip(float(spread), low, high)))
+
+
+def _said(value: object) -> str:
+    """Return a number as text, and anything else as its representation, in one short line."""
+    text = f"{float(value):g}" if isinstance(value, Real) else repr(value)
+    return " ".join(text.split())[:LONGEST]

@@ -48,9 +48,8 @@ pytestmark = pytest.mark.cluster
 #: One attempt, which gives a sample, and the scenes of its object.
 SAMPLE = [
     *FAST,
-    "candidates.method=above",
+    "candidates.method=closing",
     "candidates.max=1",
-    "candidates.standoffs=[0.042]",
     "physics.friction_hand=1.5",
     "scenes.when=assembled",
     "scenes.views=1",

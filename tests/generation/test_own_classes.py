@@ -107,8 +107,7 @@ def sampler(text: str) -> Config:
 def draw(box: ObjectModel, config: Config, count: int = 20) -> Candidates:
     X_TO = np.eye(4)
     X_TO[2, 3] = box.half_extents[2]
-    rules = config.candidates.model_copy(update={"max": count})
-    return sample_candidates(box, X_TO, rules, config.seed)
+    return sample_candidates(box, X_TO, config, count)
 
 
 def test_the_sampler_of_the_page_looks_at_the_object(own: Path, box: ObjectModel) -> None:

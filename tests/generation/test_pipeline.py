@@ -46,8 +46,8 @@ def _nothing_runs(function: Callable, items: Iterable) -> Iterator:
 
 
 Again = Callable[..., BuildReport]
-#: One attempt at an object, far above it: there is nothing to lift.
-FAR = ("candidates.max=1", "candidates.method=above", "candidates.standoffs=[0.2]")
+#: One attempt at an object, far from it: there is nothing to lift.
+FAR = ("candidates.max=1", "candidates.method=normals", "candidates.standoffs=[0.2]")
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.simulation.attempt import Attempt, Source
-from drakegrasp.simulation.candidates import Candidates, standoff_attempts
+from drakegrasp.simulation.candidates import Candidates, palm_attempts
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.trial import TrialRecord
 
@@ -98,6 +98,8 @@ def test_preshapes_are_drawn_after_the_spreads() -> None:
         distance=np.ones(count),
         resting=np.zeros(count, dtype=np.int64),
         source=np.zeros(count, dtype=np.int64),
+        spread=np.full(count, np.nan),
+        preshape_index=np.full(count, -1),
         combinations=count,
         valid=count,
         distinct=count,
@@ -105,7 +107,7 @@ def test_preshapes_are_drawn_after_the_spreads() -> None:
     rules = CandidateConfig(standoffs=(0.05, 0.07), spreads_deg=(0.0, 10.0, 20.0))
 
     def attempts(preshapes: int) -> list:
-        made = standoff_attempts(drawn, range(count), rules, name="x", seed=3, preshapes=preshapes)
+        made = palm_attempts(drawn, range(count), rules, name="x", seed=3, preshapes=preshapes)
         return list(made)
 
     without, shaped = attempts(0), attempts(3)

@@ -227,6 +227,8 @@ def resting(model: ObjectModel, X_TO: Array) -> PreparedObject:
         distance=np.full(4, np.nan),
         resting=np.zeros(4, dtype=np.int64),
         source=np.zeros(4, dtype=np.int64),
+        spread=np.full(4, np.nan),
+        preshape_index=np.full(4, -1),
         combinations=4,
         valid=4,
         distinct=4,
@@ -238,6 +240,7 @@ def resting(model: ObjectModel, X_TO: Array) -> PreparedObject:
         table_force=np.full(1, 9.81),
         stopped=np.zeros(1, dtype=bool),
         candidates=candidates,
+        asked=4,
     )
 
 

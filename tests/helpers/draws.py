@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from drakegrasp.simulation.above import Above
 from threadpoolctl import threadpool_info
 
 from drakegrasp.config import BuiltinConfig, SplitConfig
@@ -29,7 +28,7 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.seeding import Stream
 from drakegrasp.shapes.catalog import export_builtin
-from drakegrasp.simulation.candidates import normal_candidates, standoff_attempts
+from drakegrasp.simulation.candidates import normal_candidates, palm_attempts, sample_candidates
 from drakegrasp.simulation.conditions import draw_conditions
 from drakegrasp.simulation.palms import palm_motion
 from drakegrasp.simulation.robustness import _noise_factor
@@ -41,8 +40,10 @@ from drakegrasp.vision.depth_sensor import DepthSensor, spoil_depth
 REAL = ("24_mug_final", "42_wineglass_final", "110_bunny_final")
 #: Attempts whose predictions by geometry are hashed.
 PREDICTED = 600
+#: Palm poses of the sampler `closing` that are hashed.
+CLOSING = 60
 #: A resting pose of exact numbers: 3, 4, 5 are a right triangle.
-R_WO = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+R_TO = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
 
 
 def digest(*parts: object) -> str:
@@ -73,7 +74,7 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     prepared = prepare(source, config)
     model, candidates = prepared.model, prepared.candidates
     attempts = list(
-        standoff_attempts(
+        palm_attempts(
             candidates, range(len(candidates)), config.candidates, name=source.name, seed=7
         )
     )
@@ -98,8 +99,9 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     ]
     yield "conditions", digest(*(np.array([d[name] for d in drawn]) for name in drawn[0]))
     yield "normals", digest(normal_candidates(model, 1000, Stream(7)))
-    above = Above(model, make_pose(R_WO, [0.1, 0.2, 0.3]), config.candidates, Stream(7))
-    yield "above", digest(above.poses(1000))
+    X_TO = make_pose(R_TO, [0.1, 0.2, model.half_extents[2]])
+    closing = sample_candidates(model, X_TO, load_config("fast"), CLOSING)
+    yield "closing", digest(closing.X_OG, closing.spread)
     predictions = predict(model, hand, prepared.X_TO, attempts[:PREDICTED], config.screen)
     yield (
         "predictions",

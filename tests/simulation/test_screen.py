@@ -23,7 +23,7 @@ from drakegrasp.config import ScreenConfig
 from drakegrasp.frames import make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.finger_sweep import GAP_STRIDE, hand_paths
-from drakegrasp.hand.settings import load_config
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import screen
@@ -118,7 +118,7 @@ def test_attempt_that_says_where_its_fingers_start_is_never_screened(cube, confi
 
 def test_prediction_depends_on_the_attempt_alone(cube, hand, config):
     """The poses of the object differ, and the higher one blocks no finger at the table."""
-    drawn, made, together = drawn_attempts(cube, standing(cube), config, 0), [], []
+    drawn, made, together = drawn_attempts(cube, standing(cube), config), [], []
     lifted = make_pose(np.eye(3), [0.0, 0.0, 0.02]) @ standing(cube)
     while sum(found is not None and found.outcome is None for found in together) < 3:
         assert len(made) < 2000, "three of the attempts must be simulated"
@@ -152,7 +152,7 @@ def test_nothing_that_is_screened_would_have_been_lifted(tmp_path, hand, config)
 
     # Take attempts from the draw until ten of either kind are lost.
     losers: dict[Outcome, list[Attempt]] = {Outcome.START_COLLISION: [], Outcome.SCREENED: []}
-    for attempt in drawn_attempts(model, X_TO, config, 1):
+    for attempt in drawn_attempts(model, X_TO, override_config(config, ["seed=1"])):
         (found,) = predict(model, hand, X_TO, [attempt], config.screen)
         above = (X_TO @ attempt.X_OG)[2, 3] > 0.0
         if above and found is not None and found.outcome is not None:

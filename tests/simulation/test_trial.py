@@ -360,7 +360,7 @@ def test_smaller_step_gives_the_same_verdicts(tmp_path, config, hand):
     # Take attempts from the draw until there are 20 to compare, and three successes among them.
     same: list[bool] = []
     successes = 0
-    for attempt in drawn_attempts(model, X_TO, config, 0):
+    for attempt in drawn_attempts(model, X_TO, config):
         record = run_attempt(scenes[0], X_TO, attempt, coarse)
         if record.closed is not None:
             truth = run_attempt(scenes[1], X_TO, attempt, fine).outcome

@@ -111,7 +111,7 @@ def numbers(batch: Batch, candidates: AnyArray | None) -> Iterator[Violation]:
     source, preshape = batch["source"], batch["preshape"]
     shape = (preshape == NO_PRESHAPE) & ((source != Source.POSTURES) | (batch["unused"] > 0))
     for name, bad, must in (
-        ("source", ~np.isin(source, list(Source)), "0, 1, 3 or 4"),
+        ("source", ~np.isin(source, list(Source)), "0, 1, 3, 4 or 5"),
         ("preshape", shape, "255 of postures only, which use all fingers"),
     ):
         yield from batch.broken(f"{name} must be {must}", bad, batch[name])
