@@ -122,23 +122,27 @@ class Target:
             name: _Object(floor, config.samples_patience) for name, floor in floors.items()
         }
         self._lost = dict.fromkeys(floors, 0)
+        self._current: dict[str, int] | None = None  # the shares, until something changes
 
     def set_units(self, name: str, units: Sequence[ShardHeader], *, endless: bool) -> None:
         """State an object's work units, and whether more palm poses can be drawn."""
         item = self._objects[name]
         item.units, item.endless = units, endless
         item.update()
+        self._current = None
 
     def add(self, unit: ShardHeader, hits: Sequence[int]) -> None:
         """Note the palm poses of the hits of a completed unit."""
         item = self._objects[unit.object_name]
         item.found[unit.start, unit.stop] = tuple(sorted(hits))
         item.update()
+        self._current = None
 
     def lose(self, lost: Mapping[str, int]) -> bool:
         """State how many hits of each object are no samples after all; return whether more are."""
         before = dict(self._lost)
         self._lost |= {name: max(count, before[name]) for name, count in lost.items()}
+        self._current = None
         return self._lost != before
 
     @property
@@ -157,8 +161,7 @@ class Target:
     def found(self) -> int:
         """Number of hits so far, up to the wanted number of each object."""
         shares = self._shares()
-        hits = {name: sum(map(len, item.found.values())) for name, item in self._objects.items()}
-        return sum(min(count, shares[name]) for name, count in hits.items())
+        return sum(min(len(item.hits), shares[name]) for name, item in self._objects.items())
 
     def taken(self) -> dict[str, int | None]:
         """Return the palm poses of each object in the dataset; None where more must be tried."""
@@ -166,7 +169,7 @@ class Target:
         if None in taken.values():
             return taken
         # All hits up to here are known, also the others of each palm pose with several.
-        return self._taken(self._shares(whole=True))
+        return self._taken(self._even_shares(whole=True))
 
     def dry(self) -> list[str]:
         """Return the objects that need more palm poses than are drawn."""
@@ -214,7 +217,7 @@ class Target:
         config, lines = self._config, list[str]()
         what = "grasps" if config.max_grasps is not None else "samples"
         counts, spent, vain = dict[str, int](), list[str](), list[str]()
-        shares = self._shares(whole=True)
+        shares = self._even_shares(whole=True)
         for name, taken in self._taken(shares).items():
             item = self._objects[name]
             found = item.within(taken or 0)
@@ -248,7 +251,12 @@ class Target:
     def _taken(self, shares: Mapping[str, int]) -> dict[str, int | None]:
         return {name: item.taken(shares[name]) for name, item in self._objects.items()}
 
-    def _shares(self, *, whole: bool = False) -> dict[str, int]:
+    def _shares(self) -> dict[str, int]:
+        if self._current is None:
+            self._current = self._even_shares()
+        return self._current
+
+    def _even_shares(self, *, whole: bool = False) -> dict[str, int]:
         """Return the number of hits for which each object is tried, as even as possible.
 
         An exhausted object has fewer.
