@@ -168,10 +168,8 @@ def build_on(
         MeshError: If `only` names no object.
         MachineError: If a worker would give other results than this machine.
     """
-    config = posture_config(config, postures)
+    config = ended(posture_config(config, postures))
     refuse_unusable(config)
-    if part is None:
-        config = ended(config, postures)
     refuse_part(part, config)
     only, postures = _chosen(_names(sources, config), only, postures)
     with build_lock(out) as dead, ExitStack() as stack:
@@ -253,7 +251,7 @@ def known_work(request: BuildRequest, part: str | None = None) -> list[str]:
     postures = None
     if request.postures is not None:
         postures = read_attempts(request.postures, hand, read_as=request.read_as)
-    config = posture_config(request.config, postures)
+    config = ended(posture_config(request.config, postures))
     refuse_unusable(config)
     job = None if part is None else read_part(part)
     refuse_part(job, config)
@@ -266,26 +264,34 @@ def known_work(request: BuildRequest, part: str | None = None) -> list[str]:
     if postures is not None:
         rows = sum(len(postures.of_object(name)) for name in only)
         return [f"{counted(objects, 'object')}: {counted(rows, 'posture')}"]
-    poses, standoffs = config.candidates.max, len(config.candidates.standoffs)
+    if config.has_target:
+        return _target_lines(config, objects)
+    poses = config.candidates.max
     units = objects * sum(1 for _ in config.unit_ranges(poses))
-    attempts = counted(objects * poses * standoffs, "attempt")
-    lines = [f"{counted(objects, 'object')}: at most {attempts} in {counted(units, 'work unit')}"]
+    palms = counted(objects * poses, "palm pose")
+    lines = [f"{counted(objects, 'object')}: at most {palms} in {counted(units, 'work unit')}"]
     if job is not None:
         of_job = sum(map(job.has, range(units)))
         lines.append(f"part {part}: at most {of_job:,} of these work units")
-    return lines + _image_lines(config, objects)
+    return lines
 
 
-def _image_lines(config: Config, objects: int) -> list[str]:
-    """Return a line on the images of the samples that are wanted; none if no number is."""
-    each = config.samples_per_object
+def _target_lines(config: Config, objects: int) -> list[str]:
+    """Return what ends a build with a target, and the size of the images of its samples."""
+    each, grasps = config.samples_per_object, config.max_grasps
+    ends = [counted(config.samples, "sample")] if config.samples is not None else []
+    ends += [f"{counted(each, 'sample')} of each"] if each is not None else []
+    ends += [f"{counted(grasps, 'grasp')} of each"] if grasps is not None else []
+    palms = counted(config.candidates.max, "palm pose")
+    lines = [f"{counted(objects, 'object')}: until {' or '.join(ends)}, at most {palms} of each"]
     wanted = [n for n in (config.samples, each and objects * each) if n is not None]
     if not wanted:
-        return []
+        return lines
     # Their size on the disk depends on how well they can be compressed.
     images = [field.empty(1, {"S": config.camera.size}) for field in DATA_FIELDS if field.sample]
     size = min(wanted) * len(CAMERAS) * sum(image.nbytes for image in images)
-    return [f"images of {counted(min(wanted), 'sample')}: {size / 1e6:,.1f} MB before compression"]
+    images_of = f"images of {counted(min(wanted), 'sample')}"
+    return [*lines, f"{images_of}: {size / 1e6:,.1f} MB before compression"]
 
 
 def _release_unused(out: Path) -> None:

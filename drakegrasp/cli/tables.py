@@ -214,6 +214,10 @@ def barren_lines(funnel: Funnel, config: Config) -> list[str]:
 
 def unfinished_line(unfinished: Unfinished) -> str:
     """Return a line on the progress of a build that is running or was stopped."""
+    if unfinished.total is None:
+        units = counted(unfinished.done, "work unit")
+        verb = "is" if unfinished.done == 1 else "are"
+        return f"not finished: {units} {verb} done; samples are chosen at the end"
     if not unfinished.total:
         return "not finished: its objects are not prepared yet"
     if unfinished.done == unfinished.total:
@@ -435,7 +439,7 @@ def print_stats(out: Path) -> None:
             for line in holding_lines(holding):
                 say(line)
         of_benchmark = (out / BUILTIN_FOLDER / BENCHMARK_FILE).is_file()
-        if not of_benchmark and (line := split_shortfall(splits, rule, config.split)):
+        for line in [] if of_benchmark else split_shortfall(splits, rule, config.split):
             say(line)
     else:
         say(f"{out}: {unfinished_line(unfinished)}")

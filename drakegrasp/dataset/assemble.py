@@ -110,12 +110,7 @@ def assemble(
     if not out.is_dir():
         read_manifest(out)
     with build_lock(out):
-        before = read_manifest(out)
-        manifest = with_postprocessing(before, overrides)
-        if manifest.config.split != before.config.split:
-            manifest = replace(
-                manifest, objects=tuple(replace(e, split=None) for e in manifest.objects)
-            )
+        manifest = with_postprocessing(read_manifest(out), overrides)
         return assemble_locked(out, manifest, rejected=rejected, execute=execute, progress=progress)
 
 

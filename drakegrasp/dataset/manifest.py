@@ -27,6 +27,7 @@ from drakegrasp.config import (
     Config,
     Licence,
     NonNegative,
+    NonNegativeCount,
     Number,
     Positive,
     Seed,
@@ -148,7 +149,7 @@ class ObjectEntry:
     friction: Positive | None
     collision_error: NonNegative
     resting: Annotated[tuple[RestingEntry, ...], Field(min_length=1)]
-    candidates: Whole
+    candidates: NonNegativeCount
     combinations: Whole
     valid: Whole
     distinct: Whole
@@ -425,9 +426,6 @@ def _contradictions(stored: _Stored, manifest: Manifest) -> Iterator[str]:
                 f"objects.{i}: candidates, distinct, valid and combinations must rise, "
                 f"got {', '.join(map(str, numbers))}"
             )
-        if entry.candidates > config.candidates.max:
-            most = config.candidates.max
-            yield f"objects.{i}.candidates must be at most {most}, got {entry.candidates}"
 
 
 def claim_directory(out: Path, config: Config) -> Manifest | None:
@@ -510,6 +508,8 @@ def release_directory(out: Path) -> None:
 def with_postprocessing(manifest: Manifest, overrides: Sequence[str]) -> Manifest:
     """Return a manifest with other values of the filters or the split.
 
+    If the split changes, no object has one any more, so that all are drawn anew.
+
     Args:
         manifest: Manifest of the dataset.
         overrides: `key=value` texts, e.g. "split.valid_fraction=0.2".
@@ -523,6 +523,9 @@ def with_postprocessing(manifest: Manifest, overrides: Sequence[str]) -> Manifes
             "only values of filters and split can change, got one that changes what was "
             f"simulated: {differences(manifest.config, config)}"
         )
+    if config.split != manifest.config.split:
+        objects = tuple(replace(entry, split=None) for entry in manifest.objects)
+        manifest = replace(manifest, objects=objects)
     return replace(manifest, config=config)
 
 

@@ -8,7 +8,7 @@ directory. Work units, `check` and `replay` read these two files and do not need
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ _OF_MODEL = (
 #: Fields of the entry that come from the object's candidates.
 _COUNTS = ("combinations", "valid", "distinct")
 #: Fields of the entry that change when more palm poses are drawn.
-DRAWN_FACTS = (*_COUNTS, "candidates", "ended")
+_DRAWN = (*_COUNTS, "candidates", "ended")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -92,6 +92,11 @@ class PreparedObject:
             ended=len(self.candidates) < self.asked,
             **{name: getattr(self.candidates, name) for name in _COUNTS},
         )
+
+
+def with_drawn(entry: ObjectEntry, drawn: ObjectEntry) -> ObjectEntry:
+    """Return an object's entry in the manifest with the numbers of palm poses of another one."""
+    return replace(entry, **{name: getattr(drawn, name) for name in _DRAWN})
 
 
 def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:

@@ -126,6 +126,7 @@ class GraspDataset:
         # Facts about the split in the file.
         with open_samples(self.path) as file:
             self._length = len(file[split]["grasps"])
+            self._filled = [name for name in SPLITS if len(file[name]["grasps"])]
             self.image_size = int(file[split]["images"].shape[-1])
             self.K = np.array(file.attrs["K"])
             self.camera = str(file.attrs["camera"])
@@ -185,6 +186,9 @@ class GraspDataset:
             IndexError: If the index is out of range.
         """
         index = operator.index(index)
+        if not self._length:
+            others = ", ".join(self._filled) or "none"
+            raise IndexError(f"split {self.split} is empty; not empty: {others}")
         if not -self._length <= index < self._length:
             raise IndexError(f"index must be below {self._length}, got {index}")
         return index % self._length

@@ -124,12 +124,13 @@ class Unfinished:
 
     Attributes:
         funnel: Counts of the finished work units; no success is a sample yet.
-        done, total: Numbers of finished and of all work units; `max_grasps` may leave some out.
+        done: Number of finished work units.
+        total: Number of all work units; None if it follows from their results, see `Target`.
     """
 
     funnel: Funnel
     done: int
-    total: int
+    total: int | None
 
 
 def is_assembled(out: Path, *, verify_shards: bool = False, execute: Executor = run_here) -> bool:
@@ -212,7 +213,10 @@ def count_unfinished(out: Path) -> Unfinished | None:
     }
     funnel = funnel_of(Trials.of_parts(out, objects, parts))
 
-    # Palm poses that are still to be tried count as well.
+    # A build with a target tries as many palm poses as it needs. Without one, those that are still
+    # to be tried count as well.
+    if manifest.config.has_target and any(entry.tried is None for entry in entries):
+        return Unfinished(funnel=funnel, done=len(parts), total=None)
     planned = np.array([entry.candidates for entry in entries], dtype=np.int64)
     funnel = replace(funnel, candidates=planned)
     return Unfinished(funnel=funnel, done=len(parts), total=manifest.units)
@@ -479,40 +483,28 @@ def why_no_sample(outcomes: AnyArray, removals: AnyArray, config: Config) -> Sho
     return Shortfall(reason, ways_to_grasps(config))
 
 
-def split_shortfall(counts: Sequence[SplitCount], rule: str, config: SplitConfig) -> str:
-    """Return which part of a split is empty or has another fraction than requested; "" if none is.
+def split_shortfall(counts: Sequence[SplitCount], rule: str, config: SplitConfig) -> list[str]:
+    """Return a line for each split that is empty, or one if other fractions were requested.
 
     Args:
-        counts: Counts of the parts.
+        counts: Counts of the splits.
         rule: Rule of the split, `class` or `object`.
         config: The requested fractions.
     """
     samples = {count.split: count.samples for count in counts}
     total = sum(samples.values())
     if not total:
-        return ""
-    if rule == "class":
-        asked = {"train": 1.0, "valid": config.valid_fraction, "test": 1.0}
+        return []
+    asked = {"train": 1.0, "valid": config.valid_fraction, "test": config.test_fraction}
+    if rule == "object":
+        asked["train"] -= asked["valid"] + asked["test"]
+        why = dict.fromkeys(asked, _why_empty(sum(count.objects for count in counts)))
     else:
-        asked = {"valid": config.valid_fraction, "test": config.test_fraction}
-        asked["train"] = 1.0 - sum(asked.values())
+        asked["test"] = 1.0
+        why = EMPTY_BY_CLASS
     empty = [name for name, count in samples.items() if asked[name] and not count]
-
-    if rule == "class":
-        # By class, no fraction is requested for testing, and valid is drawn from the rest.
-        if "train" in empty:
-            return (
-                "no sample is for training: by class, a class trains if two of its objects have "
-                "samples, or if split.train_classes names it; --set split.by=object trains on any"
-            )
-        if empty:
-            wanted = {
-                "valid": "more samples, or a larger split.valid_fraction",
-                "test": "classes of which two objects have samples, or --set split.by=object",
-            }
-            helps = "; ".join(f"{name}: {wanted[name]}" for name in empty)
-            return f"no sample is in {' and '.join(empty)}. What would help: {helps}"
-        return ""
+    if empty or rule == "class":  # by class, no fraction is requested for testing
+        return [f"split {name} is empty: {why[name]}" for name in empty]
 
     off = [
         name
@@ -520,12 +512,31 @@ def split_shortfall(counts: Sequence[SplitCount], rule: str, config: SplitConfig
         if share and not share / MUCH <= samples[name] / total <= share * MUCH
     ]
     if not off:
-        return ""
+        return []
     told = ", ".join(f"{name} {samples[name] / total:.0%} ({asked[name]:.0%})" for name in samples)
     objects = sum(count.objects for count in counts)
-    verb = "has" if objects == 1 else "have"
-    return (
+    return [
         f"the fractions of the split differ from the requested ones (in brackets): {told}. Whole "
-        f"objects are drawn, and {counted(objects, 'object')} {verb} samples. What would help: "
-        "more objects, or equally many samples of each (--samples-per-object)"
+        f"objects are drawn, and {objects:,} objects have samples. What would help: more objects, "
+        "or equally many samples of each (--samples-per-object)"
+    ]
+
+
+def _why_empty(objects: int) -> str:
+    """Return why a split by object may be empty, given the number of objects with samples."""
+    if objects < len(SPLITS):
+        verb = "has" if objects == 1 else "have"
+        return f"{counted(objects, 'object')} {verb} samples, and three fill all splits"
+    return (
+        "objects stay in the split in which they were first; `drakegrasp assemble OUT --set "
+        "split.seed=1` draws all splits anew"
     )
+
+
+#: Why a split by class may be empty.
+EMPTY_BY_CLASS = {
+    "train": "a class trains if two of its objects have samples, or if split.train_classes names "
+    "it; --set split.by=object trains on any",
+    "valid": "more samples would help, or a larger split.valid_fraction",
+    "test": "classes of which two objects have samples would help, or --set split.by=object",
+}

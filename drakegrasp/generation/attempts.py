@@ -96,7 +96,11 @@ def trial_setup(out: Path, header: ShardHeader, config: Config) -> TrialSetup:
     Raises:
         DataError: If the object's files are damaged, or belong to another configuration or mesh.
     """
-    prepared = _load(out, header.object_name, header.mesh_sha256, config)
+    key = out, header.object_name, header.mesh_sha256, config
+    prepared = _load(*key)
+    if len(prepared.candidates) < header.stop:  # more palm poses were drawn since
+        _load.cache_clear()
+        prepared = _load(*key)
     scene = cached_scene(prepared.model, config.physics, config.hand_source)
     return TrialSetup(prepared=prepared, config=config, scene=scene)
 

@@ -29,6 +29,7 @@ from drakegrasp.dataset.manifest import (
     write_manifest,
 )
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, model_path, plan_path, shards_folder
+from drakegrasp.dataset.prepared_objects import with_drawn
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import DataError
@@ -37,9 +38,10 @@ from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
 from drakegrasp.runtime.progress import Report, silent
 
-#: Keys in which datasets may differ. The merged dataset has the seed of the first dataset and no
-#: requested number of samples.
-_FREE = ("seed", "samples", "samples_per_object", "samples_patience")
+#: What a build may end with. A merged dataset has none of it.
+_ENDS = ("samples", "samples_per_object", "max_grasps")
+#: Keys in which datasets may differ. The merged dataset has the seed of the first dataset.
+_FREE = ("seed", "samples_patience", *_ENDS)
 
 
 #: An object of one of the datasets: the directory, the object's entry there, its work units, and
@@ -86,8 +88,9 @@ def merge(
     own_filters(manifest.config.filters)
 
     with disk_full_named(into), atomic_folder(into) as folder, build_lock(folder):
+        drawn = {entry.name: entry.candidates for entry in manifest.objects}
         for part in parts:
-            _take_files(part, folder)
+            _take_files(part, drawn, folder)
         manifest = _with_hand(manifest, manifests.values(), folder)
         write_manifest(manifest, folder)
         _refuse_missing(manifest, folder, incomplete)
@@ -189,8 +192,8 @@ def _parts(manifests: Mapping[Path, Manifest]) -> list[_Part]:
             if split != entry.split:
                 raise DataError(
                     f"{out}: {entry.mesh_name} must be in one split of all datasets, got it in "
-                    f"{entry.split}, and in {split} of {first}; `drakegrasp assemble` with --set "
-                    "split.seed=... draws the splits of a dataset anew"
+                    f"{entry.split}, and in {split} of {first}; --set split.seed=1 draws the splits "
+                    "of all of them anew"
                 )
 
     # A mesh keeps its name with the first seed, or if it has only one seed.
@@ -213,22 +216,20 @@ def _merged_manifest(manifests: Mapping[Path, Manifest], parts: Iterable[_Part])
     Raises:
         DataError: If two parts have the same name and differ.
     """
-    # Use each object once; of two equal objects, use the one with more tried candidates.
+    # Use each object once.
     objects, names = dict[str, ObjectEntry](), dict[tuple[Path, str], str]()
     for out, entry, _, merged in parts:
         names[out, entry.name] = merged.name
         known = objects.setdefault(merged.name, merged)
-        untold = None in (known.tried, merged.tried)
-        tried = None if untold else max(known.tried or 0, merged.tried or 0)
-        longer = replace(known, tried=tried, split=known.split or merged.split)
-        if longer != replace(merged, tried=tried, split=longer.split):
-            theirs, ours = known.to_json(), merged.to_json()
+        if with_drawn(replace(merged, tried=known.tried, split=known.split), known) != known:
+            theirs, ours = known.to_json(), with_drawn(merged, known).to_json()
             keys = [key for key in {**theirs, **ours} if theirs.get(key) != ours.get(key)]
+            others = ", ".join(key for key in keys if key not in ("tried", "split"))
             raise DataError(
                 f"{out}: {merged.name} must be equal in all datasets that have it under the same "
-                f"seed, got others in {', '.join(key for key in keys if key != 'tried')}"
+                f"seed, got others in {others}"
             )
-        objects[merged.name] = longer
+        objects[merged.name] = _longer(known, merged)
 
     first = next(iter(manifests.values()))
     refused = [mesh for manifest in manifests.values() for mesh in manifest.refused]
@@ -240,11 +241,19 @@ def _merged_manifest(manifests: Mapping[Path, Manifest], parts: Iterable[_Part])
     ]
     return replace(
         first,
-        config=first.config.model_copy(update={"samples": None, "samples_per_object": None}),
+        config=first.config.model_copy(update=dict.fromkeys(_ENDS)),
         objects=tuple(objects.values()),
         refused=tuple({mesh.name: mesh for mesh in refused if mesh.name not in objects}.values()),
         rejected=tuple(dict.fromkeys(rejected)),
     )
+
+
+def _longer(known: ObjectEntry, other: ObjectEntry) -> ObjectEntry:
+    """Return an object's entry with the palm poses of both entries that two datasets have of it."""
+    more = max(known, other, key=lambda entry: entry.candidates)
+    rows = max(entry.candidates if entry.tried is None else entry.tried for entry in (known, other))
+    tried = None if rows == more.candidates else rows
+    return replace(more, tried=tried, split=known.split or other.split)
 
 
 def _with_hand(manifest: Manifest, parts: Iterable[Manifest], folder: Path) -> Manifest:
@@ -256,16 +265,21 @@ def _with_hand(manifest: Manifest, parts: Iterable[Manifest], folder: Path) -> M
     return manifest
 
 
-def _take_files(part: _Part, folder: Path) -> None:
+def _take_files(part: _Part, drawn: Mapping[str, int], folder: Path) -> None:
     """Link or copy the files of an object into a folder.
+
+    Args:
+        part: The object in one of the datasets.
+        drawn: Number of palm poses of each object in the merged dataset.
+        folder: Directory of the merged dataset.
 
     Raises:
         DataError: If another part has put different files there.
     """
     out, entry, headers, merged = part
-    pairs = [(path(out, entry.name), path(folder, merged.name)) for path in (model_path, plan_path)]
+    pairs = [(model_path(out, entry.name), model_path(folder, merged.name))]
     for header in headers:
-        # Units after the last requested grasp may have no shard.
+        # Another part of a build has the missing ones.
         if header.path(out).exists():
             pairs.append((header.path(out), shards_folder(folder, merged.name) / header.file_name))
     for source, target in pairs:
@@ -276,6 +290,11 @@ def _take_files(part: _Part, folder: Path) -> None:
                 f"{source}: must be equal in all datasets with {entry.mesh_name} under the "
                 "same seed, got another"
             )
+
+    # The longest plan has the palm poses of all others.
+    plan = plan_path(folder, merged.name)
+    if entry.candidates == drawn[merged.name] and not plan.exists():
+        _link(plan_path(out, entry.name), plan)
 
 
 def _link(source: Path, target: Path) -> None:

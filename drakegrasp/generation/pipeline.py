@@ -42,7 +42,7 @@ from drakegrasp.dataset.manifest import (
     write_manifest,
 )
 from drakegrasp.dataset.paths import SCENES_FILE
-from drakegrasp.dataset.prepared_objects import DRAWN_FACTS, load_prepared
+from drakegrasp.dataset.prepared_objects import load_prepared, with_drawn
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled, palms_in_files
 from drakegrasp.errors import (
@@ -175,13 +175,14 @@ def build(
         )
 
 
-def ended(config: Config, postures: Attempts | None) -> Config:
+def ended(config: Config) -> Config:
     """Return the configuration of a build that ends.
 
     Without a target and a number of palm poses, samplers without an end would go on for hours.
     """
-    endless = "closing" in config.candidates.methods and postures is None
-    if config.has_target or not endless or config.candidates.max < MOST_PALMS:
+    rules = config.candidates
+    endless = "closing" in rules.methods and rules.postures is None
+    if config.has_target or not endless or rules.max != MOST_PALMS:
         return config
     return config.model_copy(update={"samples_per_object": SAMPLES_PER_OBJECT})
 
@@ -224,11 +225,15 @@ def refuse_part(part: Part | None, config: Config) -> None:
     Raises:
         ConfigError: If it is such a part: which units it needs depends on the results of all parts.
     """
-    if part is not None and config.has_target:
-        raise ConfigError(
-            "part must be left out with samples, samples_per_object and max_grasps, which need all "
-            "units (null switches a preset's off, and candidates.max limits the palm poses)"
-        )
+    if part is None:
+        return
+    for key in ("samples", "samples_per_object", "max_grasps"):
+        value = getattr(config, key)
+        if value is not None:
+            raise ConfigError(
+                "part must be of a build with a number of palm poses (--candidates N) and no other "
+                f"end, got {key}={value}, whose work units depend on the results of all parts"
+            )
 
 
 def build_locked(
@@ -267,7 +272,6 @@ def build_locked(
         known = claim_directory(out, config)
         if known is not None:
             refuse_missing(known, [source.name for source in sources], out)
-            config = _grown(config, known.config)
         config = carry_hand(out, config, known.config.hand if known else None)
 
         notices = [] if dead is None else [f"the lock of a dead build was taken over: {dead}"]
@@ -284,13 +288,6 @@ def build_locked(
                 else:
                     release_directory(out)
             raise
-
-
-def _grown(config: Config, known: Config) -> Config:
-    """Return a configuration with no fewer palm poses than the dataset has: it only grows."""
-    most = max(config.candidates.max, known.candidates.max)
-    rules = config.candidates.model_copy(update={"max": most})
-    return config.model_copy(update={"candidates": rules})
 
 
 class _Add(Protocol):
@@ -483,21 +480,33 @@ class _Build:
                 self.log("mesh prepared", name=name, **facts)
             report(len(entries), len(sources), found=known)
 
-        # Take licence and group from the sources, because they do not affect results.
-        said = {source.name: source for source in sources}
+        # If a mesh has changed, its rows and its rejected grasps no longer exist.
         ordered = [entries[source.name] for source in sources]
+        before = {entry.name: entry for entry in manifest.objects}
+        same = {e.name for e in ordered if e.name in before and _same_mesh(before[e.name], e)}
+        floors = {name: n for name, n in palms_in_files(self._out).items() if name in same}
+        objects = list[ObjectEntry]()
+        for source in sources:
+            entry = entries[source.name]
+            if isinstance(entry, RefusedMesh):
+                continue
+            self._floors[entry.name] = floors.get(entry.name, 0)
 
-        # If a mesh has changed, its rejected grasps no longer exist.
-        before = {entry.name: entry.mesh_sha256 for entry in manifest.objects}
-        same = {entry.name for entry in ordered if before.get(entry.name) == entry.mesh_sha256}
-        self._floors = {name: n for name, n in palms_in_files(self._out).items() if name in same}
-        objects = (entry for entry in ordered if isinstance(entry, ObjectEntry))
+            # A dataset only grows: fewer palm poses take none out of the files.
+            most = max(manifest.config.candidates.max, self._floors[entry.name])
+            if entry.candidates > most:
+                entry = replace(entry, candidates=most, ended=False)
+
+            # Licence and group do not affect results. An object stays in its split.
+            split = before[entry.name].split if entry.name in before else None
+            objects.append(
+                replace(
+                    entry, tried=None, licence=source.licence, group=source.group, split=split
+                )
+            )
         return replace(
             manifest,
-            objects=tuple(
-                replace(entry, licence=said[entry.name].licence, group=said[entry.name].group)
-                for entry in objects
-            ),
+            objects=tuple(objects),
             refused=tuple(entry for entry in ordered if isinstance(entry, RefusedMesh)),
             rejected=tuple(key for key in manifest.rejected if key.object in same),
         )
@@ -510,10 +519,8 @@ class _Build:
             palm poses that the dataset takes of each object.
         """
         config = manifest.config
-        every = replace(manifest, objects=tuple(replace(e, tried=None) for e in manifest.objects))
-        floors = {entry.name: self._floors.get(entry.name, 0) for entry in manifest.objects}
-        target = Target(config, floors) if config.has_target else None
-        counts = Counts(every, target, self._pool, report)
+        target = Target(config, self._floors) if config.has_target else None
+        counts = Counts(manifest, target, self._pool, report)
 
         # The progress bar shows the number of workers as it changes.
         if self._pool is not None:
@@ -527,7 +534,7 @@ class _Build:
         # Count the units of earlier builds, which are reused.
         rejected = {(key.object, key.candidate, key.standoff_index) for key in manifest.rejected}
         if target is not None:
-            _set_units(target, every)
+            _set_units(target, manifest)
 
         def add(summary: UnitSummary, *, reused: bool = False) -> None:
             if target is not None:
@@ -538,7 +545,7 @@ class _Build:
 
         done = set[ShardHeader]()
         find = partial(find_units, config)
-        for units, damaged in self._execute(find, find_tasks(self._out, every)):
+        for units, damaged in self._execute(find, find_tasks(self._out, manifest)):
             for summary in units:
                 done.add(summary.header)
                 add(summary, reused=True)
@@ -548,31 +555,32 @@ class _Build:
         counts.show()  # the first unit may take a minute
 
         if target is not None:
-            return counts, self._meet(target, every, add)
-        due = [header for header in every.headers() if header not in done]
+            return counts, self._meet(target, manifest, add)
+        due = [header for header in manifest.headers() if header not in done]
         part = self._part
-        mine = due if part is None else [h for i, h in enumerate(every.headers()) if part.has(i)]
-        self._run_units((header for header in mine if header not in done), every, add)
+        mine = due if part is None else [h for i, h in enumerate(manifest.headers()) if part.has(i)]
+        self._run_units((header for header in mine if header not in done), manifest, add)
         self._left = len({*due} - {*mine})
-        return counts, every
+        return counts, manifest
 
-    def _meet(self, target: Target, every: Manifest, add: _Add) -> Manifest:
+    def _meet(self, target: Target, manifest: Manifest, add: _Add) -> Manifest:
         """Run units until a target is met or cannot be met.
 
         Returns:
             The manifest with the number of palm poses that the dataset takes of each object.
         """
         while True:
-            self._run_units(target.next_units(), every, add)
+            self._run_units(target.next_units(), manifest, add)
             if dry := target.dry():
-                every = self._draw_more(dry, every)
-                _set_units(target, every)
+                manifest = self._draw_more(dry, manifest)
+                write_manifest(manifest, self._out)  # for those who watch the build
+                _set_units(target, manifest)
             elif None not in (taken := target.taken()).values():
-                met = tuple(replace(e, tried=taken[e.name]) for e in every.objects)
-                manifest = replace(every, objects=met)
-                if not target.lose(self._outliers(manifest)):
+                objects = tuple(replace(e, tried=taken[e.name]) for e in manifest.objects)
+                met = replace(manifest, objects=objects)
+                if not target.lose(self._outliers(met)):
                     self._warnings = target.warnings()
-                    return manifest
+                    return met
 
     def _draw_more(self, names: Sequence[str], manifest: Manifest) -> Manifest:
         """Return the manifest with twice as many palm poses of some objects."""
@@ -588,16 +596,8 @@ class _Build:
             if entry.name in names
         ]
         drawn = dict(self._execute(draw_palms, tasks))
-        objects = tuple(
-            replace(
-                entry,
-                **{name: getattr(drawn[entry.name], name) for name in DRAWN_FACTS},
-            )
-            if entry.name in drawn
-            else entry
-            for entry in manifest.objects
-        )
-        return replace(manifest, objects=objects)
+        objects = (with_drawn(entry, drawn.get(entry.name, entry)) for entry in manifest.objects)
+        return replace(manifest, objects=tuple(objects))
 
     def _outliers(self, manifest: Manifest) -> dict[str, int]:
         """Return how many samples of each object the filter of outliers removes."""
@@ -705,8 +705,14 @@ def _known_entry(
                 prepared = load_prepared(out, source.name, manifest.config)
             except DrakegraspError:
                 return None
-            return entry if prepared.asked >= first_palms(manifest.config) else None
+            # A build that was stopped may have drawn more palm poses than the manifest says.
+            enough = prepared.asked >= first_palms(manifest.config)
+            return with_drawn(entry, prepared.entry()) if enough else None
     return None
+
+
+def _same_mesh(entry: ObjectEntry, other: ObjectEntry | RefusedMesh) -> bool:
+    return entry.mesh_sha256 == other.mesh_sha256
 
 
 def _likely_tested(manifest: Manifest) -> set[str]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from math import inf
 
 from drakegrasp.config import Config
@@ -31,60 +32,78 @@ class _Object:
 
     Attributes:
         floor: Number of palm poses that the dataset already has.
+        patience: Number of palm poses in a row without a hit after which the object is given up.
         units: Its work units, in order.
         endless: Whether more palm poses can be drawn than those of the units.
-        found: The palm poses of the hits of each completed unit, by its first palm pose.
-        known: Number of palm poses before the first unit that is not done.
+        found: The palm poses of the hits of each completed unit, by its first and last palm pose.
+        done: Number of units before the first one that is not done.
         hits: Palm poses of the hits among these, ascending.
+        last: Number of palm poses up to the last hit before the object is given up.
+        given_up: Number of palm poses after which it is given up; None if it is not.
     """
 
     floor: int
-    units: Sequence[ShardHeader]
-    endless: bool
-    found: dict[int, tuple[int, ...]] = field(default_factory=dict)
-    known: int = 0
+    patience: int
+    units: Sequence[ShardHeader] = ()
+    endless: bool = True
+    found: dict[tuple[int, int], tuple[int, ...]] = field(default_factory=dict)
+    done: int = 0
     hits: list[int] = field(default_factory=list)
+    last: int = 0
+    given_up: int | None = None
 
-    def add(self, unit: ShardHeader, hits: Sequence[int]) -> None:
-        """Note a completed unit."""
-        self.found[unit.start] = tuple(sorted(hits))
-        stops = {each.start: each.stop for each in self.units}
-        while (own := self.found.get(self.known)) is not None and self.known in stops:
+    def update(self) -> None:
+        """Count the units that follow those that were done before and are done now."""
+        while self.done < len(self.units) and self.has(self.units[self.done]):
+            unit = self.units[self.done]
+            own = self.found[unit.start, unit.stop]
+            for palm in (*own, unit.stop):
+                if self.given_up is None and palm - self.last >= self.patience:
+                    self.given_up = self.last + self.patience
+                if self.given_up is None and palm < unit.stop:
+                    self.last = palm + 1
             self.hits += own
-            self.known = stops[self.known]
+            self.done += 1
+
+    def has(self, unit: ShardHeader) -> bool:
+        """Return whether a unit is done."""
+        return (unit.start, unit.stop) in self.found
+
+    @property
+    def known(self) -> int:
+        """Number of palm poses before the first unit that is not done."""
+        return self.units[self.done - 1].stop if self.done else 0
 
     @property
     def drawn(self) -> int:
         """Number of palm poses that are drawn."""
         return self.units[-1].stop if self.units else 0
 
-    def end(self, patience: int) -> int | None:
-        """Return the number of palm poses after which the object is exhausted; None if unknown.
-
-        It is exhausted after `patience` palm poses in a row without a hit, or after the last one.
-        """
-        last = 0
-        for hit in self.hits:
-            if hit - last >= patience:
-                break
-            last = hit + 1
-        if self.known - last >= patience:
-            return max(last + patience, self.floor)
-        return self.known if self.known == self.drawn and not self.endless else None
+    @property
+    def end(self) -> int | None:
+        """Number of palm poses after which the object is exhausted; None if it is not."""
+        if self.given_up is not None:
+            return max(self.given_up, self.floor)
+        return self.drawn if self.known == self.drawn and not self.endless else None
 
     def within(self, palms: int) -> int:
         """Return the number of hits among the first palm poses."""
         return bisect_left(self.hits, palms)
 
-    def taken(self, hits: int, patience: int) -> int | None:
+    def whole(self, hits: int) -> int:
+        """Return a number of hits, with all others of the palm pose of the last one."""
+        return self.within(self.hits[hits - 1] + 1) if 0 < hits <= len(self.hits) else hits
+
+    def taken(self, hits: int) -> int | None:
         """Return the palm poses that yield a number of hits; None if more must be tried."""
         if self.known < self.floor:
             return None
         if hits <= self.within(self.floor):
             return self.floor
-        if hits <= len(self.hits):
-            return self.hits[hits - 1] + 1
-        return self.end(patience)
+        # Hits after an object was given up do not count, or the result would depend on chance.
+        if self.end is not None and hits > self.within(self.end):
+            return self.end
+        return self.hits[hits - 1] + 1 if hits <= len(self.hits) else None
 
 
 class Target:
@@ -98,23 +117,32 @@ class Target:
                 `samples_patience` define the target.
             floors: Number of palm poses of each object that the dataset already has, by name.
         """
-        self._config, self._patience = config, config.samples_patience
-        self._objects = {name: _Object(floor, (), True) for name, floor in floors.items()}
+        self._config = config
+        self._objects = {
+            name: _Object(floor, config.samples_patience) for name, floor in floors.items()
+        }
         self._lost = dict.fromkeys(floors, 0)
+        self._current: dict[str, int] | None = None  # the shares, until something changes
 
     def set_units(self, name: str, units: Sequence[ShardHeader], *, endless: bool) -> None:
         """State an object's work units, and whether more palm poses can be drawn."""
         item = self._objects[name]
         item.units, item.endless = units, endless
+        item.update()
+        self._current = None
 
     def add(self, unit: ShardHeader, hits: Sequence[int]) -> None:
         """Note the palm poses of the hits of a completed unit."""
-        self._objects[unit.object_name].add(unit, hits)
+        item = self._objects[unit.object_name]
+        item.found[unit.start, unit.stop] = tuple(sorted(hits))
+        item.update()
+        self._current = None
 
     def lose(self, lost: Mapping[str, int]) -> bool:
         """State how many hits of each object are no samples after all; return whether more are."""
         before = dict(self._lost)
         self._lost |= {name: max(count, before[name]) for name, count in lost.items()}
+        self._current = None
         return self._lost != before
 
     @property
@@ -133,15 +161,15 @@ class Target:
     def found(self) -> int:
         """Number of hits so far, up to the wanted number of each object."""
         shares = self._shares()
-        hits = {name: sum(map(len, item.found.values())) for name, item in self._objects.items()}
-        return sum(min(count, shares[name]) for name, count in hits.items())
+        return sum(min(len(item.hits), shares[name]) for name, item in self._objects.items())
 
     def taken(self) -> dict[str, int | None]:
         """Return the palm poses of each object in the dataset; None where more must be tried."""
-        shares = self._shares()
-        return {
-            name: item.taken(shares[name], self._patience) for name, item in self._objects.items()
-        }
+        taken = self._taken(self._shares())
+        if None in taken.values():
+            return taken
+        # All hits up to here are known, also the others of each palm pose with several.
+        return self._taken(self._even_shares(whole=True))
 
     def dry(self) -> list[str]:
         """Return the objects that need more palm poses than are drawn."""
@@ -159,22 +187,26 @@ class Target:
         given: dict[str, list[ShardHeader]] = {name: [] for name in self._objects}
         while True:
             shares, best = self._shares(), None
-            for name, taken in self.taken().items():
+            for name, taken in self._taken(shares).items():
                 item = self._objects[name]
                 if taken is not None:
                     continue
-                running = [unit for unit in given[name] if unit.start not in item.found]
-                free = [
-                    unit
-                    for unit in item.units
-                    if unit.start not in item.found and unit not in running
-                ]
+                running = [unit for unit in given[name] if not item.has(unit)]
+                free = next(
+                    (
+                        unit
+                        for unit in islice(item.units, item.done, None)
+                        if not item.has(unit) and unit not in running
+                    ),
+                    None,
+                )
+                given[name] = running
                 # The units that run are expected to yield as many hits as those before.
                 rate = (len(item.hits) + 1) / (item.known + 2)
                 expected = len(item.hits) + rate * sum(unit.stop - unit.start for unit in running)
-                due = free and (not running or expected < shares[name])
-                if due and (best is None or len(running) < best[0]):
-                    best = len(running), free[0]
+                due = not running or expected < shares[name]
+                if free is not None and due and (best is None or len(running) < best[0]):
+                    best = len(running), free
             if best is None:
                 return
             given[best[1].object_name].append(best[1])
@@ -185,19 +217,19 @@ class Target:
         config, lines = self._config, list[str]()
         what = "grasps" if config.max_grasps is not None else "samples"
         counts, spent, vain = dict[str, int](), list[str](), list[str]()
-        shares = self._shares()
-        for name, taken in self.taken().items():
+        shares = self._even_shares(whole=True)
+        for name, taken in self._taken(shares).items():
             item = self._objects[name]
-            counts[name] = item.within(taken or 0) - self._lost[name]
-            if item.within(taken or 0) < shares[name]:
-                is_spent = taken == item.drawn and not item.endless
-                (spent if is_spent else vain).append(name)
+            found = item.within(taken or 0)
+            counts[name] = found - self._lost[name]
+            if found < shares[name]:
+                (spent if item.given_up is None else vain).append(name)
         total = sum(counts.values())
         if config.samples is not None and total < config.samples:
             lines.append(f"{total:,} of {config.samples:,} {what} were found")
         if config.samples is None or total < config.samples:
             for names, why in (
-                (vain, f"given up after {self._patience} palm poses without one"),
+                (vain, f"given up after {config.samples_patience} palm poses without one"),
                 (spent, "all palm poses were tried"),
             ):
                 if names:
@@ -207,7 +239,8 @@ class Target:
         # A few objects may have to make up for the others.
         share = self.wanted / max(len(counts), 1)
         large = [name for name, count in counts.items() if count > MUCH * share]
-        if large:
+        fewer = [self._objects[name] for name, count in counts.items() if count < share]
+        if large and all(item.end is not None for item in fewer):
             said = listed([f"{name} ({counts[name]:,})" for name in large])
             lines.append(
                 f"more than twice their share of {share:.3g} {what}, because the other objects "
@@ -215,11 +248,26 @@ class Target:
             )
         return lines
 
+    def _taken(self, shares: Mapping[str, int]) -> dict[str, int | None]:
+        return {name: item.taken(shares[name]) for name, item in self._objects.items()}
+
     def _shares(self) -> dict[str, int]:
+        if self._current is None:
+            self._current = self._even_shares()
+        return self._current
+
+    def _even_shares(self, *, whole: bool = False) -> dict[str, int]:
         """Return the number of hits for which each object is tried, as even as possible.
 
         An exhausted object has fewer.
+
+        Args:
+            whole: Whether to count all hits of the last palm pose of each object.
         """
+        # What the dataset has must be known first: if a share could fall again, an object might be
+        # tried longer than in another run of the same command.
+        if any(item.known < item.floor for item in self._objects.values()):
+            return dict.fromkeys(self._objects, 0)
         wanted = self._config.samples
         each = self._config.samples_per_object or self._config.max_grasps or wanted or 0
         shares = {name: each + lost for name, lost in self._lost.items()}
@@ -228,13 +276,14 @@ class Target:
 
         # Every object contributes what the dataset has, or up to a level, or what it has at most.
         least = {name: item.within(item.floor) for name, item in self._objects.items()}
-        most = dict(shares)
-        for name, item in self._objects.items():
-            if (end := item.end(self._patience)) is not None:
-                most[name] = min(most[name], item.within(end))
+        most = {
+            name: shares[name] if item.end is None else min(shares[name], item.within(item.end))
+            for name, item in self._objects.items()
+        }
 
         def contributed(level: int, name: str) -> int:
-            return max(least[name], min(level + self._lost[name], most[name]))
+            hits = min(level + self._lost[name], most[name])
+            return max(least[name], self._objects[name].whole(hits) if whole else hits)
 
         # The highest level at which the objects together have at most the wanted number; the first
         # ones contribute one more.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,11 +11,14 @@ from hypothesis import strategies as st
 
 from drakegrasp.config import SplitConfig
 from drakegrasp.dataset.assembly.split import (
+    SPLIT_NAMES,
+    Home,
+    find_homes,
     may_train,
-    split_rule,
     split_samples,
 )
 
+BY_CLASS = SplitConfig(by="class")
 NAMES = ["a1", "a2", "a3", "b1", "c1", "c2"]
 CLASSES = ["a", "a", "a", "b", "c", "c"]
 OBJECTS = np.repeat(np.arange(6), 50).astype(np.int32)
@@ -21,7 +26,7 @@ OBJECTS = np.repeat(np.arange(6), 50).astype(np.int32)
 
 @given(seed=st.integers(0, 2**32))
 def test_split_is_a_partition_without_leaks(seed: int) -> None:
-    split = split_samples(OBJECTS, NAMES, CLASSES, NAMES, SplitConfig(), seed)
+    split = split_samples(OBJECTS, NAMES, CLASSES, NAMES, {}, BY_CLASS, seed)
     together = np.sort(np.concatenate(list(split.values())))
     assert np.array_equal(together, np.arange(len(OBJECTS)))
     tested = set(OBJECTS[split["test"]])
@@ -32,17 +37,18 @@ def test_split_is_a_partition_without_leaks(seed: int) -> None:
 
 
 def test_split_depends_on_the_seed_and_on_nothing_else() -> None:
-    one = split_samples(OBJECTS, NAMES, CLASSES, NAMES, SplitConfig(), 3)
-    two = split_samples(OBJECTS, NAMES, CLASSES, NAMES, SplitConfig(), 3)
+    one = split_samples(OBJECTS, NAMES, CLASSES, NAMES, {}, BY_CLASS, 3)
+    two = split_samples(OBJECTS, NAMES, CLASSES, NAMES, {}, BY_CLASS, 3)
     assert all(np.array_equal(one[k], two[k]) for k in one)
     others = [
-        split_samples(OBJECTS, NAMES, CLASSES, NAMES, SplitConfig(), s)["test"] for s in range(20)
+        split_samples(OBJECTS, NAMES, CLASSES, NAMES, {}, BY_CLASS, s)["test"] for s in range(20)
     ]
     assert any(not np.array_equal(one["test"], other) for other in others)
 
 
 def test_a_named_class_trains_with_its_only_object() -> None:
-    split = split_samples(OBJECTS, NAMES, CLASSES, NAMES, SplitConfig(train_classes=("b",)), 0)
+    config = SplitConfig(by="class", train_classes=("b",))
+    split = split_samples(OBJECTS, NAMES, CLASSES, NAMES, {}, config, 0)
     trained = np.concatenate([split["train"], split["valid"]])
     assert set(OBJECTS[trained]) == {3}
     assert len(split["valid"]) == 5
@@ -54,105 +60,101 @@ def test_a_named_class_trains_with_its_only_object() -> None:
     [(None, 1, False), (None, 2, True), (("a",), 1, True), (("b",), 9, False)],
 )
 def test_which_classes_train(named: tuple[str, ...] | None, count: int, trains: bool) -> None:
-    assert may_train("a", count, SplitConfig(train_classes=named)) is trains
+    assert may_train("a", count, SplitConfig(by="class", train_classes=named)) is trains
 
 
 def test_another_class_does_not_change_a_classs_draw() -> None:
-    whole = split_samples(OBJECTS, NAMES, CLASSES, NAMES, SplitConfig(), 1)
-    part = split_samples(OBJECTS[:150], NAMES, CLASSES, NAMES, SplitConfig(), 1)
+    whole = split_samples(OBJECTS, NAMES, CLASSES, NAMES, {}, BY_CLASS, 1)
+    part = split_samples(OBJECTS[:150], NAMES, CLASSES, NAMES, {}, BY_CLASS, 1)
     assert np.array_equal(part["valid"], whole["valid"][whole["valid"] < 150])
 
 
 def test_no_samples_make_empty_splits() -> None:
-    split = split_samples(np.zeros(0, np.int32), [], [], [], SplitConfig(), 0)
+    split = split_samples(np.zeros(0, np.int32), [], [], [], {}, BY_CLASS, 0)
     assert {k: len(v) for k, v in split.items()} == {"train": 0, "valid": 0, "test": 0}
 
 
-@pytest.mark.parametrize(
-    ("classes", "groups", "config", "rule"),
-    [
-        # auto: whether a class has objects of two meshes, and whether one is named.
-        ("ab", "12", SplitConfig(), "object"),
-        ("aab", "112", SplitConfig(), "object"),
-        ("aab", "123", SplitConfig(), "class"),
-        ("ab", "12", SplitConfig(train_classes=("a",)), "class"),
-        # What is stated holds.
-        ("ab", "12", SplitConfig(by="class"), "class"),
-        ("aab", "123", SplitConfig(by="object"), "object"),
-    ],
-)
-def test_auto_is_by_object_where_a_class_has_one_mesh(
-    classes: str, groups: str, config: SplitConfig, rule: str
-) -> None:
-    assert split_rule(config, classes, groups) == rule
-
-
-def by_object(
-    groups: list[str], seed: int = 0, config: SplitConfig | None = None
-) -> dict[str, set[str]]:
-    """Return the groups in each split by object; each group is an object with three samples."""
-    objects = np.repeat(np.arange(len(groups)), 3).astype(np.int32)
-    config = config or SplitConfig(by="object")
-    split = split_samples(objects, groups, groups, groups, config, seed)
-    assert np.array_equal(np.sort(np.concatenate(list(split.values()))), np.arange(len(objects)))
-    return {name: {groups[i] for i in objects[rows]} for name, rows in split.items()}
+@pytest.mark.parametrize(("pool", "valid"), [(7, 1), (23, 2), (26, 3), (4, 0), (6, 1)])
+def test_share_of_validation_is_rounded_to_the_nearest(pool: int, valid: int) -> None:
+    objects = np.zeros(pool, dtype=np.int32)
+    config = SplitConfig(by="class", train_classes=("a",), valid_fraction=0.1)
+    split = split_samples(objects, ["a1"], ["a"], ["a1"], {}, config, 0)
+    assert (len(split["train"]), len(split["valid"])) == (pool - valid, valid)
 
 
 def meshes(count: int) -> list[str]:
     return [f"{i}_mesh" for i in range(count)]
 
 
+def members(homes: Mapping[str, Home]) -> dict[str, set[str]]:
+    """Return the groups of each split."""
+    return {name: {g for g, home in homes.items() if home == name} for name in SPLIT_NAMES}
+
+
+def numbers(homes: Mapping[str, Home]) -> tuple[int, ...]:
+    """Return the numbers of groups in train, valid and test."""
+    return tuple(map(len, members(homes).values()))
+
+
 @pytest.mark.parametrize(
-    ("count", "numbers"),
+    ("count", "due"),
     [(1, (1, 0, 0)), (2, (1, 0, 1)), (3, (1, 1, 1)), (9, (7, 1, 1)), (20, (15, 2, 3))],
 )
-def test_by_object_the_shares_are_of_objects_and_no_split_is_empty_early(
-    count: int, numbers: tuple[int, int, int]
+def test_shares_are_of_objects_and_three_fill_all_splits(
+    count: int, due: tuple[int, int, int]
 ) -> None:
-    """Train, valid and test: each has whole objects, and one before another has two."""
-    split = by_object(meshes(count))
-    assert tuple(len(split[name]) for name in ("train", "valid", "test")) == numbers
-    assert sum(numbers) == len(set().union(*split.values()))
+    assert numbers(find_homes(meshes(count), {}, SplitConfig())) == due
 
 
-def test_by_object_a_share_may_be_large_or_nothing() -> None:
-    large = by_object(meshes(3), config=SplitConfig(by="object", test_fraction=0.8))
-    assert [len(members) for members in large.values()] == [1, 1, 1]
-    none = SplitConfig(by="object", test_fraction=0, valid_fraction=0)
-    assert by_object(meshes(3), config=none)["train"] == set(meshes(3))
+def test_a_share_may_be_large_or_nothing() -> None:
+    large = SplitConfig(test_fraction=0.8)
+    assert numbers(find_homes(meshes(3), {}, large)) == (1, 1, 1)
+    none = SplitConfig(test_fraction=0, valid_fraction=0)
+    assert numbers(find_homes(meshes(3), {}, none)) == (3, 0, 0)
 
 
-@given(seed=st.integers(0, 2**32), count=st.integers(1, 30))
-def test_by_object_one_object_more_moves_two_at_most(seed: int, count: int) -> None:
-    before, after = by_object(meshes(count), seed), by_object(meshes(count + 1), seed)
-    assert sum(len(before[name] - after[name]) for name in before) <= 2
-    assert not before["test"] & after["valid"] and not before["valid"] & after["test"]
+@given(seed=st.integers(0, 2**32), steps=st.lists(st.integers(1, 9), min_size=2, max_size=5))
+def test_who_is_in_a_split_stays_there_whatever_comes(seed: int, steps: list[int]) -> None:
+    """However a dataset grows, its shares are as if it had been drawn at once, or one beside."""
+    config, homes, count = SplitConfig(seed=seed), dict[str, Home](), 0
+    for more in steps:
+        count += more
+        grown = find_homes(meshes(count), homes, config)
+        assert homes.items() <= grown.items()
+        homes = grown
+        at_once = numbers(find_homes(meshes(count), {}, config))
+        assert all(abs(a - b) <= 1 for a, b in zip(numbers(homes), at_once, strict=True))
+        assert count < 3 or min(numbers(homes)) > 0
 
 
-def test_by_object_the_seed_draws_and_the_order_of_the_objects_does_not() -> None:
-    assert by_object(meshes(9), 1) == by_object(meshes(9)[::-1], 1)
-    assert len({frozenset(by_object(meshes(9), seed)["test"]) for seed in range(20)}) > 3
+def test_what_has_no_samples_any_more_takes_no_place_and_keeps_its_own() -> None:
+    a, b, c, d = meshes(4)
+    known: dict[str, Home] = {a: "test", b: "train", c: "valid"}
+    homes = find_homes([b, c, d], known, SplitConfig())
+    assert homes == {b: "train", c: "valid", d: "test"}
+    assert find_homes([a, b, c, d], known | homes, SplitConfig())[a] == "test"
 
 
-def test_by_object_what_is_of_one_mesh_stays_together() -> None:
+def test_something_trains_before_it_is_tested() -> None:
+    a, b, c = meshes(3)
+    homes = find_homes([a, b, c], {a: "test"}, SplitConfig())
+    assert numbers(homes) == (1, 1, 1)
+    assert find_homes([a, b], {a: "test"}, SplitConfig())[b] == "train"
+
+
+def test_seed_draws_and_order_does_not() -> None:
+    nine = meshes(9)
+    config = SplitConfig(seed=1)
+    assert find_homes(nine, {}, config) == find_homes(nine[::-1], {}, config)
+    drawn = (members(find_homes(nine, {}, SplitConfig(seed=s)))["test"] for s in range(20))
+    assert len(set(map(frozenset, drawn))) > 3
+
+
+def test_samples_are_where_their_group_is() -> None:
+    """Six objects of three groups; each has four samples."""
     groups = [name for name in meshes(3) for _ in range(2)]
-    names = [f"{i}_morph" for i in range(6)]
-    objects = np.repeat(np.arange(6), 4).astype(np.int32)
-    split = split_samples(objects, names, names, groups, SplitConfig(by="object"), 0)
-    found = {name: {groups[i] for i in objects[rows]} for name, rows in split.items()}
-    assert found == by_object(meshes(3))
-
-
-def test_by_object_what_has_no_samples_takes_no_place() -> None:
-    names = meshes(9)
-    objects = np.repeat([1, 4, 7], 5).astype(np.int32)
-    split = split_samples(objects, names, names, names, SplitConfig(by="object"), 0)
-    assert {name: len(rows) for name, rows in split.items()} == {"train": 5, "valid": 5, "test": 5}
-
-
-@pytest.mark.parametrize(("pool", "valid"), [(7, 1), (23, 2), (26, 3), (4, 0), (6, 1)])
-def test_share_of_validation_is_rounded_to_the_nearest(pool: int, valid: int) -> None:
-    objects = np.zeros(pool, dtype=np.int32)
-    config = SplitConfig(train_classes=("a",), valid_fraction=0.1)
-    split = split_samples(objects, ["a1"], ["a"], ["a1"], config, 0)
-    assert (len(split["train"]), len(split["valid"])) == (pool - valid, valid)
+    names, objects = meshes(6), np.repeat(np.arange(6), 4).astype(np.int32)
+    homes: dict[str, Home] = dict(zip(meshes(3), ("test", "train", "valid"), strict=True))
+    split = split_samples(objects, names, names, groups, homes, SplitConfig(), 0)
+    rows = {name: own.tolist() for name, own in split.items()}
+    assert rows == {"train": [*range(8, 16)], "valid": [*range(16, 24)], "test": [*range(8)]}

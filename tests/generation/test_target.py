@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import pytest
 
@@ -12,17 +12,24 @@ from drakegrasp.generation.counts import refuse_two_ends
 from drakegrasp.generation.target import Target
 from drakegrasp.hand.settings import load_config
 
-#: Palm poses in a unit, and in all.
-UNIT, PALMS = 4, 400
+#: Palm poses in a unit, and in all; palm poses without a hit after which an object is given up.
+UNIT, PALMS, PATIENCE = 4, 400, 60
 #: The palm poses of the hits of each object: many, one in ten, none, and few before it ends.
-HITS = {
+HITS: dict[str, Sequence[int]] = {
     "rich": range(PALMS),
     "poor": range(5, PALMS, 10),
     "barren": range(0),
     "short": (1, 2, 7),
 }
+#: Others: two that are given up before their last hits, and one with three at each palm pose.
+ODD: dict[str, Sequence[int]] = {
+    "late": (3, 4, 70, 71, 72),
+    "later": (0, 100),
+    "triple": sorted(3 * [*range(2, PALMS, 5)]),
+}
+EVERY = {**HITS, **ODD}
 #: The number of palm poses of each object; the samplers of one have no more.
-DRAWN = {**dict.fromkeys(HITS, PALMS), "short": 10}
+DRAWN = {**dict.fromkeys(EVERY, PALMS), "short": 10}
 
 
 def units(name: str, palms: int) -> list[ShardHeader]:
@@ -39,7 +46,7 @@ def units(name: str, palms: int) -> list[ShardHeader]:
 
 
 def make_target(floors: Mapping[str, int] | None = None, **ends: int) -> Target:
-    config = load_config(**{"samples_patience": 60, **ends})
+    config = load_config(**{"samples_patience": PATIENCE, **ends})
     target = Target(config, floors or dict.fromkeys(HITS, 0))
     for name in floors or HITS:
         target.set_units(name, units(name, DRAWN[name]), endless=False)
@@ -51,7 +58,7 @@ def make_target(floors: Mapping[str, int] | None = None, **ends: int) -> Target:
 
 
 def end(target: Target, unit: ShardHeader) -> None:
-    target.add(unit, [h for h in HITS[unit.object_name] if unit.start <= h < unit.stop])
+    target.add(unit, [h for h in EVERY[unit.object_name] if unit.start <= h < unit.stop])
 
 
 def run(target: Target, workers: int = 1) -> dict[str, int]:
@@ -68,7 +75,7 @@ def run(target: Target, workers: int = 1) -> dict[str, int]:
 
 
 def samples(taken: Mapping[str, int]) -> dict[str, int]:
-    return {name: sum(hit < palms for hit in HITS[name]) for name, palms in taken.items()}
+    return {name: sum(hit < palms for hit in EVERY[name]) for name, palms in taken.items()}
 
 
 @pytest.mark.parametrize("wanted", [1, 2, 3, 7, 40])
@@ -89,6 +96,29 @@ def test_samples_are_spread_evenly() -> None:
 def test_result_does_not_depend_on_the_number_of_workers() -> None:
     alone = run(make_target(samples=25))
     assert [run(make_target(samples=25), workers) for workers in (2, 3, 8)] == 3 * [alone]
+
+
+@pytest.mark.parametrize("ends", [{"samples_per_object": 4}, {"samples": 40}, {"max_grasps": 7}])
+@pytest.mark.parametrize("workers", [3, 30])
+def test_result_does_not_depend_on_units_that_were_run_in_vain(
+    ends: dict[str, int], workers: int
+) -> None:
+    """Hits after an object was given up count as little as if nobody had found them."""
+    floors = dict.fromkeys(EVERY, 0)
+    alone = run(make_target(floors, **ends))
+    assert run(make_target(floors, **ends), workers) == alone
+    assert (alone["late"], alone["later"]) == (65, 61)
+
+
+def test_units_of_a_build_that_was_killed_change_nothing() -> None:
+    """The killed build had many workers, and the one that continues finds their units."""
+    floors = dict.fromkeys(EVERY, 0)
+    alone = run(make_target(floors, samples=60))
+    again = make_target(floors, samples=60)
+    for name in EVERY:
+        for unit in units(name, DRAWN[name])[::-1][::2]:
+            end(again, unit)
+    assert run(again) == alone
 
 
 def test_each_object_has_the_number_of_each() -> None:
@@ -119,6 +149,51 @@ def test_smaller_target_keeps_what_is_there() -> None:
     assert run(make_target(first, samples=12)) == first
 
 
+@pytest.mark.parametrize("workers", [1, 3])
+def test_unit_that_grows_is_run_again(workers: int) -> None:
+    """A dataset of 10 palm poses ends within a unit of four: its last two are of no use."""
+    target = Target(load_config(samples=4, samples_patience=PATIENCE), {"poor": 10})
+    target.set_units("poor", units("poor", 8), endless=True)
+    for unit in units("poor", 10):
+        end(target, unit)
+    assert target.taken() == {"poor": None}
+    assert target.dry() == ["poor"]
+    target.set_units("poor", units("poor", 20), endless=True)
+    assert [(unit.start, unit.stop) for unit in target.next_units()][0] == (8, 12)
+    end(target, units("poor", 20)[2])
+    target.set_units("poor", units("poor", PALMS), endless=False)
+    assert run(target, workers) == {"poor": 36}
+
+
+def test_nothing_is_drawn_before_all_that_the_dataset_has_is_known() -> None:
+    """While the samples of one object are not known, another one seems to need more."""
+    target = Target(load_config(samples=12, samples_patience=PATIENCE), {"rich": 12, "poor": 0})
+    for name in ("rich", "poor"):
+        target.set_units(name, units(name, 12), endless=True)
+    for unit in units("poor", 12):
+        end(target, unit)
+    assert target.dry() == []
+    assert {unit.object_name for unit in target.next_units()} == {"rich"}
+    for unit in units("rich", 12):
+        end(target, unit)
+    assert target.taken() == {"rich": 12, "poor": 0}
+
+
+@pytest.mark.parametrize("wanted", [5, 8, 12])
+def test_palm_poses_with_several_hits_are_counted_whole(wanted: int) -> None:
+    """Each of eight objects has three hits at each palm pose: alone, each would exceed its share."""
+    names = [f"triple {i}" for i in range(8)]
+    target = Target(load_config(samples=wanted), dict.fromkeys(names, 0))
+    for name in names:
+        target.set_units(name, units(name, PALMS), endless=False)
+    while None in target.taken().values():
+        for unit in target.next_units():
+            target.add(unit, [h for h in EVERY["triple"] if unit.start <= h < unit.stop])
+    found = [sum(hit < palms for hit in EVERY["triple"]) for palms in target.taken().values()]
+    assert wanted <= sum(found) <= wanted + 2
+    assert max(found) <= 3
+
+
 def test_new_object_fills_up_while_others_stay() -> None:
     old = {"rich": 30, "poor": 0}
     found = samples(run(make_target(old, samples=35)))
@@ -132,6 +207,13 @@ def test_one_object_that_makes_up_for_others_is_told() -> None:
     (line,) = target.warnings()
     assert line.startswith("more than twice their share of 25 samples, because the other objects ")
     assert "rich (57)" in line
+
+
+def test_what_was_there_before_is_nobodys_larger_share() -> None:
+    """A smaller target, or new objects: the others are not exhausted."""
+    target = make_target({"rich": 30, "poor": 0}, samples=8)
+    assert run(target) == {"rich": 30, "poor": 0}
+    assert target.warnings() == []
 
 
 def test_target_that_cannot_be_met_is_told() -> None:
