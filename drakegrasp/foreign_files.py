@@ -12,6 +12,7 @@ values that are nested too deeply and for numbers of thousands of digits.
 from __future__ import annotations
 
 import json
+import re
 import stat
 from pathlib import Path
 from typing import Any, NoReturn
@@ -32,6 +33,8 @@ LARGEST_SEALED = 2**32
 #: Of a file that is larger than this [bytes] and read in parts, at least this fraction must be on
 #: the disk. A sparse file takes no room, but hours to read. File systems that compress save less.
 LARGE, SOLID = 2**36, 1e-3
+#: How the address of a file in a store begins; `Path` makes one slash of several.
+ADDRESS = re.compile(r"([a-z][a-z0-9+.-]+):/+")
 #: Names of what a path may be instead of a file.
 _KINDS = {
     stat.S_IFIFO: "a pipe",
@@ -61,6 +64,16 @@ def refuse_irregular(path: Path, largest: int | None = None) -> None:
         raise _refusal(f"a file of {size:,} byte, more than {largest:,}")
     if largest is None and size > LARGE and stored < SOLID * size:
         raise _refusal(f"a file of {size:,} byte, of which only {stored:,} are on the disk")
+
+
+def refuse_address(path: str | Path) -> None:
+    """Reject an address, e.g. s3://, as a place to write: it would be a folder `s3:` here.
+
+    Raises:
+        DataError: If the path is an address.
+    """
+    if ADDRESS.match(str(path)):
+        raise DataError(f"{path}: must be a path of this machine, got an address")
 
 
 def refuse_link(folder: Path) -> None:

@@ -9,6 +9,7 @@ kind sends them `dask_settings`. Other machines can connect only if `host` or `i
 from __future__ import annotations
 
 import ipaddress
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -41,6 +42,8 @@ from drakegrasp.errors import ConfigError, MachineError, counted
 REMOTE = ("workers", "cores", "memory", "host", "interface")
 #: Maximum memory of a worker [B], more than any machine has.
 MOST_MEMORY = 10**15
+#: Names of hosts and interfaces, and addresses; they become words of a shell on other machines.
+_PLAIN = re.compile(r"[A-Za-z0-9_:\[][A-Za-z0-9_.:%@\[\]-]*")
 
 
 class AddressMissingError(ConfigError):
@@ -100,9 +103,16 @@ class Local:
                 raise ConfigError(f"--{name} must not be given with --cluster {self.kind}")
             if name in ("workers", "cores") and value is not None and value < 1:
                 raise ConfigError(f"{name} must be at least 1, got {value}")
+            if name in ("host", "interface") and value is not None:
+                refuse_unplain(name, value)
         chosen_security(self.tls, self.tls_files, elsewhere=type(self) is not Local)
         if self.memory is not None:
             memory_bytes(self.memory)
+
+    @classmethod
+    def elsewhere(cls) -> str:
+        """Return where the user states what no option states, as the end of an error message."""
+        return ""
 
     def count(self) -> int | None:
         """Return the number of workers; None if it is known only after the start."""
@@ -255,7 +265,9 @@ def cluster_of(kind: str, own: Sequence[str] = (), **options: Any) -> Local:
         key, equals, value = text.partition("=")
         if key not in known or not (equals and value):
             settings = f"KEY=VALUE with KEY one of {', '.join(known)}" if known else "left out"
-            raise ConfigError(f"--with must be {settings} for --cluster {kind}, got {text!r}")
+            raise ConfigError(
+                f"--with must be {settings} for --cluster {kind}, got {text!r}{found.elsewhere()}"
+            )
         options[key] = value
     cluster: Local = found(kind=kind, **options)
     return cluster
@@ -291,6 +303,16 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
+
+
+def refuse_unplain(name: str, text: str) -> None:
+    """Reject what cannot be a host, an address or an interface.
+
+    Raises:
+        ConfigError: If it has other characters than these have.
+    """
+    if not _PLAIN.fullmatch(text):
+        raise ConfigError(f"{name} must be a name or an address, got {text[:40]!r}")
 
 
 def memory_bytes(text: str) -> int:

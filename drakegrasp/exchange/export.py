@@ -26,7 +26,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
 from drakegrasp.dataset.trials import Trials, sample_ids
 from drakegrasp.errors import DataError, one_line
-from drakegrasp.foreign_files import read_text
+from drakegrasp.foreign_files import read_text, refuse_address
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.runtime.files import atomic_folder
@@ -111,6 +111,7 @@ def export_dataset(
         OSError: If the disk is full; no files are left behind.
     """
     # A dataset that cannot be read is rejected before anything is written.
+    refuse_address(directory)
     out, directory = Path(out), Path(directory)
     if not registry.is_known("exporters", form):
         known = ", ".join(registry.names("exporters"))
