@@ -16,6 +16,7 @@ import re
 import stat
 from pathlib import Path
 from typing import Any, NoReturn
+from zipfile import ZipFile
 
 from drakegrasp.errors import DataError
 
@@ -90,6 +91,31 @@ def read_content(path: Path, largest: int = LARGEST_CONTENT) -> bytes:
     """Return the bytes of a file, see `refuse_irregular`."""
     refuse_irregular(path, largest)
     return path.read_bytes()
+
+
+def read_npz(path: Path, largest: int = LARGEST_CONTENT) -> dict[str, Any]:
+    """Return the arrays of a .npz file by their names.
+
+    Args:
+        path: Path of the file.
+        largest: Maximum size of the file and of its arrays [bytes]; a small file can unpack to
+            terabytes.
+
+    Raises:
+        OSError: If the file cannot be read, or is larger.
+        Exception: Of any kind, if it is another file.
+    """
+    import numpy as np
+
+    refuse_irregular(path, largest)
+    with path.open("rb") as file:
+        with ZipFile(file) as packed:
+            size = sum(item.file_size for item in packed.infolist())
+        if size > largest:
+            raise _refusal(f"arrays of {size:,} byte, more than {largest:,}")
+        file.seek(0)
+        with np.load(file, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
 
 
 def read_text(path: Path, encoding: str = "utf-8") -> str:

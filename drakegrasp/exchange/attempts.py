@@ -18,7 +18,6 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, TextIO
-from zipfile import ZipFile
 
 import h5py
 import numpy as np
@@ -36,7 +35,7 @@ from drakegrasp.errors import (
     one_line,
 )
 from drakegrasp.exchange.contacts import read_contacts
-from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
+from drakegrasp.foreign_files import LARGEST_TEXT, read_npz, refuse_irregular
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.protocols.files import is_grasp_file
@@ -452,10 +451,7 @@ def _sha256(path: Path) -> bytes:
 def _read_arrays(path: Path) -> dict[str, Any]:
     try:
         if path.suffix.lower() == ".npz":
-            with path.open("rb") as raw, ZipFile(raw) as packed:
-                refuse_large(sum(item.file_size for item in packed.infolist()))
-            with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-                return {name: file[name] for name in file.files}
+            return read_npz(path, MOST_BYTES)
         with open_hdf5(path) as file:
             refuse_large(sum(getattr(file[name], "nbytes", 0) for name in file))
             return {name: _dataset(file[name]) for name in file}
