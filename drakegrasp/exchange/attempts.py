@@ -159,16 +159,17 @@ def _raw(
     for name in reversed(registry.names("importers")):
         if Path(name).suffix == path.suffix.lower():
             read = registry.find("importers", name)
-            takes = inspect.signature(read).parameters
             try:
+                takes = inspect.signature(read).parameters
                 raw = read(path, hand, **({"nameless": nameless} if "nameless" in takes else {}))
+                if raw is not None:
+                    return _as_asked({**raw, "objects": list(raw["objects"])}, read_as)
             except DrakegraspError:
                 raise
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 got = f"{type(error).__name__} ({one_line(error)})"
-                raise GraspError(f"must be readable by the importer {name}, got {got}") from error
-            if raw is not None:
-                return _as_asked(dict(raw), read_as)
+                owned = registry.with_owner("importers", name)
+                raise GraspError(f"must be readable by the importer {owned}, got {got}") from error
     raise GraspError(f"must be a file of postures ({', '.join(suffixes())}), got another")
 
 

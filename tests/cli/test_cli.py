@@ -93,6 +93,18 @@ def test_a_name_that_the_locale_cannot_encode_is_no_error(
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize("words", [("stats", "OUT"), ("check", "OUT"), ("objects", "list")])
+def test_closed_output_is_an_error(words: tuple[str, ...], sound: Path) -> None:
+    command = ["bash", "-c", '"$@" >&-', "-", sys.executable, "-m", "drakegrasp"]
+    done = subprocess.run(
+        [*command, *(word.replace("OUT", str(sound)) for word in words)],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert done.stderr == "error: standard output must be open, got a closed one\n"
+
+
 def test_options_of_clusters_come_last() -> None:
     """A newcomer reads those of everyday first."""
     for name in ("build", "verify", "score", "bench-set"):

@@ -141,7 +141,7 @@ def test_a_network_is_for_a_hand_of_the_package_or_a_plugin(tmp_path, monkeypatc
     (tmp_path / "secret").write_text("my password")
     path = write(tmp_path / "toy.npz")
     spoil(path, about={"hand": "secret"})
-    with pytest.raises(dg.GraspError, match="must be for a hand of .*barrett.*, got 'secret'$"):
+    with pytest.raises(dg.GraspError, match=r"must be for a hand of .*barrett.*, got 'secret'$"):
         dg.load_network(path)
 
 
