@@ -155,6 +155,8 @@ def predict_scenes(
             invalid.
     """
     data = SceneDataset(path, points=None, split=split, negatives="none", balance="view", grasps=1)
+    if not len(data):
+        raise GraspError(f"{path}: {data.emptiness}")
     hand = load_hand(read_manifest(data.path.parent).config.hand_source)
     if hand.name != network.hand.name:
         raise GraspError(

@@ -16,7 +16,8 @@ from drakegrasp.dataset import hdf5
 from drakegrasp.dataset.hdf5 import ImageRows, create_field
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS, VIEW_FIELDS, sizes
-from drakegrasp.errors import DataError, MachineError
+from drakegrasp.errors import DataError, GraspError, MachineError
+from drakegrasp.verification.placing import choose_rows
 
 LETTERS = sizes(fingers=3, joints=8, image=16)
 
@@ -106,6 +107,18 @@ def test_several_samples_come_as_a_list(data_file: Path) -> None:
     for beyond in (5, -6, [0, 7]):
         with pytest.raises(IndexError, match=r"index must be below 5, got (5|-6|7)"):
             data[beyond]
+
+
+@pytest.mark.parametrize("split", ["valid", "test"])
+def test_an_empty_split_names_those_with_samples(data_file: Path, split: str) -> None:
+    data, said = GraspDataset(data_file, split=split), f"split {split} is empty; not empty: train"
+    for index in (0, -1, 7, [0]):
+        with pytest.raises(IndexError, match=f"^{said}$"):
+            data[index]
+    assert data[:] == list(data) == []
+    for rows in (None, [0]):
+        with pytest.raises(GraspError, match=f"{data_file}: {said}$"):
+            choose_rows(data, rows, 1)
 
 
 def test_sample_is_printed_on_one_screen(data_file: Path) -> None:
