@@ -60,6 +60,8 @@ from drakegrasp.verification.prediction import read_grasps
 _OF_FILE = ("frame", "link", "joints", "hand", "of_objects")
 #: Suffixes of files of arrays, tables and YAML files.
 ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml", ".yml")
+#: Array of the poses in a file of ACRONYM.
+_ACRONYM = "grasps/transforms"
 #: Maximum total size of the arrays of a file [bytes]: two million postures of a hand with 16
 #: joints.
 MOST_BYTES = 1_000_000_000
@@ -387,7 +389,7 @@ def holds_postures(path: Path) -> bool:
         if suffix in ARRAYS[1:] and path.is_file():
             with open_hdf5(path) as file:
                 named = {"q_grasp", "X_FG", "quaternion"}
-                return not named.isdisjoint(file) or is_graspgen(file)
+                return not named.isdisjoint(file) or is_graspgen(file) or _ACRONYM in file
         if suffix in TABLES and path.is_file():
             return bool({"object", "qw"} & set(_column_names(path)))
     except MachineError:
@@ -454,6 +456,11 @@ def _read_arrays(path: Path) -> dict[str, Any]:
         if path.suffix.lower() == ".npz":
             return read_npz(path, MOST_BYTES)
         with open_hdf5(path) as file:
+            if _ACRONYM in file:
+                raise GraspError(
+                    f"a file of ACRONYM: save its {_ACRONYM} as a .npy file, and read this file "
+                    "with --frame mesh and the --link of its gripper"
+                )
             refuse_large(sum(getattr(file[name], "nbytes", 0) for name in file))
             return {name: _dataset(file[name]) for name in file}
     except Exception as error:  # parsers raise all kinds of exceptions on foreign bytes

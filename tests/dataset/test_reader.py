@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
+import subprocess
 import sys
 from pathlib import Path
 
@@ -119,6 +120,18 @@ def test_an_empty_split_names_those_with_samples(data_file: Path, split: str) ->
     for rows in (None, [0]):
         with pytest.raises(GraspError, match=f"{data_file}: {said}$"):
             choose_rows(data, rows, 1)
+
+
+def test_a_file_that_another_program_writes_names_the_remedy(tmp_path: Path) -> None:
+    path = write_data_file(tmp_path / "grasping_oto.hdf5", range(2))
+    code = f"import h5py; file = h5py.File({str(path)!r}, 'r+'); print('open', flush=True); input()"
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None and other.stdout.readline() == b"open\n"
+        with pytest.raises(DataError, match=r"open to write: close it there, .*FILE_LOCKING=FALSE"):
+            GraspDataset(path)
+        other.communicate(b"\n")
+    assert len(GraspDataset(path)) == 2
 
 
 def test_sample_is_printed_on_one_screen(data_file: Path) -> None:
