@@ -871,11 +871,6 @@ def _siblings(place: tuple[Any, ...]) -> list[str]:
     return list(section.model_fields)
 
 
-#: Stand-offs at which a hand that faces the table closes on flat objects, see
-#: docs/explanation/sampling.md.
-FLAT_STANDOFFS = "candidates.standoffs=[0.095,0.1,0.105]"
-
-
 def ways_to_grasps(config: Config | None = None) -> str:
     """Return advice for an object without grasps, with the most helpful measure first.
 
@@ -891,5 +886,4 @@ def ways_to_grasps(config: Config | None = None) -> str:
         ways.append("more resting poses (--set objects.resting_poses=4)")
     else:
         ways.append("more palm poses (--candidates)")
-    ways.append(f"for what lies flat other stand-offs (--set {FLAT_STANDOFFS})")
     return ", or ".join([*ways, "another hand (--set hand=NAME)"])

@@ -12,9 +12,11 @@ values that are nested too deeply and for numbers of thousands of digits.
 from __future__ import annotations
 
 import json
+import re
 import stat
 from pathlib import Path
 from typing import Any, NoReturn
+from zipfile import ZipFile
 
 from drakegrasp.errors import DataError
 
@@ -32,6 +34,8 @@ LARGEST_SEALED = 2**32
 #: Of a file that is larger than this [bytes] and read in parts, at least this fraction must be on
 #: the disk. A sparse file takes no room, but hours to read. File systems that compress save less.
 LARGE, SOLID = 2**36, 1e-3
+#: How the address of a file in a store begins; `Path` makes one slash of several.
+ADDRESS = re.compile(r"([a-z][a-z0-9+.-]+):/+")
 #: Names of what a path may be instead of a file.
 _KINDS = {
     stat.S_IFIFO: "a pipe",
@@ -63,6 +67,16 @@ def refuse_irregular(path: Path, largest: int | None = None) -> None:
         raise _refusal(f"a file of {size:,} byte, of which only {stored:,} are on the disk")
 
 
+def refuse_address(path: str | Path) -> None:
+    """Reject an address, e.g. s3://, as a place to write: it would be a folder `s3:` here.
+
+    Raises:
+        DataError: If the path is an address.
+    """
+    if ADDRESS.match(str(path)):
+        raise DataError(f"{path}: must be a path of this machine, got an address")
+
+
 def refuse_link(folder: Path) -> None:
     """Reject a symbolic link as a folder to write to: it may lead out of the dataset.
 
@@ -77,6 +91,31 @@ def read_content(path: Path, largest: int = LARGEST_CONTENT) -> bytes:
     """Return the bytes of a file, see `refuse_irregular`."""
     refuse_irregular(path, largest)
     return path.read_bytes()
+
+
+def read_npz(path: Path, largest: int = LARGEST_CONTENT) -> dict[str, Any]:
+    """Return the arrays of a .npz file by their names.
+
+    Args:
+        path: Path of the file.
+        largest: Maximum size of the file and of its arrays [bytes]; a small file can unpack to
+            terabytes.
+
+    Raises:
+        OSError: If the file cannot be read, or is larger.
+        Exception: Of any kind, if it is another file.
+    """
+    import numpy as np
+
+    refuse_irregular(path, largest)
+    with path.open("rb") as file:
+        with ZipFile(file) as packed:
+            size = sum(item.file_size for item in packed.infolist())
+        if size > largest:
+            raise _refusal(f"arrays of {size:,} byte, more than {largest:,}")
+        file.seek(0)
+        with np.load(file, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
 
 
 def read_text(path: Path, encoding: str = "utf-8") -> str:

@@ -65,26 +65,34 @@ def find(kind: Kind, name: str) -> Any:
         ConfigError: If the name is unknown, or its entry point cannot be loaded.
         MachineError: If it needs a library that is missing.
     """
-    entry = _entry(kind, name)
-    package = "drakegrasp" if entry.dist is None else entry.dist.name
-    whose = "" if package == "drakegrasp" else f" of the package {package}"
+    entry, owned = _entry(kind, name), with_owner(kind, name)
     try:
         return entry.load()
     except ModuleNotFoundError as error:
-        extra = "".join(f": pip install '{package}[{extra}]'" for extra in entry.extras)
-        raise MachineError(f"{error.name} must be installed for {name}{whose}{extra}") from None
+        extra = "".join(f": pip install '{_package(entry)}[{extra}]'" for extra in entry.extras)
+        raise MachineError(f"{error.name} must be installed for {owned}{extra}") from None
     except (Exception, SystemExit) as error:
         got = f"{type(error).__name__} ({one_line(error)})"
         raise ConfigError(
-            f"{kind}: {name}{whose} must be loaded from {entry.value}, got {got}"
+            f"{kind}: {owned} must be loaded from {entry.value}, got {got}"
         ) from error
+
+
+def with_owner(kind: Kind, name: str) -> str:
+    """Return a name with the package that has it, if that is not ours, for error messages."""
+    package = _package(_entry(kind, name))
+    return name if package == "drakegrasp" else f"{name} of the package {package}"
 
 
 def summary(kind: Kind, name: str, constant: str = "HELP") -> str:
     """Return a text of the module of a name, without loading the module; empty if it has none."""
-    spec = util.find_spec(_entry(kind, name).module)
-    text = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
-    for node in ast.parse(text).body:
+    try:
+        spec = util.find_spec(_entry(kind, name).module)
+        text = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
+        body = ast.parse(text).body
+    except (Exception, SystemExit):  # of a broken package: `find` tells it
+        return ""
+    for node in body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == constant:
             return str(ast.literal_eval(node.value))
     return ""
@@ -94,6 +102,10 @@ def _entry(kind: Kind, name: str) -> EntryPoint:
     if not is_known(kind, name):
         raise ConfigError(f"{kind} must be one of {listed(names(kind))}, got {name!r}")
     return _ours(kind).get(name) or _theirs(kind)[name]
+
+
+def _package(entry: EntryPoint) -> str:
+    return "drakegrasp" if entry.dist is None else entry.dist.name
 
 
 @cache

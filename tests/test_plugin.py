@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.commands import error_line, run
 from helpers.datasets import make_dataset
 from helpers.jaws import HAND, box_folder, jaws
 from helpers.objects import box_model
@@ -134,6 +135,55 @@ def test_cluster_starts_its_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     with cluster_of("half").connected(tmp_path) as client:
         client.wait_for_workers(1)
         assert len(client.nthreads()) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "broken", "told"),
+    [
+        ("write_palms", lambda *_: 1 / 0, "got ZeroDivisionError (division by zero)"),
+        ("write_palms", lambda *_: None, "and return their number, got TypeError (int() "),
+        ("write_palms", lambda *_: sys.exit("no licence"), "got SystemExit (no licence)"),
+        ("write_palms", lambda out: 1, "got TypeError ("),
+        ("write_palms", 7, "must be a function, got int"),
+        ("read_palms", lambda *_: 1 / 0, "got ZeroDivisionError (division by zero)"),
+        ("read_palms", lambda *_: sys.exit("no licence"), "got SystemExit (no licence)"),
+        ("read_palms", lambda *_: 7, "got TypeError ("),
+        ("read_palms", lambda *_: {}, "got KeyError ('objects')"),
+        ("read_palms", 7, "got TypeError ("),
+    ],
+)
+def test_a_broken_function_of_a_plugin_is_one_line_with_its_name(
+    name: str,
+    broken: object,
+    told: str,
+    sound: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(f"example_plugin.{name}", broken)
+    (tmp_path / "grasps.palms").write_text("{}")
+    if name == "write_palms":
+        result = run("export", sound, tmp_path / "to", "--to", "palms")
+    else:
+        postures = ("--postures", tmp_path / "grasps.palms", "--out", tmp_path / "to")
+        result = run("build", "--objects", "builtin", *postures)
+    assert result.exit_code in (1, 2)
+    line = error_line(result)
+    assert f"palms of the package {PACKAGE}" in line
+    assert told in line
+    assert [path.name for path in tmp_path.iterdir()] == ["grasps.palms"]
+
+
+def test_help_is_there_with_a_plugin_that_is_broken(
+    plugin: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = plugin / "example_plugin" / "__init__.py"
+    text = module.read_text()
+    module.write_text("def (")
+    try:
+        assert "\n  palms" in run("export", "--help").output
+    finally:
+        module.write_text(text)
 
 
 def test_a_broken_plugin_is_one_line_with_its_name(

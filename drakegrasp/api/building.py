@@ -23,6 +23,7 @@ from drakegrasp.dataset.paths import FILE_NAME as MANIFEST
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
 from drakegrasp.errors import DataError, GraspError, counted
 from drakegrasp.exchange.attempts import read_attempts
+from drakegrasp.foreign_files import refuse_address
 from drakegrasp.generation.pipeline import (
     BuildReport,
     build_locked,
@@ -103,6 +104,7 @@ def build_dataset(
         MachineError: If there is no scheduler, the workers cannot do the work, or the disk is full;
             the same call continues when that is fixed.
     """
+    refuse_address(out)
     cluster = joined(client, workers)
     out, config = Path(out).absolute(), config or load_config(BUILD_PRESET)
     hand = load_hand(config.hand_source)

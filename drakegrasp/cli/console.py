@@ -39,8 +39,6 @@ _UTF8, _STREAMS = "PYTHONUTF8", "PYTHONIOENCODING"
 AGAIN_SECONDS = 0.05
 #: Minimum similarity of a known option to an unknown one to be proposed [ratio of `difflib`].
 ALIKE = 0.75
-#: Commands that continue where they were stopped.
-RESUMABLE = ("build", "score")
 #: Errors in the user's input. All other errors are failures of the work.
 WRONG_USAGE = (ConfigError, GraspError, HandError, MeshError)
 
@@ -101,7 +99,7 @@ class OneCommand(Command):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the requested command."""
         of_group = isinstance(self, click.Group)
-        with one_line_errors(lambda: not of_group or ctx.invoked_subcommand in RESUMABLE):
+        with one_line_errors(lambda: not of_group or ctx.invoked_subcommand == "build"):
             return super().invoke(ctx)
 
 

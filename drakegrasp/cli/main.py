@@ -71,6 +71,9 @@ for _command in (
 
 def run() -> None:
     """Run the program; commands that may simulate in this process do so with jemalloc."""
+    # Click drops what is printed to a closed stream, and a file that is opened may get its number.
+    if sys.stdout is None:
+        sys.exit("error: standard output must be open, got a closed one")
     restart_with_utf8()
     # A terminal with another encoding shows ? for characters that it does not have.
     for stream in (sys.stdout, sys.stderr):

@@ -29,6 +29,7 @@ import click
 
 from drakegrasp import registry
 from drakegrasp.errors import first_line
+from drakegrasp.foreign_files import ADDRESS
 from drakegrasp.generation.request import BUILTIN, BuildRequest
 
 if sys.flags.optimize > 1:
@@ -63,6 +64,9 @@ class PathType(click.Path):
         text = os.fspath(value)
         if not text.strip():
             self.fail(f"must be a path, got {text!r}", param, ctx)
+        # Datasets alone are read at an address; nothing is written there.
+        if ADDRESS.match(text) and (param is None or param.name != "dataset"):
+            self.fail(f"must be a path of this machine, got the address {text!r}", param, ctx)
         try:
             os.lstat(text)
         except (FileNotFoundError, NotADirectoryError, PermissionError):

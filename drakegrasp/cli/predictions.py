@@ -293,20 +293,20 @@ def score(
     link: str | None = None,
     preshape: str | None = None,
     protocol: str = "lift",
-    out: Path = Path("score"),
+    out: Path | None = None,
     as_json: bool = False,
     quiet: bool = False,
     **options: Any,
 ) -> None:
-    """Score predicted grasps against reference rows; write a card.
+    """Score predicted grasps against reference rows.
 
     Each of PREDICTIONS is a .npy, HDF5 or Parquet file of (n, 6k) numbers, one grasp per row of the
     split, or (n, m, 6k), m grasps per row, in the camera's frame. It may also be a file of postures
     with the `row` of each, or a file or folder of exported samples. Several files are treated as
     several training runs of one method. Without PREDICTIONS only the reference rows are scored.
 
-    The command writes card.json, card.md, card.png and the verdicts to DIR, so that an interrupted
-    score can continue.
+    With --out the command writes card.json, card.md, card.png and the verdicts to DIR, so that an
+    interrupted score can continue.
 
     Options:
         --dataset FILE: The data file of the predicted rows or views: OUT/grasping_oto.hdf5, _otm,
@@ -326,6 +326,7 @@ def score(
         --protocol NAME|FILE.py:NAME: The rule of a verdict, see `drakegrasp verify`. All protocols
             except lift try the first wrist pose of a prediction in MuJoCo.
         --out DIR: Folder of the card and of the verdicts, from which the same command continues.
+            [default: nothing is written]
         --json (as_json): Print the card as JSON.
         CONNECTION
         --quiet: Show neither progress nor the table.
@@ -336,6 +337,7 @@ def score(
     from drakegrasp.dataset.scenes import open_rows
     from drakegrasp.errors import DataError, GraspError
     from drakegrasp.exchange.attempts import holds_postures
+    from drakegrasp.scoring.card import share_text
     from drakegrasp.scoring.references import REFERENCES
 
     # A bad dataset is wrong usage, as for `verify`.
@@ -371,9 +373,9 @@ def score(
         click.echo(json.dumps(scored.card, indent=1, allow_nan=False))
     else:
         for name, value in scored.card["headline"].items():
-            low, high = 100.0 * value["low"], 100.0 * value["high"]
-            say(f"{name}: {100.0 * value['value']:.1f} % ({low:.1f} to {high:.1f})")
-        say(str(out / "card.md"))
+            say(f"{name}: {share_text(value, 1, ' %')}")
+        if out is not None:
+            say(str(out / "card.md"))
     if not quiet:
         make_console(stderr=True).print(score_table(scored.card, scored.seconds))
         for warning in scored.card["warnings"]:

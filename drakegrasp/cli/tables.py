@@ -50,6 +50,8 @@ _FUNNEL = [o for group in GROUPS for o in Outcome if o.group == group]
 BARREN = 10
 #: Smallest width of a terminal for which the audit has all of its columns [characters].
 ROOMY = 110
+#: Maximum width of the notes of an audit [characters].
+NOTES = 60
 #: Width of the console if standard output is not a terminal [characters]: every table fits.
 WIDTH = 1000
 
@@ -256,7 +258,7 @@ def audit_table(rows: Sequence[AuditRow], *, compact: bool = False) -> Table:
     heads = ("object", "status", *(head for head, _, _ in columns))
     table = make_table("Meshes", heads, ())
     table.columns[0].max_width, table.columns[1].justify = 24 if compact else 40, "left"
-    table.add_column("notes, and what may be wrong (!)", overflow="fold")
+    table.add_column("notes, and what may be wrong (!)", overflow="fold", max_width=NOTES)
     colours = {"fit": "green", "repaired": "yellow", "refused": "red"}
     for row in rows:
         status = f"[{colours[row.status]}]{row.status}[/]"
@@ -391,7 +393,7 @@ def score_table(card: Mapping[str, Any], seconds: Mapping[str, float]) -> Table:
 
     def row(name: str, values: Mapping[str, Mapping[str, float]]) -> list[str]:
         value, low, high = (100 * values["headline"][key] for key in ("value", "low", "high"))
-        cells = [name, f"{value:.1f}", f"{low:.0f} to {high:.0f}"]
+        cells = [name, f"{value:.1f}", f"{low:.0f} to {high:.0f}" if low < high else "-"]
         cells += [f"{100 * values[measure]['value']:.0f}" for measure in names]
         return cells + [f"{seconds[name]:.2f}" for _ in timed]
 

@@ -41,17 +41,16 @@ def inspect_(
         --static DIR (folder): Only write the pages to DIR, as files that open without a server.
         --no-browser: Only print the address.
     """
-    from drakegrasp.errors import DataError
+    from drakegrasp.errors import MachineError, one_line
 
     try:
         from drakegrasp.page.serve import serve
         from drakegrasp.page.site import write_site
-    except ModuleNotFoundError as error:
-        library = (error.name or "").partition(".")[0]
-        if library not in ("starlette", "uvicorn", "jinja2"):
+    except ImportError as error:
+        if (error.name or "").partition(".")[0] == "drakegrasp":
             raise
-        raise DataError(
-            f"inspect needs {library}, which is missing: pip install 'drakegrasp[inspect]'"
+        raise MachineError(
+            f"inspect needs its packages: pip install 'drakegrasp[inspect]' ({one_line(error)})"
         ) from None
 
     if folder is None:

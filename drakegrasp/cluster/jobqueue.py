@@ -2,8 +2,9 @@
 
 Each kind of scheduler is a short class here. It names the class of dask-jobqueue that submits the
 jobs, and overrides what differs from SLURM.
-Paths in a job's script are quoted here. dask-jobqueue (0.9) writes them without quotes, so the
-shell would split a path at a blank and run a command in `$(...)`.
+dask-jobqueue (0.9) quotes nothing in a script, so the shell would split a path at a blank and run a
+command in `$(...)`. Each path goes into a script through `_word`; names and addresses are plain
+(`kinds.refuse_unplain`), and the rest are numbers.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ import shutil
 import subprocess
 import sys
 import types
-from collections.abc import Sequence
-from functools import cache, partial
+from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -39,6 +40,10 @@ REFILL_SECONDS = 20.0
 #: this time [s]; they are shorter for short jobs. In this way units are not interrupted, and jobs
 #: do not all end at the same time.
 LIFETIME_MARGIN, LIFETIME_STAGGER = 300.0, 120.0
+#: Name of the jobs, unless jobqueue.yaml states another than the default of dask-jobqueue.
+NAME, _DEFAULT_NAME = "drakegrasp", "dask-worker"
+#: Keys of jobqueue.yaml that a newcomer looks for among the options.
+_SITE = ("queue", "account", "project", "job-extra-directives")
 #: A number of days, hours, minutes or seconds.
 _NUMBER = re.compile("[0-9]{1,6}")
 
@@ -49,6 +54,7 @@ class Jobs(Remote):
     Attributes:
         of: Class of dask-jobqueue.
         title: Name of the scheduler.
+        log: Directives that name the log file; empty if the scheduler names it after the job.
         test: Command that asks the scheduler whether it would run a script; empty if it has none.
         alone: Unit of a walltime in jobqueue.yaml that is a single number [s].
         pair: Units of the two numbers of a walltime with a single colon [s].
@@ -57,6 +63,7 @@ class Jobs(Remote):
     options = (*REMOTE, "walltime")
     of: ClassVar[type[Any]]
     title: ClassVar[str]
+    log: ClassVar[tuple[str, ...]] = ()
     test: ClassVar[tuple[str, ...]] = ()
     alone: ClassVar[float] = 1.0
     pair: ClassVar[tuple[float, float]] = (60.0, 1.0)
@@ -77,6 +84,13 @@ class Jobs(Remote):
     def setting(self, key: str) -> Any:
         """Return a value of the user's jobqueue.yaml, or dask-jobqueue's default."""
         return dask.config.get(f"jobqueue.{self.of.job_cls.config_name}.{key}", None)
+
+    @classmethod
+    def elsewhere(cls) -> str:
+        """Return which keys of jobqueue.yaml state what no option states."""
+        section = f"jobqueue.{cls.of.job_cls.config_name}"
+        keys = ", ".join(key for key in _SITE if key in dask.config.get(section))
+        return f": {section} in ~/.config/dask/jobqueue.yaml has {keys}"
 
     def listens(self) -> bool:
         """Return whether jobqueue.yaml states where the scheduler listens."""
@@ -112,7 +126,10 @@ class Jobs(Remote):
 
     def asks(self) -> dict[str, Any]:
         """Return the resources that a job requests, as options of the scheduler's class."""
-        return {"walltime": self.told_walltime()}
+        # The user's directives come later, and override ours.
+        log = () if self.setting("log-directory") else self.log
+        told = self.setting("job-extra-directives") or ()
+        return {"walltime": self.told_walltime(), "job_extra_directives": [*log, *told]}
 
     def told_walltime(self) -> str | None:
         """Return the user's time limit as H:MM:SS; None if jobqueue.yaml states it."""
@@ -126,6 +143,7 @@ class Jobs(Remote):
             "cores": self.per_job,
             "processes": self.per_job,
             "memory": memory,
+            "job_name": NAME if (name := self.setting("name")) == _DEFAULT_NAME else name,
             "interface": self.interface,
             "security": security,
             "worker_extra_args": [
@@ -201,6 +219,7 @@ class Slurm(Jobs):
     """SLURM: memory of a job by --mem."""
 
     of, title, test = dask_jobqueue.SLURMCluster, "SLURM", ("sbatch", "--test-only")
+    log = (f"-o {NAME}-%j.log",)
     alone = 60.0
 
     def told_walltime(self) -> str | None:
@@ -211,13 +230,13 @@ class Slurm(Jobs):
 class Pbs(Jobs):
     """PBS: cores and memory of a job by one -l select."""
 
-    of, title = dask_jobqueue.PBSCluster, "PBS"
+    of, title, log = dask_jobqueue.PBSCluster, "PBS", ("-j oe",)
 
 
 class Lsf(Jobs):
     """LSF: -M limits the memory of a job, in the unit of lsf.conf; times are in minutes."""
 
-    of, title = dask_jobqueue.LSFCluster, "LSF"
+    of, title, log = dask_jobqueue.LSFCluster, "LSF", (f"-o {NAME}-%J.log",)
     alone, pair = 60.0, (3600.0, 60.0)
 
     def told_walltime(self) -> str | None:
@@ -259,7 +278,9 @@ class Htcondor(Jobs):
     def asks(self) -> dict[str, Any]:
         """Return the disk and the time limit of a job."""
         disk = None if self.setting("disk") else f"{self.per_job}GB"
-        extra = dict(self.setting("job-extra-directives") or {})
+        file = f"{NAME}-$(ClusterId).log"
+        log = {} if self.setting("log-directory") else {"output": file, "error": file}
+        extra = {"batch_name": NAME, **log, **(self.setting("job-extra-directives") or {})}
         if (seconds := self.seconds()) is not None:
             extra.setdefault("allowed_job_duration", math.ceil(seconds))
         return {"disk": disk, "job_extra_directives": extra}
@@ -269,6 +290,7 @@ class Oar(Jobs):
     """OAR: cores of one node; memory if jobqueue.yaml names the property that has it."""
 
     of, title = dask_jobqueue.OARCluster, "OAR"
+    log = (f"-O {NAME}-%jobid%.log", f"-E {NAME}-%jobid%.log")
     alone, pair = 3600.0, (3600.0, 60.0)
 
     def asks(self) -> dict[str, Any]:
@@ -316,10 +338,9 @@ def walltime_seconds(
 
 
 class _Quoted:
-    """A job of dask-jobqueue in which our paths are quoted.
+    """A job of dask-jobqueue in which texts that are not ours are words of a shell.
 
-    Options and script lines in the user's jobqueue.yaml are not quoted, because they are shell
-    code already.
+    What jobqueue.yaml states is the user's shell code, e.g. `python: apptainer exec IMAGE python`.
     """
 
     config_name: str
@@ -329,39 +350,43 @@ class _Quoted:
         *arguments: Any,
         security: Security | None = None,
         worker_extra_args: Sequence[str] = (),
-        python: str | None = None,
-        local_directory: str | None = None,
         **options: Any,
     ) -> None:
         """Take the arguments of the job."""
-        told = partial(dask.config.get, default=None)
-        folder = local_directory or told(f"jobqueue.{self.config_name}.local-directory")
-        python = python or told(f"jobqueue.{self.config_name}.python") or sys.executable
+        told = dask.config.get(f"jobqueue.{self.config_name}.python", None)
         super().__init__(  # type: ignore[call-arg]
             *arguments,
             # If the certificates were given as `security`, their paths would not be quoted.
-            worker_extra_args=[*worker_extra_args, *_tls_words(security)],
-            python=shlex.quote(python),
-            local_directory=None if folder is None else shlex.quote(str(folder)),
+            worker_extra_args=[*worker_extra_args, *self._tls_words(security)],
+            python=told or self._word(sys.executable),
             **options,
         )
+
+    def _tls_words(self, security: Security | None) -> Iterator[str]:
+        """Yield a worker's options for its certificates."""
+        files = {} if security is None else security.get_tls_config_for_role("worker")
+        for key, value in files.items():
+            if key != "ciphers":  # Dask has no option for them
+                yield from (f"--tls-{key.replace('_', '-')}", self._word(str(value)))
+
+    def _word(self, text: str) -> str:
+        """Return a text as a word of a shell.
+
+        Raises:
+            ConfigError: If it has control characters: a line of a script may be a directive, also
+                between quotation marks.
+        """
+        if not text.isprintable():
+            raise ConfigError(f"a path in a job must be printable, got {text!r}")
+        word = shlex.quote(text)
+        # HTCondor replaces `$(NAME)` before the shell reads the line.
+        return word.replace("$", "$(DOLLAR)") if self.config_name == "htcondor" else word
 
 
 @cache
 def quoted(job: type[Any]) -> type[Any]:
     """Return a class of jobs in which our paths are quoted."""
     return types.new_class(f"Quoted{job.__name__}", (_Quoted, job))
-
-
-def _tls_words(security: Security | None) -> list[str]:
-    """Return a worker's options for its certificates, quoted as shell arguments."""
-    files = {} if security is None else security.get_tls_config_for_role("worker")
-    words = (
-        (f"--tls-{key.replace('_', '-')}", shlex.quote(str(value)))
-        for key, value in files.items()
-        if key != "ciphers"  # Dask has no option for them
-    )
-    return [word for pair in words for word in pair]
 
 
 def _exports() -> list[str]:

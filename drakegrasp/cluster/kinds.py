@@ -9,6 +9,7 @@ kind sends them `dask_settings`. Other machines can connect only if `host` or `i
 from __future__ import annotations
 
 import ipaddress
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -44,6 +45,8 @@ MOST = 1_000_000
 REMOTE = ("workers", "cores", "memory", "host", "interface")
 #: Maximum memory of a worker [B], more than any machine has.
 MOST_MEMORY = 10**15
+#: Names of hosts and interfaces, and addresses; they become words of a shell on other machines.
+_PLAIN = re.compile(r"[A-Za-z0-9_:\[][A-Za-z0-9_.:%@\[\]-]*")
 
 
 class AddressMissingError(ConfigError):
@@ -105,9 +108,16 @@ class Local:
                 raise ConfigError(f"{name} must be at least 1, got {value}")
             if name in ("workers", "cores") and value is not None and value > MOST:
                 raise ConfigError(f"{name} must be at most {MOST:,}, got {value}")
+            if name in ("host", "interface") and value is not None:
+                refuse_unplain(name, value)
         chosen_security(self.tls, self.tls_files, elsewhere=type(self) is not Local)
         if self.memory is not None:
             memory_bytes(self.memory)
+
+    @classmethod
+    def elsewhere(cls) -> str:
+        """Return where the user states what no option states, as the end of an error message."""
+        return ""
 
     def line(self) -> str:
         """Return a description of what will be started."""
@@ -257,7 +267,9 @@ def cluster_of(kind: str, own: Sequence[str] = (), **options: Any) -> Local:
         key, equals, value = text.partition("=")
         if key not in known or not (equals and value):
             settings = f"KEY=VALUE with KEY one of {', '.join(known)}" if known else "left out"
-            raise ConfigError(f"--with must be {settings} for --cluster {kind}, got {text!r}")
+            raise ConfigError(
+                f"--with must be {settings} for --cluster {kind}, got {text!r}{found.elsewhere()}"
+            )
         options[key] = value
     cluster: Local = found(kind=kind, **options)
     return cluster
@@ -293,6 +305,16 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
+
+
+def refuse_unplain(name: str, text: str) -> None:
+    """Reject what cannot be a host, an address or an interface.
+
+    Raises:
+        ConfigError: If it has other characters than these have.
+    """
+    if not _PLAIN.fullmatch(text):
+        raise ConfigError(f"{name} must be a name or an address, got {text[:40]!r}")
 
 
 def memory_bytes(text: str) -> int:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 import math
+import shlex
+import sys
 
 from distributed import SpecCluster, SSHCluster
 from distributed.security import Security
 
 from drakegrasp.cluster.certificates import server_options
-from drakegrasp.cluster.connect import LOOPBACK, start_environment
-from drakegrasp.cluster.kinds import Remote
+from drakegrasp.cluster.connect import BLAS_KERNEL, LOOPBACK, start_environment
+from drakegrasp.cluster.kinds import Remote, refuse_unplain
 from drakegrasp.errors import ConfigError
 
 #: A scheduler on another machine ends by itself after this time without work, because its client
@@ -32,6 +34,7 @@ class Ssh(Remote):
                     f"a host must be a name or address, got {host!r}: the user and "
                     "the key for it go into ~/.ssh/config"
                 )
+            refuse_unplain("a host", host)
 
         # All hosts have the same number of workers.
         hosts, workers, cores = len(self.where), self.workers, self.cores
@@ -64,20 +67,23 @@ class Ssh(Remote):
         SSHCluster sends Dask's settings with every command that it runs on another machine.
 
         Raises:
-            ConfigError: If a path of a certificate contains a single quotation mark, because Dask
-                puts its commands between such marks.
+            ConfigError: If a path of a certificate or a variable contains a single quotation mark,
+                because Dask puts its options between such marks.
         """
-        server = server_options(security)
-        for path in server.get("security", {}).values():
-            if "'" in str(path):
-                raise ConfigError(f"certificates (in --out) must have paths without ', got {path}")
+        server, environment = server_options(security), start_environment()
+        for text in (*server.get("security", {}).values(), *environment.values()):
+            if "'" in str(text):
+                raise ConfigError(
+                    f"paths of certificates (in --out) and {BLAS_KERNEL} must be without ', "
+                    f"got {text}"
+                )
 
         # A worker on each core; the first host also runs the scheduler.
         worker = {
             "n_workers": self.per_host,
             "nthreads": 1,
             "memory_limit": self.memory or "auto",
-            "env": start_environment(),
+            "env": environment,
             **self.workers_listening(),
             **server,
         }
@@ -87,5 +93,6 @@ class Ssh(Remote):
             worker_options=worker,
             scheduler_options={**scheduler, **self.listening(), **server},
             security=security,
+            remote_python=shlex.quote(sys.executable),
             silence_logs=logging.ERROR,
         )

@@ -51,7 +51,15 @@ def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
     """
     refuse_half_replaced(path.parent)
     refuse_irregular(path)
-    file = h5py.File(path, "r")
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        if "unable to lock file" not in str(error):
+            raise
+        raise OSError(
+            "one that another program has open to write: close it there, or, on a disk without "
+            "locks, set HDF5_USE_FILE_LOCKING=FALSE"
+        ) from None
     if again:
         return file
     try:

@@ -104,6 +104,7 @@ class GraspDataset:
         K: Camera matrix (3, 3) [px].
         image_size: Edge of the square images [px].
         content: Hash that identifies the samples of the split and their dataset.
+        emptiness: What is said of the split if it has no samples.
 
     Raises:
         DataError: If the file is missing, damaged or differs from the schema, if the split is
@@ -126,7 +127,7 @@ class GraspDataset:
         # Facts about the split in the file.
         with open_samples(self.path) as file:
             self._length = len(file[split]["grasps"])
-            self._filled = [name for name in SPLITS if len(file[name]["grasps"])]
+            self.emptiness = emptiness_of(split, [s for s in SPLITS if len(file[s]["grasps"])])
             self.image_size = int(file[split]["images"].shape[-1])
             self.K = np.array(file.attrs["K"])
             self.camera = str(file.attrs["camera"])
@@ -186,11 +187,9 @@ class GraspDataset:
             IndexError: If the index is out of range.
         """
         index = operator.index(index)
-        if not self._length:
-            others = ", ".join(self._filled) or "none"
-            raise IndexError(f"split {self.split} is empty; not empty: {others}")
         if not -self._length <= index < self._length:
-            raise IndexError(f"index must be below {self._length}, got {index}")
+            below = f"index must be below {self._length}, got {index}"
+            raise IndexError(below if self._length else self.emptiness)
         return index % self._length
 
     def __iter__(self) -> Iterator[Sample]:
@@ -321,6 +320,11 @@ class GraspDataset:
 
 #: Readers with an open file, opened here or in the process from which this one was forked.
 _open_readers: WeakSet[GraspDataset] = WeakSet()
+
+
+def emptiness_of(split: str, filled: Sequence[str]) -> str:
+    """Return what is said of an empty split; it names the splits that have rows."""
+    return f"split {split} is empty; not empty: {', '.join(filled) or 'none'}"
 
 
 def _content(file: h5py.File, split: str) -> str:

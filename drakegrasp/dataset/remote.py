@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 from pathlib import Path
 from typing import Any
 
 from drakegrasp.errors import DataError, MachineError, one_line
+from drakegrasp.foreign_files import ADDRESS
 
-#: How an address begins; `Path` makes one slash of several.
-_SCHEME = re.compile(r"([a-z][a-z0-9+.-]+):/+")
 #: The variable that names the cache folder.
 CACHE_VARIABLE = "DRAKEGRASP_CACHE"
 
@@ -28,7 +26,7 @@ def local_file(path: str | Path) -> Path:
         DataError: If there is no such file, or the download breaks off.
         MachineError: If a package is missing that the address needs.
     """
-    scheme = _SCHEME.match(str(path))
+    scheme = ADDRESS.match(str(path))
     if scheme is None or Path(path).exists():
         return Path(path).absolute()
     address = path if isinstance(path, str) else f"{scheme[1]}://{str(path)[scheme.end() :]}"

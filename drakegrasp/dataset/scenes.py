@@ -24,7 +24,7 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.dataset.hdf5 import AnyArray, ImageRows, read_rows, read_texts
 from drakegrasp.dataset.opening import SCENE_TABLES, open_scenes, opened, refuse_other_codes
-from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.reader import GraspDataset, emptiness_of
 from drakegrasp.dataset.remote import local_file
 from drakegrasp.dataset.schema import DEPTH_UNIT, SCENE_GRASP_FIELDS, SPLITS
 from drakegrasp.dataset.trials import Trials, reopened, stamp
@@ -118,6 +118,7 @@ class SceneDataset:
         near, far: Near and far planes of the cameras [m].
         tables: Columns of /scenes, /views and /grasps by their names, for all splits; no images.
         epoch: Number of the epoch, on which all draws depend.
+        emptiness: What is said of the split if it has no items.
 
     Raises:
         DataError: If the file is missing, damaged or differs from the schema, or an argument is
@@ -190,7 +191,8 @@ class SceneDataset:
         """Return an item by its index, or by epoch and index, as `rounds` yields them."""
         epoch, index = index if isinstance(index, tuple) else (self.epoch, operator.index(index))
         if not -len(self) <= index < len(self):
-            raise IndexError(f"index must be below {len(self)}, got {index}")
+            below = f"index must be below {len(self)}, got {index}"
+            raise IndexError(below if len(self) else self.emptiness)
         index %= len(self)
 
         # The view, and its frame.
@@ -308,9 +310,11 @@ class SceneDataset:
         """Return the views to draw from, and for each item the index of its object or view."""
         scenes = self.tables["scenes"]
         usable = np.array([len(good) + len(bad) > 0 for good, bad in self._kinds], dtype=bool)
-        usable &= scenes["split"] == SPLITS.index(self.split)
         if names is not None:
             usable &= np.isin(self.names, sorted(names))[scenes["object"][:, 0]]
+        filled = np.unique(scenes["split"][usable])
+        self.emptiness = emptiness_of(self.split, [SPLITS[i] for i in filled])
+        usable &= scenes["split"] == SPLITS.index(self.split)
         views = np.flatnonzero(usable[self._scene_of]) if len(usable) else np.zeros(0, np.int64)
         self._balance = balance
         if balance == "view" or not len(views):
@@ -597,7 +601,7 @@ class SceneRows(GraspDataset):
         self._data = data = SceneDataset(
             path, points=None, split=split, negatives="none", balance="view", grasps=1
         )
-        self.views = data.views
+        self.views, self.emptiness = data.views, data.emptiness
         self._length = len(self.views)
 
         # The own grasp of each view, and the trial of this grasp.

@@ -18,7 +18,6 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, TextIO
-from zipfile import ZipFile
 
 import h5py
 import numpy as np
@@ -36,7 +35,7 @@ from drakegrasp.errors import (
     one_line,
 )
 from drakegrasp.exchange.contacts import read_contacts
-from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
+from drakegrasp.foreign_files import LARGEST_TEXT, read_npz, refuse_irregular
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.protocols.files import is_grasp_file
@@ -61,6 +60,8 @@ from drakegrasp.verification.prediction import read_grasps
 _OF_FILE = ("frame", "link", "joints", "hand", "of_objects")
 #: Suffixes of files of arrays, tables and YAML files.
 ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml", ".yml")
+#: Array of the poses in a file of ACRONYM.
+_ACRONYM = "grasps/transforms"
 #: Maximum total size of the arrays of a file [bytes]: two million postures of a hand with 16
 #: joints.
 MOST_BYTES = 1_000_000_000
@@ -160,16 +161,17 @@ def _raw(
     for name in reversed(registry.names("importers")):
         if Path(name).suffix == path.suffix.lower():
             read = registry.find("importers", name)
-            takes = inspect.signature(read).parameters
             try:
+                takes = inspect.signature(read).parameters
                 raw = read(path, hand, **({"nameless": nameless} if "nameless" in takes else {}))
+                if raw is not None:
+                    return _as_asked({**raw, "objects": list(raw["objects"])}, read_as)
             except DrakegraspError:
                 raise
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 got = f"{type(error).__name__} ({one_line(error)})"
-                raise GraspError(f"must be readable by the importer {name}, got {got}") from error
-            if raw is not None:
-                return _as_asked(dict(raw), read_as)
+                owned = registry.with_owner("importers", name)
+                raise GraspError(f"must be readable by the importer {owned}, got {got}") from error
     raise GraspError(f"must be a file of postures ({', '.join(suffixes())}), got another")
 
 
@@ -386,7 +388,7 @@ def holds_postures(path: Path) -> bool:
         if suffix in ARRAYS[1:] and path.is_file():
             with open_hdf5(path) as file:
                 named = {"q_grasp", "X_FG", "quaternion"}
-                return not named.isdisjoint(file) or is_graspgen(file)
+                return not named.isdisjoint(file) or is_graspgen(file) or _ACRONYM in file
         if suffix in TABLES and path.is_file():
             return bool({"object", "qw"} & set(_column_names(path)))
     except MachineError:
@@ -451,11 +453,13 @@ def _sha256(path: Path) -> bytes:
 def _read_arrays(path: Path) -> dict[str, Any]:
     try:
         if path.suffix.lower() == ".npz":
-            with path.open("rb") as raw, ZipFile(raw) as packed:
-                refuse_large(sum(item.file_size for item in packed.infolist()))
-            with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-                return {name: file[name] for name in file.files}
+            return read_npz(path, MOST_BYTES)
         with open_hdf5(path) as file:
+            if _ACRONYM in file:
+                raise GraspError(
+                    f"a file of ACRONYM: save its {_ACRONYM} as a .npy file, and read this file "
+                    "with --frame mesh and the --link of its gripper"
+                )
             refuse_large(sum(getattr(file[name], "nbytes", 0) for name in file))
             return {name: _dataset(file[name]) for name in file}
     except Exception as error:  # parsers raise all kinds of exceptions on foreign bytes

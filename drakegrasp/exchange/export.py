@@ -25,11 +25,11 @@ from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
 from drakegrasp.dataset.trials import Trials, sample_ids
-from drakegrasp.errors import DataError, one_line
-from drakegrasp.foreign_files import read_text
+from drakegrasp.errors import DataError, DrakegraspError, one_line
+from drakegrasp.foreign_files import read_text, refuse_address
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
-from drakegrasp.runtime.files import atomic_folder
+from drakegrasp.runtime.files import atomic_folder, disk_full_named, is_no_room
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.simulation.attempts import CONDITIONS
 from drakegrasp.yaml_text import parse_yaml
@@ -108,9 +108,10 @@ def export_dataset(
         DataError: If there is no dataset, the dataset has another schema or no samples, the
             directory is not empty, or the format does not have an option.
         MachineError: If a package that the format needs is missing.
-        OSError: If the disk is full; no files are left behind.
+        DiskFullError: If the disk is full; no files are left behind.
     """
     # A dataset that cannot be read is rejected before anything is written.
+    refuse_address(directory)
     out, directory = Path(out), Path(directory)
     if not registry.is_known("exporters", form):
         known = ", ".join(registry.names("exporters"))
@@ -126,14 +127,27 @@ def export_dataset(
         raise DataError(f"{directory}: must be a new or empty directory, got one that holds files")
 
     write = registry.find("exporters", form)
-    with atomic_folder(directory) as folder:
-        count: int = write(out, folder, progress, **options)
-    return count
+    with disk_full_named(directory), atomic_folder(directory) as folder:
+        try:
+            return int(write(out, folder, progress, **options))
+        except DrakegraspError:
+            raise
+        except (Exception, SystemExit) as error:
+            if is_no_room(error):
+                raise
+            raise DataError(
+                f"{out}: exporter {registry.with_owner('exporters', form)} must write the samples "
+                f"and return their number, got {type(error).__name__} ({one_line(error)})"
+            ) from error
 
 
 def options_of(form: str) -> tuple[str, ...]:
     """Return the names of an exporter's options, which are its parameters after the first three."""
-    return tuple(inspect.signature(registry.find("exporters", form)).parameters)[3:]
+    write = registry.find("exporters", form)
+    if not callable(write):
+        owned = registry.with_owner("exporters", form)
+        raise DataError(f"exporter {owned} must be a function, got {type(write).__name__}")
+    return tuple(inspect.signature(write).parameters)[3:]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -173,7 +187,8 @@ def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
     """Yield the samples of a dataset in the order of its trials, so object by object.
 
     Raises:
-        DataError: If a file of the dataset is missing or belongs to another dataset.
+        DataError: If a file of the dataset is missing or belongs to another dataset, or a sample
+            has a number that is not finite.
     """
     # Find the trials that are samples, and their splits.
     trials = Trials(out)
@@ -185,6 +200,10 @@ def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
     # Read their postures.
     names = ("object_name", "X_TO", "X_OG", "closed_q", "spread", "unused", "preshape")
     samples = trials[rows].columns((*names, *CONDITIONS))
+    for name in ("X_TO", "X_OG", "closed_q", "spread"):
+        for row, values in zip(rows.tolist(), samples[name], strict=True):
+            if not np.isfinite(values).all():
+                raise DataError(f"{out}: {name} of trial {row} must be finite numbers, got others")
     conditions = np.column_stack([samples[name] for name in CONDITIONS])
     X_TO, X_OG = (unpack_pose(samples[name]) for name in ("X_TO", "X_OG"))
     for i, row in enumerate(rows.tolist()):

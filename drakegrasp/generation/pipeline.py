@@ -500,9 +500,7 @@ class _Build:
             # Licence and group do not affect results. An object stays in its split.
             split = before[entry.name].split if entry.name in before else None
             objects.append(
-                replace(
-                    entry, tried=None, licence=source.licence, group=source.group, split=split
-                )
+                replace(entry, tried=None, licence=source.licence, group=source.group, split=split)
             )
         return replace(
             manifest,

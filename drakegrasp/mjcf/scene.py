@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from drakegrasp.config import Config
-from drakegrasp.foreign_files import read_content
+from drakegrasp.foreign_files import read_npz
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import SLIDE, Hand
 from drakegrasp.hand.parsing import joint_slides
@@ -77,8 +77,8 @@ def _read_parts(path: Path) -> list[Array]:
     Raises:
         Exception: Of any kind, if the file is missing or holds something else.
     """
-    with np.load(io.BytesIO(read_content(path)), allow_pickle=False) as content:
-        parts = [content[f"arr_{k}"] for k in range(len(content.files))]
+    content = read_npz(path)
+    parts = [content[f"arr_{k}"] for k in range(len(content))]
     if not parts or not all(map(_is_part, parts)):
         raise ValueError(f"{path}: must hold the corners of convex parts, got something else")
     return parts

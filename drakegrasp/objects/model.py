@@ -23,7 +23,7 @@ import trimesh
 from drakegrasp.arithmetic import dot
 from drakegrasp.config import ObjectConfig, PhysicsConfig
 from drakegrasp.errors import MeshError, one_line
-from drakegrasp.foreign_files import is_name, read_content
+from drakegrasp.foreign_files import is_name, read_npz
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import count_parts
 from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
@@ -317,8 +317,8 @@ def load_object(path: str | Path) -> ObjectModel:
     # Read the arrays as they are in the file.
     path = Path(path)
     try:
-        with np.load(io.BytesIO(read_content(path)), allow_pickle=False) as content:
-            values: dict[str, Any] = {f.name: content[f.name] for f in fields(ObjectModel)}
+        content = read_npz(path)
+        values: dict[str, Any] = {f.name: content[f.name] for f in fields(ObjectModel)}
     except Exception as error:
         raise MeshError(
             f"{path.name}: must be an object file of drakegrasp, got: {one_line(error)}"

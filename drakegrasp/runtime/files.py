@@ -357,7 +357,7 @@ def disk_full_named(out: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError) as error:
-        if not _is_no_room(error):
+        if not is_no_room(error):
             raise
         raise DiskFullError(
             f"{out}: the disk or the quota is full ({os.strerror(_NO_ROOM[0])}); make room, and "
@@ -365,7 +365,8 @@ def disk_full_named(out: Path) -> Iterator[None]:
         ) from None
 
 
-def _is_no_room(error: BaseException) -> bool:
+def is_no_room(error: BaseException) -> bool:
+    """Return whether an error says that there is no room for a file."""
     # HDF5 has the error number only in its message.
     text = str(error)
     return getattr(error, "errno", None) in _NO_ROOM or any(

@@ -203,7 +203,7 @@ def card_text(card: Mapping[str, Any]) -> str:
     counts = "sample" if protocol is None else f"by {protocol['protocol']}"
     lines = ["# Score of predicted grasps", ""]
     for name, value in card["headline"].items():
-        lines += [f"**{name}: {_interval(value)}** {counts}, success@1, first wrist pose, mean "
+        lines += [f"**{name}: {share_text(value)}** {counts}, success@1, first wrist pose, mean "
                   f"over {counted(card['objects'], 'object')} "
                   f"({counted(card['rows'], 'row')}).", ""]  # fmt: skip
     lines += [f"> Warning: {warning}." for warning in card["warnings"]]
@@ -214,7 +214,7 @@ def card_text(card: Mapping[str, Any]) -> str:
     rows = []
     for name, each in card["sets"].items():
         first, *others = (each["measures"][measure] for measure in measures)
-        shares = [_interval(first), *(_percent(other["value"]) for other in others)]
+        shares = [share_text(first), *(_percent(other["value"]) for other in others)]
         rows.append([name, *shares, str(each["predictions"])])
     lines += _table(["set", *measures, "predictions"], rows)
     drawn, level = card["intervals"]["drawn"], card["intervals"]["level"]
@@ -268,14 +268,14 @@ def _more(card: Mapping[str, Any]) -> list[str]:
     for name, each in sets.items():
         for measure, value in each["measures"].items():
             if measure.startswith("success@"):
-                lines.append(f"* {name}, {measure}: {_interval(value)}")
+                lines.append(f"* {name}, {measure}: {share_text(value)}")
         for group in each["calibration"]:
             share = f"{_percent(group['share'])} % of {group['count']}"
             lines.append(f"* {name}, confidence {group['confidence']:.3g}: {share}")
         lines += [f"* {name}, {n} no grasp: {why}" for why, n in each["invalid"].items()]
     for name, others in card["above"].items():
         for other, value in others.items():
-            lines.append(f"* {name} above {other}: {_interval(value)}")
+            lines.append(f"* {name} above {other}: {share_text(value)}")
     return [*lines, ""]
 
 
@@ -301,6 +301,7 @@ def _percent(share: float) -> str:
     return f"{100.0 * share:z.0f}"
 
 
-def _interval(value: Mapping[str, float]) -> str:
-    numbers = (100.0 * value[name] for name in ("value", "low", "high"))
-    return "{:z.0f} ({:z.0f} to {:z.0f})".format(*numbers)
+def share_text(of: Mapping[str, float], decimals: int = 0, unit: str = "") -> str:
+    """Return a share and its interval in per cent; equal values, as of one object, have none."""
+    value, low, high = (f"{100.0 * of[name]:z.{decimals}f}" for name in ("value", "low", "high"))
+    return f"{value}{unit} ({f'{low} to {high}' if of['low'] < of['high'] else 'no interval'})"

@@ -9,7 +9,6 @@ judge is a logistic regression in one NumPy file, and belongs to one hand.
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -21,6 +20,7 @@ import numpy as np
 
 from drakegrasp.arithmetic import Array, dot, multiply, norm
 from drakegrasp.errors import GraspError, HandError, listed, one_line
+from drakegrasp.foreign_files import is_name, parse_json, read_npz
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.finger_sweep import closing_path, pad_points_at
 from drakegrasp.mesh.cloud import smallest_rectangle
@@ -39,6 +39,8 @@ OF_HAND = (
 STEPS, DECIMALS = 5, 6
 #: Standardised features are cut to this.
 FARTHEST = 4.0
+#: Maximum size of the arrays of a file [bytes], a thousand times that of the package's judge.
+MOST_BYTES = 16_000_000
 #: Names of the arrays of a file.
 ARRAYS = ("mean", "scale", "weights", "offset")
 
@@ -121,9 +123,9 @@ def load_judge(source: str | Path | Judge) -> Judge:
 
     # Read the file, and look for faults.
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            about = json.loads(str(file["about"]))
-            arrays = {name: np.asarray(file[name], dtype=float) for name in ARRAYS}
+        file = read_npz(path, MOST_BYTES)
+        about = parse_json(str(file["about"]))
+        arrays = {name: file[name].astype(float, casting="same_kind") for name in ARRAYS}
         fault = _fault(about, arrays)
     except Exception as error:  # a damaged file raises all kinds
         fault = one_line(error)
@@ -135,11 +137,12 @@ def load_judge(source: str | Path | Judge) -> Judge:
 def _fault(about: Any, arrays: Mapping[str, Array]) -> str:
     """Return what is wrong with the content of a file; empty if nothing is."""
     for key in ("name", "hand", "fingerprint"):
-        if not isinstance(about.get(key), str):
-            return f"its {key} is {about.get(key)!r}"
-    if "features" not in about:
-        return "its features are missing"
-    count, heads = len(about["features"]), len(HEADS)
+        if not (isinstance(value := about.get(key), str) and is_name(value)):
+            return f"its {key} is {repr(value)[:40]}"
+    features = about.get("features")
+    if not (isinstance(features, list) and all(isinstance(name, str) for name in features)):
+        return "its features must be a list of names"
+    count, heads = len(features), len(HEADS)
     shapes = {"mean": (count,), "scale": (count,), "weights": (count, heads), "offset": (heads,)}
     for name, shape in shapes.items():
         if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():

@@ -23,6 +23,7 @@ from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.errors import GraspError, TooLittleSeenError
 from drakegrasp.frames import invert_pose, unpack_pose
 from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.files import hand_names
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.scoring.judge import Judge, judge_names, load_judge
@@ -106,7 +107,12 @@ def load_network(name_or_path: str | Path = DEFAULT) -> GraspNetwork:
             f"got {str(name_or_path)!r}"
         )
     judge = load_judge(name_or_path)
-    hand = load_hand(judge.about["hand"])
+    # A hand's name could be the path of any file.
+    if (name := judge.about["hand"]) not in hand_names():
+        raise GraspError(
+            f"{name_or_path}: must be for a hand of {', '.join(hand_names())}, got {name!r}"
+        )
+    hand = load_hand(name)
     judge.refuse_other_hand(hand)
     return GraspNetwork(name=judge.name, hand=hand, judge=judge)
 
@@ -149,6 +155,8 @@ def predict_scenes(
             invalid.
     """
     data = SceneDataset(path, points=None, split=split, negatives="none", balance="view", grasps=1)
+    if not len(data):
+        raise GraspError(f"{path}: {data.emptiness}")
     hand = load_hand(read_manifest(data.path.parent).config.hand_source)
     if hand.name != network.hand.name:
         raise GraspError(

@@ -196,7 +196,7 @@ def _chosen_rows(
                 "got other rows"
             )
     if not len(rows):
-        raise GraspError(f"{data.path}: {data.split} must have rows to score, got none")
+        raise GraspError(f"{data.path}: {data.emptiness}")
     if per_object is None:
         return [int(row) for row in rows]
 

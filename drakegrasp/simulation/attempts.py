@@ -504,7 +504,8 @@ def _in_order(
     order = joint_order(hand)
     if unknown := [name for name in joints if name not in order]:
         raise GraspError(
-            f"joints must be those of the hand ({', '.join(order)}), got {unknown[0]!r}"
+            f"joints must be those of the hand, got {unknown[0]!r}: rename them in the file, or "
+            f"draft a hand of their model (`drakegrasp hand new`); the hand has {listed(order)}"
         )
     if len(set(joints)) < len(joints):
         raise GraspError("joints must be named once each, got one twice")

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from itertools import count
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -307,7 +307,9 @@ def _shape(name: str, shape: object, hand: Hand) -> Shape:
     names, index = hand.preshape_names, preshape
     if isinstance(preshape, str) and preshape in names:
         index = names.index(preshape)
-    known = isinstance(index, Integral) and 0 <= index < len(names) if names else index is None
+    known = (
+        isinstance(index, int | np.integer) and 0 <= index < len(names) if names else index is None
+    )
     if not known:
         must = f"one of {listed(names)}, or its index," if names else "None"
         raise ConfigError(

@@ -293,6 +293,8 @@ def choose_rows(
     # Check that there is one row per grasp.
     if len(chosen) != count:
         raise GraspError(f"rows must be one per grasp ({count}), got {len(chosen)}")
+    if not len(dataset):
+        raise GraspError(f"{dataset.path}: {dataset.emptiness}")
     if rows is None and count != len(dataset):
         raise GraspError(
             f"without rows there must be a grasp for each of the {len(dataset)} rows of "

@@ -24,12 +24,15 @@ from helpers.datasets import make_dataset
 from helpers.tiers import few
 from matplotlib.image import imread
 
+import drakegrasp as dg
 from drakegrasp.cli import main as cli
 from drakegrasp.cli.main import main
 from drakegrasp.cli.options import parse_request
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.errors import DataError
+from drakegrasp.exchange.export import export_dataset
 from drakegrasp.frames import make_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.protocols.protocol import DexGraspBench, Lift
@@ -90,6 +93,18 @@ def test_a_name_that_the_locale_cannot_encode_is_no_error(
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize("words", [("stats", "OUT"), ("check", "OUT"), ("objects", "list")])
+def test_closed_output_is_an_error(words: tuple[str, ...], sound: Path) -> None:
+    command = ["bash", "-c", '"$@" >&-', "-", sys.executable, "-m", "drakegrasp"]
+    done = subprocess.run(
+        [*command, *(word.replace("OUT", str(sound)) for word in words)],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert done.stderr == "error: standard output must be open, got a closed one\n"
+
+
 def test_options_of_clusters_come_last() -> None:
     """A newcomer reads those of everyday first."""
     for name in ("build", "verify", "score", "bench-set"):
@@ -98,6 +113,32 @@ def test_options_of_clusters_come_last() -> None:
             assert option in cluster and option not in daily, (name, option)
         assert {"--workers", "--quiet", "--help"} <= set(re.findall(r"--[a-z-]+", daily))
     assert "\nCommands:\n" in run("--help").stdout
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("build", "--objects", "builtin", "--out", "s3://x/y"),
+        ("submit", "--objects", "builtin", "--out", "gs://x/y", "--dry-run"),
+        ("export", "OUT", "hf://datasets/x/y", "--to", "meshes"),
+        ("merge", "s3:/x", "OUT"),
+        ("score", "--dataset", "OUT/grasping_oto.hdf5", "--out", "https://x/y"),
+        ("audit", "memory://x"),
+    ],
+    ids=" ".join,
+)
+def test_an_address_is_no_folder_of_this_machine(
+    words: tuple[str, ...], sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = run(*(word.replace("OUT", str(sound)) for word in words))
+    assert done.exit_code == 2
+    assert "must be a path of this machine, got the address" in error_line(done)
+    with pytest.raises(DataError, match="must be a path of this machine, got an address"):
+        dg.build_dataset("builtin", "s3://x/y")
+    with pytest.raises(DataError, match="must be a path of this machine, got an address"):
+        export_dataset(sound, "s3://x/y", "meshes")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.sim

@@ -175,7 +175,7 @@ def test_grasps_of_a_depth_image_are_in_the_frame_of_its_camera(
     ("words", "said"),
     [
         ("--units mm", "--units must be given with a cloud only, got scenes"),
-        ("--split valid", "in valid that show their object, got 0 views"),
+        ("--split valid", "scenes.hdf5: split valid is empty; not empty: train, test"),
     ],
 )
 def test_bad_input_is_refused_with_one_line(

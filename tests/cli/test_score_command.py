@@ -98,17 +98,35 @@ def test_the_card_has_the_command_as_it_was_given(
     assert sorted(given) == sorted(map(str, words))
 
 
+@pytest.mark.parametrize(
+    ("ends", "said"), [((0.125, 0.5), "(12.5 to 50.0)"), ((0.25, 0.25), "(no interval)")]
+)
 def test_shares_and_their_intervals_are_printed_as_percent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: tuple[float, float], said: str
 ) -> None:
-    share = {"value": 0.25, "low": 0.125, "high": 0.5}
+    """The interval of one object is none."""
+    share = {"value": 0.25, "low": ends[0], "high": ends[1]}
     scored = SimpleNamespace(card={"headline": {"net.npy": share}})
     monkeypatch.setattr("drakegrasp.api.scoring.score", lambda *_, **__: scored)
     data = make_dataset(tmp_path / "out", tmp_path / "meshes") / OTO
     np.save(tmp_path / "net.npy", np.zeros((1, 18)))
-    words = ("score", tmp_path / "net.npy", "--dataset", data, "--out", tmp_path / "card")
+    words = ("score", tmp_path / "net.npy", "--dataset", data)
     result = run(*words, "--workers", 1, "--quiet")
-    assert result.stdout.splitlines()[0] == "net.npy: 25.0 % (12.5 to 50.0)"
+    assert result.stdout == f"net.npy: 25.0 % {said}\n"
+
+
+@pytest.mark.sim
+def test_without_a_folder_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes")
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.chdir(tmp_path)
+    words = ("--dataset", out / OTO, "--per-object", 1, "--reference", "constant")
+    result = run("score", *words, "--workers", 1)
+    assert result.exit_code == 0, result.output
+    assert "constant" in result.stderr
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_mistakes_are_one_line(tmp_path: Path) -> None:

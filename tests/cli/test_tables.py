@@ -9,7 +9,13 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from drakegrasp.cli.tables import audit_table, funnel_table, hold_table, preshape_table
+from drakegrasp.cli.tables import (
+    audit_table,
+    funnel_table,
+    hold_table,
+    preshape_table,
+    print_table,
+)
 from drakegrasp.dataset.statistics import NO_NAME, Funnel, PreshapeCount
 from drakegrasp.filters import Removal
 from drakegrasp.objects.audit import AuditRow
@@ -123,3 +129,15 @@ def test_audit_is_in_millimetres_and_megabytes() -> None:
     numbers = ["1,200", "50x60x70", "1", "yes", "3.1", "0.4", "3", "425"]
     assert ["1_mug", "fit", *numbers, "one"] in text
     assert ["2_box", "refused", *"-" * 8, "open"] in text
+
+
+def test_long_notes_of_an_audit_are_folded_in_a_file(capsys: pytest.CaptureFixture[str]) -> None:
+    words = " ".join(f"word{k}" for k in range(80))
+    row = AuditRow(
+        name="1_mug", class_name="mug", status="fit", notes=(words,), warnings=("w" * 300,)
+    )
+    print_table(audit_table([row]))
+    printed = capsys.readouterr().out
+    assert max(map(len, printed.splitlines())) < 180
+    assert [word for word in printed.split() if word.startswith("word")] == words.split()
+    assert "".join(word for word in printed.split() if not word.strip("w")) == 300 * "w"

@@ -29,7 +29,7 @@ import drakegrasp
 from drakegrasp import registry
 from drakegrasp.cluster import connect as connecting
 from drakegrasp.cluster.admission import admitted_workers
-from drakegrasp.cluster.certificates import make_certificates, private_directory
+from drakegrasp.cluster.certificates import make_certificates, private_directory, security_of
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect, dask_settings
 from drakegrasp.cluster.jobqueue import _exports, walltime_seconds
 from drakegrasp.cluster.kinds import cluster_of
@@ -150,6 +150,9 @@ def test_workers_elsewhere_need_a_certificate_unless_told_otherwise(
         (["--cluster", "kubernetes", "--with", "size=1"], "KEY one of image, claim, name, namesp"),
         (["--cluster", "kubernetes", "--workers", "2"], "--with image=NAME must be given"),
         (["--cluster", "ssh", "me@a", "--cores", "2", "--host", "x"], "go into ~/.ssh/config"),
+        (["--cluster", "ssh", "a;b", "--cores", "2", "--host", "x"], "a host must be a name or"),
+        (["--cluster", "ssh", "a", "--cores", "2", "--host", "$(b)"], "host must be a name or an"),
+        (["--cluster", "ssh", "a", "--cores", "2", "--interface", "-x"], "interface must be a na"),
         (["--cluster", "scheduler"], "must be followed by its address"),
         (["--cluster", "scheduler", "tcp://a:1", "--workers", "2"], "--workers must not be given"),
         (["--cluster", "local", "node1"], "must be followed by nothing, got node1"),
@@ -174,6 +177,19 @@ def test_bad_options_are_one_line_and_make_nothing(
     assert line.startswith("error: ")
     assert words in line
     assert not out.exists()
+
+
+def test_dask_gets_no_quotation_mark_for_its_commands_over_ssh(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cluster = cluster_of("ssh", where=("a",), cores=1, host="10.0.0.1")
+    (tmp_path / "it's").mkdir()
+    security = security_of(make_certificates(tmp_path / "it's"))
+    with pytest.raises(ConfigError, match=r"must be without ', got .*it's"):
+        cluster.start(security)
+    monkeypatch.setenv("OPENBLAS_CORETYPE", "a'; touch ran; '")
+    with pytest.raises(ConfigError, match="OPENBLAS_CORETYPE must be without ', got a'; touch"):
+        cluster.start(None)
 
 
 @pytest.mark.parametrize(

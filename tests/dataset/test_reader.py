@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
+import subprocess
 import sys
 from pathlib import Path
 
@@ -16,7 +17,8 @@ from drakegrasp.dataset import hdf5
 from drakegrasp.dataset.hdf5 import ImageRows, create_field
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS, VIEW_FIELDS, sizes
-from drakegrasp.errors import DataError, MachineError
+from drakegrasp.errors import DataError, GraspError, MachineError
+from drakegrasp.verification.placing import choose_rows
 
 LETTERS = sizes(fingers=3, joints=8, image=16)
 
@@ -106,6 +108,30 @@ def test_several_samples_come_as_a_list(data_file: Path) -> None:
     for beyond in (5, -6, [0, 7]):
         with pytest.raises(IndexError, match=r"index must be below 5, got (5|-6|7)"):
             data[beyond]
+
+
+@pytest.mark.parametrize("split", ["valid", "test"])
+def test_an_empty_split_names_those_with_samples(data_file: Path, split: str) -> None:
+    data, said = GraspDataset(data_file, split=split), f"split {split} is empty; not empty: train"
+    for index in (0, -1, 7, [0]):
+        with pytest.raises(IndexError, match=f"^{said}$"):
+            data[index]
+    assert data[:] == list(data) == []
+    for rows in (None, [0]):
+        with pytest.raises(GraspError, match=f"{data_file}: {said}$"):
+            choose_rows(data, rows, 1)
+
+
+def test_a_file_that_another_program_writes_names_the_remedy(tmp_path: Path) -> None:
+    path = write_data_file(tmp_path / "grasping_oto.hdf5", range(2))
+    code = f"import h5py; file = h5py.File({str(path)!r}, 'r+'); print('open', flush=True); input()"
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None and other.stdout.readline() == b"open\n"
+        with pytest.raises(DataError, match=r"open to write: close it there, .*FILE_LOCKING=FALSE"):
+            GraspDataset(path)
+        other.communicate(b"\n")
+    assert len(GraspDataset(path)) == 2
 
 
 def test_sample_is_printed_on_one_screen(data_file: Path) -> None:

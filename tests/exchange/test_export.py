@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers.commands import run
+from helpers.commands import error_line, run
+from helpers.datasets import change
 
 from drakegrasp import registry
 from drakegrasp.dataset.assemble import assemble
@@ -18,7 +19,7 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.trials import Trials
-from drakegrasp.errors import DataError
+from drakegrasp.errors import DataError, DiskFullError
 from drakegrasp.exchange import dexgraspbench
 from drakegrasp.exchange.export import ClosedGrasp, export_dataset
 from drakegrasp.exchange.meshes import PLACE
@@ -88,9 +89,27 @@ def test_export_that_fails_leaves_nothing(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(dexgraspbench, "grasp_dictionary", fail)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(DiskFullError, match=r"to: the disk or the quota is full .*; make room"):
         export_dataset(dataset, tmp_path / "to", "dexgraspbench")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("form", ["isaac_grasp", "dexgraspbench", "glb", "mjcf"])
+@pytest.mark.parametrize(
+    ("name", "value"), [("X_TO", np.nan), ("closed_q", np.inf), ("spread", -np.inf)]
+)
+def test_numbers_that_are_not_finite_are_one_line(
+    out: Path, tmp_path: Path, form: str, name: str, value: float
+) -> None:
+    row = int(GraspDataset(out / "grasping_oto.hdf5", split="test").column("trial_id")[0])
+    change(out, "trials.hdf5", f"trials/{name}", row, lambda values: np.full_like(values, value))
+    done = run("export", out, tmp_path / "to", "--to", form)
+    assert done.exit_code == 1
+    assert (
+        error_line(done)
+        == f"error: {out}: {name} of trial {row} must be finite numbers, got others"
+    )
+    assert not (tmp_path / "to").exists()
 
 
 def test_meshes_are_in_the_frame_of_the_objects_with_a_table_of_their_rows(

@@ -181,7 +181,7 @@ def test_nothing_is_drawn_before_all_that_the_dataset_has_is_known() -> None:
 
 @pytest.mark.parametrize("wanted", [5, 8, 12])
 def test_palm_poses_with_several_hits_are_counted_whole(wanted: int) -> None:
-    """Each of eight objects has three hits at each palm pose: alone, each would exceed its share."""
+    """Each of eight objects has three hits at a palm pose, so each would exceed its share."""
     names = [f"triple {i}" for i in range(8)]
     target = Target(load_config(samples=wanted), dict.fromkeys(names, 0))
     for name in names:

@@ -150,6 +150,8 @@ def test_objects_that_are_too_low_for_a_hand_that_faces_the_table_get_a_warning(
     ]
     assert list(map(len, said)) == [1, 0, 0]
     assert said[0][0].startswith("its height must be 20 mm") and "got 12 mm" in said[0][0]
+    # Other stand-offs were advised once; they held no flat object.
+    assert "standoffs" not in said[0][0]
     assert not any("faces the table" in w for row in audit(tmp_path) for w in row.warnings)
 
 

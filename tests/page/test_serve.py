@@ -92,7 +92,7 @@ def test_a_directory_without_a_dataset_is_one_line(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("library", ["starlette", "uvicorn", "jinja2"])
+@pytest.mark.parametrize("library", ["starlette", "uvicorn", "jinja2", "h11"])
 def test_missing_extra_is_one_line(
     library: str, boxes: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -105,8 +105,9 @@ def test_missing_extra_is_one_line(
     monkeypatch.setattr("socket.socket.listen", None)  # else a mistake would serve for ever
     result = CliRunner().invoke(main, ["inspect", str(boxes), "--no-browser"])
     assert result.exit_code == 1
-    assert f"inspect needs {library}" in result.stderr
-    assert "pip install 'drakegrasp[inspect]'" in result.stderr
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("error: inspect needs its packages: pip install 'drakegrasp[inspect]' (")
+    assert library in line
 
 
 def test_command_serves_until_it_is_stopped(boxes: Path) -> None:

@@ -108,8 +108,14 @@ def test_a_file_that_is_no_judge_is_refused(tmp_path, damage):
     [
         ({"about": {"features": ["gap", "push"]}}, "its mean must be finite numbers of shape"),
         ({"about": {"fingerprint": None}}, "its fingerprint is None"),
-        ({"about": {"features": None}}, "its features are missing"),
+        ({"about": {"features": None}}, "its features must be a list of names"),
+        ({"about": {"features": 7}}, "its features must be a list of names"),
+        ({"about": {"features": "gap"}}, "its features must be a list of names"),
+        ({"about": {"features": [["gap"]]}}, "its features must be a list of names"),
         ({"about": {"hand": 7}}, "its hand is 7"),
+        ({"about": {"hand": "../secret"}}, "its hand is '../secret'"),
+        ({"about": {"name": "a\nb"}}, "its name is "),
+        ({"mean": [1j]}, "Cannot cast"),
         ({"offset": [0.0, 0.0, 0.0]}, "its offset must be finite numbers of shape"),
         ({"weights": [[np.nan, 0.0]]}, "its weights must be finite numbers"),
         ({"scale": [0.0]}, "its scale must be positive"),
@@ -120,6 +126,23 @@ def test_a_judge_that_is_spoilt_says_what_is_wrong(tmp_path, spoilt, said):
     spoil(path, **spoilt)
     with pytest.raises(dg.GraspError, match=f"must be the file of a judge .*{said}"):
         load_judge(path)
+
+
+def test_a_small_file_that_unpacks_to_a_large_one_is_refused(tmp_path):
+    path = tmp_path / "toy.npz"
+    np.savez_compressed(path, mean=np.zeros(3_000_000))
+    with pytest.raises(dg.GraspError, match="arrays of 24,000,128 byte, more than 16,000,000"):
+        load_judge(path)
+
+
+def test_a_network_is_for_a_hand_of_the_package_or_a_plugin(tmp_path, monkeypatch):
+    """The name of another file is no hand, and the text of the file is not printed."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "secret").write_text("my password")
+    path = write(tmp_path / "toy.npz")
+    spoil(path, about={"hand": "secret"})
+    with pytest.raises(dg.GraspError, match=r"must be for a hand of .*barrett.*, got 'secret'$"):
+        dg.load_network(path)
 
 
 def test_a_feature_that_nobody_measures_is_refused(tmp_path, cloud, grasps):
