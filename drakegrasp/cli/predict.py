@@ -201,10 +201,9 @@ def _read_cloud(path: Path, units: str) -> Array:
     Raises:
         GraspError: If the file has none.
     """
-    from drakegrasp.errors import GraspError, one_line
+    from drakegrasp.errors import GraspError, MeshError
     from drakegrasp.exchange.contacts import read_numbers
-    from drakegrasp.foreign_files import read_content
-    from drakegrasp.mesh.ply import declared_ply
+    from drakegrasp.mesh.loading import load_points
     from drakegrasp.objects.sources import UNITS
 
     if path.suffix.lower() == ".npy":
@@ -215,12 +214,9 @@ def _read_cloud(path: Path, units: str) -> Array:
             )
         return UNITS[units] * points
     try:
-        surface = declared_ply(read_content(path))
-    except (OSError, ValueError) as error:
-        raise GraspError(f"{path}: must be a PLY file of points, got: {one_line(error)}") from None
-    if len(surface.faces):
-        raise GraspError(f"{path}: must be a PLY file of points, got a mesh: sample its surface")
-    return UNITS[units] * surface.vertices
+        return UNITS[units] * load_points(path)
+    except MeshError as error:
+        raise GraspError(str(error)) from None
 
 
 def _of_depth(

@@ -192,8 +192,8 @@ def _parts(manifests: Mapping[Path, Manifest]) -> list[_Part]:
             if split != entry.split:
                 raise DataError(
                     f"{out}: {entry.mesh_name} must be in one split of all datasets, got it in "
-                    f"{entry.split}, and in {split} of {first}; --set split.seed=1 draws all splits "
-                    "anew"
+                    f"{entry.split}, and in {split} of {first}; --set split.seed=1 draws all "
+                    "splits anew"
                 )
 
     # A mesh keeps its name with the first seed, or if it has only one seed.

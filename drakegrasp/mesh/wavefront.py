@@ -1,10 +1,6 @@
-"""Wavefront files: read without changes, and written for Drake's in-memory meshes."""
+"""Wavefront texts, for Drake's in-memory meshes."""
 
 from __future__ import annotations
-
-import codecs
-from array import array
-from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +8,6 @@ import trimesh
 from scipy.sparse import coo_matrix
 
 from drakegrasp.frames import Array
-from drakegrasp.mesh.declared import Declared, triangulate
 from drakegrasp.mesh.surfaces import Faces
 
 #: Faces that meet at an angle below this are shaded as one smooth surface.
@@ -70,60 +65,3 @@ def _corner_normals(vertices: Array, faces: Faces) -> Array:
         @ weighted
     )
     return np.asarray(mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300))
-
-
-#: Statements of surfaces that are not polygons, and of other files.
-_NOT_READ = frozenset((b"surf", b"curv", b"bzp", b"bsp", b"cdp", b"res", b"call"))
-
-
-def declared_obj(content: bytes) -> Declared:
-    """Return the surface of a Wavefront file.
-
-    Raises:
-        ValueError: If a line cannot be read; the message has the line.
-    """
-    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        raise ValueError("text in UTF-16: save it in UTF-8")
-    positions, corners, counts = array("d"), array("q"), array("q")
-    for number, line in _lines(content):
-        words = line.split()
-        if not words:
-            continue
-        kind = words[0].lower()
-        try:
-            if kind == b"v":
-                x, y, z = words[1:4]
-                positions.extend((float(x), float(y), float(z)))
-            elif kind in (b"f", b"fo"):
-                total = len(positions) // 3
-                for word in words[1:]:
-                    index = int(word.partition(b"/")[0])
-                    if index == 0 or index < -total:
-                        raise ValueError(index)
-                    corners.append(index - 1 if index > 0 else total + index)
-                counts.append(len(words) - 1)
-        except (ValueError, OverflowError) as error:
-            text = line.strip()[:60].decode(errors="replace")
-            what = "x y z as numbers" if kind == b"v" else "vertices before it or numbers from 1"
-            raise ValueError(f"line {number}, {text!r}, which must have {what}") from error
-        if kind in _NOT_READ:
-            raise ValueError(f"line {number}, {kind.decode()!r}, which is no polygon")
-
-    return triangulate(
-        np.array(positions, dtype=np.float64).reshape(-1, 3),
-        np.array(corners, dtype=np.int64),
-        np.array(counts, dtype=np.int64),
-    )
-
-
-def _lines(content: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield each statement with the number of its last line; a backslash continues a line."""
-    begun = b""
-    for number, line in enumerate(content.removeprefix(codecs.BOM_UTF8).splitlines(), start=1):
-        said = begun + line.partition(b"#")[0].rstrip()
-        if said.endswith(b"\\"):
-            begun = said[:-1] + b" "
-            continue
-        begun = b""
-        yield number, said
-    yield 0, begun

@@ -48,11 +48,12 @@ from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
-from drakegrasp.errors import MachineError
+from drakegrasp.errors import MachineError, MeshError
 from drakegrasp.frames import X_WT, Array, make_pose, transform_points
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.shapes import hull_corners
+from drakegrasp.mesh.loading import join_scene, load_scene
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.environment import prepare_rendering
 from drakegrasp.vision.camera import Picture, object_colour
@@ -422,13 +423,13 @@ def _mesh(inspector: SceneGraphInspector, geometry: GeometryId) -> Any:
 
 
 def _file_mesh(inspector: SceneGraphInspector, geometry: GeometryId, shape: Mesh | Convex) -> Any:
-    """Return the mesh of a file; its convex hull if trimesh cannot read the file."""
+    """Return the mesh of a file; its convex hull if the file cannot be read."""
     source = shape.source()
     path = Path(str(source.path())) if source.is_path() else None
     if path is not None and path.is_file():
         try:
-            mesh = trimesh.load_mesh(path, process=False)
+            mesh = trimesh.Trimesh(*join_scene(load_scene(path)), process=False)
             return mesh.apply_scale(shape.scale3())
-        except (ValueError, NotImplementedError, ImportError):
+        except MeshError:
             pass
     return trimesh.convex.convex_hull(hull_corners(inspector, geometry))

@@ -159,7 +159,7 @@ def test_unit_that_grows_is_run_again(workers: int) -> None:
     assert target.taken() == {"poor": None}
     assert target.dry() == ["poor"]
     target.set_units("poor", units("poor", 20), endless=True)
-    assert [(unit.start, unit.stop) for unit in target.next_units()][0] == (8, 12)
+    assert next((unit.start, unit.stop) for unit in target.next_units()) == (8, 12)
     end(target, units("poor", 20)[2])
     target.set_units("poor", units("poor", PALMS), endless=False)
     assert run(target, workers) == {"poor": 36}

@@ -53,20 +53,20 @@ FILES = {
     "other files": ('<sdf version="1.7"><model name="a"><include><uri>model://b</uri></include>'
                     "</model></sdf>", "hand.sdf", "must be complete by itself, got <include>"),
     "missing mesh of MJCF": ('<mujoco><asset><mesh file="lost.stl"/></asset></mujoco>', "hand.xml",
-                             "lost.stl' must be a file, got none"),
-    "frame that holds a joint": (
-        re.sub("(<joint name=.*?/>)", r"<frame>\1</frame>", JAWS_MJCF, count=1), "hand.xml",
-        "<joint> must lie in a body, got it in a <frame>"),
+                             "lost.stl: must be a readable file, got: No such file"),
+    "other files of MJCF": ('<mujoco><asset><model name="a" file="b.xml"/></asset></mujoco>',
+                            "hand.xml", "must be complete by itself, got <model>"),
 }
 #: Of the jaws in URDF: what is replaced, how often (-1: everywhere), and what is said of it.
 URDF = {
-    "missing mesh": (JAW, FILE.format("lost.stl"), 1, "lost.stl' must be a file, got none"),
+    "missing mesh": (JAW, FILE.format("lost.stl"), 1, "lost.stl: must be a readable file, got"),
     "mesh of the web": (JAW, FILE.format("https://x.org/a.stl"), 1, "nothing is fetched"),
-    "mesh of another format": (JAW, FILE.format("jaw.step"), 1, r"one of \.obj, .* got '\.step'"),
-    "mesh of no name": (JAW, FILE.format(""), 1, r"must be one of \.obj, .* got ''"),
-    "broken mesh": (JAW, FILE.format("broken.glb"), 1, "broken.glb' must be readable, got"),
+    "mesh of another format": (JAW, FILE.format("jaw.step"), 1, r"must be one of .* '\.step'"),
+    "mesh of glTF": (JAW, FILE.format("tip.gltf"), 1, r"gltf: must be one of .* '\.gltf'"),
+    "mesh of no name": (JAW, FILE.format(""), 1, "must be a readable file, got: a folder"),
+    "broken mesh": (JAW, FILE.format("broken.glb"), 1, "mesh broken.glb: must be a valid .glb"),
     "mesh without triangles": (JAW, FILE.format("empty.obj"), 1,
-                               "'empty.obj' must hold triangles with finite corners"),
+                               "mesh empty.obj: must hold triangles, got no faces"),
     "mesh outside": (JAW, FILE.format("../broken.glb"), 1,
                      "'../broken.glb' must lie in the model's folder, got .* --root FOLDER"),
     "mesh of an unknown package": (JAW, FILE.format("package://other/jaw.stl"), 1,
@@ -138,6 +138,14 @@ MJCF = {
                                  "joint 'right_slide' must follow a joint, got an equality with a"),
     "bodies that are not written out": ("</worldbody>", '<replicate count="9"/></worldbody>', -1,
                                         "must have its bodies written out, got <replicate>"),
+    "soft body": ("<equality>", '<deformable><flex name="f" dim="1" body="body left_jaw" '
+                  'element="0 1"/></deformable><equality>', -1,
+                  "must be of rigid bodies, got <flex>"),
+    "ball joint": ("</body>\n  </body>", '<body name="b"><joint name="ball" type="ball"/><geom '
+                   'size="0.01"/></body></body></body>', -1,
+                   "joint 'ball' must be revolute, prismatic or fixed, got ball"),
+    "two roots": ("</worldbody>", '<body name="table"><geom size="1"/></body></worldbody>', -1,
+                  r"must be one tree of links, with one root, got 2 \(body, table\)"),
     "inertia of no body": (
         '<body name="left_jaw">',
         '<body name="left_jaw"><inertial pos="0 0 0" mass="1" diaginertia="1 1e-3 1e-3"/>', -1,
@@ -165,6 +173,8 @@ def test_a_spoilt_model_is_refused_in_one_line(tmp_path: Path, fault: str) -> No
     path = write_model(tmp_path, text, name)
     (tmp_path / "broken.glb").write_bytes(bytes(range(256)))
     (tmp_path / "empty.obj").write_text("v 0 0 0\n")
+    (tmp_path / "tip.gltf").write_text("{}")
+    (tmp_path / "jaw.step").write_text("ISO-10303-21;")
     out = tmp_path / "out"
     result = CliRunner().invoke(main, ["hand", "new", str(path), "--out", str(out)])
     assert result.exit_code == 2, result.output

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.mesh_files import CUBE, READ, REFUSED, dae, obj, write_file
 from helpers.vendors import JAWS, JAWS_MJCF, write_mesh, write_model
 from trimesh.transformations import translation_matrix
 
 from drakegrasp.commissioning.draft.model import VendorModel, read_model
-from drakegrasp.commissioning.draft.run import write_urdf
+from drakegrasp.commissioning.draft.run import draft_hand, write_urdf
 from drakegrasp.commissioning.draft.source import read_source
 from drakegrasp.errors import HandError
+from drakegrasp.hand.description import load_hand
+from drakegrasp.objects.audit import audit
 
 JAW_BOX = '<geometry><box size="0.02 0.012 0.06"/></geometry>'
 MESH = '<geometry><mesh filename="{}"/></geometry>'
@@ -105,6 +109,18 @@ TENDON = """<tendon><fixed name="t"><joint joint="left_slide" coef="0.5"/>
         ({LEFT: f'<frame pos="0 0.01 0"><frame euler="0 0 90">{LEFT}</frame></frame>'}, 60.0, 1.0),
         ({LEFT: f'{LEFT}<frame pos="0 0 -0.03"><geom size="0.01" mass="0.2"/></frame>'}, 60.0, 1.0),
         ({"<worldbody>": "<worldbody><frame>", "</worldbody>": "</frame></worldbody>"}, 60.0, 1.0),
+        ({JOINT: f'{JOINT} pos="0.01 0.02 0.03"'}, 60.0, 1.0),
+        ({LINE: 'active="false"', MOTOR: '<motor joint="left_slide" gear="3"/>'}, 0.0, None),
+        ({MOTOR: f'{MOTOR}<motor joint="left_slide" gear="2" forcerange="-5 5"/>'}, 70.0, 1.0),
+        (
+            {
+                LEFT: LEFT.replace("<joint ", "<frame><joint ").replace(
+                    '.05"/>', '.05"/></frame>', 1
+                )
+            },
+            60.0,
+            1.0,
+        ),
     ],
 )
 def test_mjcf_is_read_as_mujoco_compiles_it(
@@ -139,6 +155,131 @@ def test_mjcf_is_read_as_mujoco_compiles_it(
         X_WL = X_WR @ model.pose(name, drawn)
         centre = X_WL[:3, :3] @ link.inertia.get_com() + X_WL[:3, 3]
         np.testing.assert_allclose(centre, data.body(name).xipos, atol=1e-9)
+
+
+def test_a_body_of_two_joints_moves_as_in_mujoco(tmp_path: Path) -> None:
+    """About points beside its origin, and from positions at which the model is not drawn."""
+    mujoco = pytest.importorskip("mujoco")
+    lean = '<joint name="lean" axis="1 0.5 0" pos="0.01 0 0.02" range="-40 40" ref="10"/>'
+    text = JAWS_MJCF.replace(JOINT, f'{lean}{JOINT} pos="0 0.03 0" ref="0.02"')
+    text = text.replace(
+        '<body name="left_jaw">', '<body name="left_jaw" pos="0 0 0.01" euler="9 8 7">'
+    )
+    path = write_model(tmp_path, text, "hand.xml")
+    model, peer = read(path), mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(peer)
+    for lean_at, slide_at in ((0.0, 0.0), (0.3, 0.04), (-0.5, 0.01)):
+        data.joint("lean").qpos, data.joint("left_slide").qpos = lean_at, slide_at
+        mujoco.mj_kinematics(peer, data)
+        X_RL = model.pose("left_jaw", {"lean": lean_at, "left_slide": slide_at})
+        (shape,) = model.links["left_jaw"].collisions
+        X_RS = X_RL @ shape.X_LS
+        np.testing.assert_allclose(X_RS[:3, 3], data.geom_xpos[1], atol=1e-12)
+        np.testing.assert_allclose(X_RS[:3, :3].ravel(), data.geom_xmat[1], atol=1e-12)
+
+
+def test_what_mjcf_does_not_name_has_a_name(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    text = re.sub(r' name="(left|right)_(jaw|slide)"', "", JAWS_MJCF)
+    text = re.sub("<equality>.*</equality>|<actuator>.*</actuator>", "", text)
+    model = read(write_model(tmp_path, text, "hand.xml"))
+    assert list(model.links) == ["body", "body2", "body3"]
+    assert list(model.joints) == ["body-body2", "body-body3"]
+    twin = text.replace("<worldbody>", '<worldbody><body name="body3"/>')
+    with pytest.raises(HandError, match="names must be unique, got 'body3' twice"):
+        read(write_model(tmp_path, twin, "hand.xml"))
+
+
+PLATE = "0 0 0 .02 0 0 0 .012 0 .02 .012 0 0 0 .06 .02 0 .06 0 .012 .06 .02 .012 .06"
+
+
+def mesh_tip(attributes: str) -> dict[str, str]:
+    """Return changes by which the tip of the left jaw is a mesh."""
+    asset = f'<asset><mesh name="tip" {attributes}/></asset><worldbody>'
+    return {"<worldbody>": asset, TIP: '<geom type="mesh" mesh="tip"'}
+
+
+TIP = '<geom type="box" size="0.01 0.006 0.03" pos="0 0.006 0.03"'
+
+
+@pytest.mark.parametrize(
+    ("changes", "low", "high"),
+    [
+        ({TIP: '<geom type="box" size=".01" fromto="0 0 0 0 0 .06"'}, (-10, -10, 0), (10, 10, 60)),
+        ({TIP: '<geom type="ellipsoid" size=".01" fromto="0 0 0 0 0 .06"'},
+         (-10, -10, 0), (10, 10, 60)),
+        ({TIP: '<geom type="capsule" size=".01" fromto="0 0 0 .06 0 0"'},
+         (-10, -10, -10), (70, 10, 10)),
+        ({TIP: '<geom type="cylinder" size=".01" fromto="0 0 0 0 .06 0"'},
+         (-10, 0, -10), (10, 60, 10)),
+        ({TIP: '<geom type="sphere" size=".01" pos="0 0 .05"'}, (-10, -10, 40), (10, 10, 60)),
+        ({TIP: '<geom type="ellipsoid" size=".01 .02 .03"'}, (-10, -20, -30), (10, 20, 30)),
+        (mesh_tip(f'vertex="{PLATE}"'), (0, 0, 0), (20, 12, 60)),
+        (mesh_tip(f'vertex="{PLATE}" scale="2 1 1"'), (0, 0, 0), (40, 12, 60)),
+        (mesh_tip('file="jaw.stl" refpos="0 0 0.01"'), (-10, -6, -40), (10, 6, 20)),
+        (mesh_tip('file="jaw.obj" refquat="1 1 0 0"'), (-10, -30, -6), (10, 30, 6)),
+        (mesh_tip('file="jaw.glb"'), (-10, -6, -30), (10, 6, 30)),
+        (mesh_tip('builtin="cone" params="64 1" scale=".01 .01 .03"'),
+         (-10, -10, -30), (10, 10, 30)),
+        ({TIP: TIP.replace("size=", 'class="wide" size='), "<worldbody>":
+          '<default><default class="wide"><geom euler="90 0 0"/></default></default><worldbody>'},
+         (-10, -24, 24), (10, 36, 36)),
+    ],
+)  # fmt: skip
+def test_shapes_of_mjcf_are_those_that_mujoco_compiles(
+    tmp_path: Path, changes: dict[str, str], low: tuple[int, ...], high: tuple[int, ...]
+) -> None:
+    """Bounds in [mm]; the mass stays, and the picture has the same shape."""
+    pytest.importorskip("mujoco")
+    for suffix in ("stl", "obj", "glb"):
+        write_mesh(tmp_path / f"jaw.{suffix}")
+    text = JAWS_MJCF
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    link = read(write_model(tmp_path, text, "hand.xml")).links["left_jaw"]
+    for (shape,) in (link.collisions, link.visuals):
+        corners = 1e3 * shape.corners()
+        np.testing.assert_allclose(corners.min(axis=0), low, atol=0.3)
+        np.testing.assert_allclose(corners.max(axis=0), high, atol=0.3)
+    assert link.inertia.get_mass() == pytest.approx(0.05)
+
+
+def test_shapes_of_mjcf_collide_or_are_drawn_as_in_mujoco(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    more = ('<geom size="0.001" contype="0" conaffinity="0"/><geom size="0.002" group="3"/>'
+            '<geom size="0.003" contype="0" rgba="1 0 0 0"/>'
+            '<geom size="0.004" material="red"/>')  # fmt: skip
+    text = JAWS_MJCF.replace(TIP, more + TIP).replace(
+        "<worldbody>", '<asset><material name="red" rgba="1 0 0 1"/></asset><worldbody>'
+    )
+    text = text.replace('<body name="body">', '<body name="body"><geom type="plane" size="1 1 1"/>')
+    model = read(write_model(tmp_path, text, "hand.xml"))
+    link = model.links["left_jaw"]
+    sizes = [
+        [round(1e3 * float(s.corners().max(axis=0)[0])) for s in shapes]
+        for shapes in (link.collisions, link.visuals)
+    ]
+    assert sizes == [[2, 3, 4, 10], [1, 4, 10]]
+    assert [s.colour.tolist() for s in link.visuals] == [[0.5] * 3, [1.0, 0.0, 0.0], [0.5] * 3]
+    assert model.notes == ("link body: a shape of type plane is not kept",)
+
+
+def test_a_draft_of_mjcf_is_urdf_that_needs_no_mujoco(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("mujoco")
+    monkeypatch.setattr("drakegrasp.commissioning.draft.run.GRASPS", ())
+    text = JAWS_MJCF
+    for old, new in mesh_tip(f'vertex="{PLATE}"').items():
+        text = text.replace(old, new)
+    path = write_model(tmp_path, text, "hand.xml")
+    file = draft_hand(path, tmp_path / "out").path
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    assert load_hand(file).num_fingers == 2
+    assert not list(file.parent.glob("*.xml"))
+    with pytest.raises(HandError, match=r"^model: MJCF is read with MuJoCo, got none: pip inst"):
+        read(path)
 
 
 @pytest.mark.parametrize("moments", ["1 1e-6 1e-6", "0 0 0", "-1e-5 1e-5 1e-5", "1e-5 1e-5 3e-5"])
@@ -193,6 +334,47 @@ def test_meshes_of_many_formats_are_drawn(tmp_path: Path, suffix: str) -> None:
     assert len(again.links["left_jaw"].visuals) == 1
     if suffix == ".glb":
         np.testing.assert_allclose(again.links["left_jaw"].visuals[0].colour, [1.0, 0.15, 0.15])
+
+
+@pytest.mark.parametrize("case", [*READ, *REFUSED])
+def test_a_hand_reads_the_mesh_files_that_objects_read(tmp_path: Path, case: str) -> None:
+    """And refuses the others in the same words: there is one door for meshes."""
+    name, content, _ = (READ | REFUSED)[case]
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    write_file(folder, name, content)
+    (row,) = audit(folder, units="cm")
+    mesh = f'<mesh filename="meshes/{name}" scale="0.02 0.02 0.02"/>'
+    text = with_mesh("", "collision").replace('<mesh filename=""/>', mesh)
+    path = write_model(tmp_path, text.replace('xyz="0 0.006 0.03"', 'xyz="0 0 0"', 1))
+    if case in REFUSED:
+        assert row.status == "refused"
+        with pytest.raises(HandError) as caught:
+            read(path)
+        assert str(caught.value) == f"model: mesh {name}: {row.notes[0]}"
+        return
+    assert row.status != "refused"
+    (shape,) = read(path).links["left_jaw"].collisions
+    size = np.ptp(shape.corners(), axis=0)
+    np.testing.assert_allclose(size, 2.0 * np.array(row.extents), atol=1e-6)
+
+
+def test_a_picture_has_the_colour_of_a_material_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "jaw.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    (tmp_path / "other.mtl").symlink_to(tmp_path / "lost.mtl")
+    (tmp_path.parent / "far.mtl").write_text("newmtl red\nKd 0 0 1\n")
+    for name, colour in (("jaw.mtl", [1.0, 0.15, 0.15]), ("../far.mtl", None), ("lost.mtl", None)):
+        write_file(tmp_path, "jaw.obj", f"mtllib {name}\nusemtl red\n" + obj(CUBE / 20))
+        (shape,) = read(write_model(tmp_path, with_mesh("jaw.obj"))).links["left_jaw"].visuals
+        found = None if shape.colour is None else shape.colour.tolist()
+        assert found == colour or (colour is None and found != [0.15, 0.15, 1.0])
+
+
+def test_a_picture_in_collada_has_the_unit_of_its_file(tmp_path: Path) -> None:
+    pytest.importorskip("collada")
+    write_file(tmp_path, "jaw.dae", dae('<unit meter="0.001"/>', 60.0 * CUBE))
+    (shape,) = read(write_model(tmp_path, with_mesh("jaw.dae"))).links["left_jaw"].visuals
+    np.testing.assert_allclose(np.ptp(shape.corners(), axis=0), 0.06)
 
 
 def test_a_picture_that_cannot_be_read_is_left_out_and_said(tmp_path: Path) -> None:

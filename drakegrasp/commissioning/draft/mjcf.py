@@ -1,136 +1,49 @@
-"""MJCF as MuJoCo compiles it and as Drake reads it.
+"""MJCF as MuJoCo compiles it.
 
-Input: the XML of an MJCF file, and its meshes. Output: the same hand without the parts of
-the language that Drake drops (bodies and joints without names, frames, classes within classes), and
-the joints, couplings, efforts and inertias as MuJoCo compiles them; Drake reads only a part of
-these.
+Input: the XML of an MJCF file, and its meshes. Output: bodies with their shapes and inertias,
+joints, couplings and efforts, all of them from the compiled model.
 """
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias
-from xml.etree.ElementTree import Element
+from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
+from pydrake.geometry import Box, Capsule, Cylinder, Sphere
 from pydrake.math import RotationMatrix
 from pydrake.multibody.tree import RotationalInertia, SpatialInertia
 
 from drakegrasp.arithmetic import norm
+from drakegrasp.commissioning.draft.parts import ENDLESS, Carrier, Link, Parts, motion
+from drakegrasp.commissioning.draft.shapes import Shape, ellipsoid, read_mesh
+from drakegrasp.commissioning.draft.source import Source
 from drakegrasp.errors import HandError, one_line
-from drakegrasp.frames import Array
+from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.parsing import Mimic
+from drakegrasp.mesh.wavefront import obj_text
 
-#: Attributes that a class of MJCF gives to the elements of each tag.
-_Defaults = dict[str, dict[str, str]]
-#: Sections that are not about a hand.
-_ASIDE = ("size", "keyframe", "sensor", "visual", "statistic", "custom", "deformable")
-#: Elements that create bodies that the file does not write out.
-_MADE = ("replicate", "composite", "flexcomp", "attach", "model")
-
-
-def trim(root: Element) -> None:
-    """Remove sections that are not about a hand, and name each body and joint.
-
-    Raises:
-        HandError: If bodies are not written out.
-    """
-    for element in root.iter():
-        if element.tag in _MADE:
-            raise HandError(
-                f"model: must have its bodies written out, got <{element.tag}>: load and save it "
-                "with MuJoCo"
-            )
-    for section in [child for child in root if child.tag in _ASIDE]:
-        root.remove(section)
-    for material in root.iter("material"):
-        for layer in material.findall("layer"):
-            material.remove(layer)
-    for world in root.findall("worldbody"):
-        _name(world, "world", [0])
+#: Elements that are drawn only, and whose files are not read.
+_LOOKS = ("texture", "layer", "skin")
+#: Elements that make any number of bodies.
+_MADE = ("replicate", "flexcomp")
+#: First group of shapes that MuJoCo does not draw unless it is asked to.
+HIDDEN = 3
+#: Colour of a shape whose model gives none: that of its material is drawn.
+_PLAIN = np.array([0.5, 0.5, 0.5, 1.0])
 
 
-def _name(parent: Element, name: str, count: list[int]) -> None:
-    """Give names to the unnamed bodies and joints below an element.
-
-    Args:
-        parent: The element, which is the body `name` or a frame in this body.
-        name: Name of the body.
-        count: Number of bodies visited so far, in a list of one; it is increased.
-    """
-    for child in parent:
-        if child.tag == "frame":
-            _name(child, name, count)
-        elif child.tag == "body":
-            count[0] += 1
-            own = child.attrib.setdefault("name", f"body{count[0]}")
-            joints = [joint for joint in child.iterfind("joint") if not joint.get("name")]
-            for n, joint in enumerate(joints):
-                joint.set("name", f"{name}-{own}" + (f"-{n + 1}" if n else ""))
-            _name(child, own, count)
-
-
-def spell_out(root: Element) -> None:
-    """Replace frames by welded bodies, and write into each class the values that it inherits.
+def compile_parts(source: Source) -> Parts:
+    """Return the parts of an MJCF model.
 
     Raises:
-        HandError: If a frame contains a joint or an inertia of the body around it.
-    """
-    for world in root.findall("worldbody"):
-        _lift_frames(world)
-    for frame in root.iter("frame"):
-        if spoilt := [c.tag for c in frame if c.tag in ("joint", "freejoint", "inertial")]:
-            raise HandError(f"model: <{spoilt[0]}> must lie in a body, got it in a <frame>")
-    for n, frame in enumerate(list(root.iter("frame"))):
-        frame.tag = "body"
-        frame.set("name", f"drakegrasp_frame_{n}")
-    main: _Defaults = {}
-    for default in root.findall("default"):
-        main = _inherit(default, main)
-
-
-def _lift_frames(world: Element) -> None:
-    """Move the content of the world's frames into the world: the pose of the hand is not used."""
-    while (frame := world.find("frame")) is not None:
-        place = list(world).index(frame)
-        for child in frame:
-            if "childclass" in frame.attrib and child.tag in ("body", "frame"):
-                child.attrib.setdefault("childclass", frame.attrib["childclass"])
-        world.remove(frame)
-        world[place:place] = list(frame)
-
-
-def _inherit(default: Element, above: _Defaults) -> _Defaults:
-    """Write the values that a class of MJCF inherits into the class; return all its values.
-
-    Drake looks only at the next class, so values that this class does not name would be lost.
-    """
-    given = {tag: dict(attributes) for tag, attributes in above.items()}
-    own = [element for element in default if element.tag != "default"]
-    for element in own:
-        given.setdefault(element.tag, {}).update(element.attrib)
-        element.attrib.update(given[element.tag])
-    present = {element.tag for element in own}
-    default.extend(Element(tag, given[tag]) for tag in given if tag not in present)
-    for nested in default.findall("default"):
-        _inherit(nested, given)
-    return given
-
-
-#: Results of MuJoCo's compiler: M_BBo_B of each body with a mass; limits (2,) of each moving joint
-#: [rad or m]; the largest effort of each joint that has one [N m or N]; joints that follow others;
-#: and notes on what was left out, one line each.
-Compiled: TypeAlias = tuple[
-    dict[str, SpatialInertia], dict[str, Array], dict[str, float], list[Mimic], list[str]
-]
-
-
-def compile_model(path: Path) -> Compiled:
-    """Return MuJoCo's compilation of an MJCF file in which every body and joint has a name.
-
-    Raises:
-        HandError: If MuJoCo is missing or rejects the file, or an equality is not linear.
+        HandError: If MuJoCo is missing or rejects the file, or if the model has something that no
+            hand of rigid links has.
     """
     try:
         import mujoco
@@ -138,24 +51,194 @@ def compile_model(path: Path) -> Compiled:
         raise HandError(
             "model: MJCF is read with MuJoCo, got none: pip install 'drakegrasp[peer]'"
         ) from None
-    try:
-        model = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        text = one_line(error).replace(str(path.parent) + "/", "")
-        raise HandError(f"model: must be MJCF that MuJoCo reads, got {text}") from None
+    with tempfile.TemporaryDirectory() as scratch:
+        path = _write(source, Path(scratch))
+        try:
+            model = mujoco.MjModel.from_xml_path(str(path))
+        except ValueError as error:
+            text = one_line(error).replace(f"{scratch}/", "")
+            raise HandError(f"model: must be MJCF that MuJoCo reads, got {text}") from None
+    if model.nflex:
+        raise HandError("model: must be of rigid bodies, got <flex>")
 
-    kinds = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
-    endless = np.array([-np.inf, np.inf])
-    limits = {
-        model.joint(j).name: model.jnt_range[j].copy() if model.jnt_limited[j] else endless
-        for j, kind in enumerate(model.jnt_type.tolist())
-        if kind in kinds
+    # Bodies and joints without a name get one.
+    bodies = [model.body(b).name or f"body{b}" for b in range(model.nbody)]
+    joints = [model.joint(j).name or _joint_name(model, bodies, j) for j in range(model.njnt)]
+    for names in (bodies, joints):
+        if twins := sorted({name for name in names if names.count(name) > 1}):
+            raise HandError(f"model: names must be unique, got {twins[0]!r} twice")
+    carriers = list(_carriers(mujoco, model, bodies, joints))
+    mimics, notes = _mimics(mujoco, model, joints)
+    links: dict[Any, Link] = {}
+    for b in range(1, model.nbody):
+        links[b], left_out = _link(mujoco, model, b, bodies[b])
+        notes += left_out
+    for carrier in carriers:
+        bare = Link(name=f"{carrier.name}_end", inertia=SpatialInertia.Zero())
+        links.setdefault(carrier.child, bare)
+    return Parts(
+        name=model.names.partition(b"\0")[0].decode(),
+        bodies=links,
+        carriers=carriers,
+        efforts=_efforts(mujoco, model, joints),
+        mimics=mimics,
+        notes=notes,
+    )
+
+
+def _write(source: Source, folder: Path) -> Path:
+    """Write a model, whose meshes become Wavefront files beside it; return its path.
+
+    Raises:
+        HandError: If a mesh cannot be read.
+    """
+    # The compiler element specifies the folder of the meshes.
+    root, base = source.root, source.folder
+    for compiler in root.iter("compiler"):
+        place = compiler.attrib.pop("meshdir", None) or compiler.attrib.pop("assetdir", None)
+        base = source.folder / place if place else base
+        for key in ("assetdir", "texturedir", "strippath"):
+            compiler.attrib.pop(key, None)
+    for element in list(root.iter()):
+        if element.tag in _MADE:
+            raise HandError(
+                f"model: must have its bodies written out, got <{element.tag}>: load and save it "
+                "with MuJoCo"
+            )
+        element.attrib.pop("texture", None)
+        for child in [child for child in element if child.tag in _LOOKS]:
+            element.remove(child)
+
+    # If a mesh has no name, its name is that of the file.
+    for n, mesh in enumerate(root.iterfind("asset/mesh")):
+        if file := mesh.get("file"):
+            shape = read_mesh(source.find(file, base))
+            assert shape.vertices is not None and shape.faces is not None
+            text = obj_text(shape.vertices, shape.faces, normals=False)
+            (folder / f"{n}.obj").write_text(text, encoding="utf-8")
+            mesh.attrib.pop("content_type", None)
+            mesh.attrib.setdefault("name", Path(file).stem)
+            mesh.set("file", f"{n}.obj")
+    path = folder / "model.xml"
+    ElementTree.ElementTree(root).write(path, encoding="utf-8")
+    return path
+
+
+def _joint_name(model: Any, bodies: Sequence[str], j: int) -> str:
+    """Return a name for a joint: those of the bodies that it joins."""
+    body = int(model.jnt_bodyid[j])
+    n = j - int(model.body_jntadr[body])
+    return f"{bodies[model.body_parentid[body]]}-{bodies[body]}" + (f"-{n + 1}" if n else "")
+
+
+def _pose(p: Array, quaternion: Array) -> Array:
+    """Return a pose (4, 4) of a position (3,) and a quaternion w, x, y, z."""
+    R = RotationMatrix(Quaternion(quaternion / norm(quaternion)))
+    return make_pose(R.matrix(), p)
+
+
+def _carriers(
+    mujoco: Any, model: Any, bodies: Sequence[str], joints: Sequence[str]
+) -> Iterator[Carrier]:
+    """Yield what carries each body. The hand is free, however the file fixes it to the world.
+
+    A body with several joints has a body without mass between each two of them.
+    """
+    kinds = mujoco.mjtJoint
+    for b in range(1, model.nbody):
+        parent: Any = int(model.body_parentid[b])
+        if parent == 0:
+            continue
+        X_PB, first = _pose(model.body_pos[b], model.body_quat[b]), int(model.body_jntadr[b])
+        last = first + int(model.body_jntnum[b]) - 1
+        if last < first:
+            yield Carrier(name=bodies[b], parent=parent, child=b, X_PJ=X_PB, X_CJ=np.eye(4))
+        for j in range(first, last + 1):
+            kind = kinds(int(model.jnt_type[j]))
+            if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
+                raise HandError(
+                    f"model: joint {joints[j]!r} must be revolute, prismatic or fixed, got "
+                    f"{kind.name.removeprefix('mjJNT_').lower()}"
+                )
+
+            # The body is at X_PB where the joint has the position of the model's reference.
+            child = b if j == last else (b, j)
+            axis, slides = model.jnt_axis[j].copy(), kind == kinds.mjJNT_SLIDE
+            reference = float(model.qpos0[model.jnt_qposadr[j]])
+            X_BJ = make_pose(np.eye(3), model.jnt_pos[j])
+            yield Carrier(
+                name=joints[j],
+                parent=parent,
+                child=child,
+                X_PJ=X_PB @ X_BJ @ motion(axis, slides, -reference),
+                X_CJ=X_BJ,
+                axis=axis,
+                slides=slides,
+                limits=model.jnt_range[j].copy() if model.jnt_limited[j] else ENDLESS,
+            )
+            parent, X_PB = child, np.eye(4)
+
+
+def _link(mujoco: Any, model: Any, b: int, name: str) -> tuple[Link, list[str]]:
+    """Return a body with its shapes, and notes on the shapes that are left out."""
+    mass, inertia = float(model.body_mass[b]), SpatialInertia.Zero()
+    if not np.isfinite([mass, *model.body_inertia[b], *model.body_ipos[b]]).all():
+        raise HandError(f"model: mass and inertia of body {name!r} must be finite numbers")
+    if mass > 0.0:
+        R_BI = RotationMatrix(Quaternion(model.body_iquat[b] / norm(model.body_iquat[b])))
+        central = RotationalInertia(*model.body_inertia[b]).ReExpress(R_BI)
+        inertia = SpatialInertia.MakeFromCentralInertia(mass, model.body_ipos[b], central)
+
+    # Shapes collide, are drawn, or both.
+    collisions, visuals, notes = [], [], list[str]()
+    for g in np.flatnonzero(model.geom_bodyid == b).tolist():
+        shape, rgba = _shape(mujoco, model, g), _colour(model, g)
+        if shape is None:
+            kind = mujoco.mjtGeom(int(model.geom_type[g])).name.removeprefix("mjGEOM_").lower()
+            notes.append(f"link {name}: a shape of type {kind} is not kept")
+            continue
+        if model.geom_contype[g] or model.geom_conaffinity[g]:
+            collisions.append(shape)
+        if model.geom_group[g] < HIDDEN and rgba[3] > 0.0:
+            visuals.append(replace(shape, colour=rgba[:3]))
+    shapes = {"collisions": tuple(collisions), "visuals": tuple(visuals)}
+    return Link(name=name, inertia=inertia, **shapes), notes
+
+
+def _shape(mujoco: Any, model: Any, g: int) -> Shape | None:
+    """Return a shape on its body; None for a kind that no hand has."""
+    kinds, kind, size = mujoco.mjtGeom, int(model.geom_type[g]), model.geom_size[g]
+    X_BS = _pose(model.geom_pos[g], model.geom_quat[g])
+    primitives = {
+        kinds.mjGEOM_BOX: lambda: Box(2.0 * size),
+        kinds.mjGEOM_SPHERE: lambda: Sphere(size[0]),
+        kinds.mjGEOM_CAPSULE: lambda: Capsule(size[0], 2.0 * size[1]),
+        kinds.mjGEOM_CYLINDER: lambda: Cylinder(size[0], 2.0 * size[1]),
     }
-    mimics, notes = _mimics(mujoco, model)
-    return _inertias(model), limits, _efforts(mujoco, model), mimics, notes
+    if kind in primitives:
+        return Shape(X_LS=X_BS, primitive=primitives[kind]())
+    if kind == kinds.mjGEOM_ELLIPSOID:
+        return Shape(X_LS=X_BS, **ellipsoid(size))
+    if kind != kinds.mjGEOM_MESH:
+        return None
+
+    # A mesh, in the frame that MuJoCo gives it.
+    m = int(model.geom_dataid[g])
+    start, face = int(model.mesh_vertadr[m]), int(model.mesh_faceadr[m])
+    vertices = model.mesh_vert[start : start + model.mesh_vertnum[m]].astype(float)
+    faces = model.mesh_face[face : face + model.mesh_facenum[m]].astype(np.int64)
+    return Shape(X_LS=X_BS, vertices=vertices, faces=faces)
 
 
-def _mimics(mujoco: Any, model: Any) -> tuple[list[Mimic], list[str]]:
+def _colour(model: Any, g: int) -> Array:
+    """Return the colour (4,) with which MuJoCo draws a shape."""
+    own, material = np.asarray(model.geom_rgba[g], dtype=float), int(model.geom_matid[g])
+    if material >= 0 and np.array_equal(own, _PLAIN):
+        return np.asarray(model.mat_rgba[material], dtype=float)
+    return own
+
+
+def _mimics(mujoco: Any, model: Any, joints: Sequence[str]) -> tuple[list[Mimic], list[str]]:
     """Return the active equalities of joints, and a note for each other active equality."""
     mimics, notes = [], []
     for e in np.flatnonzero(model.eq_active0):
@@ -164,7 +247,7 @@ def _mimics(mujoco: Any, model: Any) -> tuple[list[Mimic], list[str]]:
             notes.append(f"equality <{kind.name.removeprefix('mjEQ_').lower()}>: is not kept")
             continue
         follower, led_by = model.eq_obj1id[e], model.eq_obj2id[e]
-        name = model.joint(follower).name
+        name = joints[follower]
         offset, ratio, *rest = (float(x) for x in model.eq_data[e, :5])
         if led_by < 0:
             raise HandError(
@@ -177,12 +260,11 @@ def _mimics(mujoco: Any, model: Any) -> tuple[list[Mimic], list[str]]:
         # Equalities hold between displacements from the posture that the file draws.
         zero, start = (float(q) for q in model.qpos0[model.jnt_qposadr[[follower, led_by]]])
         offset += zero - ratio * start
-        leader = model.joint(led_by).name
-        mimics.append(Mimic(joint=name, leader=leader, ratio=ratio, offset=offset))
+        mimics.append(Mimic(joint=name, leader=joints[led_by], ratio=ratio, offset=offset))
     return mimics, notes
 
 
-def _efforts(mujoco: Any, model: Any) -> dict[str, float]:
+def _efforts(mujoco: Any, model: Any, joints: Sequence[str]) -> dict[str, float]:
     """Return the total effort of each joint's actuators at rest, within the joint's own limit."""
     total: dict[int, Array] = {}
     for a in range(len(model.actuator_trntype)):
@@ -198,7 +280,7 @@ def _efforts(mujoco: Any, model: Any) -> dict[str, float]:
             most = model.jnt_actfrcrange[j]
             span = most if span is None else np.clip(span, *most)
         if span is not None:
-            efforts[model.joint(j).name] = float(np.abs(span).max())
+            efforts[joints[j]] = float(np.abs(span).max())
     return efforts
 
 
@@ -236,17 +318,3 @@ def _force(mujoco: Any, model: Any, a: int) -> Array:
     if model.actuator_forcelimited[a]:
         force = np.clip(force, *model.actuator_forcerange[a])
     return force
-
-
-def _inertias(model: Any) -> dict[str, SpatialInertia]:
-    """Return M_BBo_B of each body with a mass, except for the world."""
-    found = {}
-    for b in range(1, model.nbody):
-        name, mass = model.body(b).name, float(model.body_mass[b])
-        if not np.isfinite([mass, *model.body_inertia[b], *model.body_ipos[b]]).all():
-            raise HandError(f"model: mass and inertia of body {name!r} must be finite numbers")
-        if mass > 0.0:
-            R_BI = RotationMatrix(Quaternion(model.body_iquat[b] / norm(model.body_iquat[b])))
-            central = RotationalInertia(*model.body_inertia[b]).ReExpress(R_BI)
-            found[name] = SpatialInertia.MakeFromCentralInertia(mass, model.body_ipos[b], central)
-    return found

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import re
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,8 @@ from pydrake.math import RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 
-from drakegrasp.commissioning.draft.mjcf import compile_model, spell_out, trim
+from drakegrasp.commissioning.draft.mjcf import compile_parts
+from drakegrasp.commissioning.draft.parts import Carrier, Link, Parts, motion
 from drakegrasp.commissioning.draft.shapes import (
     Shape,
     added,
@@ -32,7 +33,7 @@ from drakegrasp.commissioning.draft.shapes import (
 )
 from drakegrasp.commissioning.draft.source import FORMATS, Source
 from drakegrasp.errors import HandError, first_line
-from drakegrasp.frames import Array, invert_pose, rotation_about, transform_points
+from drakegrasp.frames import Array, invert_pose, transform_points
 from drakegrasp.hand.parsing import (
     Mimic,
     declared_efforts,
@@ -59,38 +60,8 @@ SMALLEST_TURN, LARGEST_TURN, MASSES = 0.1, 2.0 * np.pi, (0.01, 60.0)
 HOLLOW = 0.01
 #: Mass [kg] and radius [m] of a moving link that has neither mass nor shape.
 BARE_MASS, BARE_RADIUS = 1e-3, 0.016
-#: Drake's warnings on parts that MuJoCo reads or that no hand has, or that are reported elsewhere.
-_ASIDE = re.compile(
-    "child of '(equality|actuator|tendon|contact|sensor|asset|option|default)'|'(light|camera|site|"
-    "compiler|option|tendon|equality|sensor|contact|exclude|transmission|gazebo|general)'|"
-    "effort limits|inertia|'actuatorfrc|The motor"
-)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Link:
-    """A rigid link: a vendor's links that are welded together, under the name of the heaviest.
-
-    Attributes:
-        name: Name of the link.
-        inertia: M_LLo_L; zero for a body whose model gives none, before it is welded.
-        collisions: Convex collision shapes.
-        visuals: Shapes that are drawn.
-    """
-
-    name: str
-    inertia: SpatialInertia
-    collisions: tuple[Shape, ...]
-    visuals: tuple[Shape, ...]
-
-    def corners(self) -> Array:
-        """Return the corners (n, 3) of the collision shapes [m]."""
-        return np.concatenate([np.zeros((0, 3)), *[s.corners() for s in self.collisions]])
-
-    @property
-    def weight(self) -> tuple[float, int, int]:
-        """Rank of the link among the links welded to it: the highest gives its name to all."""
-        return self.inertia.get_mass(), len(self.collisions), len(self.visuals)
+#: Drake's warnings on parts that no hand has, or that are reported elsewhere.
+_ASIDE = re.compile("'(light|camera|sensor|transmission|gazebo)'|effort limits|inertia")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -120,13 +91,7 @@ class VendorJoint:
 
     def motion(self, positions: Array | float) -> Array:
         """Return the poses (..., 4, 4) of the child at positions (...), relative to position 0."""
-        positions = np.asarray(positions, dtype=float)
-        X = np.zeros((*positions.shape, 4, 4)) + np.eye(4)
-        if self.slides:
-            X[..., :3, 3] = positions[..., None] * self.axis
-        else:
-            X[..., :3, :3] = rotation_about(self.axis, positions)
-        return X
+        return motion(self.axis, self.slides, positions)
 
     def pose(self, position: float) -> Array:
         """Return the pose (4, 4) of the child in the parent at a position [rad or m]."""
@@ -203,63 +168,68 @@ def read_model(source: Source) -> VendorModel:
     Raises:
         HandError: If it is not a tree of rigid links with readable meshes, in one line.
     """
-    # Read what the text declares and Drake does not keep.
-    root = source.root
-    is_mjcf = root.tag == "mujoco"
-    masses = {} if is_mjcf else declared_masses(root)
-    for name, mass in masses.items():
-        if not 0.0 <= mass < np.inf:
-            raise HandError(f"model: link {name!r} must have a mass of 0 kg or more, got {mass:g}")
-    impossible = {} if is_mjcf else impossible_inertias(root)
-    if not is_mjcf:
-        refuse_impossible(root)
-
-    # Parse it with Drake, and MJCF also with MuJoCo.
-    with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch) / f"model.{FORMATS[root.tag]}"
-        if is_mjcf:
-            trim(root)
-        meshes, notes = replace_meshes(source, path.parent)
-        inertias, limits, said = None, dict[str, Array](), list[str]()
-        if is_mjcf:
-            ElementTree.ElementTree(root).write(path, encoding="utf-8")
-            inertias, limits, efforts, mimics, said = compile_model(path)
-            spell_out(root)
-        else:
-            efforts, mimics = declared_efforts(root), declared_mimics(root)
-        ElementTree.ElementTree(root).write(path, encoding="utf-8")
-        plant, graph = MultibodyPlant(1e-3), SceneGraph()
-        plant.RegisterAsSourceForSceneGraph(graph)
-        instance, warned = _parse(plant, path)
-        bodies = _bodies(plant, graph, instance, masses, meshes, inertias)
-    moved = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
-    if is_mjcf:
-        _refuse_lost("joint", limits, {joint.name() for joint in moved})
-        _refuse_lost("body", inertias or (), {body.name for body in bodies.values()})
-    else:
-        for motor in map(plant.get_joint_actuator, plant.GetJointActuatorIndices()):
-            efforts.setdefault(motor.joint().name(), motor.effort_limit())
+    # MuJoCo reads MJCF, and Drake the other formats.
+    parts = (compile_parts if source.root.tag == "mujoco" else _parse_parts)(source)
+    impossible = {} if source.root.tag == "mujoco" else impossible_inertias(source.root)
 
     # Build links and joints, and find their leaders.
-    carriers = _carriers(plant, moved, bodies)
-    places, links = _places(bodies, carriers), {}
+    carriers = _carriers(parts)
+    places, links, notes = _places(parts.bodies, carriers), {}, list(parts.notes)
     for head in dict.fromkeys(head for head, _ in places.values()):
-        members = [(bodies[i], X_LB) for i, (at, X_LB) in places.items() if at == head]
+        members = [(parts.bodies[i], X_LB) for i, (at, X_LB) in places.items() if at == head]
         links[head], remarks = _weld(members, impossible)
-        warned += remarks
-    joints = _joints(carriers, places, links, efforts, limits)
-    leaders = find_leaders(mimics, joints)
-    widened = list(make_room(joints, leaders))
+        notes += remarks
+    joints = _joints(carriers, places, links, parts.efforts)
+    leaders = find_leaders(parts.mimics, joints)
+    notes += make_room(joints, leaders)
     model = VendorModel(
-        name=plant.GetModelInstanceName(instance),
-        root=next(link.name for index, link in links.items() if index not in carriers),
+        name=parts.name,
+        root=next(link.name for key, link in links.items() if key not in carriers),
         links={link.name: link for link in links.values()},
         joints=joints,
         mimics=leaders,
-        notes=(*notes, *said, *warned, *widened),
+        notes=tuple(notes),
     )
     _refuse_size(model)
     return model
+
+
+def _parse_parts(source: Source) -> Parts:
+    """Return the parts of a URDF or SDFormat model.
+
+    Raises:
+        HandError: If Drake rejects the model, or its numbers are impossible.
+    """
+    # Read what the text declares and Drake does not keep.
+    root = source.root
+    masses = declared_masses(root)
+    for name, mass in masses.items():
+        if not 0.0 <= mass < np.inf:
+            raise HandError(f"model: link {name!r} must have a mass of 0 kg or more, got {mass:g}")
+    refuse_impossible(root)
+    efforts, mimics = declared_efforts(root), declared_mimics(root)
+
+    # Parse it with Drake.
+    plant, graph = MultibodyPlant(1e-3), SceneGraph()
+    plant.RegisterAsSourceForSceneGraph(graph)
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / f"model.{FORMATS[root.tag]}"
+        meshes, notes = replace_meshes(source, path.parent)
+        ElementTree.ElementTree(root).write(path, encoding="utf-8")
+        instance, warned = _parse(plant, path)
+        bodies = _bodies(plant, graph, instance, masses, meshes)
+    for motor in map(plant.get_joint_actuator, plant.GetJointActuatorIndices()):
+        efforts.setdefault(motor.joint().name(), motor.effort_limit())
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
+    world = plant.world_body().index()
+    return Parts(
+        name=plant.GetModelInstanceName(instance),
+        bodies=bodies,
+        carriers=[_carrier(joint) for joint in joints if joint.parent_body().index() != world],
+        efforts=efforts,
+        mimics=mimics,
+        notes=[*notes, *warned],
+    )
 
 
 def _parse(plant: MultibodyPlant, path: Path) -> tuple[Any, list[str]]:
@@ -289,10 +259,9 @@ def _bodies(
     instance: Any,
     masses: Mapping[str, float],
     meshes: Mapping[str, Shape],
-    inertias: Mapping[str, SpatialInertia] | None,
-) -> dict[Any, Link]:
+) -> dict[Hashable, Link]:
     """Return the bodies that Drake parsed, before welded bodies are joined."""
-    found = {}
+    found = dict[Hashable, Link]()
     for index in plant.GetBodyIndices(instance):
         body = plant.get_body(index)
         name, mass = body.name(), body.default_mass()
@@ -306,42 +275,53 @@ def _bodies(
 
         # Drake replaces a mass of zero by its own value. Shapes without bounds are left out.
         inertia = SpatialInertia.Zero()
-        if inertias is not None:
-            inertia = inertias.get(name, inertia)
-        elif masses.get(name, mass) != 0.0 and mass != 0.0:
+        if masses.get(name, mass) != 0.0 and mass != 0.0:
             inertia = body.default_spatial_inertia()
         solids, visuals = (tuple(s for s in own if s is not None) for own in shapes)
         found[index] = Link(name=name, inertia=inertia, collisions=solids, visuals=visuals)
     return found
 
 
-def _refuse_lost(kind: str, of_mujoco: Iterable[str], of_drake: Set[str]) -> None:
-    """Reject joints or bodies that MuJoCo reads and Drake does not."""
-    for name in of_mujoco:
-        if name not in of_drake:
-            raise HandError(f"model: {kind} {name!r} of MuJoCo must be one of Drake, got none")
+def _carrier(joint: Any) -> Carrier:
+    """Return what a joint of Drake is."""
+    refuse_other_joint(joint)
+    X_PJ, X_CJ = (
+        np.asarray(frame.GetFixedPoseInBodyFrame().GetAsMatrix4())
+        for frame in (joint.frame_on_parent(), joint.frame_on_child())
+    )
+    ends = {
+        "name": joint.name(),
+        "parent": joint.parent_body().index(),
+        "child": joint.child_body().index(),
+    }
+
+    # A weld may hold its child away from its frame.
+    if not moving_joint(joint):
+        return Carrier(**ends, X_PJ=X_PJ @ joint.X_FM().GetAsMatrix4(), X_CJ=X_CJ)
+    return Carrier(
+        **ends,
+        X_PJ=X_PJ,
+        X_CJ=X_CJ,
+        axis=joint_axis(joint),
+        slides=joint_slides(joint),
+        limits=np.array([joint.position_lower_limit(), joint.position_upper_limit()]),
+        velocity=float(joint.velocity_upper_limit()),
+    )
 
 
-def _carriers(
-    plant: MultibodyPlant, joints: Sequence[Any], bodies: Mapping[Any, Link]
-) -> dict[Any, Any]:
-    """Return the joint to the parent of each body except for the root."""
-    # The hand is free, however the file fixes it to the world.
-    found: dict[Any, Any] = {}
-    for joint in joints:
-        if joint.parent_body().index() == plant.world_body().index():
-            continue
-        refuse_other_joint(joint)
-        child = joint.child_body()
-        if child.index() in found:
+def _carriers(parts: Parts) -> dict[Hashable, Carrier]:
+    """Return what carries each body except for the root."""
+    found: dict[Hashable, Carrier] = {}
+    for carrier in parts.carriers:
+        if carrier.child in found:
             raise HandError(
-                f"model: link {child.name()!r} must be carried by one joint, got "
-                f"{found[child.index()].name()!r} and {joint.name()!r}: cut the closed loop"
+                f"model: link {parts.bodies[carrier.child].name!r} must be carried by one joint, "
+                f"got {found[carrier.child].name!r} and {carrier.name!r}: cut the closed loop"
             )
-        found[child.index()] = joint
+        found[carrier.child] = carrier
 
     # One body must be left that has no parent.
-    roots = [body.name for index, body in bodies.items() if index not in found]
+    roots = [body.name for key, body in parts.bodies.items() if key not in found]
     if len(roots) != 1:
         got = f"{len(roots)} ({', '.join(roots)})" if roots else "none: its joints form a loop"
         raise HandError(f"model: must be one tree of links, with one root, got {got}")
@@ -349,38 +329,33 @@ def _carriers(
 
 
 def _places(
-    bodies: Mapping[Any, Link], carriers: Mapping[Any, Any]
-) -> dict[Any, tuple[Any, Array]]:
+    bodies: Mapping[Hashable, Link], carriers: Mapping[Hashable, Carrier]
+) -> dict[Hashable, tuple[Hashable, Array]]:
     """Return for each body the first body of its link, and its pose (4, 4) in the link.
 
     Bodies come after their parents.
     """
     # Go from the root outwards. The frame of a link is that of its joint.
-    order = [index for index in bodies if index not in carriers]
-    places: dict[Any, tuple[Any, Array]] = {}
-    for index in order:
-        joint = carriers.get(index)
-        if joint is None:
-            places[index] = index, np.eye(4)
-        elif moving_joint(joint):
-            places[index] = index, invert_pose(_fixed(joint.frame_on_child()))
+    order = [key for key in bodies if key not in carriers]
+    places: dict[Hashable, tuple[Hashable, Array]] = {}
+    for key in order:
+        carrier = carriers.get(key)
+        if carrier is None:
+            places[key] = key, np.eye(4)
+        elif carrier.axis is not None:
+            places[key] = key, invert_pose(carrier.X_CJ)
         else:
-            head, X_LP = places[joint.parent_body().index()]
-            X_PC = _fixed(joint.frame_on_parent()) @ joint.X_FM().GetAsMatrix4()
-            places[index] = head, X_LP @ X_PC @ invert_pose(_fixed(joint.frame_on_child()))
-        order += [i for i, above in carriers.items() if above.parent_body().index() == index]
+            head, X_LP = places[carrier.parent]
+            places[key] = head, X_LP @ carrier.X_PJ @ invert_pose(carrier.X_CJ)
+        order += [child for child, above in carriers.items() if above.parent == key]
     if len(order) < len(bodies):
-        lost = next(body.name for index, body in bodies.items() if index not in places)
+        lost = next(body.name for key, body in bodies.items() if key not in places)
         raise HandError(f"model: must be one tree of links, got a loop at link {lost!r}")
 
     # The frame of the root is that of its heaviest body.
-    members = [index for index, (head, _) in places.items() if head == order[0]]
-    X_LR = invert_pose(places[max(members, key=lambda i: bodies[i].weight)][1])
-    return places | {index: (order[0], X_LR @ places[index][1]) for index in members}
-
-
-def _fixed(frame: Any) -> Array:
-    return np.asarray(frame.GetFixedPoseInBodyFrame().GetAsMatrix4())
+    members = [key for key, (head, _) in places.items() if head == order[0]]
+    X_LR = invert_pose(places[max(members, key=lambda key: bodies[key].weight)][1])
+    return places | {key: (order[0], X_LR @ places[key][1]) for key in members}
 
 
 def _weld(
@@ -432,40 +407,37 @@ def _weld(
         )
         likely = solid_inertia(collisions) if collisions else ball
         total = SpatialInertia(total.get_mass(), likely.get_com(), likely.get_unit_inertia())
-    shapes = {"collisions": tuple(collisions), "visuals": tuple(visuals)}
-    return Link(name=name, inertia=total, **shapes), notes
+    drawn = tuple(shape.simplified() for shape in visuals)
+    return Link(name=name, inertia=total, collisions=tuple(collisions), visuals=drawn), notes
 
 
 def _joints(
-    carriers: Mapping[Any, Any],
-    places: Mapping[Any, tuple[Any, Array]],
-    links: Mapping[Any, Link],
+    carriers: Mapping[Hashable, Carrier],
+    places: Mapping[Hashable, tuple[Hashable, Array]],
+    links: Mapping[Hashable, Link],
     efforts: Mapping[str, float],
-    ranges: Mapping[str, Array],
 ) -> dict[str, VendorJoint]:
     """Return the joints that move, by name, each after those above its parent."""
     found = {}
-    for index in links:
-        joint = carriers.get(index)
-        if joint is None:
+    for key in links:
+        carrier = carriers.get(key)
+        if carrier is None or carrier.axis is None:
             continue
-        name, (head, X_LP) = joint.name(), places[joint.parent_body().index()]
-        drakes = np.array([joint.position_lower_limit(), joint.position_upper_limit()])
-        limits = ranges.get(name, drakes)
-        refuse_limits(name, *limits)
+        name, (head, X_LP) = carrier.name, places[carrier.parent]
+        refuse_limits(name, *carrier.limits)
 
         # Infinite efforts give no information.
         effort = efforts.get(name, 0.0)
         found[name] = VendorJoint(
             name=name,
-            slides=joint_slides(joint),
+            slides=carrier.slides,
             parent=links[head].name,
-            child=links[index].name,
-            X_PJ=X_LP @ _fixed(joint.frame_on_parent()),
-            axis=joint_axis(joint),
-            limits=limits,
+            child=links[key].name,
+            X_PJ=X_LP @ carrier.X_PJ,
+            axis=carrier.axis,
+            limits=carrier.limits,
             effort=effort if np.isfinite(effort) else 0.0,
-            velocity=float(joint.velocity_upper_limit()),
+            velocity=carrier.velocity,
         )
     return found
 

@@ -34,13 +34,13 @@ from drakegrasp.commissioning.checks import (
 from drakegrasp.commissioning.draft.fingers import Answers, find_fingers, find_palm
 from drakegrasp.commissioning.draft.grips import clear_grips, find_grips, find_members
 from drakegrasp.commissioning.draft.model import (
-    Link,
     VendorJoint,
     VendorModel,
     doubtful_units,
     read_model,
 )
 from drakegrasp.commissioning.draft.palm import find_palm_frames
+from drakegrasp.commissioning.draft.parts import Link
 from drakegrasp.commissioning.draft.shapes import Shape
 from drakegrasp.commissioning.draft.source import read_source
 from drakegrasp.commissioning.draft.tree import Draft, draft_tree, positions, unused_parts

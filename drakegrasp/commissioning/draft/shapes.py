@@ -9,7 +9,6 @@ becomes a convex hull.
 from __future__ import annotations
 
 import hashlib
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from xml.etree.ElementTree import Element
 
 import fast_simplification
 import numpy as np
+import numpy.typing as npt
 import trimesh
 from pydrake.geometry import (
     Box,
@@ -36,16 +36,15 @@ from scipy.spatial import cKDTree
 
 from drakegrasp.arithmetic import dot
 from drakegrasp.commissioning.draft.source import Source
-from drakegrasp.errors import HandError, first_line
+from drakegrasp.errors import HandError, MeshError
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.shapes import ball_corners, hull_corners, primitive_corners
+from drakegrasp.mesh.loading import join_scene, load_scene
 from drakegrasp.mesh.surfaces import Faces
 from drakegrasp.mesh.wavefront import obj_text
 
-#: Formats of mesh files.
-FORMATS = (".obj", ".stl", ".dae", ".glb", ".gltf", ".ply")
-#: Maximum size of a mesh file [bytes]; number of faces to which larger meshes are simplified.
-LARGEST, MOST_FACES = 200_000_000, 8_000
+#: Number of faces to which larger meshes are simplified.
+MOST_FACES = 8_000
 #: Lower bound of colours, because the details of a black hand are invisible in a picture.
 DARKEST = 0.15
 #: Number of corners of the hull of a collision mesh; on a ball of 10 mm radius they miss less than
@@ -92,10 +91,20 @@ class Shape:
         if np.ptp(points, axis=0).min() < THIN / 4.0:
             points = np.concatenate([points - THIN / 2.0, points + THIN / 2.0])
 
-        # The farthest points along even directions.
-        directions = np.concatenate([np.eye(3), -np.eye(3), ball_corners(1.0, CORNERS)])
+        # The farthest points along the link's axes, and along even directions.
+        axes = self.X_LS[:3, :3]
+        directions = np.concatenate([axes, -axes, ball_corners(1.0, CORNERS)])
         farthest = np.unique([int(np.argmax(dot(points, d))) for d in directions])
         return _with_hull(self, points[farthest])
+
+    def simplified(self) -> Shape:
+        """Return a mesh with at most `MOST_FACES` faces, to be drawn; other shapes unchanged."""
+        if self.vertices is None or self.faces is None or len(self.faces) <= MOST_FACES:
+            return self
+        vertices, faces = fast_simplification.simplify(
+            self.vertices.astype(np.float32), self.faces.astype(np.int32), target_count=MOST_FACES
+        )
+        return replace(self, vertices=vertices.astype(float), faces=faces.astype(np.int64))
 
     def reach_beyond(self, mesh: Shape) -> float:
         """Return the largest distance of the surface of a hull from that of its mesh [m]."""
@@ -144,11 +153,15 @@ def read_shape(
         colour = mesh.colour if colour is None else colour
         return replace(found, vertices=vertices, faces=mesh.faces, colour=colour)
     if isinstance(shape, Ellipsoid):
-        ball = trimesh.creation.icosphere(2)
-        axes = [shape.a(), shape.b(), shape.c()]
-        return replace(found, vertices=np.array(ball.vertices) * axes, faces=ball.faces)
+        return replace(found, **ellipsoid([shape.a(), shape.b(), shape.c()]))
     corners = hull_corners(inspector, geometry)
     return None if corners is None else _with_hull(found, corners)
+
+
+def ellipsoid(axes: npt.ArrayLike) -> dict[str, Any]:
+    """Return vertices and faces of an ellipsoid with half axes (3,) [m]."""
+    ball = trimesh.creation.icosphere(2)
+    return {"vertices": np.array(ball.vertices) * np.asarray(axes), "faces": np.array(ball.faces)}
 
 
 def solid_inertia(shapes: Sequence[Shape]) -> SpatialInertia:
@@ -179,7 +192,7 @@ def added(one: SpatialInertia, other: SpatialInertia) -> SpatialInertia:
 
 
 def replace_meshes(source: Source, folder: Path) -> tuple[dict[str, Shape], list[str]]:
-    """Replace every mesh in the XML by a Wavefront file in a folder.
+    """Replace every mesh in the XML of a URDF or SDFormat model by a Wavefront file in a folder.
 
     A visual shape that cannot be read is left out; the collision shapes are drawn instead.
 
@@ -191,21 +204,19 @@ def replace_meshes(source: Source, folder: Path) -> tuple[dict[str, Shape], list
     """
     files: dict[str, Shape] = {}
 
-    def convert(uri: str, base: Path) -> str:
-        path = source.find(uri, base)
+    def convert(uri: str) -> str:
+        path = source.find(uri, source.folder)
         name = f"{hashlib.sha256(str(path).encode()).hexdigest()[:16]}.obj"
         if name not in files:
-            mesh = files[name] = _read_mesh(path)
-            assert mesh.vertices is not None and mesh.faces is not None
-            text = obj_text(mesh.vertices, mesh.faces, normals=True)
+            files[name] = read_mesh(path)
+            # Drake must find a file, but its triangles are not used.
+            few = files[name].simplified()
+            assert few.vertices is not None and few.faces is not None
+            text = obj_text(few.vertices, few.faces, normals=False)
             (folder / name).write_text(text, encoding="utf-8")
         return name
 
-    # In URDF and SDFormat, shapes of links contain the meshes.
     notes: list[str] = []
-    if source.root.tag == "mujoco":
-        _replace_assets(source, convert)
-        return files, notes
     for link in source.root.iter("link"):
         for shape in [*link.findall("collision"), *link.findall("visual")]:
             try:
@@ -219,77 +230,31 @@ def replace_meshes(source: Source, folder: Path) -> tuple[dict[str, Shape], list
     return files, notes
 
 
-def _replace(mesh: Element, source: Source, convert: Callable[[str, Path], str]) -> None:
+def _replace(mesh: Element, source: Source, convert: Callable[[str], str]) -> None:
     """Change the file that a mesh element of a URDF or SDFormat model names."""
     if source.root.tag == "robot":
-        mesh.set("filename", convert(mesh.get("filename", ""), source.folder))
+        mesh.set("filename", convert(mesh.get("filename", "")))
         return
     uri = mesh.find("uri")
     if uri is None or mesh.find("submesh") is not None:
         raise HandError("model: a mesh must be a whole file, got <submesh> or no <uri>")
-    uri.text = convert((uri.text or "").strip(), source.folder)
+    uri.text = convert((uri.text or "").strip())
 
 
-def _replace_assets(source: Source, convert: Callable[[str, Path], str]) -> None:
-    """Replace the files of an MJCF model's meshes, and leave out its textures."""
-    # The compiler element specifies the folder of the meshes.
-    base = source.folder
-    for compiler in source.root.iter("compiler"):
-        place = compiler.attrib.pop("meshdir", None) or compiler.attrib.pop("assetdir", None)
-        base = base / place if place else base
-        for key in ("assetdir", "texturedir", "strippath"):
-            compiler.attrib.pop(key, None)
-
-    # If a mesh has no name, its name is that of the file.
-    for assets in source.root.iter("asset"):
-        for element in list(assets):
-            if element.tag == "texture":
-                assets.remove(element)
-            element.attrib.pop("texture", None)
-            file = element.get("file")
-            if element.tag == "mesh" and file:
-                element.attrib.setdefault("name", Path(file).stem)
-                element.set("file", convert(file, base))
-
-
-def _read_mesh(path: Path) -> Shape:
+def read_mesh(path: Path) -> Shape:
     """Return the content of a mesh file.
 
     Raises:
-        HandError: If the file is missing, has another format, or contains no triangles.
+        HandError: If the file is missing or not a mesh, see `drakegrasp.mesh.loading`.
     """
-    # Reject what need not be given to trimesh.
-    what = f"model: mesh {path.name!r}"
-    if path.suffix.lower() not in FORMATS:
-        raise HandError(f"{what} must be one of {', '.join(FORMATS)}, got {path.suffix!r}")
-    if not path.is_file():
-        raise HandError(f"model: mesh {str(path)!r} must be a file, got none")
-    if path.stat().st_size > LARGEST:
-        raise HandError(f"{what} must have at most {LARGEST // 10**6} MB")
-
-    # Libraries raise all kinds of errors for a broken file.
-    logging.getLogger("trimesh").setLevel(logging.CRITICAL)
     try:
-        scene: Any = trimesh.load_scene(path)
-        mesh: Any = scene.to_mesh()
-        # Seams of textures and shading would become gaps when faces are removed.
-        mesh.merge_vertices(merge_tex=True, merge_norm=True)
-        vertices = np.asarray(mesh.vertices, dtype=float)
-        faces = np.asarray(mesh.faces, dtype=np.int64)
-    except ImportError as error:
-        missing = "pycollada" if path.suffix.lower() == ".dae" else first_line(error)
-        raise HandError(f"{what} needs `pip install {missing}`, or another format") from None
-    except Exception as error:
-        raise HandError(f"{what} must be readable, got: {first_line(error)}") from None
-    if not len(faces) or not np.isfinite(vertices).all():
-        raise HandError(f"{what} must hold triangles with finite corners")
-
-    # A picture needs only few faces.
-    if len(faces) > MOST_FACES:
-        vertices, faces = fast_simplification.simplify(
-            vertices.astype(np.float32), faces.astype(np.int32), target_count=MOST_FACES
-        )
-    vertices, faces = vertices.astype(float), faces.astype(np.int64)
+        scene = load_scene(path)
+    except MeshError as error:
+        raise HandError(f"model: mesh {error}") from None
+    # Seams of textures and shading would become gaps when faces are removed.
+    mesh = trimesh.Trimesh(*join_scene(scene), process=False)
+    mesh.merge_vertices()
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     return Shape(vertices=vertices, faces=faces, colour=_colour(scene))
 
 

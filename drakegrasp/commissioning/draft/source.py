@@ -42,7 +42,9 @@ _MJCF_NUMBERS = {
 _ENDLESS = ("lower", "upper", "effort", "velocity", "range", "ctrlrange", "forcerange")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 #: Elements that would make Drake look for other files.
-_ELSEWHERE = {"robot": ("drake:include",), "sdf": ("include",), "mujoco": ("hfield", "plugin")}
+_ELSEWHERE = {"robot": ("drake:include",), "sdf": ("include",), "mujoco": ("plugin",)}
+#: Elements of MJCF whose files are read, or not needed.
+_FILES = ("mesh", "texture", "skin")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +136,9 @@ def read_source(path: Path, packages: Mapping[str, Path], given: Sequence[Path] 
     if root.tag == "mujoco":
         _include(root, source, [0])
     for element in root.iter():
-        if element.tag in _ELSEWHERE[root.tag] and (element.get("file") or len(element)):
+        named = element.tag in _ELSEWHERE[root.tag]
+        other = named or (root.tag == "mujoco" and element.tag not in _FILES)
+        if (named and len(element)) or (other and element.get("file")):
             raise HandError(
                 f"{path}: must be complete by itself, got <{element.tag}>: put what it names into "
                 "the file"
