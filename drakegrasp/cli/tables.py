@@ -188,7 +188,7 @@ def approach_line(funnel: Funnel) -> str:
     if not distinct:
         return ""
     found = counted(distinct, "distinct grasp")
-    cells = counted(int(funnel.cells.sum()), "approach cell")
+    cells = counted(int(funnel.approach_cells.sum()), "approach cell")
     bands = zip(BANDS, funnel.elevations.sum(axis=0).tolist(), strict=True)
     shares = ", ".join(f"{low}-{high}° {number / distinct:.0%}" for (low, high), number in bands)
     return f"{found} in {cells}; above the table they come from {shares}"

@@ -269,7 +269,7 @@ def _counts(file: h5py.File, funnel: Funnel, distinct: AnyArray) -> dict[str, An
             r.label: int(removals[r]) for r in Removal if r is not Removal.KEPT and removals[r]
         },
         "approaches": {
-            "cells": int(funnel.cells.sum()),
+            "cells": int(funnel.approach_cells.sum()),
             "elevations": by_band(funnel.elevations.sum(axis=0)),
         },
         "splits": {

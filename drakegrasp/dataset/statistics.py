@@ -63,7 +63,7 @@ class Funnel:
         removals: (m, 1 + max(Removal)), successes by object and reason of removal.
         elevations: (m, 3), distinct grasps among the samples, see `distinct_samples`, by object and
             by the band of `BANDS` from which the palm approaches.
-        cells: (m,), approach cells in which the object has a sample, see `approach_cells`.
+        approach_cells: (m,), cells in which the object has a sample, see `approach_cells`.
         preshapes: (256, 4), by index of the preshape: attempts, successes, stable grasps and
             samples.
     """
@@ -76,7 +76,7 @@ class Funnel:
     stable: npt.NDArray[np.int64]
     removals: npt.NDArray[np.int64]
     elevations: npt.NDArray[np.int64]
-    cells: npt.NDArray[np.int64]
+    approach_cells: npt.NDArray[np.int64]
     preshapes: npt.NDArray[np.int64]
 
     @property
@@ -247,7 +247,7 @@ def funnel_of(trials: Trials) -> Funnel:
         stable=zeros(count),
         removals=zeros(count, 1 + max(Removal)),
         elevations=zeros(count, len(BANDS)),
-        cells=zeros(count),
+        approach_cells=zeros(count),
         preshapes=zeros(1 + NO_PRESHAPE, 4),
     )
     for block in trials.blocks(_COUNTED):
@@ -271,7 +271,7 @@ def funnel_of(trials: Trials) -> Funnel:
     # From where the palms of the samples approach.
     samples = _samples(trials)
     cells = np.unique(np.column_stack([samples.objects, approach_cells(samples.X_OG)]), axis=0)
-    _count(funnel.cells, cells[:, 0])
+    _count(funnel.approach_cells, cells[:, 0])
     bands = elevation_bands(multiply(samples.X_TO, samples.X_OG))
     own = samples.distinct
     _count(funnel.elevations, (samples.objects[own], bands[own]))
@@ -401,7 +401,10 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
             "outcomes": labelled(Outcome, funnel.outcomes[i]),
             **{key: int(getattr(funnel, key)[i]) for key in ("precision", "stable")},
             "removals": labelled(Removal, funnel.removals[i]),
-            **{key: int(getattr(funnel, key)[i]) for key in ("samples", "distinct", "cells")},
+            **{
+                key: int(getattr(funnel, key)[i])
+                for key in ("samples", "distinct", "approach_cells")
+            },
             "elevations": by_band(funnel.elevations[i]),
         }
         for i, name in enumerate(funnel.names)

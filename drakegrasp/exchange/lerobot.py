@@ -163,6 +163,7 @@ def _chosen(out: Path, attempts: Attempts) -> list[dict[str, Any]]:
     outcomes = [Outcome(int(value)) for value in columns["outcome"]]
     sample = columns["removal"] == Removal.KEPT
     held = np.array([outcome is Outcome.SUCCESS for outcome in outcomes])
+    # A hand that never closed shows nothing.
     known = np.array([outcome.stage >= Stage.CLOSED for outcome in outcomes])
     chosen = {"samples": sample, "failed": known & ~held, "all": known}[attempts]
     if not chosen.any():

@@ -42,7 +42,7 @@ HANDS = {
 #: Mass of the objects [kg], and maximum number of a hand's samples that are tried again.
 MASS, MOST_AGAIN = 0.3, 40
 HEADS = (
-    *("hand", "attempts", "held", "precision", "stable", "samples"),
+    *("hand", "attempts", "held", "precision", "stable", "samples", "distinct"),
     "held again as postures",
 )
 
@@ -96,6 +96,7 @@ def _counts(out: Path) -> list[str]:
         funnel.precision.sum(),
         funnel.stable.sum(),
         funnel.samples.sum(),
+        funnel.distinct.sum(),
     )
     return [f"{int(n):,}" for n in counts]
 

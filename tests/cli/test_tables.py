@@ -30,7 +30,7 @@ def make_funnel(outcomes: np.ndarray, *names: str, **counts: np.ndarray) -> Funn
         "stable": none,
         "removals": np.zeros((len(names), 1 + max(Removal)), dtype=np.int64),
         "elevations": np.zeros((len(names), 3), dtype=np.int64),
-        "cells": none,
+        "approach_cells": none,
         "preshapes": np.zeros((256, 4), dtype=np.int64),
     }
     return Funnel(

@@ -162,7 +162,7 @@ def test_samples_that_are_distinct_are_counted(out: Path) -> None:
     funnel = count_funnel(out)
     assert funnel.samples.tolist() == [3, 3, 3]
     assert funnel.elevations[0].tolist() == [1, 0, 1]
-    assert (funnel.distinct[0], funnel.cells[0]) == (2, 2)
+    assert (funnel.distinct[0], funnel.approach_cells[0]) == (2, 2)
     assert funnel.elevations[1:].tolist() == before.elevations[1:].tolist()
     total = int(funnel.distinct.sum())
 
@@ -172,7 +172,7 @@ def test_samples_that_are_distinct_are_counted(out: Path) -> None:
     assert approach_line(funnel).startswith(f"{total} distinct grasps in ")
     assert sum(split.distinct for split in count_splits(out)) == total
     said = counts_as_dict(out)
-    assert said["objects"][0]["distinct"] == said["objects"][0]["cells"] == 2
+    assert said["objects"][0]["distinct"] == said["objects"][0]["approach_cells"] == 2
     assert said["objects"][0]["elevations"] == {"0-30": 1, "30-60": 0, "60-90": 1}
     assert sum(split["distinct"] for split in said["splits"]) == total
     card = card_content(out)["counts"]

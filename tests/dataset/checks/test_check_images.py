@@ -75,8 +75,8 @@ def test_a_contact_off_the_image_of_the_object_is_found(out: Path, edit: Edit, w
     must_find(out / OTO, (OTO, "/test", 3, what))
 
 
-def change_contact(out: Path, edit_p: Edit, edit_n: Edit) -> int:
-    """Change the first contact of the first test sample, alike in all files; return its trial."""
+def change_contact(out: Path, edit_p: Edit, edit_n: Edit) -> None:
+    """Change the first contact of the first test sample, alike in all files."""
     with h5py.File(out / TRIALS, "r+") as trials, h5py.File(out / OTO) as data:
         number = int(data["test/trial_id"][0])
         p = trials["trials/closed_p_OQ"][number]
@@ -97,7 +97,6 @@ def change_contact(out: Path, edit_p: Edit, edit_n: Edit) -> int:
                 [(p @ X_CO[:3, :3].T + X_CO[:3, 3]).ravel(), (n @ X_CO[:3, :3].T).ravel()]
             )
             file["test/grasp_props/f_Q_C"][0] = f @ X_CO[:3, :3].T
-    return number
 
 
 @pytest.mark.parametrize(
@@ -110,9 +109,8 @@ def change_contact(out: Path, edit_p: Edit, edit_n: Edit) -> int:
 def test_a_contact_inside_the_object_or_a_normal_into_it_is_found(
     out: Path, inward: float, sign: float, what: str
 ) -> None:
-    trial = change_contact(out, lambda p: p - [inward, 0.0, 0.0], lambda n: sign * n)
-    chance = (TRIALS, "/trials", trial, "chance must follow from the contacts after closing")
-    must_find_without_shards(out, *((name, "/test", 0, what) for name in BOTH), chance)
+    change_contact(out, lambda p: p - [inward, 0.0, 0.0], lambda n: sign * n)
+    must_find_without_shards(out, *((name, "/test", 0, what) for name in BOTH))
 
 
 def test_object_pixels_are_checked_against_the_mesh(out: Path) -> None:
