@@ -394,7 +394,7 @@ def test_stats_say_that_nothing_trains(out: Path) -> None:
     said = run("stats", out).stdout
     assert "no sample is for training" not in said
     assert "split by class: 3 objects with samples, 2 of them test\n" in said
-    assemble(out, overrides=["split.train_classes=[]"])
+    assemble(out, overrides=["split.by=class", "split.train_classes=[]"])
     assert "no sample is for training" in run("stats", out).stdout
     # Of the frozen benchmark it is meant.
     (out / "builtin").mkdir()

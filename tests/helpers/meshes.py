@@ -104,7 +104,12 @@ def assert_sound(model: ObjectModel) -> None:
 
 #: Four units of each object of the small dataset, enough for samples to train and to test on.
 SMALL = [
-    *("candidates.max=16", "unit_candidates=4", "split.train_classes=[wineglass]"),
+    *(
+        "candidates.max=16",
+        "unit_candidates=4",
+        "split.by=class",
+        "split.train_classes=[wineglass]",
+    ),
     *("filters.outlier_sigma=0", "filters.require=held", "filters.max_normal_angle_deg=null"),
     *("lift.max_speed=2", "lift.max_acceleration=20", "lift.hold_time=0.1"),
 ]

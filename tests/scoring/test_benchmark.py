@@ -168,7 +168,9 @@ def test_all_objects_test(part):
 
 
 def test_a_card_says_whether_all_rows_are_the_published_ones(tmp_path, monkeypatch):
-    out = make_dataset(tmp_path / "out", tmp_path, overrides=["split.train_classes=[]"])
+    out = make_dataset(
+        tmp_path / "out", tmp_path, overrides=["split.by=class", "split.train_classes=[]"]
+    )
     (out / BUILTIN_FOLDER).mkdir()
     about = {"objects": 3, "of": 3, "different_meshes": []}
     (out / BUILTIN_FOLDER / BENCHMARK_FILE).write_text(json.dumps(about))
