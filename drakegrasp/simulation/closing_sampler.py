@@ -34,7 +34,8 @@ POINTS = 2048
 GOOD, BEST, LEAST = (0.9, 0.7, 0.1), 5, 0.1
 #: Palms are near if they are closer than both limits [m, degree], those of the number of distinct
 #: grasps; if all good palms are near others, both shrink by a factor, down to a fraction of them.
-NEAR, NEARER, NEAREST = (0.020, 30.0), 0.7, 0.02
+#: Number of rounds in a row in vain after which there are no more palms then.
+NEAR, NEARER, NEAREST, LAST_ROUNDS = (0.020, 30.0), 0.7, 0.1, 10
 #: Least downward component of the approach of palms from above and of slanted ones: the sines of
 #: 60 and 30 degrees. Palms with more than the last one, the cosine of 14 degrees, are left out:
 #: their camera sees a flat image, which is no sample.
@@ -118,19 +119,22 @@ class Closing:
         None tells that the palms that follow are nearer to those before.
         """
         X_OL = invert_pose(self._X_LO)
-        while self._near >= NEAREST:
+        rounds = 0  # in a row without a palm
+        while True:
             palm = self._next()
             if palm is not None:
+                rounds = 0
                 self._order.append(palm)
                 yield multiply(X_OL, palm.X_LG), palm.shape
             elif min(self._vain) < PATIENCE:
                 self._add(self._draw())
             elif self._good > GOOD[1]:
                 self._good, self._vain = self._good - GOOD[2], [PATIENCE - 1] * 3
-            elif not self._order:
+            elif rounds == LAST_ROUNDS or not self._order:
                 return
             else:
-                self._near, self._vain = NEARER * self._near, [0, 0, 0]
+                rounds += self._near == NEAREST
+                self._near, self._vain = max(NEARER * self._near, NEAREST), [0, 0, 0]
                 yield None
 
     def _next(self) -> Palm | None:

@@ -362,19 +362,23 @@ def centred(model: ObjectModel, hand: Hand, attempts: Sequence[Attempt]) -> list
     found = list(attempts)
     groups: dict[tuple[int | None, float], list[int]] = {}
     for row, attempt in enumerate(found):
-        given = attempt.source is Source.POSTURES
-        if attempt.ray_hits and attempt.closing is None and not given:
+        is_given = attempt.source is Source.POSTURES
+        if attempt.ray_hits and attempt.closing is None and not is_given:
             groups.setdefault((attempt.preshape, attempt.spread), []).append(row)
 
     for (preshape, spread), rows in groups.items():
-        X_OG = centre(model, hand.at(preshape), spread, np.stack([found[row].X_OG for row in rows]))
-        for row, X in zip(rows, X_OG, strict=True):
-            found[row] = replace(found[row], X_OG=X)
+        given = np.stack([found[row].X_OG for row in rows])
+        X_OG = centre(model, hand.at(preshape), spread, given)
+        if X_OG is not given:
+            for row, X in zip(rows, X_OG, strict=True):
+                found[row] = replace(found[row], X_OG=X)
     return found
 
 
 def centre(model: ObjectModel, hand: Hand, spread: float, X_OG: Array) -> Array:
     """Return palm poses (n, 4, 4) at which fingers that share a motor meet the object together.
+
+    These are the given ones if no motor drives several fingers.
 
     Args:
         model: The object.
