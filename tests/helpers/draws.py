@@ -20,7 +20,7 @@ import trimesh
 from threadpoolctl import threadpool_info
 
 from drakegrasp.config import BuiltinConfig, SplitConfig
-from drakegrasp.dataset.assembly.split import split_samples
+from drakegrasp.dataset.assembly.split import find_homes, split_samples
 from drakegrasp.frames import make_pose
 from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.description import load_hand
@@ -130,20 +130,22 @@ def main(meshes: Path | None) -> dict[str, object]:
     found["jittered palm poses"] = digest(poses)
     names = [f"{i}_thing" for i in range(12)]
     for by in ("class", "object"):
+        config = SplitConfig(by=by, seed=7)
         split = split_samples(
             np.repeat(np.arange(12, dtype=np.int32), 40),
             names,
             [f"class {i // 3}" for i in range(12)],
             names,
-            SplitConfig(by=by),
+            find_homes(names, {}, config) if by == "object" else {},
+            config,
             7,
         )
         found[f"split by {by}"] = digest(*split.values())
-    config = load_config().certify
+    noise = load_config().certify
     stream = Stream(7, 1)
     found["certificate noise"] = digest(
         *(
-            palm_motion(stream.normal(6), config.palm_noise, np.deg2rad(config.palm_noise_deg))
+            palm_motion(stream.normal(6), noise.palm_noise, np.deg2rad(noise.palm_noise_deg))
             for _ in range(100)
         ),
         np.array([_noise_factor(stream, 0.1) for _ in range(100)]),
