@@ -62,6 +62,8 @@ def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
         ) from None
     if again:
         return file
+
+    # Search the file for links, values elsewhere and claimed rows.
     try:
         elsewhere = _find_elsewhere(file)
     except BaseException as error:

@@ -163,11 +163,14 @@ def _chosen(out: Path, attempts: Attempts) -> list[dict[str, Any]]:
     outcomes = [Outcome(int(value)) for value in columns["outcome"]]
     sample = columns["removal"] == Removal.KEPT
     held = np.array([outcome is Outcome.SUCCESS for outcome in outcomes])
+
     # A hand that never closed shows nothing.
     known = np.array([outcome.stage >= Stage.CLOSED for outcome in outcomes])
     chosen = {"samples": sample, "failed": known & ~held, "all": known}[attempts]
     if not chosen.any():
         raise DataError(f"{out}: must have attempts to export ({attempts}), got none")
+
+    # Samples come first, split by split.
     splits = np.where(sample, columns["split"], len(SPLITS))
     return [
         {
