@@ -152,14 +152,13 @@ def test_the_defaults_are_the_papers_numbers_but_for_the_split() -> None:
 
 
 def test_a_split_by_object_has_no_classes_to_train_and_leaves_some_objects_to_train() -> None:
-    by_class = "split: by must be class or auto where train_classes is given, got object"
+    by_class = "split: by must be class where train_classes is given, got object"
     with pytest.raises(ConfigError, match=by_class):
-        load_config(overrides=["split.by=object", "split.train_classes=[a]"])
+        load_config(overrides=["split.train_classes=[a]"])
     large = ["split.test_fraction=0.6", "split.valid_fraction=0.4"]
     less = "together must be less than 1, unless by is class, got 0.6 and 0.4"
-    for by in ("auto", "object"):
-        with pytest.raises(ConfigError, match=less):
-            load_config(overrides=[*large, f"split.by={by}"])
+    with pytest.raises(ConfigError, match=less):
+        load_config(overrides=large)
     assert load_config("paper", large).split.valid_fraction == 0.4
 
 
@@ -168,8 +167,8 @@ def test_released_differs_from_the_paper_in_exactly_the_published_numbers() -> N
     assert values == {**DEFAULT_VALUES, **RELEASED}
 
 
-def test_randomized_is_the_defaults_with_every_draw_on() -> None:
-    values, off = load_config("randomized").to_dict(), load_config().to_dict()
+def test_randomized_is_the_paper_with_every_draw_on() -> None:
+    values, off = load_config("randomized").to_dict(), load_config("paper").to_dict()
     drawn, nothing = values.pop("randomize"), off.pop("randomize")
     assert values == off
     assert not any(nothing.values())
@@ -313,6 +312,8 @@ def test_simulation_hash_changes_with_what_is_simulated_and_nothing_else(key: st
     base = load_config(overrides=[] if key == "certify.repeats" else ["certify.repeats=1"])
     if key.startswith("lift.stop_"):
         base = override_config(base, ["lift.stop_when=lost_sample"])
+    if key == "split.train_classes":
+        base = override_config(base, ["split.by=class"])
     tree = base.to_dict()
     apply_override(tree, f"{key}={json.dumps(EVERYTHING[key])}")
     changed = parse_config(tree)

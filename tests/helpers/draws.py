@@ -20,7 +20,7 @@ import trimesh
 from threadpoolctl import threadpool_info
 
 from drakegrasp.config import BuiltinConfig, SplitConfig
-from drakegrasp.dataset.assembly.split import split_samples
+from drakegrasp.dataset.assembly.split import find_homes, split_samples
 from drakegrasp.frames import make_pose
 from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.description import load_hand
@@ -129,12 +129,14 @@ def main(meshes: Path | None) -> dict[str, object]:
     poses, *_ = rotation_candidates(half, X_TO, jittered, Stream(7, 3))
     found["jittered palm poses"] = digest(poses)
     names = [f"{i}_thing" for i in range(12)]
+    homes = find_homes(names, {}, SplitConfig(seed=7))
     for by in ("class", "object"):
         split = split_samples(
             np.repeat(np.arange(12, dtype=np.int32), 40),
             names,
             [f"class {i // 3}" for i in range(12)],
             names,
+            homes,
             SplitConfig(by=by),
             7,
         )
