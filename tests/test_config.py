@@ -154,7 +154,7 @@ def test_the_defaults_are_the_papers_numbers_but_for_the_split() -> None:
 def test_a_split_by_object_has_no_classes_to_train_and_leaves_some_objects_to_train() -> None:
     by_class = "split: by must be class where train_classes is given, got object"
     with pytest.raises(ConfigError, match=by_class):
-        load_config(overrides=["split.by=object", "split.train_classes=[a]"])
+        load_config(overrides=["split.train_classes=[a]"])
     large = ["split.test_fraction=0.6", "split.valid_fraction=0.4"]
     less = "together must be less than 1, unless by is class, got 0.6 and 0.4"
     with pytest.raises(ConfigError, match=less):
@@ -167,9 +167,8 @@ def test_released_differs_from_the_paper_in_exactly_the_published_numbers() -> N
     assert values == {**DEFAULT_VALUES, **RELEASED}
 
 
-def test_randomized_is_the_defaults_with_every_draw_on() -> None:
-    values = load_config("randomized").to_dict()
-    off = load_config(overrides=["split.by=class"]).to_dict()
+def test_randomized_is_the_paper_with_every_draw_on() -> None:
+    values, off = load_config("randomized").to_dict(), load_config("paper").to_dict()
     drawn, nothing = values.pop("randomize"), off.pop("randomize")
     assert values == off
     assert not any(nothing.values())

@@ -24,6 +24,7 @@ from drakegrasp.dataset.assembly.split import rank_in_split
 from drakegrasp.dataset.assembly.survey import (
     headers_by_object,
     judge_successes,
+    known_homes,
     number_rows,
     own_filters,
     survey_object,
@@ -343,6 +344,7 @@ class _Build:
                 release_directory(out)
             reasons = "; ".join(f"{entry.name}: {entry.reason}" for entry in manifest.refused)
             raise DataError(f"no mesh can be simulated: {reasons}")
+        known_homes(manifest)  # objects of two splits that have become one group are rejected
         write_manifest(manifest, out)
         self._warn(too_heavy(manifest))
         if self._postures is not None:

@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import Config
-from drakegrasp.dataset.assembly.split import may_train, rank_in_split
+from drakegrasp.dataset.assembly.split import home_by_rank, may_train, rank_in_split
+from drakegrasp.dataset.assembly.survey import known_homes
 from drakegrasp.dataset.card import write_card
 from drakegrasp.dataset.hdf5 import AnyArray, create_field, packed_chunk, write_field
 from drakegrasp.dataset.lock import build_lock
@@ -180,37 +181,31 @@ def _tasks(out: Path, manifest: Manifest, trials: Trials) -> Iterator[SceneTask]
 def split_objects(manifest: Manifest, present: Sequence[set[int]]) -> list[int]:
     """Return the split of each object as an index into SPLITS; no object is in two splits.
 
-    All objects of a group are in the same split. A group with samples in `test` is in `test`. In a
-    split by object, a group with samples in `valid` is in `valid`. In a split by class, samples of
-    every object are in `valid`; so of the groups that are not in `test`, the fraction
-    `valid_fraction` with the highest ranks is in `valid`. A group without samples is in the split
-    that follows from its rank or its class.
+    All objects of a group are in the same split. In a split by object, a group is in the split of
+    its samples, or without samples in one that follows from its rank. In a split by class, a group
+    with samples in `test` is in `test`, and samples of every other object are in `valid`; so the
+    fraction `valid_fraction` of the other groups with the highest ranks is in `valid`.
 
     Args:
         manifest: Manifest of the dataset.
         present: For each object, the splits that have samples of it.
     """
-    config, seed = manifest.config.split, manifest.config.split.seed
+    config, seed = manifest.config.split, manifest.config.seed
+    if config.by == "object":
+        homes = known_homes(manifest)
+        return [SPLITS.index(homes.get(g) or home_by_rank(g, config)) for g in manifest.groups]
     train, valid, test = range(len(SPLITS))
-    groups, by_class = manifest.groups, config.by == "class"
+    groups = manifest.groups
     found = {group: set[int]() for group in groups}
     for group, splits in zip(groups, present, strict=True):
         found[group] |= splits
-    ranks = {group: rank_in_split(group, seed) for group in found}
     classes = Counter(entry.class_name for entry in manifest.objects)
-
     tested = {group for group, splits in found.items() if test in splits}
-    last = max((ranks[group] for group in tested), default=-1.0)
     for entry, group in zip(manifest.objects, groups, strict=True):
-        trains = may_train(entry.class_name, classes[entry.class_name], config)
-        if not found[group] and (not trains if by_class else ranks[group] < last):
+        if not found[group] and not may_train(entry.class_name, classes[entry.class_name], config):
             tested.add(group)
-    others = sorted(found.keys() - tested, key=lambda group: (ranks[group], group))
-    if by_class:
-        validating = set(others[len(others) - round(config.valid_fraction * len(others)) :])
-    else:
-        first = min((ranks[g] for g in others if found[g] == {valid}), default=2.0)
-        validating = {group for group in others if ranks[group] >= first}
+    others = sorted(found.keys() - tested, key=lambda group: (rank_in_split(group, seed), group))
+    validating = set(others[len(others) - round(config.valid_fraction * len(others)) :])
     return [test if g in tested else valid if g in validating else train for g in groups]
 
 

@@ -143,16 +143,16 @@ def test_a_value_that_may_be_but_was_not_written_is_refused(
     assert read_manifest(tmp_path) == manifest
 
 
-def test_rule_of_the_split_and_groups_are_stated(tmp_path: Path, manifest: Manifest) -> None:
-    """Two objects of a class are one mesh if a group says so."""
-    others = (replace(MUG, name="3_mug"), replace(MUG, name="4_morph", group="3_mug"))
-    for objects, rule in (((MUG, *others[:1]), "class"), (others, "object")):
-        write_manifest(replace(manifest, objects=objects), tmp_path)
-        assert json.loads((tmp_path / FILE_NAME).read_text(encoding="utf-8"))["split_by"] == rule
-        assert read_manifest(tmp_path).objects == objects
+def test_rule_of_the_split_splits_and_groups_are_stated(tmp_path: Path, manifest: Manifest) -> None:
+    objects = (replace(MUG, split="test"), replace(MUG, name="4_morph", group="3_mug"))
+    write_manifest(replace(manifest, objects=objects), tmp_path)
+    tree = json.loads((tmp_path / FILE_NAME).read_text(encoding="utf-8"))
+    assert tree["split_by"] == "object"
+    assert [entry.get("split") for entry in tree["objects"]] == ["test", None]
+    assert read_manifest(tmp_path).objects == objects
     text = (tmp_path / FILE_NAME).read_text(encoding="utf-8")
     (tmp_path / FILE_NAME).write_text(text.replace('"split_by": "object"', '"split_by": "class"'))
-    with pytest.raises(DataError, match="split_by must be object with its objects, got class"):
+    with pytest.raises(DataError, match="split_by must be object, that of its config, got class"):
         read_manifest(tmp_path)
 
 
@@ -181,6 +181,11 @@ def test_units_of_many_candidates_grow(manifest: Manifest) -> None:
 
 
 def test_filters_may_change_but_not_the_physics(manifest: Manifest) -> None:
+    manifest = replace(manifest, objects=(replace(MUG, split="test"),))
+    changed = with_postprocessing(manifest, ["filters.max_slip=0.001", "split.seed=0"])
+    assert changed.config.filters.max_slip == 0.001
+    assert changed.objects == manifest.objects
+    # Another split is drawn anew.
     changed = with_postprocessing(manifest, ["split.valid_fraction=0.2"])
     assert changed.config.split.valid_fraction == 0.2
     assert changed.objects == (MUG,)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -12,10 +13,11 @@ import pytest
 from helpers.datasets import MISSING, SLIPPED, SUCCESS, TRIALS, change, make_dataset
 from helpers.hands import write_with_preshapes
 
-from drakegrasp.cli.tables import approach_line, funnel_table, hold_table
+from drakegrasp.cli.tables import approach_line, funnel_table, hold_table, unfinished_line
 from drakegrasp.config import SplitConfig
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.card import card_content
+from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
 from drakegrasp.dataset.statistics import (
@@ -62,6 +64,30 @@ def test_words_of_a_build_that_runs_are_those_of_its_shards(out: Path) -> None:
     assert unfinished.funnel.precision.tolist() == [3, 2, 3]
     assert unfinished.funnel.stable.tolist() == [3, 2, 3]
     assert not unfinished.funnel.removals[:, Removal.KEPT].any()
+
+
+def test_build_with_a_target_runs_as_many_units_as_it_needs(out: Path) -> None:
+    """Its number of units is not known before; what was tried is counted, not what was drawn."""
+    (out / "shards/2_box_b/0000002-0000004.h5").unlink()
+    manifest = read_manifest(out)
+    manifest = replace(manifest, config=manifest.config.model_copy(update={"samples": 9}))
+    write_manifest(manifest, out)
+    unfinished = count_unfinished(out)
+    assert unfinished is not None
+    assert (unfinished.done, unfinished.total) == (5, None)
+    assert unfinished.funnel.candidates.tolist() == [4, 2, 4]
+    assert unfinished_line(unfinished) == (
+        "not finished: 5 work units are done; samples are chosen at the end"
+    )
+    assert counts_as_dict(out)["unfinished"] == {"done": 5, "total": None}
+
+    # When it is met, the number is known.
+    met = tuple(replace(entry, tried=2) for entry in manifest.objects)
+    write_manifest(replace(manifest, objects=met), out)
+    unfinished = count_unfinished(out)
+    assert unfinished is not None
+    assert (unfinished.done, unfinished.total) == (3, 3)
+    assert "`drakegrasp assemble` writes them" in unfinished_line(unfinished)
 
 
 def test_attempts_are_counted_by_preshape(out: Path, tmp_path: Path) -> None:
@@ -186,7 +212,9 @@ def test_samples_that_are_distinct_are_counted(out: Path) -> None:
 
 
 def test_splits_are_counted(out: Path) -> None:
-    """A class with one object is tested whole; of the other class one object is."""
+    """By object each has one; by class the only one of a class is tested, and one of two others."""
+    assert [(c.samples, c.objects, c.classes) for c in count_splits(out)] == 3 * [(3, 1, 1)]
+    assemble(out, overrides=["split.by=class"])
     counts = {c.split: (c.samples, c.objects, c.classes) for c in count_splits(out)}
     assert counts["test"] == (6, 2, 2)
     assert counts["train"][0] + counts["valid"][0] == 3
@@ -260,16 +288,32 @@ def counts(train: int, valid: int, test: int) -> list[SplitCount]:
 
 def test_split_that_is_not_as_asked_is_told() -> None:
     config = SplitConfig()
-    told = split_shortfall(counts(24, 43, 8), "object", config)
+    (told,) = split_shortfall(counts(24, 43, 8), "object", config)
     assert "train 32% (75%), valid 57% (10%), test 11% (15%)" in told
     assert "3 objects have samples" in told
-    assert "valid 0% (10%)" in split_shortfall(counts(60, 0, 15), "object", config)
-    assert split_shortfall(counts(75, 10, 15), "object", config) == ""
-    none = SplitConfig(valid_fraction=0.0)
-    assert split_shortfall(counts(85, 0, 15), "object", none) == ""
+    assert split_shortfall(counts(75, 10, 15), "object", config) == []
 
-    # By class the test has the share that it has, but a part may be empty.
-    assert split_shortfall(counts(20, 2, 90), "class", config) == ""
-    assert "no sample is in valid." in split_shortfall(counts(4, 0, 2), "class", config)
-    assert "no sample is for training" in split_shortfall(counts(0, 0, 9), "class", config)
-    assert split_shortfall(counts(0, 0, 0), "class", config) == ""
+    # By class the test has the share that it has.
+    assert split_shortfall(counts(20, 2, 90), "class", config) == []
+
+
+def test_each_empty_split_has_a_line() -> None:
+    config, none = SplitConfig(), SplitConfig(valid_fraction=0.0)
+    few = "has samples, and three fill all splits"
+    assert split_shortfall(counts(60, 0, 0), "object", config) == [
+        f"split {name} is empty: 1 object {few}" for name in ("valid", "test")
+    ]
+    # There are enough objects, but they were in other splits.
+    more = [replace(count, objects=3 * count.objects) for count in counts(60, 0, 15)]
+    (line,) = split_shortfall(more, "object", config)
+    assert line.startswith("split valid is empty: objects stay in the split in which they were ")
+    assert "assemble OUT --set split.seed=1" in line
+    assert split_shortfall(counts(85, 0, 15), "object", none) == []
+
+    # By class, too.
+    (line,) = split_shortfall(counts(4, 0, 2), "class", config)
+    assert line.startswith("split valid is empty: more samples ")
+    (train, valid) = split_shortfall(counts(0, 0, 9), "class", config)
+    assert train.startswith("split train is empty: a class trains if two of its objects ")
+    assert valid.startswith("split valid is empty: ")
+    assert split_shortfall(counts(0, 0, 0), "class", config) == []

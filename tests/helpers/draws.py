@@ -129,15 +129,15 @@ def main(meshes: Path | None) -> dict[str, object]:
     poses, *_ = rotation_candidates(half, X_TO, jittered, Stream(7, 3))
     found["jittered palm poses"] = digest(poses)
     names = [f"{i}_thing" for i in range(12)]
+    homes = find_homes(names, {}, SplitConfig(seed=7))
     for by in ("class", "object"):
-        config = SplitConfig(by=by, seed=7)
         split = split_samples(
             np.repeat(np.arange(12, dtype=np.int32), 40),
             names,
             [f"class {i // 3}" for i in range(12)],
             names,
-            find_homes(names, {}, config) if by == "object" else {},
-            config,
+            homes,
+            SplitConfig(by=by),
             7,
         )
         found[f"split by {by}"] = digest(*split.values())

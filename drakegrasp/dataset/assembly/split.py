@@ -109,6 +109,14 @@ def rank_in_split(group: str, seed: int) -> float:
     return float(Stream(seed, object_key(group), 0, 2).uniform(1)[0])
 
 
+def home_by_rank(group: str, config: SplitConfig) -> Home:
+    """Return the split of a group of objects without samples, in a split by object."""
+    rank = rank_in_split(group, config.seed)
+    if rank < config.test_fraction:
+        return "test"
+    return "valid" if rank >= 1.0 - config.valid_fraction else "train"
+
+
 def find_homes(
     present: Collection[str], known: Mapping[str, Home], config: SplitConfig
 ) -> dict[str, Home]:

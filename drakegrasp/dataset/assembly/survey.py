@@ -41,7 +41,7 @@ from drakegrasp.dataset.shards import (
     read_field,
     trial_columns,
 )
-from drakegrasp.errors import ConfigError, listed
+from drakegrasp.errors import ConfigError, DataError, listed
 from drakegrasp.filters import NEEDED, Flags, Removal, Rule, first_removal, is_outlier
 from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp, unused_fingers
@@ -446,7 +446,7 @@ def decide(
         [entry.mesh_name for entry in manifest.objects],
         [entry.class_name for entry in manifest.objects],
         manifest.groups,
-        {group: home for group, home in _homes(manifest).items() if home is not None},
+        known_homes(manifest),
         manifest.config.split,
         manifest.config.seed,
     )
@@ -454,11 +454,24 @@ def decide(
     return Decisions(manifest=manifest, shards=shards, removal=removal, splits=splits)
 
 
-def _homes(manifest: Manifest) -> dict[str, Home | None]:
-    """Return the split of each group of objects; None for one that never had samples."""
-    homes = dict[str, Home | None]()
+def known_homes(manifest: Manifest) -> dict[str, Home]:
+    """Return the split of each group that was in one before; none if the split is by class.
+
+    Raises:
+        DataError: If objects of a group were in two splits.
+    """
+    homes, first = dict[str, Home](), dict[str, str]()
+    if manifest.config.split.by == "class":
+        return homes
     for group, entry in zip(manifest.groups, manifest.objects, strict=True):
-        homes[group] = homes.get(group) or entry.split
+        if entry.split is None:
+            continue
+        if homes.setdefault(group, entry.split) != entry.split:
+            raise DataError(
+                f"{first[group]} and {entry.name} must be in one split to be of one group "
+                f"({group}), got them in {homes[group]} and {entry.split}"
+            )
+        first.setdefault(group, entry.name)
     return homes
 
 
@@ -472,7 +485,7 @@ def _with_homes(manifest: Manifest, present: Collection[int]) -> Manifest:
     rules, groups = manifest.config.split, manifest.groups
     if rules.by == "class":
         return manifest
-    known = {group: home for group, home in _homes(manifest).items() if home is not None}
+    known = known_homes(manifest)
     homes = {**known, **find_homes({groups[i] for i in present}, known, rules)}
     objects = tuple(
         replace(entry, split=homes.get(group))
