@@ -369,10 +369,11 @@ def parse_request(options: Mapping[str, Any]) -> BuildRequest:
     from drakegrasp.config import BUILD_PRESET
     from drakegrasp.hand.settings import load_config
 
+    config = BUILD_PRESET if options["config"] is None else options["config"]
     return BuildRequest(
         objects=options["objects"],
         out=options["out"].absolute(),
-        config=load_config(options["config"] or BUILD_PRESET, chosen_settings(options)),
+        config=load_config(config, chosen_settings(options)),
         units=options["units"],
         manifest=options["manifest"],
         only=options["only"],

@@ -377,8 +377,8 @@ def reach(hand: Hand, direction: Array) -> float:
 def _swept_corners(hand: Hand) -> Array:
     """Return the corners (n, 3) in {G} of the convex hull of everything the closing hand sweeps."""
     surfaces, closing, corners = link_points(hand), closing_path(hand, STEPS), []
-    for link, points in surfaces.items():
-        if len(points):
+    for link in hand.link_chains:
+        if len(points := surfaces[link]):
             X_GL = link_poses(hand, link, spread=0.0, closing=closing)
             swept = multiply(points, np.swapaxes(X_GL[:, :3, :3], -1, -2)) + X_GL[:, None, :3, 3]
             swept = swept.reshape(-1, 3)

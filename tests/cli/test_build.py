@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -31,6 +30,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.generation.counts import Counts
+from drakegrasp.generation.target import Target
 from drakegrasp.generation.work_unit import UnitSummary
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime import files as file_set
@@ -241,7 +241,7 @@ def test_crashes_that_no_physics_explains_end_the_build_with_an_error(
     monkeypatch.setattr("drakegrasp.generation.work_unit.try_attempt", _crash)
     (tmp_path / "meshes").mkdir()
     trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "meshes" / "1_box.obj")
-    few = ("--set", "candidates.max=1", "--set", "candidates.global_x_deg=[0]")
+    few = ("--candidates", "3")
     for _ in range(2):
         result = run("build", "--objects", tmp_path / "meshes", "--out", tmp_path / "out", *few)
         assert result.exit_code == 1
@@ -250,7 +250,7 @@ def test_crashes_that_no_physics_explains_end_the_build_with_an_error(
 
 
 def test_few_crashes_are_no_error(whole: Path) -> None:
-    counts = Counts(read_manifest(whole), None, silent)
+    counts = Counts(read_manifest(whole), None, None, silent)
     header = next(read_manifest(whole).headers())
     for crashed, said in ((9, 0), (1, 1)):
         outcomes = {Outcome.SUCCESS: 100, Outcome.CRASHED: crashed}
@@ -259,19 +259,31 @@ def test_few_crashes_are_no_error(whole: Path) -> None:
 
 
 def test_bar_counts_the_samples_of_a_target(whole: Path) -> None:
+    """Their number is due from when each object has been tried."""
     manifest, shown = read_manifest(whole), list[tuple[int, int | None, dict[str, int]]]()
-    config = manifest.config.model_copy(update={"samples": 1000})
+    config = manifest.config.model_copy(update={"samples": 4})
+    target = Target(config, {entry.name: 0 for entry in manifest.objects})
     counts = Counts(
-        replace(manifest, config=config),
+        manifest,
+        target,
         None,
         lambda done, total, *, found, **figures: shown.append((done, total, figures)),
     )
-    for header in manifest.headers():
+    by_object = {
+        entry.name: [unit for unit in manifest.headers() if unit.object_name == entry.name]
+        for entry in manifest.objects
+    }
+    for name, units in by_object.items():
+        target.set_units(name, units, endless=True)
+    for unit in (units[0] for units in by_object.values()):
+        target.add(unit, [unit.start])
         outcomes = {Outcome.SUCCESS: 2, Outcome.RAY_MISS: 1}
-        counts.add(UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={}, samples=1))
-    units = len(shown)
-    assert shown[0] == (3, None, {"grasps": 2, "of 1,000 samples": 1})
-    assert shown[-1] == (3 * units, 3 * units, {"grasps": 2 * units, "of 1,000 samples": units})
+        counts.add(UnitSummary(header=unit, outcomes=outcomes, seconds={}, errors={}))
+    assert shown == [
+        (1, None, {"attempts": 3, "grasps": 2}),
+        (2, None, {"attempts": 6, "grasps": 4}),
+        (3, 4, {"attempts": 9, "grasps": 6}),
+    ]
 
 
 def test_build_connects_with_the_certificates_that_it_is_given(

@@ -20,16 +20,22 @@ def dry_run(out: Path, *words: str | Path) -> Result:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ((), ["128 objects: at most 3,840,000 attempts in 3,584 work units"]),
+        (
+            (),
+            [
+                "128 objects: until 20 samples of each, at most 10,000 palm poses of each",
+                "images of 2,560 samples: 1,426.1 MB before compression",
+            ],
+        ),
         (
             ("--only", "1_mug_1", "--only", "1_mug_1", "--candidates", "101"),
-            ["1 object: at most 303 attempts in 3 work units"],
+            ["1 object: at most 101 palm poses in 13 work units"],
         ),
         (
             ("--only", "1_mug_1", "--candidates", "101", "--part", "2/2"),
             [
-                "1 object: at most 303 attempts in 3 work units",
-                "part 2/2: at most 1 of these work units",
+                "1 object: at most 101 palm poses in 13 work units",
+                "part 2/2: at most 6 of these work units",
             ],
         ),
     ],
@@ -83,7 +89,7 @@ def test_dry_run_of_postures_counts_those_that_can_be_tried(tmp_path: Path) -> N
     [
         (("--only", "1_jug_1"), "only must be names of objects"),
         (("--part", "3/2"), "part must be I/N"),
-        (("--part", "1/2", "--samples", "3"), "part must be left out with samples"),
+        (("--part", "1/2", "--samples", "3"), "part must be of a build with a number"),
         (("--samples", "3", "--max-grasps", "3"), "max_grasps must be null"),
         (("--set", "candidates.postures=0123456789abcdef"), "candidates.postures must be"),
     ],

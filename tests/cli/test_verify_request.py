@@ -29,9 +29,9 @@ DRAWN = [
 
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset with drawn friction and mass. Read only."""
+    """A dataset with drawn friction and mass; two objects are tested. Read only."""
     folder = tmp_path_factory.mktemp("drawn")
-    return make_dataset(folder / "out", folder, overrides=DRAWN)
+    return make_dataset(folder / "out", folder, overrides=[*DRAWN, "split.by=class"])
 
 
 def request(out: Path, **options: object) -> VerifyRequest:

@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from helpers.datasets import OTM, OTO, SLIP, TRIALS, change, make_dataset, set_at
+from helpers.datasets import OTM, OTO, SLIP, TRIALS, change, set_at
 from helpers.pages import coded, numbered
 
 from drakegrasp.dataset.assemble import assemble
@@ -258,20 +258,6 @@ def test_files_of_an_earlier_state_are_told(out: Path, monkeypatch: pytest.Monke
     assemble(out)
     assert catalog.current().missing == ()
     assert catalog.current().table.count == 36
-
-
-@pytest.mark.parametrize("wanted", [1, 2])
-def test_attempts_beyond_the_wanted_grasps_are_not_shown(tmp_path: Path, wanted: int) -> None:
-    """Assembly takes none of them, so they cannot be rejected either."""
-    out = make_dataset(tmp_path / "out", tmp_path, overrides=[f"max_grasps={wanted}"])
-    assembled = Catalog(out).current()
-    build_again(out)
-    building = Catalog(out).current()
-    assert building.table.held.sum() == 3 * wanted
-    for name in ("object", "candidate", "standoff_index", "outcome"):
-        np.testing.assert_array_equal(building.table[name], assembled.table[name])
-    for name, values in building.closed.items():
-        np.testing.assert_array_equal(values, assembled.closed[name])
 
 
 def test_a_contact_without_a_normal_has_the_largest_angle(out: Path) -> None:

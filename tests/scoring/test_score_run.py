@@ -233,7 +233,7 @@ def test_files_of_a_card_are_whole_and_come_again(data, tmp_path):
         5 * len(data) - 1
     )
     text = paths[1].read_text()
-    assert "**net: 100 (100 to 100)** sample" in text
+    assert "**net: 100 (no interval)** sample" in text
     assert "net, success@5" in text
     assert "confidence" in text
     picture = paths[2].read_bytes()

@@ -270,7 +270,7 @@ PLAN: tuple[Kind, ...] = (
             "model_sha256": (),
             "config_hash": ("a text",),  # `replay` compares them
             "mesh_sha256": ("a text",),
-            "max": ("a number",),
+            "asked": ("a number",),
             "combinations": ("a number",),
             "valid": ("a number",),
             "distinct": ("a number",),
