@@ -257,7 +257,7 @@ def _draw_map(axes: Axes, item: ObjectApproaches) -> None:
         axes.add_patch(Circle((0.0, 0.0), radius, facecolor="none", edgecolor="#8A9099",
                               linewidth=1.0 if horizon else 0.5, zorder=2))  # fmt: skip
         axes.text(0.0, -radius, f"{height:.0f}°", fontsize=7, color="#6A7078", ha="center",
-                  va="center", zorder=5,
+                  va="center", zorder=3,
                   bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6})  # fmt: skip
     for place, text in (((EXTENT - 0.06, 0.0), "+Tx"), ((0.0, EXTENT - 0.06), "+Ty")):
         axes.text(*place, text, fontsize=7.5, color="#6A7078", ha="center", va="center", zorder=5)

@@ -68,25 +68,32 @@ def draw_counts(
     *,
     colours: Sequence[str] | None = None,
     title: str = "",
+    log: bool = True,
 ) -> Figure:
-    """Return the counts of each kind as bars on a logarithmic scale.
+    """Return the counts of each kind as bars.
 
     Args:
         counts: Counts by kind, in the order of the bars; the first kind is the desired one.
         what: What is counted, e.g. "attempts".
         colours: Colours of the bars; if None, the first differs from the others.
         title: What the figure counts; none if empty.
+        log: Whether the scale is logarithmic.
     """
     names, numbers = list(counts), np.array(list(counts.values()))
     figure = Figure(figsize=(8.0, 0.9 + 0.3 * len(names)), layout="constrained")
-    _write_title(figure, title)
     axes = figure.add_subplot()
+    axes.set_title(title, fontsize="medium", color=INK)
     colours = colours or [GROUPS["stable"] if i == 0 else FAILED for i in range(len(names))]
-    bars = axes.barh(range(len(names)), np.maximum(numbers, 0.8), color=colours, height=0.72)
+    bars = axes.barh(
+        range(len(names)), np.maximum(numbers, 0.8 if log else 0), color=colours, height=0.72
+    )
     axes.bar_label(bars, [f"{n:,}" for n in numbers], padding=3, color=INK, fontsize=9)
     _name_bars(axes, [name.replace("_", " ") for name in names])
-    axes.set_xscale("log")
-    axes.set_xlim(0.8, 6.0 * max(10, numbers.max(initial=0)))
+    if log:
+        axes.set_xscale("log")
+        axes.set_xlim(0.8, 6.0 * max(10, numbers.max(initial=0)))
+    else:
+        axes.set_xlim(0.0, 1.1 * max(10, numbers.max(initial=0)))
     axes.set_xlabel(what)
     return figure
 
@@ -108,8 +115,6 @@ def draw_objects(
     figure = Figure(figsize=(8.0, 1.1 + 0.22 * max(len(order), 1)), layout="constrained")
     axes = figure.add_subplot()
 
-    _write_title(figure, title)
-
     # Bars over one another: each group is a part of the previous one.
     for group, each in counts.items():
         numbers = np.array(each, dtype=int)[order]
@@ -117,9 +122,8 @@ def draw_objects(
     _name_bars(axes, [names[i] for i in order])
     axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True))
     axes.set_xlabel("grasps")
-    figure.legend(
-        loc="outside upper center", ncols=3, frameon=False, labelcolor=INK, title=_left_out(names)
-    )
+    told = "\n".join(filter(None, (title, _left_out(names))))
+    figure.legend(loc="outside upper center", ncols=3, frameon=False, labelcolor=INK, title=told)
     return figure
 
 
@@ -138,15 +142,15 @@ def draw_distributions(
     columns = 2
     rows = -(-len(quantities) // columns)
     figure = Figure(figsize=(8.0, 2.0 * rows), layout="constrained")
-    _write_title(figure, title)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in panels[len(quantities) :]:
         axes.set_visible(False)
-    for axes, (title, values) in zip(panels, quantities, strict=False):
-        _histogram(axes, title, values, groups)
+    for axes, (quantity, values) in zip(panels, quantities, strict=False):
+        _histogram(axes, quantity, values, groups)
     figure.supylabel("grasps", fontsize="medium", color=INK)
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
+    place = {"loc": "outside upper center", "ncols": 3, "frameon": False}
+    figure.legend(handles, labels, **place, labelcolor=INK, title=title)
     return figure
 
 
@@ -162,12 +166,6 @@ def _histogram(axes: Axes, title: str, values: Array, groups: Mapping[str, Array
     axes.set_xlabel(title)
     axes.yaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
     _plain(axes)
-
-
-def _write_title(figure: Figure, title: str) -> None:
-    """Write what a figure counts above it."""
-    if title:
-        figure.suptitle(title, fontsize=10, color=INK)
 
 
 def _name_bars(axes: Axes, names: Sequence[str]) -> None:

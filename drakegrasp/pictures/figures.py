@@ -262,7 +262,8 @@ def _hold(samples: Samples, funnel: Funnel) -> Drawn:
     numbers = {name: int(group.sum()) for name, group in samples.groups.items()}
     numbers["distinct"] = int(funnel.distinct.sum())
     colours = [GROUPS[name] for name in numbers]
-    return draw_counts(numbers, "samples", colours=colours, title=_told(funnel)), numbers
+    figure = draw_counts(numbers, "samples", colours=colours, title=_told(funnel), log=False)
+    return figure, numbers
 
 
 def _objects(samples: Samples, funnel: Funnel) -> Drawn:

@@ -124,9 +124,9 @@ def sample_sheet(path: Path) -> tuple[Figure, list[int]]:
     objects = len(set(names))
     chosen = spread_over_objects(names, min(max(PLACES, objects), MOST))
     samples: list[Sample] = [places[i][0][places[i][1]] for i in chosen]
-    note = f"{len(samples):,} of {counted(len(names), 'sample')}, "
     shown = len({names[i] for i in chosen})
-    note += f"{shown:,} of {counted(objects, 'object')}" if shown < objects else "of all objects"
+    note = f"{len(samples):,} of {counted(len(names), 'sample')}, "
+    note += f"{shown:,} of {counted(objects, 'object')} with samples"
     figure = draw_sheet(samples, parts[0].K, far=read_far(path), note=note)
     return figure, [sample.trial_id for sample in samples]
 

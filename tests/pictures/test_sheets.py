@@ -89,15 +89,15 @@ def test_the_sheet_of_a_dataset_has_all_objects(
     write_data_file(path, ["1_mug_small", "1_mug_small", "2_box"], split="test")
     figure, trials = sample_sheet(path)
     assert trials == [10, 11, 12]
-    assert notes(figure) == "3 of 3 samples, of all objects"
+    assert notes(figure) == "3 of 3 samples, 2 of 2 objects with samples"
 
     # More objects than places have a sample each, and there is a limit.
     monkeypatch.setattr(sheets, "PLACES", 4)
     monkeypatch.setattr(sheets, "MOST", 6)
     for objects, drawn, note in (
-        (2, [10, 12, 11, 13], "4 of 10 samples, of all objects"),
-        (5, [10, 11, 12, 13, 14], "5 of 10 samples, of all objects"),
-        (9, [10, 12, 13, 15, 16, 18], "6 of 10 samples, 6 of 9 objects"),
+        (2, [10, 12, 11, 13], "4 of 10 samples, 2 of 2 objects with samples"),
+        (5, [10, 11, 12, 13, 14], "5 of 10 samples, 5 of 5 objects with samples"),
+        (9, [10, 12, 13, 15, 16, 18], "6 of 10 samples, 6 of 9 objects with samples"),
     ):
         write_data_file(path, [f"{1 + i % objects}_box" for i in range(10)])
         figure, trials = sample_sheet(path)
