@@ -77,11 +77,12 @@ def figures(
     \b
     phases         one grasp from the side: start, closed, lifted
     classes        colour, depth and mask of one grasp of each class
-    outcomes       how the attempts ended
-    hold           how well successes hold, and how many are samples
-    objects        successes of each object
-    distributions  slip, turn, forces
-    approaches     from where successes came
+    sheet          colour, depth and mask of samples of all objects in turn
+    outcomes       how the attempts ended: samples, removed, failed
+    hold           samples: how well they hold, how many are distinct
+    objects        samples of each object, and how many are distinct
+    distributions  slip, turn, forces of the samples
+    approaches     from where the palms of the samples came
     views          views of scenes with a sample of each, if there are scenes
 
     Options:

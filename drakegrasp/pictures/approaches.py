@@ -22,7 +22,10 @@ from scipy.spatial import KDTree
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.statistics import distinct_samples
 from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import counted
+from drakegrasp.filters import Removal
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.charts import GROUPS
@@ -47,14 +50,16 @@ LIGHT = np.array([-0.48, 0.6, 0.64])
 OBJECT_COLOUR = np.array([0.70, 0.77, 0.86])
 #: Colour of attempts that failed.
 FAILED = "#B8BDC4"
+#: How a sample holds, from a sample that is no precision grasp to a stable one.
+HOLDS = ("samples", "precision", "stable")
 #: Maximum numbers of rays and dots in a panel.
 MAX_RAYS, MAX_DOTS = 300, 3000
 #: Elevations above the table that have a circle on a map [deg].
 CIRCLES_DEG = (60.0, 30.0, 0.0)
 #: Half the edge of a map, which also shows directions slightly below the horizon.
 EXTENT = 1.24
-#: Edge of a picture or a map, spaces, caption and head [inch]; number of objects in a row.
-EDGE, GAP, BETWEEN, CAPTION, HEAD, ACROSS = 2.5, 0.05, 0.3, 0.28, 0.24, 2
+#: Edge of a picture or a map, spaces, caption, head and foot [inch]; number of objects in a row.
+EDGE, GAP, BETWEEN, CAPTION, HEAD, FOOT, ACROSS = 2.5, 0.05, 0.3, 0.28, 0.24, 0.34, 2
 
 
 def approach_directions(X_TO: Array, X_OG: Array) -> Array:
@@ -109,13 +114,15 @@ class ObjectApproaches:
         name: Name of the object.
         vertices, faces: (n, 3) in {O} [m] and (m, 3).
         R_TO: (3, 3), orientation in which it rests.
-        attempts: Number of attempts.
-        directions: (a, 3) in {T}, directions of palms that found no grasp, without those whose palm
+        attempts: Number of attempts in this resting pose.
+        distinct: Number of distinct grasps among the samples, see `distinct_samples`.
+        elsewhere: Number of samples in other resting poses, which are not drawn.
+        directions: (a, 3) in {T}, directions of palms that gave no sample, without those whose palm
             ray misses.
-        rays: (s, 2, 3) in {O}, rays of the successes from the palm's origin to the surface [m]; of
+        rays: (s, 2, 3) in {O}, rays of the samples from the palm's origin to the surface [m]; of
             length 0 if a palm that was tried as it is does not look at the object.
-        successes: (s, 3) in {T}, directions of the successes.
-        groups: (s,), index into GROUPS of how each success holds.
+        samples: (s, 3) in {T}, directions of the samples.
+        holds: (s,), index into HOLDS of how each sample holds.
     """
 
     name: str
@@ -123,14 +130,16 @@ class ObjectApproaches:
     faces: npt.NDArray[np.int32]
     R_TO: Array
     attempts: int
+    distinct: int
+    elsewhere: int
     directions: Array
     rays: Array
-    successes: Array
-    groups: npt.NDArray[np.int64]
+    samples: Array
+    holds: npt.NDArray[np.int64]
 
 
 def read_approaches(out: Path, name: str, config: Config) -> ObjectApproaches:
-    """Return an object's approaches in the resting pose with most successes.
+    """Return an object's approaches in the resting pose with most samples.
 
     Args:
         out: Directory of the dataset.
@@ -140,19 +149,21 @@ def read_approaches(out: Path, name: str, config: Config) -> ObjectApproaches:
     Raises:
         DataError: If a file is missing or damaged.
     """
-    # A picture shows one resting pose: that with the most held grasps.
+    # A picture shows one resting pose: that with the most samples.
     prepared = load_prepared(out, name, config)
     trials = Trials(out).where(object_name=name)
-    resting, held = trials["resting"], trials["outcome"] == Outcome.SUCCESS
-    pose = int(np.bincount(resting[held], minlength=1).argmax())
-    own = trials[resting == pose].columns(
-        ("outcome", "X_OG", "candidate", "standoff_index", "precision", "stable")
+    resting, kept = trials["resting"], trials["removal"] == Removal.KEPT
+    counts = np.bincount(resting[kept], minlength=1)
+    pose = int(counts.argmax())
+    own = trials[resting == pose]
+    columns = own.columns(
+        ("outcome", "removal", "X_OG", "candidate", "standoff_index", "precision", "stable")
     )
-    outcome, packed, candidate, standoff, precision, stable = own.values()
+    outcome, removal, packed, candidate, standoff, precision, stable = columns.values()
     X_OG = unpack_pose(packed)
 
     # Attempts whose palm ray misses do not approach the object.
-    won, approached = outcome == Outcome.SUCCESS, outcome != Outcome.RAY_MISS
+    won, approached = removal == Removal.KEPT, outcome != Outcome.RAY_MISS
     X_TO = prepared.resting_poses[pose]
     directions = approach_directions(X_TO, X_OG)
     standoffs = np.array(config.candidates.standoffs)[standoff[won]]
@@ -164,10 +175,12 @@ def read_approaches(out: Path, name: str, config: Config) -> ObjectApproaches:
         faces=prepared.model.visual_faces,
         R_TO=X_TO[:3, :3],
         attempts=len(outcome),
+        distinct=len(distinct_samples(own)),
+        elsewhere=int(counts.sum() - counts[pose]),
         directions=directions[approached & ~won],
         rays=np.stack([p_OG, p_OG + reach[:, None] * z_O], axis=1),
-        successes=directions[won],
-        groups=(precision[won].astype(np.int64) + stable[won]),
+        samples=directions[won],
+        holds=(precision[won].astype(np.int64) + stable[won]),
     )
 
 
@@ -176,14 +189,14 @@ def approaches_figure(objects: Sequence[ObjectApproaches], *, left_out: int) -> 
 
     Args:
         objects: Objects to draw, at least one.
-        left_out: Number of objects with successes that are not drawn.
+        left_out: Number of objects with samples that are not drawn.
     """
     # The page: blocks of a picture and a map, below a head with the legend.
     across = min(ACROSS, len(objects))
     lines = -(-len(objects) // across)
     block = 2 * EDGE + GAP
     width = max(across * block + (across - 1) * BETWEEN + 0.3, 7.0)
-    height = HEAD + lines * (CAPTION + EDGE) + 0.1
+    height = HEAD + lines * (CAPTION + EDGE) + FOOT
     figure = new_page(width, height)
 
     for i, item in enumerate(objects):
@@ -192,21 +205,29 @@ def approaches_figure(objects: Sequence[ObjectApproaches], *, left_out: int) -> 
         picture = add_axes(figure, left, top, EDGE, EDGE)
         _draw_picture(picture, item)
         _draw_map(add_axes(figure, left + EDGE + GAP, top, EDGE, EDGE), item)
-        counts = f"{len(item.successes):,} of {item.attempts:,} attempts"
-        write_beside(picture, 0.0, 1.02, f"{shortened(item.name, 30)}: {counts}", 9.5)
+        write_beside(picture, 0.0, 1.02, f"{shortened(item.name, 24)}: {_counts(item)}", 8.5)
 
-    # The head.
-    colours = {**GROUPS, "attempt that failed": FAILED}
+    # The head, and below the drawings what they show.
+    colours = {**{name: GROUPS[name] for name in HOLDS}, "attempts without a sample": FAILED}
     marks = [
-        Line2D([], [], color=colour, label=name, markersize=6 if name in GROUPS else 4, marker="o",
+        Line2D([], [], color=colour, label=name, markersize=6 if name in HOLDS else 4, marker="o",
                linestyle="none", markeredgewidth=0.0) for name, colour in colours.items()
     ]  # fmt: skip
     draw_legend(figure, marks, (0.15 / width, 1.0 - 0.08 / height), 9)
+    text = "Each object in its resting pose with the most samples."
     if left_out:
-        text = f"{left_out:,} objects with fewer successes are left out"
-        figure.text(1.0 - 0.15 / width, 1.0 - 0.1 / height, text, fontsize=9, color=INK,
-                    ha="right", va="top")  # fmt: skip
+        text += f" {counted(left_out, 'object')} with fewer samples not drawn."
+    figure.text(0.15 / width, 0.08 / height, text, fontsize=8.5, color=INK, va="bottom")
     return figure
+
+
+def _counts(item: ObjectApproaches) -> str:
+    """Return the numbers of the samples and attempts that are drawn of an object."""
+    shown, total = len(item.samples), len(item.samples) + item.elsewhere
+    samples = counted(total, "sample")
+    if item.elsewhere:
+        samples = f"{shown:,} of {samples}"
+    return f"{samples} ({item.distinct:,} distinct), {counted(item.attempts, 'attempt')}"
 
 
 def spread(count: int, most: int) -> npt.NDArray[np.int64]:
@@ -215,13 +236,13 @@ def spread(count: int, most: int) -> npt.NDArray[np.int64]:
 
 
 def _draw_picture(axes: Axes, item: ObjectApproaches) -> None:
-    """Draw the object with the palm rays of its successes."""
+    """Draw the object with the palm rays of its samples."""
     R_VO = view_rotation() @ item.R_TO
     triangles = triangles_in_view(item.vertices, item.faces, item.R_TO)
     shown = spread(len(item.rays), MAX_RAYS)
-    rays, groups = item.rays[shown] @ R_VO.T, item.groups[shown]
-    for number, colour in enumerate(GROUPS.values()):
-        draw_rays(axes, rays[groups == number], colour)
+    rays, holds = item.rays[shown] @ R_VO.T, item.holds[shown]
+    for number, name in enumerate(HOLDS):
+        draw_rays(axes, rays[holds == number], GROUPS[name])
     draw_object(axes, triangles)
 
     # A square around everything.
@@ -238,18 +259,18 @@ def _draw_map(axes: Axes, item: ObjectApproaches) -> None:
         axes.add_patch(Circle((0.0, 0.0), radius, facecolor="none", edgecolor="#8A9099",
                               linewidth=1.0 if horizon else 0.5, zorder=2))  # fmt: skip
         axes.text(0.0, -radius, f"{height:.0f}°", fontsize=7, color="#6A7078", ha="center",
-                  va="center", zorder=5,
+                  va="center", zorder=3,
                   bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6})  # fmt: skip
     for place, text in (((EXTENT - 0.06, 0.0), "+Tx"), ((0.0, EXTENT - 0.06), "+Ty")):
         axes.text(*place, text, fontsize=7.5, color="#6A7078", ha="center", va="center", zorder=5)
 
-    # Failures are dots in the background; successes are drawn over them.
+    # Attempts without a sample are dots in the background; samples are drawn over them.
     failed = map_directions(item.directions[spread(len(item.directions), MAX_DOTS)])
     axes.plot(*failed.T, "o", color=FAILED, markersize=1.7, markeredgewidth=0.0, zorder=1,
               rasterized=len(failed) > 500)  # fmt: skip
-    places = map_directions(item.successes)
-    for number, colour in enumerate(GROUPS.values()):
-        axes.plot(*places[item.groups == number].T, "o", color=colour, markersize=4.2,
+    places = map_directions(item.samples)
+    for number, name in enumerate(HOLDS):
+        axes.plot(*places[item.holds == number].T, "o", color=GROUPS[name], markersize=4.2,
                   markeredgecolor="white", markeredgewidth=0.4, zorder=4)  # fmt: skip
     axes.set(xlim=(-EXTENT, EXTENT), ylim=(-EXTENT, EXTENT), aspect="equal")
     hide_ticks(axes)

@@ -21,9 +21,15 @@ from drakegrasp.frames import Array
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.style import INK, PREDICTED, png_bytes, shortened
 
-#: Colours of grasps that are held, precision and stable (Okabe and Ito), and of failures.
-HELD, PRECISION, STABLE, FAILED = "#E69F00", "#56B4E9", "#009E73", "#9AA0A8"
-GROUPS = {"held": HELD, "precision": PRECISION, "stable": STABLE}
+#: Colours of groups of grasps (Okabe and Ito), and of failures.
+GROUPS = {
+    "held": "#E69F00",
+    "samples": "#E69F00",
+    "distinct": "#0072B2",
+    "precision": "#56B4E9",
+    "stable": "#009E73",
+}
+FAILED = "#9AA0A8"
 #: Maximum number of objects in a plot, which are those with the most grasps.
 MAX_OBJECTS = 60
 #: Bins of a histogram, and the fraction of the values that determines its range, since a few
@@ -57,64 +63,81 @@ def draw_codes(
 
 
 def draw_counts(
-    counts: Mapping[str, int], what: str, *, colours: Sequence[str] | None = None
+    counts: Mapping[str, int],
+    what: str,
+    *,
+    colours: Sequence[str] | None = None,
+    title: str = "",
+    log: bool = True,
 ) -> Figure:
-    """Return the counts of each kind as bars on a logarithmic scale.
+    """Return the counts of each kind as bars.
 
     Args:
         counts: Counts by kind, in the order of the bars; the first kind is the desired one.
         what: What is counted, e.g. "attempts".
         colours: Colours of the bars; if None, the first differs from the others.
+        title: What the figure counts; none if empty.
+        log: Whether the scale is logarithmic.
     """
     names, numbers = list(counts), np.array(list(counts.values()))
     figure = Figure(figsize=(8.0, 0.9 + 0.3 * len(names)), layout="constrained")
     axes = figure.add_subplot()
-    colours = colours or [STABLE if i == 0 else FAILED for i in range(len(names))]
-    bars = axes.barh(range(len(names)), np.maximum(numbers, 0.8), color=colours, height=0.72)
+    axes.set_title(title, fontsize="medium", color=INK)
+    colours = colours or [GROUPS["stable"] if i == 0 else FAILED for i in range(len(names))]
+    bars = axes.barh(
+        range(len(names)), np.maximum(numbers, 0.8 if log else 0), color=colours, height=0.72
+    )
     axes.bar_label(bars, [f"{n:,}" for n in numbers], padding=3, color=INK, fontsize=9)
     _name_bars(axes, [name.replace("_", " ") for name in names])
-    axes.set_xscale("log")
-    axes.set_xlim(0.8, 6.0 * max(10, numbers.max(initial=0)))
+    if log:
+        axes.set_xscale("log")
+        axes.set_xlim(0.8, 6.0 * max(10, numbers.max(initial=0)))
+    else:
+        axes.set_xlim(0.0, 1.1 * max(10, numbers.max(initial=0)))
     axes.set_xlabel(what)
     return figure
 
 
-def draw_objects(names: Sequence[str], counts: Mapping[str, Sequence[int]]) -> Figure:
-    """Return a chart of the number of grasps of each object, and of how well they hold.
+def draw_objects(
+    names: Sequence[str], counts: Mapping[str, Sequence[int]], *, title: str = ""
+) -> Figure:
+    """Return a chart of the number of grasps of each object.
 
     Args:
         names: Names of the objects.
-        counts: For each object the number of `held`, `precision` and `stable` grasps; each group is
-            a part of the previous one.
+        counts: Number of grasps of each object by the names of GROUPS, the largest group first;
+            each group is a part of the previous one.
+        title: What the figure counts; none if empty.
     """
     # The objects with the most grasps, the largest on top.
-    held = np.array(counts["held"], dtype=int)
-    order = np.argsort(-held, kind="stable")[:MAX_OBJECTS]
+    most = np.array(next(iter(counts.values())), dtype=int)
+    order = np.argsort(-most, kind="stable")[:MAX_OBJECTS]
     figure = Figure(figsize=(8.0, 1.1 + 0.22 * max(len(order), 1)), layout="constrained")
     axes = figure.add_subplot()
 
-    # Bars over one another: stable grasps are precision grasps, and these are held.
-    for group, colour in GROUPS.items():
-        numbers = np.array(counts[group], dtype=int)[order]
-        axes.barh(range(len(order)), numbers, color=colour, height=0.78, label=group)
+    # Bars over one another: each group is a part of the previous one.
+    for group, each in counts.items():
+        numbers = np.array(each, dtype=int)[order]
+        axes.barh(range(len(order)), numbers, color=GROUPS[group], height=0.78, label=group)
     _name_bars(axes, [names[i] for i in order])
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True))
     axes.set_xlabel("grasps")
-    figure.legend(
-        loc="outside upper center", ncols=3, frameon=False, labelcolor=INK, title=_left_out(names)
-    )
+    told = "\n".join(filter(None, (title, _left_out(names))))
+    figure.legend(loc="outside upper center", ncols=3, frameon=False, labelcolor=INK, title=told)
     return figure
 
 
 def draw_distributions(
-    quantities: Sequence[tuple[str, Array]], groups: Mapping[str, Array]
+    quantities: Sequence[tuple[str, Array]], groups: Mapping[str, Array], *, title: str = ""
 ) -> Figure:
-    """Return histograms of quantities of the held grasps, one panel each.
+    """Return histograms of quantities of grasps, one panel each.
 
     The range of a panel contains 98 % of the values; larger values are counted in its last bin.
 
     Args:
-        quantities: Title with unit, and values (n,) of all held grasps.
+        quantities: Title with unit, and values (n,) of all grasps.
         groups: Which grasps (n,) are in each group, by the names of GROUPS.
+        title: What the figure counts; none if empty.
     """
     columns = 2
     rows = -(-len(quantities) // columns)
@@ -122,11 +145,19 @@ def draw_distributions(
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in panels[len(quantities) :]:
         axes.set_visible(False)
-    for axes, (title, values) in zip(panels, quantities, strict=False):
-        _histogram(axes, title, values, groups)
+    for axes, (quantity, values) in zip(panels, quantities, strict=False):
+        _histogram(axes, quantity, values, groups)
     figure.supylabel("grasps", fontsize="medium", color=INK)
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
+    figure.legend(
+        handles,
+        labels,
+        loc="outside upper center",
+        ncols=3,
+        frameon=False,
+        labelcolor=INK,
+        title=title,
+    )
     return figure
 
 

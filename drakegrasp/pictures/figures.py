@@ -24,21 +24,19 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.statistics import Funnel, count_funnel
 from drakegrasp.dataset.trials import Trials
-from drakegrasp.errors import DataError, MachineError
+from drakegrasp.errors import DataError, MachineError, counted
 from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.approaches import approaches_figure, coverage, read_approaches
 from drakegrasp.pictures.charts import (
-    FAILED,
     GROUPS,
-    draw_codes,
     draw_counts,
     draw_distributions,
     draw_objects,
 )
 from drakegrasp.pictures.rendered import phases_figure
-from drakegrasp.pictures.sheets import class_sheets, scene_views
+from drakegrasp.pictures.sheets import class_sheets, sample_sheet, scene_views
 from drakegrasp.pictures.style import png_bytes, svg_bytes
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.runtime.progress import Report, silent
@@ -49,13 +47,21 @@ DPI = 150
 OBJECTS = 8
 #: Name of the file of the numbers.
 NUMBERS_FILE = "figures.json"
-#: Colour of the bars of samples.
-SAMPLES_COLOUR = "#5B6470"
-#: Columns from which the quantities of `HeldGrasps` are computed.
+#: Columns from which `Samples` are computed.
 COLUMNS = (
-    *("slip", "turn", "closed_f_Q_O", "lifted_f_Q_O", "lifted_penetration", "normal_angle"),
+    *(
+        "object",
+        "slip",
+        "turn",
+        "closed_f_Q_O",
+        "lifted_f_Q_O",
+        "lifted_penetration",
+        "normal_angle",
+    ),
     *("precision", "stable"),
 )
+#: Why a figure of samples is left out.
+NO_SAMPLE = "no attempt became a sample"
 #: A figure or the pages of a figure, with its numbers.
 Drawn: TypeAlias = tuple[Figure | list[Figure], Any]
 
@@ -75,16 +81,18 @@ class Written:
     left_out: dict[str, str] = field(default_factory=dict)
 
 
-class HeldGrasps(NamedTuple):
-    """The h successes of a dataset.
+class Samples(NamedTuple):
+    """The n samples of a dataset.
 
     Attributes:
-        trial_ids: (h,), rows of `/trials`.
-        groups: (h,) bool each, by `held`, `precision` and `stable`.
-        quantities: (h,) each, by title with unit.
+        trial_ids: (n,), rows of `/trials`.
+        objects: (n,), rows of `/objects`.
+        groups: (n,) bool each, by `samples`, `precision` and `stable`.
+        quantities: (n,) each, by title with unit.
     """
 
     trial_ids: npt.NDArray[np.int64]
+    objects: npt.NDArray[np.int64]
     groups: dict[str, npt.NDArray[Any]]
     quantities: dict[str, Array]
 
@@ -111,16 +119,17 @@ def write_figures(
         MachineError: If OpenGL failed and `trial_id` was given.
         OSError: If a file cannot be written.
     """
-    held = read_held(out)
+    samples = read_samples(out)
     read_manifest(out)  # a damaged manifest must raise an error and not just omit some figures
     funnel = count_funnel(out)
     drawings: dict[str, Callable[[], Drawn]] = {
-        "phases": lambda: _phases(out, held, trial_id),
+        "phases": lambda: _phases(out, samples, trial_id),
         "classes": lambda: _classes(out),
-        "outcomes": lambda: draw_codes(funnel.outcomes.sum(axis=0), Outcome.SUCCESS, "attempts"),
-        "hold": lambda: _hold(held, funnel),
-        "objects": lambda: _objects(funnel),
-        "distributions": lambda: _distributions(held),
+        "sheet": lambda: _sheet(out),
+        "outcomes": lambda: _outcomes(funnel),
+        "hold": lambda: _hold(samples, funnel),
+        "objects": lambda: _objects(samples, funnel),
+        "distributions": lambda: _distributions(samples, funnel),
         "approaches": lambda: _approaches(out, funnel),
         "views": lambda: scene_views(out / SCENES_FILE),
     }
@@ -157,22 +166,23 @@ def write_figures(
     return written
 
 
-def read_held(out: Path) -> HeldGrasps:
-    """Return the successes of a dataset.
+def read_samples(out: Path) -> Samples:
+    """Return the samples of a dataset.
 
     Raises:
         DataError: If trials.hdf5 is missing or damaged.
     """
-    held = Trials(out).where(outcome=Outcome.SUCCESS)
-    columns = held.columns(COLUMNS)
+    samples = Trials(out).where(sample=True)
+    columns = samples.columns(COLUMNS)
 
     degrees = np.rad2deg(1.0)
     closed, lifted = (norm(columns[f"{when}_f_Q_O"]) for when in ("closed", "lifted"))
     angles = np.nan_to_num(columns["normal_angle"])
-    return HeldGrasps(
-        trial_ids=held.trial_ids,
+    return Samples(
+        trial_ids=samples.trial_ids,
+        objects=columns["object"].astype(np.int64),
         groups={
-            "held": np.ones(len(held), dtype=np.bool_),
+            "samples": np.ones(len(samples), dtype=np.bool_),
             "precision": columns["precision"],
             "stable": columns["stable"],
         },
@@ -203,14 +213,14 @@ def _plain_style() -> Iterator[None]:
         yield
 
 
-def _phases(out: Path, held: HeldGrasps, trial_id: int | None) -> Drawn:
+def _phases(out: Path, samples: Samples, trial_id: int | None) -> Drawn:
     if trial_id is None:
         # The first grasp of the best group that is not empty.
-        groups = [held.groups[name] for name in ("stable", "precision", "held")]
+        groups = [samples.groups[name] for name in ("stable", "precision", "samples")]
         best = next((group for group in groups if group.any()), None)
         if best is None:
-            raise DataError("no attempt succeeded")
-        trial_id = int(held.trial_ids[np.argmax(best)])
+            raise DataError(NO_SAMPLE)
+        trial_id = int(samples.trial_ids[np.argmax(best)])
     return phases_figure(out, trial_id), {"trial_id": trial_id}
 
 
@@ -219,61 +229,85 @@ def _classes(out: Path) -> Drawn:
     return pages, {"trial_ids": trials}
 
 
-def _hold(held: HeldGrasps, funnel: Funnel) -> Drawn:
-    removals = funnel.removals.sum(axis=0)
-    numbers = {name: int(group.sum()) for name, group in held.groups.items()}
-    numbers["samples"] = int(funnel.samples.sum())
-    colours = [*GROUPS.values(), *[SAMPLES_COLOUR] * (len(numbers) - len(GROUPS))]
-    for removal in Removal:
-        if removals[removal] and removal is not Removal.KEPT:
-            numbers[f"removed: {removal.label}"] = int(removals[removal])
-    colours += [FAILED] * (len(numbers) - len(colours))
-    return draw_counts(numbers, "successes", colours=colours), numbers
+def _sheet(out: Path) -> Drawn:
+    figure, trials = sample_sheet(out / DATA_FILES["oto"])
+    return figure, {"trial_ids": trials}
 
 
-def _objects(funnel: Funnel) -> Drawn:
-    groups = {
-        "held": funnel.outcomes[:, Outcome.SUCCESS],
-        "precision": funnel.precision,
-        "stable": funnel.stable,
-    }
-    counts = {"attempts": funnel.outcomes.sum(axis=1), **groups, "samples": funnel.samples}
+def _told(funnel: Funnel) -> str:
+    """Return which rows the charts of samples count."""
+    objects = counted(int(np.count_nonzero(funnel.samples)), "object")
+    distinct = int(funnel.distinct.sum())
+    return f"{counted(int(funnel.samples.sum()), 'sample')} of {objects} ({distinct:,} distinct)"
+
+
+def _outcomes(funnel: Funnel) -> Drawn:
+    # Every attempt is in one bar: the samples, then what prevented one, by frequency.
+    removals, outcomes = funnel.removals.sum(axis=0), funnel.outcomes.sum(axis=0)
+    lost = {f"removed: {each.label}": int(removals[each]) for each in Removal}
+    lost |= {each.label: int(outcomes[each]) for each in Outcome}
+    for name in (f"removed: {Removal.KEPT.label}", Outcome.SUCCESS.label):
+        del lost[name]
+    numbers = {"samples": int(removals[Removal.KEPT])}
+    numbers |= {name: n for name, n in sorted(lost.items(), key=lambda each: -each[1]) if n}
+    title = f"{counted(int(outcomes.sum()), 'attempt')} of {counted(len(funnel.names), 'object')}"
+    return draw_counts(numbers, "attempts", title=title), numbers
+
+
+def _hold(samples: Samples, funnel: Funnel) -> Drawn:
+    numbers = {name: int(group.sum()) for name, group in samples.groups.items()}
+    numbers["distinct"] = int(funnel.distinct.sum())
+    colours = [GROUPS[name] for name in numbers]
+    figure = draw_counts(numbers, "samples", colours=colours, title=_told(funnel), log=False)
+    return figure, numbers
+
+
+def _objects(samples: Samples, funnel: Funnel) -> Drawn:
+    size = len(funnel.names)
+    counts = {"attempts": funnel.outcomes.sum(axis=1)}
+    for name, group in samples.groups.items():
+        counts[name] = np.bincount(samples.objects[group], minlength=size)
+    counts["distinct"] = funnel.distinct
     rows = zip(funnel.names, zip(*(v.tolist() for v in counts.values()), strict=True), strict=True)
     numbers = {name: dict(zip(counts, row, strict=True)) for name, row in rows}
-    return draw_objects(funnel.names, {name: v.tolist() for name, v in groups.items()}), numbers
+    shown = {name: counts[name].tolist() for name in ("samples", "distinct")}
+    return draw_objects(funnel.names, shown, title=_told(funnel)), numbers
 
 
-def _distributions(held: HeldGrasps) -> Drawn:
-    if not len(held.trial_ids):
-        raise DataError("no attempt succeeded")
+def _distributions(samples: Samples, funnel: Funnel) -> Drawn:
+    if not len(samples.trial_ids):
+        raise DataError(NO_SAMPLE)
     numbers = {
         title: {
             name: {
                 "median": round(float(np.median(values[group])), 4),
                 "90 %": round(float(np.quantile(values[group], 0.9)), 4),
             }
-            for name, group in held.groups.items()
+            for name, group in samples.groups.items()
             if group.any()
         }
-        for title, values in held.quantities.items()
+        for title, values in samples.quantities.items()
     }
-    return draw_distributions(list(held.quantities.items()), held.groups), numbers
+    quantities = list(samples.quantities.items())
+    return draw_distributions(quantities, samples.groups, title=_told(funnel)), numbers
 
 
 def _approaches(out: Path, funnel: Funnel) -> Drawn:
-    # The objects with the most successes.
-    held, names = funnel.outcomes[:, Outcome.SUCCESS], funnel.names
+    # The objects with the most samples.
+    samples, names = funnel.samples, funnel.names
     config_of = read_manifest(out).config_of
-    shown = [int(i) for i in np.argsort(-held, kind="stable")[:OBJECTS] if held[i]]
+    shown = [int(i) for i in np.argsort(-samples, kind="stable")[:OBJECTS] if samples[i]]
     if not shown:
-        raise DataError("no attempt succeeded")
+        raise DataError(NO_SAMPLE)
     items = [read_approaches(out, names[i], config_of(names[i])) for i in shown]
     numbers = {
         item.name: {
             "attempts": item.attempts,
-            "successes": len(item.successes),
-            "coverage_of_successes": round(coverage(item.successes), 4),
+            "samples": len(item.samples),
+            "distinct": item.distinct,
+            "samples_in_other_resting_poses": item.elsewhere,
+            "coverage_of_samples": round(coverage(item.samples), 4),
         }
         for item in items
     }
-    return approaches_figure(items, left_out=int(np.count_nonzero(held)) - len(shown)), numbers
+    return approaches_figure(items, left_out=int(np.count_nonzero(samples)) - len(shown)), numbers

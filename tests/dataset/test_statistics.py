@@ -143,7 +143,10 @@ def test_samples_are_as_many_wherever_they_are_counted(
     write_figures(out, tmp_path / "figures")
     numbers = json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())
     assert {name: row["samples"] for name, row in numbers["objects"].items()} == found
-    assert numbers["hold"]["samples"] == total
+    assert numbers["hold"]["samples"] == numbers["outcomes"]["samples"] == total
+    distinct = sum(row.distinct for row in count_splits(out))
+    assert numbers["hold"]["distinct"] == distinct
+    assert sum(row["distinct"] for row in numbers["objects"].values()) == distinct
     assert np.count_nonzero(Catalog(out).current().table.split != NONE) == total
 
 

@@ -136,11 +136,12 @@ def test_lifts_are_tried_elsewhere_as_they_lay(
 
 def test_pictures_are_of_one_resting_pose(dataset: Path) -> None:
     columns, name = trials(dataset), "8_wineglass_flute"
-    own = (columns["object"] == 0) & (columns["outcome"] == Outcome.SUCCESS)
+    own = (columns["object"] == 0) & (columns["removal"] == Removal.KEPT)
     counts = np.bincount(columns["resting"][own])
     assert 0 < counts.max() < counts.sum()
     shown = read_approaches(dataset, name, read_manifest(dataset).config_of(name))
-    assert len(shown.successes) == counts.max()
+    assert len(shown.samples) == counts.max()
+    assert shown.elsewhere == counts.sum() - counts.max()
     pose = (columns["object"] == 0) & (columns["resting"] == counts.argmax())
     assert shown.attempts == np.count_nonzero(pose)
 

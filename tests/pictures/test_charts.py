@@ -10,7 +10,6 @@ import pytest
 from matplotlib.image import imread
 
 from drakegrasp.pictures.charts import (
-    GROUPS,
     MAX_OBJECTS,
     card_picture,
     draw_counts,
@@ -36,7 +35,7 @@ def test_objects_are_in_the_order_of_their_grasps() -> None:
 
 def test_the_objects_with_most_grasps_are_drawn() -> None:
     number = MAX_OBJECTS + 7
-    counts = {name: list(range(number)) for name in GROUPS}
+    counts = {name: list(range(number)) for name in ("samples", "distinct")}
     figure = draw_objects([f"object {i}" for i in range(number)], counts)
     labels = [text.get_text() for text in figure.axes[0].get_yticklabels()]
     assert len(labels) == MAX_OBJECTS
@@ -47,7 +46,8 @@ def test_the_objects_with_most_grasps_are_drawn() -> None:
 def test_what_is_beyond_a_histogram_is_in_its_last_bin() -> None:
     values = np.append(np.linspace(0.0, 1.0, 99), [50.0, np.nan])
     groups = {"held": np.ones(101, bool), "stable": values < 0.5}
-    figure = draw_distributions([("slip [mm]", values)], groups)
+    figure = draw_distributions([("slip [mm]", values)], groups, title="101 samples")
+    assert figure.legends[0].get_title().get_text() == "101 samples"
     held, stable = (patch.get_data().values for patch in figure.axes[0].patches)
     assert held.sum() == 100
     assert stable.sum() == (values < 0.5).sum()
@@ -56,7 +56,7 @@ def test_what_is_beyond_a_histogram_is_in_its_last_bin() -> None:
 
 @pytest.mark.parametrize("name", ["<script>alert(1)</script>", "a $x^2$ b", "$", "ä & ö"])
 def test_names_are_drawn_as_they_are(name: str) -> None:
-    counts = {group: [1] for group in GROUPS}
+    counts = {"samples": [1]}
     svg = svg_bytes(draw_objects([name], counts)).decode()
     assert "<script" not in svg
     assert svg == svg_bytes(draw_objects([name], counts)).decode()

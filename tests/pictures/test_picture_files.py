@@ -15,18 +15,34 @@ from helpers import datasets
 from helpers.datasets import OTO, SLIP, TRIALS, edit_file, make_dataset
 from helpers.machine import needs_egl
 
+from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import DataError, MachineError
+from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
+from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures import figures
 from drakegrasp.pictures.approaches import read_approaches
-from drakegrasp.pictures.figures import NUMBERS_FILE, read_held, write_figures
+from drakegrasp.pictures.figures import NUMBERS_FILE, read_samples, write_figures
 
-ALL = {"phases", "classes_1", "outcomes", "hold", "objects", "distributions", "approaches"}
+ALL = {
+    *("phases", "classes_1", "sheet", "outcomes", "hold", "objects"),
+    *("distributions", "approaches"),
+}
 
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def lose_all(out: Path) -> None:
+    """Let every attempt of a dataset end as a failure."""
+
+    def lose(file: h5py.File) -> None:
+        file["trials/outcome"][:] = Outcome.DROPPED
+        file["successes/removal"][:] = Removal.SLID
+
+    edit_file(out / TRIALS, lose)
 
 
 @pytest.fixture
@@ -55,8 +71,8 @@ def test_the_same_dataset_gives_the_same_bytes(
             ElementTree.fromstring(content)
             assert b"<dc:date>" not in content
     numbers = json.loads(files[NUMBERS_FILE])
-    assert numbers["outcomes"]["success"] == 9
-    assert numbers["hold"]["held"] == numbers["hold"]["stable"] == 9
+    assert numbers["outcomes"]["samples"] == 9
+    assert numbers["hold"]["samples"] == numbers["hold"]["stable"] == 9
     assert numbers["phases"]["trial_id"] == 0
 
     # The style of somebody's papers changes nothing.
@@ -70,23 +86,39 @@ def test_the_same_dataset_gives_the_same_bytes(
 def test_what_the_dataset_lacks_is_left_out(sound: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(sound, tmp_path / "out"))
     (out / OTO).unlink()
-    edit_file(out / TRIALS, lambda f: f["trials/outcome"].write_direct(np.full(36, 9, "u1")))
+    lose_all(out)
     folder = tmp_path / "figures"
     folder.mkdir()
     for name in ("approaches.png", "classes_1.png", "classes_12.svg", "mine.png"):
         (folder / name).touch()
     written = write_figures(out, folder)
     assert set(written.names) == {"outcomes", "hold", "objects"}
-    assert written.left_out["approaches"] == "no attempt succeeded"
-    assert written.left_out["distributions"] == "no attempt succeeded"
-    assert OTO in written.left_out["classes"]
+    assert written.left_out["approaches"] == "no attempt became a sample"
+    assert written.left_out["distributions"] == "no attempt became a sample"
+    assert OTO in written.left_out["classes"] and OTO in written.left_out["sheet"]
     # A picture of what was there before is removed, and nothing else.
     assert {p.name for p in folder.glob("*.png")} == {
         *(f"{name}.png" for name in written.names),
         "mine.png",
     }
     assert not list(folder.glob("classes_*.svg"))
-    assert json.loads((folder / NUMBERS_FILE).read_text())["hold"]["held"] == 0
+    assert json.loads((folder / NUMBERS_FILE).read_text())["hold"]["samples"] == 0
+
+
+@pytest.mark.usefixtures("no_render")
+def test_pictures_of_samples_count_the_same_rows(sound: Path, tmp_path: Path) -> None:
+    """Two of the nine successes are removed; each picture tells of the seven samples."""
+    out = Path(shutil.copytree(sound, tmp_path / "out"))
+    assemble(out, rejected=[0, 12])
+    assert "sheet" in write_figures(out, tmp_path / "figures").names
+    numbers = json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())
+    assert numbers["hold"]["samples"] == numbers["outcomes"]["samples"] == 7
+    assert numbers["outcomes"]["removed: rejected"] == 2
+    assert sum(numbers["outcomes"].values()) == 36
+    for kind in ("objects", "approaches"):
+        assert [each["samples"] for each in numbers[kind].values()].count(2) == 2, kind
+        assert sum(each["samples"] for each in numbers[kind].values()) == 7, kind
+    assert sorted(numbers["sheet"]["trial_ids"]) == [3, 11, 15, 23, 24, 27, 35]
 
 
 def test_names_are_drawn_as_they_are_also_without_opengl(
@@ -118,9 +150,10 @@ def test_what_was_asked_for_must_be_drawn(sound: Path, tmp_path: Path) -> None:
         write_figures(sound, tmp_path, trial_id=2)
 
 
-def test_every_success_is_read_once(sound: Path) -> None:
-    held = read_held(sound)
+def test_every_sample_is_read_once(sound: Path) -> None:
+    held = read_samples(sound)
     assert held.trial_ids.tolist() == [0, 3, 11, 12, 15, 23, 24, 27, 35]
+    assert held.objects.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
     assert [int(group.sum()) for group in held.groups.values()] == [9, 9, 9]
     np.testing.assert_allclose(held.quantities["slip in the hand [mm]"], 1e3 * SLIP)
     np.testing.assert_allclose(held.quantities["turn in the hand [°]"], 1.0)
@@ -128,26 +161,27 @@ def test_every_success_is_read_once(sound: Path) -> None:
     np.testing.assert_allclose(held.quantities["largest penetration after the lift [mm]"], 0.125)
 
 
-def test_a_file_without_successes_has_none(sound: Path, tmp_path: Path) -> None:
+def test_a_file_without_samples_has_none(sound: Path, tmp_path: Path) -> None:
     shutil.copy(sound / TRIALS, tmp_path)
-    edit_file(tmp_path / TRIALS, lambda f: f["trials/outcome"].write_direct(np.full(36, 9, "u1")))
-    held = read_held(tmp_path)
+    lose_all(tmp_path)
+    held = read_samples(tmp_path)
     assert len(held.trial_ids) == 0
     assert all(len(values) == 0 for values in held.quantities.values())
 
 
 def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"trials\.hdf5: must be the trials"):
-        read_held(tmp_path)
+        read_samples(tmp_path)
 
 
 def test_approaches_are_of_one_object(sound: Path, tmp_path: Path) -> None:
     config = read_manifest(sound).config
     found = read_approaches(sound, "2_box_b", config)
     assert found.attempts == 12
-    assert found.groups.tolist() == [2, 2, 2]  # stable
+    assert found.holds.tolist() == [2, 2, 2]  # stable
+    assert found.elsewhere == 0
     # All palms are tilted by 0.25 rad; the one attempt whose ray misses, row 7, approached nothing.
-    np.testing.assert_allclose(found.successes[:, 2], np.cos(0.25), atol=1e-9)
+    np.testing.assert_allclose(found.samples[:, 2], np.cos(0.25), atol=1e-9)
     with h5py.File(sound / TRIALS, "r") as file:
         rows = [1, 2, 4, 5, 6, 8, 9, 10]
         X_TO, X_OG = (unpack_pose(file[f"trials/{name}"][12:24][rows]) for name in ("X_TO", "X_OG"))

@@ -13,7 +13,7 @@ import pytest
 from doc_figures import find_sample, frames_figure, hero_figure
 from helpers.datasets import MISSING, OTO
 from helpers.machine import needs_egl
-from helpers.scripts import PIPELINES, load_script
+from helpers.scripts import PIPELINES
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
@@ -30,7 +30,9 @@ from drakegrasp.pictures import sheets
 from drakegrasp.pictures.sheets import (
     class_sheets,
     draw_sheet,
+    sample_sheet,
     scene_views,
+    spread_over_objects,
 )
 from drakegrasp.pictures.style import draw_contacts
 from drakegrasp.vision.camera import intrinsics, project
@@ -77,26 +79,34 @@ def write_data_file(path: Path, names: list[str], split: str = "train") -> None:
                     dataset[:] = values.get(field.name, 0.0)
 
 
-def test_contact_sheet_of_the_demo(tmp_path: Path) -> None:
-    contact_sheet = load_script("demo").contact_sheet
-    path, png = tmp_path / "grasping_oto.hdf5", tmp_path / "sheet.png"
+def test_the_sheet_of_a_dataset_has_all_objects(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "grasping_oto.hdf5"
     write_data_file(path, [])
     with pytest.raises(DataError, match="at least one sample"):
-        contact_sheet(path, png)
+        sample_sheet(path)
     write_data_file(path, ["1_mug_small", "1_mug_small", "2_box"], split="test")
-    with pytest.raises(DataError, match="at least one sample"):
-        contact_sheet(path, png, split="valid")
-    assert not png.exists()
-    assert contact_sheet(path, png) == 3
-    height, width = imread(png).shape[:2]
-    assert width > 1000
-    assert 150 < height < width / 3
-    # No more lines than asked for, and the same bytes again.
-    write_data_file(path, ["1_mug"] * 9)
-    assert contact_sheet(path, png, rows=2) == 6
-    first = png.read_bytes()
-    assert contact_sheet(path, png, rows=2, split="train") == 6
-    assert png.read_bytes() == first
+    figure, trials = sample_sheet(path)
+    assert trials == [10, 11, 12]
+    assert notes(figure) == "3 of 3 samples, 2 of 2 objects with samples"
+
+    # More objects than places have a sample each, and there is a limit.
+    monkeypatch.setattr(sheets, "PLACES", 4)
+    monkeypatch.setattr(sheets, "MOST", 6)
+    for objects, drawn, note in (
+        (2, [10, 12, 11, 13], "4 of 10 samples, 2 of 2 objects with samples"),
+        (5, [10, 11, 12, 13, 14], "5 of 10 samples, 5 of 5 objects with samples"),
+        (9, [10, 12, 13, 15, 16, 18], "6 of 10 samples, 6 of 9 objects with samples"),
+    ):
+        write_data_file(path, [f"{1 + i % objects}_box" for i in range(10)])
+        figure, trials = sample_sheet(path)
+        assert trials == drawn
+        assert notes(figure) == note
+
+
+def notes(figure: Figure) -> str:
+    return figure.texts[0].get_text()
 
 
 def test_dots_are_where_the_contacts_project(tmp_path: Path) -> None:
@@ -117,7 +127,6 @@ def test_dots_are_where_the_contacts_project(tmp_path: Path) -> None:
 
 
 def test_samples_are_spread_over_objects() -> None:
-    spread_over_objects = load_script("demo").spread_over_objects
     names = ["10_can"] * 4 + ["2_mug"] * 3 + ["1_box"]
     assert spread_over_objects(names, 3) == [7, 4, 0]
     assert spread_over_objects(names, 5) == [7, 4, 5, 0, 1]
