@@ -135,14 +135,19 @@ def as_numbers(value: npt.ArrayLike, must: str) -> Array:
         GraspError: If the value is anything else.
     """
     try:
-        array = np.asarray(without_torch(value))
+        plain = without_torch(value)
+        array = np.asarray(plain)
     except (TypeError, ValueError, RuntimeError) as error:
         raise GraspError(
             f"{must}, got a {type(value).__name__} that cannot be read ({first_line(error)})"
         ) from None
-    # An empty list is accepted: NumPy gives it real numbers.
-    if array.dtype.kind not in "fiu":
-        got = _OTHER_KINDS.get(array.dtype.kind, f"a {type(value).__name__}")
+    # An empty list is accepted: NumPy gives it real numbers. It also reads [True, 0.5] as numbers.
+    kind = array.dtype.kind
+    if kind in "fiu" and isinstance(plain, list):
+        flat = np.asarray(plain, dtype=object).flat
+        kind = "b" if any(isinstance(each, bool | np.bool_) for each in flat) else kind
+    if kind not in "fiu":
+        got = _OTHER_KINDS.get(kind, f"a {type(value).__name__}")
         raise GraspError(f"{must}, got {'None' if value is None else got}")
     return array.astype(np.float64)
 

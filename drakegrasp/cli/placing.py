@@ -59,13 +59,19 @@ def place_requested(
             refuse_unwritable(request.out)
         postures = holds_postures(request.grasps)
         path = _dataset_of(request, postures)
+        found: tuple[list[PlacedGrasp], Config, PredictedRows | None]
         if path is None:
-            return _place_on_mesh(request)
-        if postures and request.split is None and not has_rows(request.grasps):
-            return _place_on_objects(request, path)
-        return _place_on_rows(request, path)
+            found = _place_on_mesh(request)
+        elif postures and request.split is None and not has_rows(request.grasps):
+            found = _place_on_objects(request, path)
+        else:
+            found = _place_on_rows(request, path)
     except DataError as error:
         raise GraspError(str(error)) from None
+    # Invalid contacts are failures of a network, but such a file of postures belongs elsewhere.
+    if postures and all(grasp.invalid for grasp in found[0]):
+        raise GraspError(f"{request.grasps}: {found[0][0].invalid}")
+    return found
 
 
 def _dataset_of(request: VerifyRequest, postures: bool) -> Path | None:

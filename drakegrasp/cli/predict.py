@@ -69,7 +69,8 @@ def predict(
         --units m|cm|mm: Unit of length of a cloud. [default: m]
         --camera FX,FY,CX,CY|JSON: Camera matrix of a depth image in pixels: four numbers, or a file
             with K or with fx, fy, cx and cy.
-        --mask FILE: Image or .npy of the size of the depth image, not 0 on the object.
+        --mask FILE: Image or .npy of the size of the depth image: 0, and one other value on the
+            object.
         --camera-pose FILE: .npy file with the pose of the camera over the table, X_TC, as (4, 4).
             [default: from the plane on which the object stands]
         --depth-scale METRES: Unit of a .png depth image. [default: 0.001]

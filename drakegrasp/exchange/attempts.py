@@ -12,6 +12,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import inspect
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -36,7 +37,7 @@ from drakegrasp.errors import (
 )
 from drakegrasp.exchange.contacts import read_contacts
 from drakegrasp.foreign_files import LARGEST_TEXT, read_npz, refuse_irregular
-from drakegrasp.frames import Array, unpack_pose
+from drakegrasp.frames import Array, as_numbers, unpack_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.protocols.files import is_grasp_file
 from drakegrasp.runtime.files import atomic_path
@@ -57,7 +58,7 @@ from drakegrasp.verification.placing import choose_rows, read_several
 from drakegrasp.verification.prediction import read_grasps
 
 #: Values that a file states once for all its rows.
-_OF_FILE = ("frame", "link", "joints", "hand", "of_objects")
+_OF_FILE = ("frame", "link", "joints", "hand", "gripper", "of_objects")
 #: Suffixes of files of arrays, tables and YAML files.
 ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml", ".yml")
 #: Array of the poses in a file of ACRONYM.
@@ -65,6 +66,8 @@ _ACRONYM = "grasps/transforms"
 #: Maximum total size of the arrays of a file [bytes]: two million postures of a hand with 16
 #: joints.
 MOST_BYTES = 1_000_000_000
+#: Words that the names of many hands have.
+_COMMON_WORDS = {"hand", "palm", "gripper", "base", "link", "left", "right", "model", "robot"}
 #: The arrays of our own layout that are neither poses nor joints.
 _TEXTS = ("object", "joints", "source", "frame", "link", "preshape")
 _SCALARS = ("resting", "scale")
@@ -122,7 +125,7 @@ def read_attempts(
             table = read_grasps(said["grasps"], hand.num_fingers, rows=said["rows"])
             if (stated := said["confidence"]) is None:
                 return table
-            return replace(table, confidence=read_confidence(stated, len(table)))
+            return replace(table, confidence=read_confidence(stated, (len(table),)))
 
     # Postures of a file, or of all files of a folder.
     read_as = read_as or {}
@@ -146,9 +149,9 @@ def _raw(
 ) -> dict[str, Any]:
     """Return the postures of a file, with the caller's values, as arguments of `make_attempts`.
 
-    There are three additional keys: `hand` is the name of the hand, `trial` (n,) has the trials
-    from which the samples were exported, and `of_objects` states whether each grasp is for its
-    object in any pose.
+    There are four additional keys: `hand` is the name of the hand, `gripper` what another tool
+    calls it, `trial` (n,) has the trials from which the samples were exported, and `of_objects`
+    states whether each grasp is for its object in any pose.
 
     Raises:
         GraspError: If the file is not a file of postures.
@@ -183,7 +186,8 @@ def _as_asked(raw: dict[str, Any], read_as: Mapping[str, str]) -> dict[str, Any]
         # Meshes in {O} are exported in metres, so a scale of 1 does not refer to the source mesh.
         raw["scale"] = np.where(np.asarray(raw["scale"]) == 1.0, np.nan, raw["scale"])
     if "link" in read_as:
-        raw["link"] = _link([read_as["link"]])
+        # A caller who names the frame of the poses knows the gripper.
+        raw |= {"link": _link([read_as["link"]]), "gripper": None}
     if shape := read_as.get("preshape"):
         named = raw.get("preshape") or [""] * len(raw["objects"])
         raw["preshape"] = [name or shape for name in named]
@@ -278,12 +282,24 @@ def _made(hand: Hand, raw: dict[str, Any]) -> Attempts:
     told = raw.get("hand")
     if told not in (None, hand.name):
         raise GraspError(f"hand must be {told}, as the file says, got {hand.name} (--hand)")
-    beside = ("hand", "trial", "of_objects")
+    if (gripper := raw.get("gripper")) and not _is_called(hand, str(gripper)):
+        raise GraspError(
+            f"grasps must be of the hand {hand.name} (--hand), got those of the gripper {gripper}: "
+            "if both are the same, name the frame of the poses (--link)"
+        )
+    beside = ("hand", "gripper", "trial", "of_objects")
     said = {name: value for name, value in raw.items() if name not in beside}
     try:
         return make_attempts(hand, **said)
     except (HandError, TypeError, ValueError) as error:
         raise GraspError(one_line(error)) from None
+
+
+def _is_called(hand: Hand, gripper: str) -> bool:
+    """Return whether a gripper of another tool has a word of the hand's names in its name."""
+    names = f"{hand.name} {hand.model.path.stem} {hand.palm_link}".lower()
+    words = set(re.findall(r"[a-z0-9]{3,}", names)) - _COMMON_WORDS
+    return any(word in gripper.lower() for word in words)
 
 
 def _for_rows(path: Path, hand: Hand, data: GraspDataset, read_as: Mapping[str, str]) -> Attempts:
@@ -504,6 +520,8 @@ def _of_arrays(arrays: Mapping[str, Any], nameless: bool) -> dict[str, Any]:
         missing.append("X_FG (or position and quaternion)")
     if missing:
         raise GraspError(f"{', '.join(missing)} must be there, got only {listed(sorted(arrays))}")
+    if "X_FG" in arrays and not {"position", "quaternion"}.isdisjoint(arrays):
+        raise GraspError("poses must be X_FG, or position and quaternion, got both")
     texts = {name: _texts(arrays[name], name) for name in _TEXTS if name in arrays}
 
     # The palm poses, in either form.
@@ -555,13 +573,11 @@ def _conditions(columns: Mapping[str, Any], count: int) -> dict[str, Any]:
     """Return the conditions (n, 3) of the rows as a keyword; empty if there are no such columns."""
     if not set(CONDITIONS) & set(columns):
         return {}
-    unknown = np.full(count, np.nan)
-    try:
-        told = [np.asarray(columns.get(n, unknown), dtype=float) for n in CONDITIONS]
-        return {"conditions": np.column_stack(told)}
-    except (TypeError, ValueError):
-        must = f"{', '.join(CONDITIONS)} must be {count} numbers each"
-        raise GraspError(f"{must}, got something else") from None
+    must, unknown = f"{', '.join(CONDITIONS)} must be {count} numbers each", np.full(count, np.nan)
+    told = [as_numbers(columns.get(name, unknown), must) for name in CONDITIONS]
+    if any(each.shape != (count,) for each in told):
+        raise GraspError(f"{must}, got other shapes")
+    return {"conditions": np.column_stack(told)}
 
 
 def _texts(value: Any, name: str) -> list[str]:
@@ -589,10 +605,7 @@ def _link(values: Sequence[str | None] | None) -> str | None:
 
 def _stacked(value: Any, name: str) -> Array:
     """Return poses (n, 4, 4) from numbers (n, 4, 4), (n, 3, 4) or (n, 12)."""
-    try:
-        X = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        raise GraspError(f"{name} must be poses, 4 x 4 numbers each, got something else") from None
+    X = as_numbers(value, f"{name} must be poses, 4 x 4 numbers each")
     if X.ndim == 3 and X.shape[1:] == (3, 4):
         X = X.reshape(len(X), 12)
     if X.ndim == 2 and X.shape[1] == 12:

@@ -20,6 +20,7 @@ from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.errors import GraspError, listed, one_line
 from drakegrasp.exchange.attempts import is_graspgen, refuse_large
 from drakegrasp.foreign_files import read_json
+from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import Hand
 
 #: Name of GraspGen's gripper frame in hand files.
@@ -40,17 +41,18 @@ def read_graspgen_json(path: Path, hand: Hand) -> dict[str, Any]:
         raise GraspError(f"{path}: must be JSON, got: {one_line(error)}") from None
     try:
         thing, grasps = tree["object"], tree["grasps"]
-        X_MA, held = _poses(grasps["transforms"]), grasps["object_in_gripper"]
-        held = np.asarray(held, dtype=float)
-        scale = float(thing["scale"])
+        X_MA = _poses(grasps["transforms"])
+        held = np.asarray(grasps["object_in_gripper"], dtype=float)
+        scale = float(as_numbers(thing["scale"], "scale must be a number"))
         name = Path(str(thing["file"])).stem
-    except (KeyError, TypeError, ValueError) as error:
+        gripper = tree.get("gripper", {}).get("name")
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         got = listed(sorted(map(str, tree))) if isinstance(tree, dict) else type(tree).__name__
         raise GraspError(
             f"{path}: must be a file of GraspGen's datasets, with object (file, scale) and grasps "
             f"(transforms, object_in_gripper), got {got} ({one_line(error)})"
         ) from None
-    return _raw([name] * len(X_MA), X_MA, np.full(len(X_MA), scale), held)
+    return _raw(gripper, [name] * len(X_MA), X_MA, np.full(len(X_MA), scale), held)
 
 
 def read_graspgen_hdf5(path: Path, hand: Hand) -> dict[str, Any] | None:
@@ -70,8 +72,12 @@ def read_graspgen_hdf5(path: Path, hand: Hand) -> dict[str, Any] | None:
             lambda _, item: groups.append(item) if "pred_grasps" in _names(item) else None
         )
         refuse_large(sum(group["pred_grasps"].nbytes for group in groups))
+
+        # What the groups of the objects and the file as a whole state.
         try:
             parts = [_predicted(group) for group in groups]
+            gripper = file.get("misc/gripper_name")
+            gripper = None if gripper is None else gripper.asstr()[()]
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise GraspError(
                 f"{path}: objects must have asset_path, asset_scale, pred_grasps and confidence, "
@@ -80,7 +86,7 @@ def read_graspgen_hdf5(path: Path, hand: Hand) -> dict[str, Any] | None:
     if not parts:
         raise GraspError(f"{path}: objects must have pred_grasps, got none")
     names, *columns = zip(*parts, strict=True)
-    return _raw([name for each in names for name in each], *map(np.concatenate, columns))
+    return _raw(gripper, [name for each in names for name in each], *map(np.concatenate, columns))
 
 
 def _names(item: object) -> list[str]:
@@ -91,8 +97,9 @@ def _predicted(group: h5py.Group) -> tuple[list[str], Any, Any, Any]:
     """Return object name, pose, scale and confidence of each grasp of one object."""
     X_MA = _poses(group["pred_grasps"][()])
     name = Path(group["asset_path"].asstr()[()]).stem
-    scale, confidence = float(group["asset_scale"][()]), group["confidence"][()].astype(float)
-    return [name] * len(X_MA), X_MA, np.full(len(X_MA), scale), confidence.ravel()
+    confidence = as_numbers(group["confidence"][()], "confidence must be numbers")
+    scale = np.full(len(X_MA), float(group["asset_scale"][()]))
+    return [name] * len(X_MA), X_MA, scale, confidence.ravel()
 
 
 def _poses(numbers: Any) -> Any:
@@ -101,14 +108,17 @@ def _poses(numbers: Any) -> Any:
     Raises:
         ValueError: If they do not have this shape.
     """
-    X = np.asarray(numbers, dtype=float)
+    X = as_numbers(numbers, "poses must be numbers")
     if X.ndim != 3 or X.shape[1:] != (4, 4):
         raise ValueError(f"poses must be of shape (n, 4, 4), got {X.shape}")
     return X
 
 
-def _raw(objects: list[str], X_MA: Any, scale: Any, confidence: Any) -> dict[str, Any]:
+def _raw(
+    gripper: str | None, objects: list[str], X_MA: Any, scale: Any, confidence: Any
+) -> dict[str, Any]:
     return {
+        "gripper": gripper,
         "objects": objects,
         "X_FG": X_MA,
         "link": LINK,

@@ -9,7 +9,7 @@ conditions under which the sample held, so that the file can be read back as the
 from __future__ import annotations
 
 from itertools import groupby
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -103,9 +103,9 @@ def grasp_entry(hand: Hand, grasp: ClosedGrasp) -> dict[str, Any]:
 def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
     """Return the grasps of a file as arguments of `make_attempts`.
 
-    The object has the name of the file. Its frame is the frame of its mesh file; in a file that
-    drakegrasp exported, this is {O}. A grasp without `cspace_position` is a palm pose without
-    joints, as GraspGen writes it.
+    The object has the name of the mesh file that the file states, or else of the file. Its frame is
+    the frame of its mesh file; in a file that drakegrasp exported, this is {O}. A grasp without
+    `cspace_position` is a palm pose without joints, as GraspGen writes it.
 
     Raises:
         GraspError: If the file is not an isaac_grasp file.
@@ -121,6 +121,10 @@ def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
     grasps = tree.get("grasps")
     if not isinstance(grasps, dict) or not grasps:
         raise GraspError(f"{path}: grasps must be there, got none")
+    try:
+        scale = _number(tree.get("object_scale", np.nan))
+    except (TypeError, ValueError) as error:
+        raise GraspError(f"{path}: object_scale must be a number, got {one_line(error)}") from None
 
     # Read from each grasp the joints that the first grasp with joints names. A grasp without
     # joints is a palm pose without joints.
@@ -139,14 +143,14 @@ def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
     for i, (name, grasp) in enumerate(grasps.items()):
         try:
             numbers[i] = _isaac_numbers(grasp, joints)
-            alone[i], stated[i] = _STAGES[0] not in grasp, _confidence(grasp)
+            alone[i], stated[i] = _STAGES[0] not in grasp, _number(grasp.get("confidence", np.nan))
             if ours:
                 known[i], preshape[i] = _of_export(grasp), str(grasp.get("preshape", ""))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             must, names = "position and orientation", ", ".join(joints)
             if joints:
                 must = f"position, orientation and cspace_position of the joints {names}"
-            invalid[i] = f"{name} must have {must}, got none ({one_line(error)})"
+            invalid[i] = f"{name} must have {must}, got others ({one_line(error)})"
     X_FL, reasons = quaternion_poses(numbers[:, :3], numbers[:, 3:7])
     X_TO, no_rest = quaternion_poses(known[:, :3], known[:, 3:7])
     lies = np.isfinite(known[:, :7]).any(axis=1)
@@ -157,7 +161,7 @@ def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
     trials = known[:, 7]
     grasp_q, pregrasp_q = np.split(numbers[:, 7:], 2, axis=1)
     return {
-        "objects": [path.stem] * len(grasps),
+        "objects": [PureWindowsPath(str(tree.get("object_file", path))).stem] * len(grasps),
         "X_FG": X_FL,
         "link": hand.palm_link,
         "frame": "object" if ours else "mesh",
@@ -174,6 +178,8 @@ def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
         "preshape": preshape,
         "trial": None if np.isnan(trials).any() else trials.astype(np.int64),
         "of_objects": not ours,
+        "scale": np.full(len(grasps), scale),
+        "gripper": PureWindowsPath(str(tree.get("gripper_file", ""))).stem,
         "hand": str(tree["hand"]) if ours and "hand" in tree else None,
     }
 
@@ -185,13 +191,18 @@ def _of_export(grasp: Any) -> list[float]:
         found = [*lies["position"], lies["orientation"]["w"], *lies["orientation"]["xyz"]]
     told = grasp.get("conditions", {})
     found += [grasp.get("trial_id", np.nan), *(told.get(name, np.nan) for name in CONDITIONS)]
-    return [float(value) for value in found]
+    return [_number(value) for value in found]
 
 
-def _confidence(grasp: Any) -> float:
-    """Return the confidence that a grasp states; NaN if it is not a number."""
-    stated = grasp.get("confidence")
-    return float(stated) if isinstance(stated, int | float) else np.nan
+def _number(value: Any) -> float:
+    """Return a number; YAML reads some numbers, e.g. 1e-3, as text.
+
+    Raises:
+        TypeError, ValueError: If it is none.
+    """
+    if isinstance(value, bool):
+        raise TypeError(f"{value}")
+    return float(value)
 
 
 def _isaac_numbers(grasp: Any, joints: list[str]) -> list[float]:
@@ -200,4 +211,4 @@ def _isaac_numbers(grasp: Any, joints: list[str]) -> list[float]:
     closed, before = _STAGES
     q = [grasp.get(closed, nothing), grasp.get(before) or nothing]
     place = [*grasp["position"], turn["w"], *turn["xyz"]]
-    return [float(v) for v in (*place, *(stage[joint] for stage in q for joint in joints))]
+    return [_number(v) for v in (*place, *(stage[joint] for stage in q for joint in joints))]

@@ -283,21 +283,18 @@ def ranked(table: Attempts, of: Sequence[Any] | npt.NDArray[Any]) -> Attempts:
     """Return a table with the rank of each row among the rows with the same target.
 
     The row with the greatest confidence is first; of equal ones, the row that was given first.
-    Confidence that is not a finite number becomes -inf.
+    Invalid rows without a confidence are last.
 
     Args:
         table: The attempts.
         of: (n,), target of each row, e.g. a row of a dataset.
     """
-    stated = table.confidence
-    if stated is not None:
-        stated = np.where(np.isfinite(stated), stated, -np.inf)
     _, number, counts = np.unique(np.asarray(of), return_inverse=True, return_counts=True)
-    falling = np.zeros(len(table)) if stated is None else -stated
+    falling = np.zeros(len(table)) if table.confidence is None else -table.confidence
     order = np.lexsort((falling, number))
     ranks = np.zeros(len(table), dtype=np.int64)
     ranks[order] = np.arange(len(table)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return replace(table, confidence=stated, rank=ranks)
+    return replace(table, rank=ranks)
 
 
 def taken(value: Any, rows: Sequence[int]) -> Any:
@@ -403,21 +400,30 @@ def make_attempts(
         X_TO=_poses(X_TO, count, "X_TO", bad, some=True),
         invalid=tuple(bad),
         of_row=of_row,
-        confidence=None if confidence is None else read_confidence(confidence, count),
+        confidence=None if confidence is None else read_confidence(confidence, (count,), bad),
         link=link or "",
         X_FG_xyzw=X_FG_xyzw,
     )
 
 
-def read_confidence(stated: Any, count: int) -> Array:
-    """Return the confidence (n,) that is stated of as many rows; NaN: none is.
+def read_confidence(stated: Any, shape: tuple[int, ...], invalid: Sequence[str] = ()) -> Array:
+    """Return the confidence that is stated, an array of a shape.
+
+    Args:
+        stated: The confidence.
+        shape: Its shape, (n,) for n rows, or (n, m) for m predictions per row.
+        invalid: (n,), reasons why rows are not valid; these rows may have none.
 
     Raises:
-        GraspError: If it is not one number per row.
+        GraspError: If it is not one finite number per row.
     """
-    confidence = as_numbers(stated, "confidence must be numbers")
-    if confidence.shape != (count,):
-        raise GraspError(f"confidence must be ({count},), one per grasp, got {confidence.shape}")
+    must = f"confidence must be {shape} finite numbers, one per grasp"
+    confidence = as_numbers(stated, must)
+    if confidence.shape != shape:
+        raise GraspError(f"{must}, got {confidence.shape}")
+    valid = np.array([not reason for reason in invalid] or True)
+    if (wrong := confidence[valid & ~np.isfinite(confidence)]).size:
+        raise GraspError(f"{must}, got {wrong[0]:g}")
     return confidence
 
 
@@ -553,10 +559,7 @@ def _joint_rows(values: Any, shape: tuple[int, int], stage: str, turning: list[b
 
 def _array(values: Any, shape: tuple[int, ...], name: str) -> Array:
     """Return numbers of a shape."""
-    try:
-        array = np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        raise GraspError(f"{name} must be numbers of shape {shape}, got something else") from None
+    array = as_numbers(values, f"{name} must be numbers of shape {shape}")
     if array.shape != shape:
         raise GraspError(f"{name} must be of shape {shape}, got {array.shape}")
     return array
@@ -624,10 +627,10 @@ def quaternion_poses(
     Raises:
         GraspError: If the arguments are not numbers, or have other shapes.
     """
-    try:
-        p, wxyz = np.asarray(positions, dtype=float), np.asarray(quaternions, dtype=float)
-    except (TypeError, ValueError):
-        raise GraspError("positions and quaternions must be numbers, got something else") from None
+    p, wxyz = (
+        as_numbers(each, "position and quaternion must be numbers")
+        for each in (positions, quaternions)
+    )
     if p.ndim != 2 or p.shape[1] != 3 or wxyz.shape != (len(p), 4):
         raise GraspError(
             "positions must be of shape (n, 3) and quaternions of (n, 4), "
@@ -653,7 +656,7 @@ def quaternion_poses(
 
 def xyzw_poses(positions: npt.ArrayLike, quaternions: npt.ArrayLike) -> Array:
     """Return the poses (n, 4, 4) of `quaternion_poses` if the numbers had the order x, y, z, w."""
-    return quaternion_poses(positions, np.roll(np.asarray(quaternions, dtype=float), 1, axis=1))[0]
+    return quaternion_poses(positions, np.roll(np.asarray(quaternions), 1, axis=1))[0]
 
 
 def _poses(

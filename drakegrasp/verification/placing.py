@@ -38,6 +38,7 @@ from drakegrasp.simulation.attempts import (
     UNTOLD,
     Attempts,
     misfits,
+    read_confidence,
     unknown_objects,
 )
 from drakegrasp.simulation.placement import (
@@ -338,12 +339,7 @@ def read_several(
     of_row = np.repeat(choose_rows(data, rows, len(array)), array[0, ..., 0].size)
     stated = None
     if confidence is not None:
-        stated = as_numbers(confidence, "confidence must be numbers")
-        if stated.shape != array.shape[:-1]:
-            raise GraspError(
-                f"confidence must be {array.shape[:-1]}, one per grasp, got {stated.shape}"
-            )
-        stated = stated.ravel()
+        stated = read_confidence(confidence, array.shape[:-1]).ravel()
     flat = array.reshape(-1, array.shape[-1])
     return read_grasps(flat, fingers, rows=of_row, confidence=stated)
 

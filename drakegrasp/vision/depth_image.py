@@ -9,8 +9,10 @@ left out. Image files and camera files are read here too.
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 from typing import Any
+from warnings import catch_warnings
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +28,9 @@ from drakegrasp.vision.camera import unproject
 DEPTHS = 0.03, 30.0
 #: Minimum number of object pixels with a depth.
 FEWEST = 10
+#: The largest depth may mean that a depth is unknown if it is larger than the median of the others
+#: by this factor.
+FAR_OFF = 2.0
 #: A pixel is on a plane if it is closer to it than this fraction of its depth: the error of depth
 #: cameras grows with the depth.
 ON_PLANE = 0.01
@@ -63,7 +68,7 @@ def cloud_from_depth(
     Args:
         depth: (h, w), along the camera's z axis [m]; 0, NaN or infinite where it is unknown.
         K: Camera matrix (3, 3) [px].
-        mask: (h, w), not 0 on the object.
+        mask: (h, w), 0 beside the object, and one other value on it.
         X_TC: Pose of the camera over the table (4, 4), known or from `fit_table`.
 
     Raises:
@@ -101,6 +106,7 @@ def _share_on_table(others: Array, pose: Array) -> float:
         raise GraspError(
             f"X_TC must place {LEAST_KNOWN_SHARE:.0%} of the pixels beside the object on the table "
             f"(z = 0), got {share:.1%}: is it inverted (X_CT), or in another unit?"
+            f"{_mark_of_unknown(others)}"
         )
     return share
 
@@ -124,7 +130,7 @@ def fit_table(
     Args:
         depth: (h, w), see `cloud_from_depth`.
         K: Camera matrix (3, 3) [px].
-        mask: (h, w), not 0 on the object.
+        mask: (h, w), 0 beside the object, and one other value on it.
 
     Returns:
         X_TC (4, 4); the root mean square of the distances from the plane, of the pixels to which it
@@ -148,6 +154,7 @@ def fit_table(
             raise GraspError(
                 f"depth must show the table on at least {LEAST_SHARE:.0%} of the pixels beside the "
                 f"object, got {share:.0%} on the best plane below it: {few}"
+                f"{_mark_of_unknown(own, others)}"
             )
         apart = np.abs(dot(on_plane, normal) - offset)
         inner = on_plane[apart <= max(CLOSE, SIGMAS * float(np.median(apart)))]
@@ -189,12 +196,6 @@ def _points(depth: npt.ArrayLike, K: npt.ArrayLike, mask: npt.ArrayLike) -> tupl
         raise GraspError(
             f"mask must be 0 beside the object, got {own.mean():.1%} of the image on the object"
         )
-    median = float(np.median(z[known]))
-    if not DEPTHS[0] <= median <= DEPTHS[1]:
-        raise GraspError(
-            f"depth must be in metres, with a median of {DEPTHS[0]} to {DEPTHS[1]:g}, "
-            f"got {median:.3g}: is it in another unit?"
-        )
 
     lens = read_lens(K)
     middle, size = lens[:2, 2], np.array(z.shape[::-1])
@@ -205,22 +206,50 @@ def _points(depth: npt.ArrayLike, K: npt.ArrayLike, mask: npt.ArrayLike) -> tupl
         )
     parts = (np.nonzero(known & chosen) for chosen in (own, ~own))
     own_points, others = (unproject(lens, np.column_stack([u, v]), z[v, u]) for v, u in parts)
+    if mark := _mark_of_unknown(own_points):
+        raise GraspError(f"depth must be that of the object, or 0, where the mask is not 0{mark}")
+    median = float(np.median(z[known]))
+    if not DEPTHS[0] <= median <= DEPTHS[1]:
+        raise GraspError(
+            f"depth must be in metres, with a median of {DEPTHS[0]} to {DEPTHS[1]:g}, got "
+            f"{median:.3g}: is it in another unit?{_mark_of_unknown(own_points, others)}"
+        )
     return own_points, others
 
 
+def _mark_of_unknown(*points: Array) -> str:
+    """Return advice on a depth of points p_CQ (n, 3) [m] that seems to mean that it is unknown.
+
+    It is empty if there is no such depth.
+    """
+    depths = np.concatenate(points)[:, 2]
+    far = float(depths.max())
+    count, others = np.count_nonzero(depths == far), depths[depths < far]
+    if count < FEWEST or not others.size or far < FAR_OFF * np.median(others):
+        return ""
+    return f"; {count:,} pixels have the depth {far:g} m: if it means unknown, replace it by 0"
+
+
 def _chosen(mask: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-    """Return where a mask is not 0.
+    """Return where a mask (h, w), or (h, w, channels), is not 0.
 
     Raises:
-        GraspError: If it is no array of numbers or truth values, or has NaN.
+        GraspError: If it is no array of numbers or truth values, has NaN, or several values that
+            are not 0.
     """
-    must = "mask must be numbers (h, w), not 0 on the object"
-    if getattr(mask, "dtype", None) == np.bool_:
-        return np.asarray(mask)
-    values = as_numbers(mask, must)
+    must = "mask must be numbers (h, w), 0 beside the object and one other value on it"
+    is_bool = getattr(mask, "dtype", None) == np.bool_
+    values = np.asarray(mask) if is_bool else as_numbers(mask, must)
     if unknown := np.count_nonzero(np.isnan(values)):
         raise GraspError(f"{must}, got {unknown:,} that are NaN")
-    return values != 0
+    own = np.asarray(values.any(axis=2) if values.ndim == 3 else values != 0)
+    found = values[own]
+    if (found != found[:1]).any():
+        raise GraspError(
+            f"{must}, got several: is it a lossy file (JPEG, WebP), or a mask of several objects? "
+            "Write the mask of one object as PNG or .npy"
+        )
+    return own
 
 
 def _table_plane(own: Array, others: Array) -> tuple[Array, float]:
@@ -249,7 +278,7 @@ def _table_plane(own: Array, others: Array) -> tuple[Array, float]:
     if not stands.any():
         raise GraspError(
             "depth must show the table on which the object stands, got no plane below the object: "
-            "give the pose of the camera (X_TC)"
+            f"give the pose of the camera (X_TC){_mark_of_unknown(own, others)}"
         )
     best = int(np.argmax(np.where(stands, counts, -1)))
     return normals[best], float(offsets[best])
@@ -284,16 +313,25 @@ def read_lens(K: npt.ArrayLike) -> Array:
 
 # Files
 
+#: Maximum number of pixels of an image file, which may unpack to thousands of times its size.
+MOST_PIXELS = 2**25
+#: Kinds of image whose pixels are brightnesses and opacities; others have e.g. rows of a palette.
+_PLAIN_MODES = ("1", "L", "LA", "I", "I;16", "I;16B", "F", "RGB", "RGBA")
+#: Names of a camera matrix, and of coefficients of distortion, in camera files.
+_MATRICES = ("K", "k", "camera_matrix", "intrinsic_matrix")
+_DISTORTION = re.compile(r"d|coeffs|[kps][1-6]|dist|dist(ort|_?coef).*", re.IGNORECASE)
+
 
 def read_camera(text: str, shape: tuple[int, ...]) -> Array:
     """Return the camera matrix (3, 3) [px] of the text "fx fy cx cy", or of a JSON file.
 
-    The file has a matrix, or an object with `K`, `k` or `camera_matrix`, or with `fx`, `fy`, `cx`
-    and `cy`. If it also states the `width` and `height` of its images, they must be those of the
-    depth image, whose shape is (h, w).
+    The file has a matrix, or an object with `K`, `k` or `camera_matrix`, with `intrinsic_matrix` as
+    Open3D writes it, with `fx`, `fy`, `cx` and `cy`, or with `ppx` and `ppy` of RealSense. If it
+    also states the `width` and `height` of its images, they must be those of the depth image, whose
+    shape is (h, w).
 
     Raises:
-        GraspError: If it is neither, or for images of another size.
+        GraspError: If it is neither, for images of another size, or states a distortion.
     """
     # Four numbers.
     must = "camera must be fx,fy,cx,cy in pixels, or a JSON file with K"
@@ -305,7 +343,7 @@ def read_camera(text: str, shape: tuple[int, ...]) -> Array:
         if not path.is_file():
             raise GraspError(f"{must}, got {text!r}") from None
     else:
-        return read_lens([[f_u, 0.0, c_u], [0.0, f_v, c_v], [0.0, 0.0, 1.0]])
+        return read_lens(_pinhole(f_u, f_v, c_u, c_v))
 
     # A file.
     try:
@@ -319,15 +357,51 @@ def read_camera(text: str, shape: tuple[int, ...]) -> Array:
                 f"{path}: camera must be for {shape[-1]} x {shape[0]} pixels, as the depth image, "
                 f"got {wide} x {high}"
             )
-        if {"fx", "fy", "cx", "cy"} <= content.keys():
-            f_u, f_v, c_u, c_v = (content[key] for key in ("fx", "fy", "cx", "cy"))
-            content = [[f_u, 0.0, c_u], [0.0, f_v, c_v], [0.0, 0.0, 1.0]]
-        else:
-            content = next((content[k] for k in ("K", "k", "camera_matrix") if k in content), None)
+        _refuse_distortion(content, path)
+        content = _lens_in(content)
     try:
         return read_lens(as_numbers(content, must))
     except GraspError as error:
         raise GraspError(f"{path}: {one_line(error)}") from None
+
+
+def _refuse_distortion(content: dict[str, Any], path: Path) -> None:
+    """Reject a camera file that states a distortion: points would be up to centimetres off.
+
+    Raises:
+        GraspError: If a coefficient is not zero, or is no number.
+    """
+    must = f"{path}: camera must have no distortion"
+    for key, value in content.items():
+        # Names of models are texts; ROS writes the coefficients as rows, cols and data.
+        value = value.get("data") if isinstance(value, dict) else value
+        if not _DISTORTION.fullmatch(key) or value is None or isinstance(value, str):
+            continue
+        if as_numbers(value, f"{must}, and {key} must be numbers").any():
+            raise GraspError(
+                f"{must}, got {key} {value}: undistort depth and mask (cv2.remap, INTER_NEAREST), "
+                "and give the camera of the new images"
+            )
+
+
+def _lens_in(content: dict[str, Any]) -> Any:
+    """Return what a camera file has as its camera matrix; None if it has none."""
+    real_sense = {f"c{axis}": content[f"pp{axis}"] for axis in "xy" if f"pp{axis}" in content}
+    known = real_sense | content
+    if {"fx", "fy", "cx", "cy"} <= known.keys():
+        return _pinhole(*(known[name] for name in ("fx", "fy", "cx", "cy")))
+    name = next((name for name in _MATRICES if name in content), "")
+    found = content.get(name)
+    if isinstance(found, dict):
+        found = found.get("data")
+    if name == "intrinsic_matrix" and isinstance(found, list) and len(found) == 9:
+        return [found[i::3] for i in range(3)]  # Open3D writes the columns one after another
+    return found
+
+
+def _pinhole(f_u: Any, f_v: Any, c_u: Any, c_v: Any) -> list[list[Any]]:
+    """Return the rows of a camera matrix [px]."""
+    return [[f_u, 0.0, c_u], [0.0, f_v, c_v], [0.0, 0.0, 1.0]]
 
 
 def read_depth_png(path: Path, scale: float) -> Array:
@@ -353,17 +427,15 @@ def read_mask(path: Path) -> npt.NDArray[np.bool_]:
     """Return the mask (h, w) of an image file or a .npy file: where any channel is not 0.
 
     Raises:
-        GraspError: If the file is neither, is 0 everywhere, or has NaN.
+        GraspError: If the file is neither, is 0 everywhere, or has NaN or several other values.
     """
     pixels = _pixels(path)
+    if pixels.ndim == 3 and pixels.shape[2] in (2, 4):
+        pixels = pixels[:, :, :-1]  # without the opacity
     try:
         own = _chosen(pixels)
     except GraspError as error:
         raise GraspError(f"{path}: {one_line(error)}") from None
-    if own.ndim == 3:
-        # The last of two or four channels is the opacity.
-        channels = own.shape[2] - (own.shape[2] in (2, 4))
-        own = np.asarray(own[:, :, :channels].any(axis=2))
     if own.ndim != 2:
         raise GraspError(f"{path}: must be an image, got an array of shape {pixels.shape}")
     if not own.any():
@@ -380,8 +452,10 @@ def _pixels(path: Path) -> npt.NDArray[Any]:
         content = io.BytesIO(read_content(path))
         if path.suffix.lower() == ".npy":
             return np.asarray(np.lib.format.read_array(content, allow_pickle=False))
-        with Image.open(content) as image:
-            return np.asarray(image)
+        with catch_warnings(action="ignore"), Image.open(content) as image:
+            if (count := image.width * image.height) > MOST_PIXELS:
+                raise ValueError(f"{count:,} pixels, more than {MOST_PIXELS:,}")
+            return np.asarray(image if image.mode in _PLAIN_MODES else image.convert("RGB"))
     except UnidentifiedImageError:  # its message has the address of `content`
         raise GraspError(f"{path}: must be an image, got no image file") from None
     except Exception as error:

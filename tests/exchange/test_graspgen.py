@@ -99,6 +99,30 @@ def test_other_json_is_refused_in_one_line(tmp_path: Path, content: Any, message
     assert "\n" not in str(caught.value)
 
 
+def test_grasps_of_another_gripper_are_refused(tmp_path: Path) -> None:
+    """Files of its datasets and of its inference name it; a caller who names the frame knows it."""
+    path = write_json(tmp_path / "a.json", gripper={"name": "franka_panda", "width": 0.08})
+    assert read_attempts(path, FRANKA).invalid == ("", "")
+    write_json(path, gripper={"name": "robotiq_2f_140", "width": 0.136})
+    other = write_hdf5(tmp_path / "a.h5")
+    with h5py.File(other, "a") as file:
+        file["misc/gripper_name"][()] = "single_suction_cup_30mm"
+    for file_of_another in (path, other):
+        with pytest.raises(GraspError, match=r"of the hand franka \(--hand\), got those of the gr"):
+            read_attempts(file_of_another, FRANKA)
+        assert not any(read_attempts(file_of_another, FRANKA, read_as={"link": "palm"}).invalid)
+    write_json(path, gripper="robotiq")
+    with pytest.raises(GraspError, match="must be a file of GraspGen's datasets"):
+        read_attempts(path, FRANKA)
+
+
+@pytest.mark.parametrize("scale", [True, "0.5", None, [0.5, 0.5]])
+def test_a_scale_is_a_number(tmp_path: Path, scale: Any) -> None:
+    path = write_json(tmp_path / "a.json", object={"file": "mug.obj", "scale": scale})
+    with pytest.raises(GraspError, match="must be a file of GraspGen's datasets"):
+        read_attempts(path, FRANKA)
+
+
 def test_damaged_predictions_are_refused(tmp_path: Path) -> None:
     path = write_hdf5(tmp_path / "a.h5")
     with h5py.File(path, "a") as file:
@@ -116,6 +140,12 @@ def test_a_verdict_ranks_by_object_and_by_row(out: Path, tmp_path: Path) -> None
     placed, _, rows = place_requested(VerifyRequest(**where))
     assert rows is None
     assert [int(grasp.attempt.rank[0]) for grasp in placed] == [1, 0]
+
+    # A mesh of half the size is another object.
+    write_json(path, object=thing | {"scale": 0.5})
+    with pytest.raises(GraspError, match=rf"a\.json: scale must be that of {names[0]}, .*got 0.5"):
+        place_requested(VerifyRequest(**where))
+    write_json(path, object=thing)
 
     # As a score has them: both grasps on each row of their object.
     placed, _, rows = place_requested(VerifyRequest(**where, split="train"))

@@ -20,7 +20,7 @@ from drakegrasp.exchange.attempts import read_attempts, write_attempts
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
-from drakegrasp.simulation.attempts import CONDITIONS, Attempts, quaternion_poses
+from drakegrasp.simulation.attempts import CONDITIONS, Attempts, quaternion_poses, ranked
 from drakegrasp.simulation.posture import joint_order
 
 HAND = load_hand("allegro")
@@ -323,6 +323,49 @@ def test_isaac_grasp_is_of_the_object_that_its_file_is_named_after(tmp_path):
     assert table.said[0] == "grasp_0, confidence 0.5"
 
 
+def stated(path: Path, **content: Any) -> Path:
+    """Write a grasp of isaac_grasp with what GraspDataGen says of object and gripper."""
+    tree = yaml.safe_load(write_isaac(path, a=isaac_grasp(POSES[0])).read_text())
+    path.write_text(yaml.safe_dump(tree | content))
+    return path
+
+
+def test_isaac_grasp_says_of_which_object_and_gripper_it_is(tmp_path):
+    """The object is that of the mesh; its scale is compared with that of the object later."""
+    path = tmp_path / "grasps.yaml"
+    table = read_attempts(stated(path, object_file="objects/mug.1.0.obj", object_scale=0.5), HAND)
+    assert (table.objects, table.scale.tolist()) == (("mug.1.0",), [0.5])
+    assert read_attempts(stated(path, object_file=r"C:\meshes\can.usd"), HAND).objects == ("can",)
+    table = read_attempts(stated(path, object_scale="1e-3"), HAND)
+    assert (table.objects, table.scale.tolist()) == (("grasps",), [0.001])
+    assert np.isnan(read_attempts(stated(path), HAND).scale).all()
+    for scale in ("half", True, None, [1.0, 1.0, 2.0]):
+        with pytest.raises(GraspError, match="object_scale must be a number, got"):
+            read_attempts(stated(path, object_scale=scale), HAND)
+
+
+@pytest.mark.parametrize(
+    ("gripper", "own"),
+    [
+        ("bots/allegro_hand_right.usd", True),
+        ("WonikAllegro.usd", True),
+        ("bots/franka_panda.usd", False),
+        ("single_suction_cup_30mm.usd", False),
+        ("hand.usd", False),
+    ],
+)
+def test_grasps_of_another_gripper_are_refused_unless_their_frame_is_named(tmp_path, gripper, own):
+    path = stated(tmp_path / "mug.yaml", gripper_file=gripper)
+    if own:
+        assert read_attempts(path, HAND).invalid == ("",)
+        return
+    with pytest.raises(
+        GraspError, match=rf"of the hand allegro .*, got those of .* {Path(gripper).stem}:"
+    ):
+        read_attempts(path, HAND)
+    assert read_attempts(path, HAND, read_as={"link": HAND.palm_link}).invalid == ("",)
+
+
 def test_palm_link_named_palm_is_no_palm_frame_in_files_of_others(tmp_path):
     leap = load_hand("leap")
     assert leap.palm_link == "palm" and not np.allclose(leap.X_BG, np.eye(4))
@@ -536,6 +579,14 @@ def test_pickles_of_every_protocol_are_read(tmp_path):
         ({"link": np.array("wrist")}, "link must be 'palm' for the palm frame, or 'base'"),
         ({"joints": np.array(["a"] * 16)}, "of the hand, got 'a': rename .* has index_roll_joint"),
         ({"magic": np.zeros(2)}, "arrays must be some of .*, got 'magic'"),
+        ({"X_FG": POSES + 0.5j}, "X_FG must be poses, .*, got complex numbers"),
+        ({"q_grasp": GRASP + 1j}, "grasp joints must be numbers .*, got complex numbers"),
+        ({"resting": np.array([0, 1j])}, "resting must be numbers .*, got complex numbers"),
+        ({"mass": np.array([0.1, 1j])}, "mass must be 2 numbers each, got complex numbers"),
+        ({"mass": np.array([0.1])}, "mass must be 2 numbers each, got other shapes"),
+        ({"confidence": np.array([0.1, 1j])}, "confidence must .*, got complex numbers"),
+        ({"q_grasp": GRASP.astype(str)}, "grasp joints must be numbers .*, got text"),
+        ({"quaternion": np.eye(4)[:2]}, "poses must be X_FG, or position and .*, got both"),
         ({"object": np.zeros(2)}, "object must be texts"),
     ],
 )
@@ -590,6 +641,13 @@ def test_other_files_are_refused_in_a_line(tmp_path, name, content, words):
     (tmp_path / name).write_text(content, encoding="utf-8")
     with pytest.raises(GraspError, match=words):
         read_attempts(tmp_path / name, HAND)
+
+
+def test_quaternions_that_are_complex_are_refused(tmp_path):
+    turns = np.tile([1.0, 0.0, 0.0, 1j], (2, 1))
+    np.savez(tmp_path / "p.npz", object=OBJECTS, position=np.zeros((2, 3)), quaternion=turns)
+    with pytest.raises(GraspError, match=r"position and quaternion must .*, got complex"):
+        read_attempts(tmp_path / "p.npz", HAND)
 
 
 def test_damaged_stream_is_refused_in_a_line(tmp_path):
@@ -702,7 +760,7 @@ def test_without_a_dataset_rows_are_not_asked_and_confidence_is_one_per_row(tmp_
     assert table.of_row is None
     assert table.at([1]).confidence.tolist() == [0.7]
     np.savez(tmp_path / "p.npz", **arrays(), confidence=0.5)
-    with pytest.raises(GraspError, match=r"confidence must be \(2,\), one per grasp, got \(\)"):
+    with pytest.raises(GraspError, match=r"confidence must be \(2,\) finite .* grasp, got \(\)"):
         read_attempts(tmp_path / "p.npz", HAND)
 
 
@@ -718,3 +776,33 @@ def test_a_file_of_acronym_leads_to_a_file_that_is_read(tmp_path):
         np.save(tmp_path / "mug.npy", file["grasps/transforms"][:])
     found = read_attempts(tmp_path / "mug.npy", HAND, of="1_mug", read_as={"frame": "mesh"})
     assert (len(found), found.frame) == (5, "mesh")
+
+
+@pytest.mark.parametrize("none", ["nan", "inf", "-inf", ""])
+def test_a_confidence_that_is_not_finite_is_refused_unless_its_row_is(tmp_path, none):
+    """A row that is no posture spoils no other, whatever its confidence."""
+    header, first, second = write_csv(tmp_path).read_text(encoding="utf-8").splitlines()
+    path, must = (
+        tmp_path / "p.csv",
+        r"confidence must be \(2,\) finite numbers, one per grasp, got ",
+    )
+    path.write_text(f"{header},confidence\n{first},{none}\n{second},0.7\n", encoding="utf-8")
+    with pytest.raises(GraspError, match=f"^{path}: {must}{none}"):
+        read_attempts(path, HAND)
+    path.write_text(f"{header},confidence\nmug\n{second},0.7\n", encoding="utf-8")
+    table = read_attempts(path, HAND)
+    assert [bool(reason) for reason in table.invalid] == [True, False]
+    assert ranked(table, ["mug"] * 2).rank.tolist() == [1, 0]
+
+
+def test_a_confidence_of_isaac_grasp_is_a_finite_number_of_each_grasp(tmp_path):
+    known, other = isaac_grasp(POSES[0]), isaac_grasp(POSES[1])
+    without = {name: value for name, value in other.items() if name != "confidence"}
+    for bad in (without, other | {"confidence": np.nan}, other | {"confidence": np.inf}):
+        path = write_isaac(tmp_path / "mug.yaml", a=known, b=bad)
+        with pytest.raises(GraspError, match=r"confidence must be .* finite numbers"):
+            read_attempts(path, HAND)
+    for none in ("high", True):
+        path = write_isaac(tmp_path / "mug.yaml", a=known, b=other | {"confidence": none})
+        table = read_attempts(path, HAND)
+        assert table.invalid[0] == "" and str(none) in table.invalid[1]

@@ -28,9 +28,11 @@ def test_without_confidence_the_order_is_the_rank():
     assert ranked.confidence is None
 
 
-def test_a_confidence_that_is_no_number_ranks_last():
-    ranked = ranked_array("a", GRASPS[:1], length=1, confidence=[[np.nan, 0.2, 0.3]])
-    np.testing.assert_array_equal(ranked.grasps[-1], GRASPS[0, 0])
+@pytest.mark.parametrize("none", [np.nan, np.inf, -np.inf, True, 1j])
+def test_a_confidence_that_is_no_finite_number_is_refused(none):
+    """It would have a rank, and nobody could say which."""
+    with pytest.raises(GraspError, match=r"confidence must be \(1, 3\) finite numbers, .*, got"):
+        ranked_array("a", GRASPS[:1], length=1, confidence=[[none, 0.2, 0.3]])
 
 
 def test_bad_numbers_stay_as_they_are_failures_of_the_network():

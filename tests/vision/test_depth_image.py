@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 
 import numpy as np
 import pytest
@@ -89,6 +90,8 @@ def bad(**changes):
         (bad(depth=lambda z, m: np.where(m, z, 0.0)), "the table beside the object, got none"),
         (bad(mask=lambda z, m: np.where(m, 1.0, np.nan)), "mask must be numbers .* that are NaN"),
         (bad(mask=lambda z, m: [[1], [1, 2]]), "mask must be numbers .* cannot be read"),
+        (bad(mask=lambda z, m: m * np.arange(1, WIDE + 1)), "one other value on it, got several"),
+        (bad(K=lambda z, m: [*K[:2].tolist(), [0.0, 0.0, True]]), "camera must .*truth values"),
         (bad(K=lambda z, m: K * [[0.5], [0.5], [1.0]]), "for another resolution"),
         (bad(K=lambda z, m: K * [[2.0], [2.0], [1.0]]), "for another resolution"),
         (bad(depth=lambda z, m: image(table=False, offset=-1.0)[0]), "no plane below the object"),
@@ -129,16 +132,106 @@ def test_files_of_a_camera(tmp_path):
     np.save(tmp_path / "mask.npy", mask)
     grey = np.dstack([9 * mask, 255 + 0 * mask]).astype(np.uint8)
     Image.fromarray(grey).save(tmp_path / "opaque.png")
-    for name in ("bits.png", "grey.png", "colours.png", "opaque.png", "mask.npy"):
-        np.testing.assert_array_equal(read_mask(tmp_path / name), mask)
+    Image.fromarray(mask.astype(np.uint16) * 60000).save(tmp_path / "deep.png")
+    Image.fromarray(200 * mask.astype(np.uint8)).save(tmp_path / "exact.webp", lossless=True)
+    # With a palette the pixels are its rows, here 0 on the object.
+    for name in ("palette.png", "palette.gif"):
+        rows = Image.fromarray((~mask).astype(np.uint8), mode="P")
+        rows.putpalette([255, 255, 255, 0, 0, 0])
+        rows.save(tmp_path / name)
+    found = [path for path in tmp_path.iterdir() if path.name != "depth.png"]
+    assert len(found) == 9
+    for path in found:
+        np.testing.assert_array_equal(read_mask(path), mask, str(path))
 
     # A camera in any form.
     path = tmp_path / "K.json"
     flat = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "width": WIDE}
-    for content in (K.tolist(), {"K": K.ravel().tolist()}, {"camera_matrix": K.tolist()}, flat):
+    no_distortion = {"D": [0.0] * 5, "distortion_model": "plumb_bob", "k1": 0, "dist": None}
+    real_sense = {"ppx": K[0, 2], "ppy": K[1, 2], "fx": K[0, 0], "fy": K[1, 1], "coeffs": [0, 0]}
+    ros = {"camera_matrix": {"rows": 3, "cols": 3, "data": K.ravel().tolist()}}
+    open_3d = {"intrinsic_matrix": K.T.ravel().tolist(), "height": HIGH}
+    for content in (
+        *(K.tolist(), {"K": K.ravel().tolist()}, {"camera_matrix": K.tolist()}, flat),
+        *(flat | no_distortion, real_sense, ros, open_3d, {"intrinsic_matrix": K.tolist()}),
+    ):
         path.write_text(json.dumps(content))
         np.testing.assert_array_equal(read_camera(str(path), (HIGH, WIDE)), K)
     np.testing.assert_array_equal(read_camera("150,152, 80 58", (HIGH, WIDE)), K)
+
+
+@pytest.mark.parametrize("name", ["m.jpg", "m.webp", "resaved.png", "parts.png", "colours.png"])
+def test_a_mask_has_one_value_on_the_object(tmp_path, name):
+    """Lossy files have values of their own at its edge, and masks of parts one for each part."""
+    _, mask = image()
+    grey = Image.fromarray(255 * mask.astype(np.uint8))
+    if name == "resaved.png":
+        grey.save(tmp_path / "m.jpg", quality=95)
+        grey = Image.open(tmp_path / "m.jpg")
+    if name == "parts.png":
+        grey = Image.fromarray(mask * np.uint8(1 + np.arange(WIDE) // 80))
+    if name == "colours.png":
+        sides = np.arange(WIDE) % 2 == 0
+        channels = np.dstack([mask & sides, mask & ~sides, 0 * mask])
+        grey = Image.fromarray(200 * channels.astype(np.uint8))
+    grey.save(tmp_path / name)
+    with pytest.raises(dg.GraspError, match=f"{name}: mask must .*, got several: is it a lossy"):
+        read_mask(tmp_path / name)
+
+
+def test_a_picture_is_refused_by_its_size_before_it_is_decoded(tmp_path):
+    """The header of a picture may promise any size; only its first bytes are here."""
+    for side in (6_000, 12_000, 40_000):
+        Image.new("1", (8, 8)).save(tmp_path / "m.png")
+        content = (tmp_path / "m.png").read_bytes()
+        header = b"IHDR" + 2 * side.to_bytes(4, "big") + content[24:29]
+        (tmp_path / "m.png").write_bytes(
+            content[:12] + header + zlib.crc32(header).to_bytes(4, "big") + content[33:]
+        )
+        with pytest.raises(
+            dg.GraspError, match=r"m.png: must be an image, got: .*(limit|more than)"
+        ):
+            read_mask(tmp_path / "m.png")
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        {"D": [-0.15, 0, 0, 0, 0], "distortion_model": "plumb_bob"},
+        {"d": [0, 0, 1e-3, 0, 0]},
+        {"k1": -0.1, "k2": 0.0},
+        {"coeffs": [0.1, 0, 0, 0, 0], "model": "distortion.inverse_brown_conrady"},
+        {"distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.2, 0, 0, 0, 0]}},
+        {"distCoeffs": [[0.0, 0.0, 0.0, 0.0, 0.3]]},
+        {"P2": 0.01},
+    ],
+)
+def test_a_camera_with_a_distortion_is_refused(tmp_path, stated):
+    path = tmp_path / "K.json"
+    path.write_text(json.dumps({"K": K.ravel().tolist()} | stated))
+    said = f"^{path}: camera must have no distortion, got {next(iter(stated))} .*undistort depth"
+    with pytest.raises(dg.GraspError, match=said):
+        read_camera(str(path), (HIGH, WIDE))
+
+
+@pytest.mark.parametrize("mark", [65.535, 10.0])
+def test_a_depth_that_means_unknown_is_named_where_it_spoils_the_table(mark):
+    """It may be on the object, beside it, or on most of the image."""
+    depth, mask = image()
+    said = f"pixels have the depth {mark:g} m: if it means unknown, replace it by 0"
+    part = (np.arange(WIDE) % 5 == 0)[None].repeat(HIGH, axis=0)
+    with pytest.raises(dg.GraspError, match=f"that of the object, or 0, .*; 120 {said}"):
+        dg.fit_table(np.where(part, mark, depth), K, mask)
+    with pytest.raises(dg.GraspError, match=f"depth must show the table .*; 608 {said}"):
+        dg.fit_table(np.where(mask, mark, depth), K, mask)
+    most = (np.arange(HIGH) % 40 > 0)[:, None] & ~mask
+    for given in ({}, {"X_TC": X_TC}):
+        made = dg.cloud_from_depth if given else dg.fit_table
+        with pytest.raises(dg.GraspError, match=f"^[^;]*; [0-9,]* {said}"):
+            made(np.where(most, mark, depth), K, mask, **given)
+    # What does not spoil it is of no interest.
+    some = (np.arange(HIGH) % 10 == 0)[:, None] & ~mask
+    assert off(dg.fit_table(np.where(some, mark, depth), K, mask)[0])[0] < 1e-4
 
 
 @pytest.mark.parametrize(
@@ -157,6 +250,16 @@ def test_files_of_a_camera(tmp_path):
             r"camera must be .*got None",
         ),
         (lambda path: read_camera(str(path), (HIGH, WIDE)), b"{", "a JSON file with K, got: "),
+        (
+            lambda path: read_camera(str(path), (HIGH, WIDE)),
+            b'{"fx": true, "fy": 300, "cx": 80, "cy": 60}',
+            "camera must be .*, got truth values",
+        ),
+        (
+            lambda path: read_camera(str(path), (HIGH, WIDE)),
+            b'{"K": [1, 0, 80, 0, 1, 60, 0, 0, 1], "d": ["0"]}',
+            "d must be numbers, got text",
+        ),
     ],
 )
 def test_bad_files_are_refused_with_their_name(tmp_path, read, content, said):
