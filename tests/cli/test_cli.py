@@ -392,16 +392,16 @@ def test_stats_of_a_build_that_runs_count_what_is_done(small_dataset: Path, tmp_
 
 def test_stats_say_that_nothing_trains(out: Path) -> None:
     said = run("stats", out).stdout
-    assert "no sample is for training" not in said
+    assert "split train is empty" not in said
     assert "split by object: 3 objects with samples, 1 of them test, 1 valid\n" in said
     assemble(out, overrides=["split.by=class", "split.train_classes=[]"])
     said = run("stats", out).stdout
-    assert "no sample is for training" in said
+    assert "split train is empty" in said
     assert "split by class: 3 objects with samples, 3 of them test\n" in said
     # Of the frozen benchmark it is meant.
     (out / "builtin").mkdir()
     (out / "builtin" / "benchmark.json").write_text("{}")
-    assert "no sample is for training" not in run("stats", out).stdout
+    assert "split train is empty" not in run("stats", out).stdout
     said = run("assemble", out, "--set", "split={by: object}").stdout
     assert "split by object: 3 objects with samples, 1 of them test, 1 valid\n" in said
 
