@@ -153,7 +153,7 @@ def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (assemble, FILE_NAME),
         (count_unfinished, TRIALS),
         (count_funnel, TRIALS),
-        (count_splits, OTO),
+        (count_splits, TRIALS),
         (partial(claim_directory, config=load_config()), FILE_NAME),
         (partial(replay_trial, trial_id=0), FILE_NAME),
     ],

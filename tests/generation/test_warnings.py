@@ -42,9 +42,13 @@ def test_a_hand_without_a_payload_has_no_warning(tmp_path: Path) -> None:
         (["a", "b"], {"by": "class"}, "every class has one object, which is tested"),
         (["a", "b"], {}, ""),
         (["a", "b", "b"], {}, ""),
-        (["a", "b"], {"train_classes": ("b",)}, ""),
-        (["a", "b"], {"train_classes": ()}, ""),
-        (["a", "a"], {"train_classes": ("c",)}, "split.train_classes names none of the classes"),
+        (["a", "b"], {"by": "class", "train_classes": ("b",)}, ""),
+        (["a", "b"], {"by": "class", "train_classes": ()}, ""),
+        (
+            ["a", "a"],
+            {"by": "class", "train_classes": ("c",)},
+            "split.train_classes names none of the classes",
+        ),
     ],
 )
 def test_a_split_that_trains_nothing_is_a_warning(

@@ -40,7 +40,7 @@ def some_shard(*, trials: int = 12, looks: int = 3, seed: int = 0) -> Shard:
         looks={f.name: column(f, looks, rng) for f in LOOK_FIELDS},
     )
     # Two columns stand for something that there is.
-    outcome = (shard.trials["outcome"] % len(Outcome)).astype(np.uint8)
+    outcome = np.array(list(Outcome), dtype=np.uint8)[shard.trials["outcome"] % len(Outcome)]
     return replace(
         shard,
         trials={**shard.trials, "outcome": outcome},

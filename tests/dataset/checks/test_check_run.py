@@ -21,7 +21,6 @@ from helpers.datasets import (
     change,
     edit_file,
     found,
-    make_dataset,
     must_find,
     must_find_without_shards,
     set_at,
@@ -51,14 +50,6 @@ def test_a_sound_dataset_passes(sound: Path) -> None:
 def test_a_sound_file_passes_alone(sound: Path, tmp_path: Path, name: str) -> None:
     shutil.copy(sound / name, tmp_path / "renamed.h5")
     assert check_dataset(tmp_path / "renamed.h5") == []
-
-
-def test_shards_after_the_last_wanted_grasp_may_be_missing(tmp_path: Path) -> None:
-    (tmp_path / "meshes").mkdir()
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=["max_grasps=1"])
-    for path in out.glob("shards/*/0000002-*.h5"):
-        path.unlink()
-    assert check_dataset(out) == []
 
 
 def test_progress_ends_at_the_total(sound: Path) -> None:

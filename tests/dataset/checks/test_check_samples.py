@@ -311,12 +311,14 @@ def test_by_object_no_object_is_in_two_splits_nor_another_of_its_mesh(out: Path)
         for entry in manifest.objects
     )
     write_manifest(replace(manifest, objects=objects), out)
-    what = "an object and its group must be in one split"
-    assert {(name, "/valid", None, what) for name in BOTH} <= found(out)
+    with pytest.raises(DataError, match=r"must be in one split to be of one group"):
+        found(out)
+    write_manifest(manifest, out)
 
     # A sample of the objects that train is in the split that validates.
     with h5py.File(out / OTO, "r+") as file:
         file["valid/object_props/object_name"][0] = members["train"]
+    what = "an object and its group must be in one split"
     assert (OTO, "/valid", None, what) in found(out / OTO)
 
 
