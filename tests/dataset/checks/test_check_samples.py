@@ -34,6 +34,7 @@ from drakegrasp.dataset.assembly.pack import IMAGES
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.schema import DATA_FIELDS
+from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome
 
 #: Fields of a sample that are no images and no texts.
