@@ -147,6 +147,8 @@ def draw_distributions(
         axes.set_visible(False)
     for axes, (quantity, values) in zip(panels, quantities, strict=False):
         _histogram(axes, quantity, values, groups)
+
+    # One legend for all panels.
     figure.supylabel("grasps", fontsize="medium", color=INK)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(

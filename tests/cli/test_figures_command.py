@@ -24,7 +24,7 @@ def test_figures_are_written_beside_the_dataset(
     assert result.exit_code == 0, result.output
     assert result.stdout.splitlines() == [
         "phases is left out: not in this test",
-        f"6 figures in {out / 'figures'}",
+        f"7 figures in {out / 'figures'}",
     ]
     assert (out / "figures" / "hold.svg").is_file()
     # A build that goes on, and a second run, are not disturbed by them.

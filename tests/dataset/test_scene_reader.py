@@ -11,6 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from helpers.datasets import CERTIFIED, make_dataset
 
 from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.errors import DataError
@@ -21,8 +22,9 @@ pytestmark = pytest.mark.sim
 
 
 @pytest.fixture(scope="module")
-def path(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = Path(shutil.copytree(sound, tmp_path_factory.mktemp("scenes") / "out"))
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out, meshes = tmp_path_factory.mktemp("scenes") / "out", tmp_path_factory.mktemp("meshes")
+    make_dataset(out, meshes, overrides=[*CERTIFIED, "split.by=class"])
     make_scenes(out)
     return out / "scenes.hdf5"
 

@@ -208,7 +208,7 @@ def test_what_is_no_pose_is_refused_in_one_line(
     ("hand", "shape", "stored"),
     [
         ("barrett", "(None, np.deg2rad(11.25))", (-1, np.deg2rad(11.25))),
-        ("barrett", "(None, 3.1415927)", (-1, np.pi)),  # beyond the limit by rounding
+        ("barrett", "(None, 3.1415927)", (-1, 3.141592654)),  # the limit of the hand's model
         ("franka", "(None, 0)", (-1, 0.0)),
         ("allegro_four", "('envelope', 0.0)", (1, 0.0)),
         ("allegro_four", "(np.int64(1), 0.0)", (1, 0.0)),

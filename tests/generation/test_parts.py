@@ -129,5 +129,5 @@ def test_each_unit_is_of_one_part() -> None:
 
 def test_a_number_of_samples_has_no_parts(tmp_path: Path) -> None:
     refuse_part(None, load_config("paper", ["samples=5"]))
-    with pytest.raises(ConfigError, match="part must be left out with samples"):
+    with pytest.raises(ConfigError, match="part must be of a build with a number of palm poses"):
         refuse_part(Part(1, 2), load_config("paper", ["samples=5"]))

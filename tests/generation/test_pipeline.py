@@ -213,41 +213,6 @@ def test_build_keeps_what_an_inspection_rejected(meshes: Path, out: Path, again:
     assert read_manifest(out).rejected == ()
 
 
-def test_max_grasps_cuts_after_the_last_wanted_one(
-    small_dataset: Path, small_config: Config, out: Path, again: Again
-) -> None:
-    """The rows are those of the full dataset up to each object's first success."""
-    # One object is left to be tried, as long as it takes.
-    shutil.rmtree(out / "shards" / "11_box_slim")
-    report = again(out, config=override_config(small_config, ["max_grasps=1"]))
-    assert 0 < report.simulated < 4
-    few, full = count_funnel(out), count_funnel(small_dataset)
-    found = full.outcomes[:, Outcome.SUCCESS] > 0
-    assert np.array_equal(few.outcomes[:, Outcome.SUCCESS], found.astype(int))
-    with h5py.File(out / "trials.hdf5") as file:
-        outcome, index = file["trials/outcome"][:], file["trials/object"][:]
-    for i in np.flatnonzero(found):
-        assert outcome[index == i][-1] == Outcome.SUCCESS
-    assert [str(v) for v in check_dataset(out)] == []
-
-
-def test_damage_beyond_the_last_wanted_grasp_is_nobodys(
-    out: Path, small_config: Config, small_dataset: Path, again: Again
-) -> None:
-    with h5py.File(out / "trials.hdf5") as file:
-        success = file["trials/outcome"][:] == Outcome.SUCCESS
-        early = success & (file["trials/candidate"][:] < small_config.candidates.max // 2)
-        index = int(file["trials/object"][:][early][0])
-        name = file["objects/name"].asstr()[index]
-    _flip_byte(max((out / "shards" / name).glob("*.h5")))
-    config = small_config.model_copy(update={"max_grasps": 1})
-    report = again(out, _nothing_runs, config=config)
-    assert report.notices == ()
-    full = again(out)
-    assert "damaged, and simulated again" in full.notices[0]
-    assert_same_dataset(small_dataset, out)
-
-
 def test_other_configuration_is_refused_and_nothing_changes(
     out: Path, small_config: Config, again: Again
 ) -> None:

@@ -19,6 +19,7 @@ from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.trials import Trials
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.generation.pipeline import build
@@ -136,7 +137,7 @@ def test_lifts_are_tried_elsewhere_as_they_lay(
 
 def test_pictures_are_of_one_resting_pose(dataset: Path) -> None:
     columns, name = trials(dataset), "8_wineglass_flute"
-    own = (columns["object"] == 0) & (columns["removal"] == Removal.KEPT)
+    own = (columns["object"] == 0) & (Trials(dataset)["removal"] == Removal.KEPT)
     counts = np.bincount(columns["resting"][own])
     assert 0 < counts.max() < counts.sum()
     shown = read_approaches(dataset, name, read_manifest(dataset).config_of(name))

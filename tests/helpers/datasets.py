@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 import trimesh
 
-from drakegrasp.config import CameraConfig, Config
+from drakegrasp.config import MOST_PALMS, CameraConfig, Config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import DIGEST, Manifest, installed_versions, write_manifest
@@ -240,7 +240,7 @@ def resting(model: ObjectModel, X_TO: Array) -> PreparedObject:
         table_force=np.full(1, 9.81),
         stopped=np.zeros(1, dtype=bool),
         candidates=candidates,
-        asked=4,
+        asked=MOST_PALMS,
     )
 
 
