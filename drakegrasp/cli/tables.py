@@ -16,7 +16,7 @@ from rich.table import Table
 
 from drakegrasp.cli.console import say
 from drakegrasp.config import Config
-from drakegrasp.dataset.distinct import BANDS
+from drakegrasp.distinct import BANDS
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
 from drakegrasp.dataset.quality import holding_lines, holding_of

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import Config, SplitConfig, ways_to_grasps
 from drakegrasp.dataset.assembly.survey import shards_sha256
-from drakegrasp.dataset.distinct import (
+from drakegrasp.distinct import (
     BANDS,
     approach_cells,
     distinct_grasps,

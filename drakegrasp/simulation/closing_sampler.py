@@ -17,6 +17,7 @@ import numpy as np
 
 from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
 from drakegrasp.config import Config
+from drakegrasp.distinct import approach_cells
 from drakegrasp.frames import invert_pose, make_pose, rotation_about, transform_points
 from drakegrasp.hand.description import load_hand
 from drakegrasp.mesh.cloud import Solid
@@ -39,7 +40,7 @@ NEAR, NEARER, NEAREST, LAST_ROUNDS = (0.020, 30.0), 0.7, 0.1, 10
 #: Least downward component of the approach of palms from above and of slanted ones: the sines of
 #: 60 and 30 degrees. Palms with more than the last one, the cosine of 14 degrees, are left out:
 #: their camera sees a flat image, which is no sample.
-ABOVE, SLANTED, FLAT = float(np.sqrt(0.75)), 0.5, 0.97
+ABOVE, SLANTED, FLAT = float(np.sqrt(0.75)), 0.5, 2.0
 #: While palms from other sides close well, at most so many palms from above for each of these.
 MOST_ABOVE = 1.5
 #: Number of rounds in a row without a good palm after which a side counts as not free.
@@ -141,8 +142,7 @@ class Closing:
         """Return the next palm of the order, or None if more must be drawn first."""
         least = max(LEAST, self._good * self._best[0])
         for side, waiting in enumerate(self._waiting):
-            while waiting and waiting[0].score >= least and self._is_near(waiting[0].X_LG):
-                waiting.pop(0)
+            waiting[:] = [p for p in waiting if p.score < least or not self._is_near(p.X_LG)]
             if waiting and waiting[0].score >= least:
                 self._vain[side] = min(self._vain[side], PATIENCE - 1)
         ready = [s for s in range(3) if self._waiting[s] and self._waiting[s][0].score >= least]
@@ -155,7 +155,16 @@ class Closing:
         others_are_free = min(self._vain[1:]) < PATIENCE
         if side == 0 and others_are_free and counts[0] >= MOST_ABOVE * (counts[1] + counts[2] + 1):
             return None
-        return self._waiting[side].pop(0)
+
+        # Of its good palms, the best one of those from the direction with the fewest palms.
+        waiting = self._waiting[side]
+        good = [i for i, palm in enumerate(waiting) if palm.score >= least]
+        X = np.array([waiting[i].X_LG for i in good])
+        filled = np.bincount(
+            approach_cells(np.reshape([palm.X_LG for palm in self._order], (-1, 4, 4))),
+            minlength=42,
+        )[approach_cells(X)]
+        return waiting.pop(good[int(filled.argmin())])
 
     def _add(self, drawn: Sequence[tuple[Array, Shape]]) -> None:
         """Close the hand at palms, and let those that close well wait for their turn."""

@@ -7,7 +7,7 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 
-from drakegrasp.dataset.distinct import (
+from drakegrasp.distinct import (
     approach_cells,
     cell_directions,
     distinct_grasps,
