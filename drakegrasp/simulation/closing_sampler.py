@@ -38,14 +38,14 @@ GOOD, BEST, LEAST = (0.9, 0.7, 0.1), 5, 0.1
 #: Number of rounds in a row in vain after which there are no more palms then.
 NEAR, NEARER, NEAREST, LAST_ROUNDS = (0.020, 30.0), 0.7, 0.1, 10
 #: Least downward component of the approach of palms from above and of slanted ones: the sines of
-#: 60 and 30 degrees. Palms with more than the last one, the cosine of 14 degrees, are left out:
-#: their camera sees a flat image, which is no sample.
-ABOVE, SLANTED, FLAT = float(np.sqrt(0.75)), 0.5, 2.0
+#: 60 and 30 degrees.
+ABOVE, SLANTED = float(np.sqrt(0.75)), 0.5
 #: While palms from other sides close well, at most so many palms from above for each of these.
 MOST_ABOVE = 1.5
 #: Number of rounds in a row without a good palm after which a side counts as not free.
 PATIENCE = 1
-#: Numbers of palms drawn in a round.
+#: The kinds of palms of each side, and the numbers of palms drawn in a round.
+SIDES = ("above", "slanted", "beside")
 ROUND = {"above": 16, "slanted": 14, "beside": 14, "near": 4, "surface": 6}
 #: Random numbers of a palm.
 NUMBERS = 7
@@ -112,7 +112,7 @@ class Closing:
 
         # What counts as good and as near, and the rounds in a row without a good palm of each side.
         self._good, self._near, self._vain = GOOD[0], 1.0, [0, 0, 0]
-        self._add(fixed)
+        self._add(fixed, range(3))
 
     def poses(self) -> Iterator[tuple[Array, Shape] | None]:
         """Yield palm poses X_OG (4, 4) and the shape of the hand, as long as palms close well.
@@ -125,10 +125,10 @@ class Closing:
             palm = self._next()
             if palm is not None:
                 rounds = 0
-                self._order.append(palm)
                 yield multiply(X_OL, palm.X_LG), palm.shape
             elif min(self._vain) < PATIENCE:
-                self._add(self._draw())
+                sides = [s for s in range(3) if self._vain[s] < PATIENCE and not self._good_of(s)]
+                self._add(self._draw(sides), sides)
             elif self._good > GOOD[1]:
                 self._good, self._vain = self._good - GOOD[2], [PATIENCE - 1] * 3
             elif rounds == LAST_ROUNDS or not self._order:
@@ -139,54 +139,60 @@ class Closing:
                 yield None
 
     def _next(self) -> Palm | None:
-        """Return the next palm of the order, or None if more must be drawn first."""
-        least = max(LEAST, self._good * self._best[0])
-        for side, waiting in enumerate(self._waiting):
-            waiting[:] = [p for p in waiting if p.score < least or not self._is_near(p.X_LG)]
-            if waiting and waiting[0].score >= least:
+        """Return the next palm, now in the order, or None if more must be drawn first."""
+        good = [self._good_of(side) for side in range(3)]
+        for side in range(3):
+            if good[side]:
                 self._vain[side] = min(self._vain[side], PATIENCE - 1)
-        ready = [s for s in range(3) if self._waiting[s] and self._waiting[s][0].score >= least]
-        if not ready:
+        if not any(good):
             return None
 
         # The side with the fewest palms comes next, and those from above do not outnumber others.
         counts = np.bincount([palm.side for palm in self._order], minlength=3)
-        side = min(ready, key=lambda side: (counts[side], -side))
+        side = min((s for s in range(3) if good[s]), key=lambda side: (counts[side], -side))
         others_are_free = min(self._vain[1:]) < PATIENCE
         if side == 0 and others_are_free and counts[0] >= MOST_ABOVE * (counts[1] + counts[2] + 1):
             return None
 
         # Of its good palms, the best one of those from the direction with the fewest palms.
-        waiting = self._waiting[side]
-        good = [i for i, palm in enumerate(waiting) if palm.score >= least]
-        X = np.array([waiting[i].X_LG for i in good])
-        filled = np.bincount(
-            approach_cells(np.reshape([palm.X_LG for palm in self._order], (-1, 4, 4))),
-            minlength=42,
-        )[approach_cells(X)]
-        return waiting.pop(good[int(filled.argmin())])
+        before = approach_cells(_stacked(self._order)).tolist()
+        cells = approach_cells(_stacked(good[side])).tolist()
+        fewest = min(range(len(cells)), key=lambda i: before.count(cells[i]))
+        palm = good[side][fewest]
+        self._order.append(palm)
 
-    def _add(self, drawn: Sequence[tuple[Array, Shape]]) -> None:
-        """Close the hand at palms, and let those that close well wait for their turn."""
-        fresh = [
-            (X_LG, shape) for X_LG, shape in drawn if -X_LG[2, 2] < FLAT and not self._is_near(X_LG)
-        ]
-        palms = self._closed(fresh)
-        self._best = sorted([*self._best, *(palm.score for palm in palms)])[-BEST:]
+        # Palms that are near it, and the palm itself, wait no longer.
+        for waiting in self._waiting:
+            near = self._near_any(_stacked(waiting), palm.X_LG[None])
+            waiting[:] = [each for each, is_near in zip(waiting, near, strict=True) if not is_near]
+        return palm
+
+    def _good_of(self, side: int) -> list[Palm]:
+        """Return the good palms of a side that wait, best first."""
         least = max(LEAST, self._good * self._best[0])
-        for side, waiting in enumerate(self._waiting):
-            own = [palm for palm in palms if palm.side == side and palm.score >= LEAST]
-            self._waiting[side] = sorted([*waiting, *own], key=lambda palm: -palm.score)
-            found = any(palm.score >= least for palm in own)
-            self._vain[side] = 0 if found else self._vain[side] + 1
+        return [palm for palm in self._waiting[side] if palm.score >= least]
 
-    def _is_near(self, X_LG: Array) -> bool:
-        """Return whether a palm is near one in the order."""
-        X = np.reshape([other.X_LG for other in self._order], (-1, 4, 4))
-        shift = norm(X[:, :3, 3] - X_LG[:3, 3])
-        cosine = (dot(X[:, :3, :3].reshape(-1, 9), X_LG[:3, :3].ravel()) - 1.0) / 2.0
+    def _add(self, drawn: Sequence[tuple[Array, Shape]], sides: Sequence[int]) -> None:
+        """Close the hand at palms drawn for some sides; those that close well wait their turn."""
+        X_LG = np.reshape([X for X, _ in drawn], (-1, 4, 4))
+        near = self._near_any(X_LG, _stacked(self._order))
+        palms = self._closed([each for each, is_near in zip(drawn, near, strict=True) if not is_near])
+        self._best = sorted([*self._best, *(palm.score for palm in palms)])[-BEST:]
+        for side, waiting in enumerate(self._waiting):
+            waiting += [palm for palm in palms if palm.side == side and palm.score >= LEAST]
+            waiting.sort(key=lambda palm: -palm.score)
+            if self._good_of(side):
+                self._vain[side] = 0
+            elif side in sides:
+                self._vain[side] += 1
+
+    def _near_any(self, X_LG: Array, others: Array) -> Array:
+        """Return whether palms (m,) are near any of others (n, 4, 4)."""
+        shift = norm(X_LG[:, None, :3, 3] - others[:, :3, 3])
+        R, others_R = (np.reshape(X[:, :3, :3], (-1, 9)) for X in (X_LG, others))
+        cosine = (dot(R[:, None], others_R) - 1.0) / 2.0
         closer = cosine >= sin_cos_deg(self._near * NEAR[1])[1]
-        return bool((closer & (shift <= self._near * NEAR[0])).any())
+        return np.asarray((closer & (shift <= self._near * NEAR[0])).any(axis=1))
 
     def _closed(self, drawn: Sequence[tuple[Array, Shape]]) -> list[Palm]:
         """Return palms with their scores."""
@@ -201,11 +207,12 @@ class Closing:
                 palms += [Palm(X_LG, shape, score) for X_LG, score in rows]
         return palms
 
-    def _draw(self) -> list[tuple[Array, Shape]]:
-        """Return the palms of a round, as far as the table leaves room for them."""
-        count = sum(ROUND.values())
-        numbers = self._stream.uniform(NUMBERS * count).reshape(count, NUMBERS)
+    def _draw(self, sides: Sequence[int]) -> list[tuple[Array, Shape]]:
+        """Return the palms of a round for some sides, as far as the table leaves room for them."""
+        left_out = [kind for side, kind in enumerate(SIDES) if side not in sides]
         kinds = [kind for kind, number in ROUND.items() for _ in range(number)]
+        kinds = [kind for kind in kinds if kind not in left_out]
+        numbers = self._stream.uniform(NUMBERS * len(kinds)).reshape(-1, NUMBERS)
         drawn = [self._palm(kind, *row) for kind, row in zip(kinds, numbers.tolist(), strict=True)]
         return [(X_LG, shape) for X_LG, shape in drawn if X_LG is not None]
 
@@ -249,6 +256,10 @@ class Closing:
         R = multiply(np.column_stack([x, np.cross(z, x), z]), _turned(360.0 * u[1]))
         least = min(self._hand.standoffs)
         return make_pose(R, self._points[i] - (least + FARTHER * u[2]) * z)
+
+
+def _stacked(palms: Sequence[Palm]) -> Array:
+    return np.reshape([palm.X_LG for palm in palms], (-1, 4, 4))
 
 
 def level_pose(X_TO: Array) -> Array:
