@@ -12,11 +12,11 @@ from itertools import combinations, product
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import Array, dot, norm
+from drakegrasp.arithmetic import Array, dot, norm, sin_cos_deg
 
-#: A grasp is not distinct if its palm is within this distance [m] and this angle [rad] of the palm
-#: of a distinct grasp.
-NEAR_SHIFT, NEAR_TURN = 0.020, float(np.deg2rad(30.0))
+#: A grasp is not distinct if its palm is within this distance [m] and this angle [degree] of the
+#: palm of a distinct grasp.
+NEAR_SHIFT, NEAR_TURN = 0.020, 30.0
 #: Bands of elevation above the table, from the side to straight from above [degree].
 BANDS = ((0, 30), (30, 60), (60, 90))
 #: Limits are inclusive by more than rounding: lengths [m], angles [rad] and their cosines.
@@ -61,7 +61,7 @@ def _is_near(p: Array, R: Array, others_p: Array, others_R: Array) -> bool:
     close = norm(others_p - p) <= NEAR_SHIFT + EDGE
     # The trace of R_A^T R_B is 1 + 2 cos(angle).
     cosine = (dot(others_R[close], R) - 1.0) / 2.0
-    return bool((cosine >= np.cos(NEAR_TURN) - EDGE).any())
+    return bool((cosine >= sin_cos_deg(NEAR_TURN)[1] - EDGE).any())
 
 
 def cell_directions() -> Array:

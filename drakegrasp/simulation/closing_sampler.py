@@ -4,8 +4,8 @@ At a resting pose the first palms are the fixed ones of `palms.Palms`. Then palm
 rounds: from the same family, with random places, heights, turns and slants; near palms that close
 well; and at surface points, for rims and handles of what is too wide for the hand. Geometry closes
 the hand on the surface (`closing.close_on`), and palms that close much worse than the best ones are
-left out. Palms from above, slanted and from the side take turns. Palms near an earlier one are left
-out, until there is no other.
+left out. Palms from above, slanted and from the side take turns, and so do the directions of a
+side. Palms near an earlier one are left out, until there is no other.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
 from drakegrasp.config import Config
-from drakegrasp.distinct import approach_cells
+from drakegrasp.distinct import NEAR_SHIFT, NEAR_TURN, approach_cells
 from drakegrasp.frames import invert_pose, make_pose, rotation_about, transform_points
 from drakegrasp.hand.description import load_hand
 from drakegrasp.mesh.cloud import Solid
@@ -32,11 +32,11 @@ from drakegrasp.simulation.screen import centre
 POINTS = 2048
 #: A palm is good if its score is at least a fraction of the score of the best few: first the first
 #: one, which then falls to the second one in steps of the third one. Least score of a good palm.
-GOOD, BEST, LEAST = (0.9, 0.7, 0.1), 5, 0.1
-#: Palms are near if they are closer than both limits [m, degree], those of the number of distinct
-#: grasps; if all good palms are near others, both shrink by a factor, down to a fraction of them.
-#: Number of rounds in a row in vain after which there are no more palms then.
-NEAR, NEARER, NEAREST, LAST_ROUNDS = (0.020, 30.0), 0.7, 0.1, 10
+GOOD, BEST, LEAST = (0.9, 0.8, 0.1), 5, 0.4
+#: Palms are near if their grasps would not be distinct; if all good palms are near others, both
+#: limits shrink by a factor, down to a fraction of them. Number of rounds in a row in vain after
+#: which there are no more palms then.
+NEARER, NEAREST, LAST_ROUNDS = 0.7, 0.1, 10
 #: Least downward component of the approach of palms from above and of slanted ones: the sines of
 #: 60 and 30 degrees.
 ABOVE, SLANTED = float(np.sqrt(0.75)), 0.5
@@ -176,7 +176,9 @@ class Closing:
         """Close the hand at palms drawn for some sides; those that close well wait their turn."""
         X_LG = np.reshape([X for X, _ in drawn], (-1, 4, 4))
         near = self._near_any(X_LG, _stacked(self._order))
-        palms = self._closed([each for each, is_near in zip(drawn, near, strict=True) if not is_near])
+        palms = self._closed(
+            [each for each, is_near in zip(drawn, near, strict=True) if not is_near]
+        )
         self._best = sorted([*self._best, *(palm.score for palm in palms)])[-BEST:]
         for side, waiting in enumerate(self._waiting):
             waiting += [palm for palm in palms if palm.side == side and palm.score >= LEAST]
@@ -191,8 +193,8 @@ class Closing:
         shift = norm(X_LG[:, None, :3, 3] - others[:, :3, 3])
         R, others_R = (np.reshape(X[:, :3, :3], (-1, 9)) for X in (X_LG, others))
         cosine = (dot(R[:, None], others_R) - 1.0) / 2.0
-        closer = cosine >= sin_cos_deg(self._near * NEAR[1])[1]
-        return np.asarray((closer & (shift <= self._near * NEAR[0])).any(axis=1))
+        closer = cosine >= sin_cos_deg(self._near * NEAR_TURN)[1]
+        return np.asarray((closer & (shift <= self._near * NEAR_SHIFT)).any(axis=1))
 
     def _closed(self, drawn: Sequence[tuple[Array, Shape]]) -> list[Palm]:
         """Return palms with their scores."""
