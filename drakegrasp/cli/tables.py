@@ -16,7 +16,6 @@ from rich.table import Table
 
 from drakegrasp.cli.console import say
 from drakegrasp.config import Config
-from drakegrasp.distinct import BANDS
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
 from drakegrasp.dataset.quality import holding_lines, holding_of
@@ -35,6 +34,7 @@ from drakegrasp.dataset.statistics import (
     split_shortfall,
 )
 from drakegrasp.dataset.trials import Trials
+from drakegrasp.distinct import BANDS
 from drakegrasp.errors import counted, printable
 from drakegrasp.filters import Removal
 from drakegrasp.objects.audit import AuditRow

@@ -20,12 +20,6 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import Config, SplitConfig, ways_to_grasps
 from drakegrasp.dataset.assembly.survey import shards_sha256
-from drakegrasp.distinct import (
-    BANDS,
-    approach_cells,
-    distinct_grasps,
-    elevation_bands,
-)
 from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_names
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.opening import open_samples, open_trials
@@ -33,6 +27,12 @@ from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRI
 from drakegrasp.dataset.quality import holding_of
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
 from drakegrasp.dataset.trials import NONE, Trials, shard_part
+from drakegrasp.distinct import (
+    BANDS,
+    approach_cells,
+    distinct_grasps,
+    elevation_bands,
+)
 from drakegrasp.errors import DataError, HandError, counted
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose

@@ -65,10 +65,16 @@ def material_of(item: BuiltinObject) -> tuple[float, float]:
 
 
 def rows_digest(data: GraspDataset, rows: Sequence[int]) -> str:
-    """Return a hash of some rows of a split: of their trials and grasps, to the last bit."""
-    grasps = np.ascontiguousarray(data.column("grasps")[list(rows)], dtype=np.float32)
-    trials = np.ascontiguousarray(data.column("trial_id")[list(rows)], dtype=np.int64)
-    return hashlib.sha256(trials.tobytes() + grasps.tobytes()).hexdigest()
+    """Return a hash of some rows of a split, to the last bit, whatever their numbers of trials are.
+
+    It covers the objects' names, their poses, those of camera and palm, and the grasps.
+    """
+    names = data.column("object_props/object_name")[list(rows)].tolist()
+    digest = hashlib.sha256(json.dumps(names).encode())
+    poses = "frame_world2obj", f"frame_work2cam_{data.camera}"
+    for field in (*(f"object_props/{pose}" for pose in poses), "grasp_props/X_CG", "grasps"):
+        digest.update(np.ascontiguousarray(data.column(field)[list(rows)]))
+    return digest.hexdigest()
 
 
 def write_objects(

@@ -33,9 +33,9 @@ import numpy as np
 import yaml
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.distinct import approach_cells, distinct_grasps, elevation_bands
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.distinct import approach_cells, distinct_grasps, elevation_bands
 from drakegrasp.frames import unpack_pose
 from drakegrasp.shapes.catalog import export_builtin
 

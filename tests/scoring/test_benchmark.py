@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections import Counter
 
+import h5py
 import pytest
 import yaml
 from helpers.datasets import make_dataset
@@ -165,6 +167,18 @@ def test_all_objects_test(part):
     assert CONFIG.split.train_classes == ()
     said = yaml.safe_load((part / BUILTIN_FOLDER / "objects.yaml").read_text())
     assert said["objects"].keys() == {BOTTLE}
+
+
+@pytest.mark.parametrize("field", ["grasps", "grasp_props/X_CG", "object_props/frame_world2obj"])
+def test_rows_are_the_same_whatever_the_numbers_of_their_trials(tmp_path, field):
+    path, digests = make_dataset(tmp_path / "out", tmp_path) / DATA_FILES["oto"], []
+    for name, change in (("trial_id", 0), ("trial_id", 7), (field, 0.001)):
+        changed = shutil.copy(path, tmp_path / f"{len(digests)}.hdf5")
+        with h5py.File(changed, "r+") as file:
+            file[f"train/{name}"][:] += change
+        data = GraspDataset(changed, split="train")
+        digests.append(rows_digest(data, range(len(data))))
+    assert digests[0] == digests[1] != digests[2]
 
 
 def test_a_card_says_whether_all_rows_are_the_published_ones(tmp_path, monkeypatch):
