@@ -13,6 +13,7 @@ from pathlib import Path
 
 from drakegrasp.api.building import build_dataset
 from drakegrasp.cli.tables import make_console, print_stats
+from drakegrasp.config import BuiltinConfig
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.hand.settings import load_config
@@ -20,12 +21,10 @@ from drakegrasp.pictures.sheets import sample_sheet
 from drakegrasp.pictures.style import save_figure
 from drakegrasp.shapes.catalog import draw_builtin, export_builtin
 
-#: Classes that the hand often grasps.
-CLASSES = ("wineglass", "carton", "boot")
-#: Objects per class: one trains and validates, the other is tested.
-PER_CLASS = 2
-#: Palm poses per object, normal to its surface: far fewer of the paper's poses become samples.
-CANDIDATES, METHOD = 40, "normals"
+#: Classes of the objects, and objects per class.
+CLASSES, PER_CLASS = ("wineglass", "carton", "boot"), 2
+#: Samples of all objects together.
+SAMPLES = 60
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -35,10 +34,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("directory", type=Path, metavar="DIR", help="where to write")
     parser.add_argument(
-        "--candidates",
+        "--samples",
         type=int,
-        default=CANDIDATES,
-        help=f"palm poses per object  [default: {CANDIDATES}]",
+        default=SAMPLES,
+        help=f"samples of all objects together  [default: {SAMPLES}]",
     )
     parser.add_argument(
         "--per-class",
@@ -51,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         run(
             arguments.directory,
-            candidates=arguments.candidates,
+            samples=arguments.samples,
             per_class=arguments.per_class,
             workers=arguments.workers,
         )
@@ -62,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(
-    directory: Path, *, candidates: int, per_class: int = PER_CLASS, workers: int | None = None
+    directory: Path, *, samples: int, per_class: int = PER_CLASS, workers: int | None = None
 ) -> None:
     """Export the objects, build their dataset, and print and draw its contents."""
     meshes, out, sheet = (
@@ -71,13 +70,9 @@ def run(
         directory / "contact_sheet.png",
     )
 
-    # Shards of 20 candidates keep all cores busy to the end of such a small dataset.
-    overrides = [f"candidates.max={candidates}", f"candidates.method={METHOD}"]
-    overrides += [f"builtin.per_class={per_class}", "unit_candidates=20"]
-    config = load_config(None, overrides)
-    drawn = draw_builtin(config.builtin)
+    drawn = draw_builtin(BuiltinConfig(per_class=per_class))
     export_builtin(meshes, [item.name for item in drawn if item.object_class.name in CLASSES])
-    build_dataset(meshes, out, config=config, workers=workers)
+    build_dataset(meshes, out, config=load_config("fast", samples=samples), workers=workers)
 
     print_stats(out)
     console = make_console()

@@ -14,6 +14,7 @@ from helpers.meshes import write
 from helpers.objects import model_of
 
 from drakegrasp.config import Config
+from drakegrasp.distinct import NEAR_SHIFT, NEAR_TURN, approach_cells
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, make_pose, rotation_about
 from drakegrasp.generation.pipeline import build
@@ -28,10 +29,6 @@ from drakegrasp.simulation.candidates import Candidates, palm_attempts, sample_c
 
 #: Full extents of a tall box, which leaves all sides free [m].
 TALL = (0.05, 0.06, 0.16)
-#: Palms that are nearer than both are one grasp [m, degree].
-NEAR = 0.020, 30.0
-#: A palm that is less than this from straight above sees a flat image [degree].
-FLAT = 14.0
 
 
 def meshes() -> dict[str, trimesh.Trimesh]:
@@ -145,7 +142,7 @@ def test_sides_take_turns(model: Callable[[str], ObjectModel]) -> None:
     found = down(model("tall"), draw(model("tall"), 60))
     sides = np.array([np.count_nonzero(found < 30.0), np.count_nonzero(found >= 60.0)])
     beside, above = sides
-    assert beside >= 15 and above >= 6 and 60 - beside - above >= 6
+    assert beside >= 15 and above >= 6
     share = np.cumsum(found >= 60.0) / np.arange(1, 61)
     assert share[4:].max() <= 0.6
 
@@ -155,14 +152,20 @@ def test_first_palms_are_distinct(model: Callable[[str], ObjectModel]) -> None:
     shift = np.linalg.norm(X[:, None, :3, 3] - X[None, :, :3, 3], axis=2)
     cosine = (np.einsum("aij,bij->ab", X[:, :3, :3], X[:, :3, :3]) - 1.0) / 2.0
     turn = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    near = (shift < NEAR[0]) & (turn < NEAR[1])
+    near = (shift < NEAR_SHIFT) & (turn < NEAR_TURN)
     assert near.sum() == len(X)
 
 
-def test_no_palm_comes_from_straight_above(model: Callable[[str], ObjectModel]) -> None:
+def test_low_things_are_taken_from_straight_above_too(model: Callable[[str], ObjectModel]) -> None:
     found = down(model("low"), draw(model("low"), 60))
-    assert (found >= 60.0).sum() > 10
-    assert found.max() < 90.0 - FLAT + 0.1
+    assert (found > 85.0).sum() >= 4
+
+
+def test_directions_of_a_side_take_turns(model: Callable[[str], ObjectModel]) -> None:
+    """Around a ball every direction from the side is as good."""
+    X = draw(model("ball"), 40).X_OG
+    counts = np.bincount(approach_cells(X), minlength=42)
+    assert np.count_nonzero(counts) >= 15
 
 
 @pytest.mark.parametrize("name", ["ball", "mug"])
