@@ -73,7 +73,7 @@ def rows_digest(data: GraspDataset, rows: Sequence[int]) -> str:
     digest = hashlib.sha256(json.dumps(names).encode())
     poses = "frame_world2obj", f"frame_work2cam_{data.camera}"
     for field in (*(f"object_props/{pose}" for pose in poses), "grasp_props/X_CG", "grasps"):
-        digest.update(np.ascontiguousarray(data.column(field)[list(rows)]))
+        digest.update(data.column(field)[list(rows)].tobytes())
     return digest.hexdigest()
 
 

@@ -4,8 +4,8 @@ At a resting pose the first palms are the fixed ones of `palms.Palms`. Then palm
 rounds: from the same family, with random places, heights, turns and slants; near palms that close
 well; and at surface points, for rims and handles of what is too wide for the hand. Geometry closes
 the hand on the surface (`closing.close_on`), and palms that close much worse than the best ones are
-left out. Palms from above, slanted and from the side take turns, and so do the directions of a
-side. Palms near an earlier one are left out, until there is no other.
+left out. Directions take turns, and so do palms from above, slanted and from the side. Palms near
+an earlier one are left out, until there is no other.
 """
 
 from __future__ import annotations
@@ -90,6 +90,7 @@ class Closing:
 
         # Points of the surface in {L}, with outward normals.
         self._X_LO = level_pose(X_TO)
+        self._X_OL = invert_pose(self._X_LO)
         self._points, self._normals = _surface(model, self._X_LO)
         inside = np.argwhere(model.field.values < 0.0)
         middle = inside.mean(axis=0) * model.field.spacing + model.field.origin
@@ -119,13 +120,12 @@ class Closing:
 
         None tells that the palms that follow are nearer to those before.
         """
-        X_OL = invert_pose(self._X_LO)
         rounds = 0  # in a row without a palm
         while True:
             palm = self._next()
             if palm is not None:
                 rounds = 0
-                yield multiply(X_OL, palm.X_LG), palm.shape
+                yield multiply(self._X_OL, palm.X_LG), palm.shape
             elif min(self._vain) < PATIENCE:
                 sides = [s for s in range(3) if self._vain[s] < PATIENCE and not self._good_of(s)]
                 self._add(self._draw(sides), sides)
@@ -144,21 +144,23 @@ class Closing:
         for side in range(3):
             if good[side]:
                 self._vain[side] = min(self._vain[side], PATIENCE - 1)
-        if not any(good):
-            return None
 
-        # The side with the fewest palms comes next, and those from above do not outnumber others.
+        # Palms from above do not outnumber others by much.
         counts = np.bincount([palm.side for palm in self._order], minlength=3)
-        side = min((s for s in range(3) if good[s]), key=lambda side: (counts[side], -side))
         others_are_free = min(self._vain[1:]) < PATIENCE
-        if side == 0 and others_are_free and counts[0] >= MOST_ABOVE * (counts[1] + counts[2] + 1):
+        if others_are_free and counts[0] >= MOST_ABOVE * (counts[1] + counts[2] + 1):
+            good[0] = []
+        palms = [palm for of_side in good for palm in of_side]
+        if not palms:
             return None
 
-        # Of its good palms, the best one of those from the direction with the fewest palms.
-        before = approach_cells(_stacked(self._order)).tolist()
-        cells = approach_cells(_stacked(good[side])).tolist()
-        fewest = min(range(len(cells)), key=lambda i: before.count(cells[i]))
-        palm = good[side][fewest]
+        # Directions take turns, of these sides, and of these palms the best one is the next.
+        before, cells = self._cells(self._order), self._cells(palms)
+        turns = [
+            (before.count(cell), counts[palm.side], -palm.score)
+            for palm, cell in zip(palms, cells, strict=True)
+        ]
+        palm = palms[min(range(len(palms)), key=turns.__getitem__)]
         self._order.append(palm)
 
         # Palms that are near it, and the palm itself, wait no longer.
@@ -166,6 +168,11 @@ class Closing:
             near = self._near_any(_stacked(waiting), palm.X_LG[None])
             waiting[:] = [each for each, is_near in zip(waiting, near, strict=True) if not is_near]
         return palm
+
+    def _cells(self, palms: Sequence[Palm]) -> list[int]:
+        """Return the cell of directions of each palm's approach, in {O}."""
+        cells: list[int] = approach_cells(multiply(self._X_OL, _stacked(palms))).tolist()
+        return cells
 
     def _good_of(self, side: int) -> list[Palm]:
         """Return the good palms of a side that wait, best first."""
@@ -198,12 +205,12 @@ class Closing:
 
     def _closed(self, drawn: Sequence[tuple[Array, Shape]]) -> list[Palm]:
         """Return palms with their scores."""
-        palms, X_OL = list[Palm](), invert_pose(self._X_LO)
+        palms = list[Palm]()
         for shape in self._shapes:
             own = [X_LG for X_LG, other in drawn if other == shape]
             if own:
                 hand = self._hand.at(shape.preshape)
-                X_OG = centre(self._model, hand, shape.spread, multiply(X_OL, np.array(own)))
+                X_OG = centre(self._model, hand, shape.spread, multiply(self._X_OL, np.array(own)))
                 found = close_on(self._solid, hand, shape.spread, X_OG, X_TS=self._X_LO)
                 rows = zip(multiply(self._X_LO, X_OG), found["score"].tolist(), strict=True)
                 palms += [Palm(X_LG, shape, score) for X_LG, score in rows]
