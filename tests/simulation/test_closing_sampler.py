@@ -161,11 +161,10 @@ def test_low_things_are_taken_from_straight_above_too(model: Callable[[str], Obj
     assert (found > 85.0).sum() >= 4
 
 
-def test_directions_of_a_side_take_turns(model: Callable[[str], ObjectModel]) -> None:
-    """Around a ball every direction from the side is as good."""
-    X = draw(model("ball"), 40).X_OG
-    counts = np.bincount(approach_cells(X), minlength=42)
-    assert np.count_nonzero(counts) >= 15
+def test_directions_take_turns(model: Callable[[str], ObjectModel]) -> None:
+    """Around a ball many directions are as good."""
+    cells = approach_cells(draw(model("ball"), 12).X_OG)
+    assert len(set(cells.tolist())) >= 9
 
 
 @pytest.mark.parametrize("name", ["ball", "mug"])
