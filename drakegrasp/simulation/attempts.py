@@ -154,22 +154,27 @@ class Attempts:
         chosen: dict[str, Any] = {name: taken(value, rows) for name, value in self}
         return replace(self, **chosen)
 
-    def posture(self, i: int, X_TO: Array, X_OM: Array) -> Posture:
+    def posture(self, i: int, X_TO: Array, X_OM: Array | None = None) -> Posture:
         """Return the posture of a row.
 
         Args:
             i: Index of the row in the table.
             X_TO: Pose (4, 4) of its object on the table.
-            X_OM: Pose (4, 4) of the mesh file's frame in {O}.
+            X_OM: Pose (4, 4) of the mesh file's frame in {O}, for the frame "mesh".
+
+        Raises:
+            GraspError: If the frame is "mesh" and its pose is not given.
         """
         X_OG = multiply(self.frame_pose(i, X_TO, X_OM), self.X_FG[i])
         return _posture(self, i, X_OG)
 
-    def frame_pose(self, i: int, X_TO: Array, X_OM: Array) -> Array:
+    def frame_pose(self, i: int, X_TO: Array, X_OM: Array | None) -> Array:
         """Return the pose (4, 4) in {O} of the frame of a row; see `posture`."""
         if self.frame == "object":
             return np.eye(4)
         if self.frame == "mesh":
+            if X_OM is None:
+                raise GraspError("X_OM must be given for the frame mesh, got None")
             return X_OM
         X_OT = invert_pose(X_TO)
         if self.frame == "table":

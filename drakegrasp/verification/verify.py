@@ -204,8 +204,8 @@ def _of_all_fingers(trial: TrialRecord, unused: int, fingers: int) -> TrialRecor
 
 def _judged(base: Verification, tries: tuple[PoseTrial, ...]) -> Verification:
     """Return the verdict of the first trial, which decides."""
-    placed, trial, start = base.placed, tries[0].trial, tries[0].pregrasp
-    message = trial.message
+    trial = tries[0].trial
+    placed, start, message = base.placed, tries[0].pregrasp, trial.message
     if trial.outcome is Outcome.START_COLLISION:
         about = base.config.physics, base.config.hand_source, start.preshape
         met = start_meetings(cached_scene(placed.model, *about), placed.X_TO_simulated, start)
