@@ -90,7 +90,7 @@ def test_posture_in_the_frame_of_the_rows_camera_is_that_in_the_objects(data, tm
         ({"row": np.array([0, 99])}, "rows must be 0 to .*, got 99"),
         ({"row": np.array([0.5, 1.0])}, "rows must be whole numbers"),
         ({"X_TC": np.tile(np.eye(4), (2, 1, 1))}, "X_TC must be left out: the camera is that of"),
-        ({"confidence": np.zeros(3)}, r"confidence must be \(2,\), one per grasp"),
+        ({"confidence": np.zeros(3)}, r"confidence must be \(2,\) finite numbers, one per grasp"),
     ],
 )
 def test_what_belongs_to_no_row_is_refused(data, tmp_path, changes, words):
