@@ -29,11 +29,6 @@ P_WT = np.array([0.0, 0.0, 0.65])
 
 #: Largest deviation of a rotation matrix from orthogonal; files store them in single precision.
 ROTATION_TOLERANCE = 1e-4
-#: Error message for numbers in the unknown frame of a mesh file.
-NO_MESH_FRAME = (
-    "frame must not be mesh where the frame of the mesh file is not known, as on a dataset, got "
-    "mesh: give the mesh itself (drakegrasp verify FILE --object MESH)"
-)
 #: Largest distance of a contact or a palm from the origin of its frame [m].
 FARTHEST = 1e3
 #: Names of other kinds of array in errors, by NumPy's letter.

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 from distributed import Client
+from helpers.datasets import make_dataset
 
 from drakegrasp.api import building, verifying
 from drakegrasp.api.building import build_dataset, build_on
@@ -28,8 +29,11 @@ from drakegrasp.api.verifying import (
 )
 from drakegrasp.cluster.connect import connect
 from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.prepared_objects import load_prepared, save_prepared
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError, MachineError, MeshError
+from drakegrasp.frames import invert_pose
+from drakegrasp.grasp import pack_grasp, transform_grasp
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
@@ -190,6 +194,25 @@ def test_row_knows_the_frames_of_both_cameras(test_split: GraspDataset) -> None:
     assert "the frame of the dataset's other camera" in hints(other.column("grasps"), "camera")
     assert hints(own, "object") == hints(own, "workspace") == {"the camera's frame (camera)"}
     assert not hints(own, "camera")
+
+
+def test_contacts_in_the_frame_of_the_mesh_file_are_told_and_read_on_a_sample(
+    tmp_path: Path,
+) -> None:
+    """The origin of the file is 0.3 m beside the object."""
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes")
+    sample = GraspDataset(out / "grasping_oto.hdf5", split="train")[0]
+    name, config = sample.props["object_name"], read_manifest(out).config
+    prepared = load_prepared(out, name, config)
+    moved = replace(prepared.model, p_OM=np.array([0.0, 0.3, 0.0]))
+    save_prepared(replace(prepared, model=moved), out, config)
+    right = verify_grasp(sample.grasp, sample, method="forces")
+    grasp_M = transform_grasp(invert_pose(moved.X_OM), pack_grasp(right.p_OQ, right.nhat_Q_O))
+    lost = verify_grasp(grasp_M, sample, method="forces")
+    assert lost.misplaced and lost.hints == ("the mesh file's frame (mesh)",)
+    assert ". This would fit much better: the mesh file's frame (mesh). The grasp" in lost.explain()
+    found = verify_grasp(grasp_M, sample, frame="mesh", method="forces")
+    np.testing.assert_allclose(found.p_OQ, right.p_OQ, atol=1e-4)
 
 
 @pytest.mark.parametrize(

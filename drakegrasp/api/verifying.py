@@ -230,7 +230,7 @@ def _place_on_rows(
     # The user can verify more grasps on the object of a verdict.
     things = {id(thing): thing for grasp in placed for thing in grasp.stands}
     doors = {
-        key: PlacedObject(model=thing.model, X_TO=thing.X_TO, config=thing.config, X_OM=thing.X_OM)
+        key: PlacedObject(model=thing.model, X_TO=thing.X_TO, config=thing.config)
         for key, thing in things.items()
     }
     return [replace(g, stands=tuple(doors[id(thing)] for thing in g.stands)) for g in placed]
@@ -294,9 +294,7 @@ def place_object(
     if hand is not None:
         used = override_config(used, [], hand=str(hand))
     placed = put_on_table(mesh, units=units, X_TO=X_TO, config=used)
-    return PlacedObject(
-        model=placed.model, X_TO=placed.X_TO, config=placed.config, X_OM=placed.X_OM
-    )
+    return PlacedObject(model=placed.model, X_TO=placed.X_TO, config=placed.config)
 
 
 def verify_rows(

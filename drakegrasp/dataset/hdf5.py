@@ -57,8 +57,8 @@ def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
         if "unable to lock file" not in str(error):
             raise
         raise OSError(
-            "one that another program has open to write: close it there, or, on a disk without "
-            "locks, set HDF5_USE_FILE_LOCKING=FALSE"
+            "another program has it open to write: close it there, or, on a disk without locks, "
+            "set HDF5_USE_FILE_LOCKING=FALSE"
         ) from None
     if again:
         return file

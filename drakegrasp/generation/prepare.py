@@ -19,7 +19,7 @@ from drakegrasp.errors import DrakegraspError, MachineError, MeshError
 from drakegrasp.frames import Array
 from drakegrasp.hand.folder import hand_places, moved_hand
 from drakegrasp.objects.model import ObjectModel, prepare_object
-from drakegrasp.objects.sources import MeshSource, file_frame
+from drakegrasp.objects.sources import MeshSource
 from drakegrasp.runtime.environment import one_thread, release_memory
 from drakegrasp.runtime.files import disk_full_named
 from drakegrasp.runtime.journal import (
@@ -251,8 +251,7 @@ def prepare(source: MeshSource, config: Config, postures: Attempts | None = None
     if postures is None:
         candidates = _drawing(model, poses, config).candidates(asked)
     else:
-        X_OM = file_frame(source) if postures.frame == "mesh" else np.eye(4)
-        candidates = given_candidates(model, poses, postures, X_OM, config)
+        candidates = given_candidates(model, poses, postures, config)
     return PreparedObject(
         model=replace(model, notes=(*model.notes, *resting[0].notes)),
         resting_poses=poses,

@@ -273,8 +273,9 @@ STEPS = 60
 UNEVEN = 1.0
 #: Points at most this far behind the foremost point are treated as equally far in front [m].
 FLAT = 2e-4
-#: Fingers whose motions differ between directions by at most this fraction have no main axis.
-ROUND = 1e-9
+#: Fingers whose motions differ between directions by at most this fraction have no main axis, like
+#: three fingers that close around a centre, however exactly they are mounted.
+ROUND = 0.05
 #: Largest allowed difference between the width of a pinch and the requested width [m].
 WIDTH_ERROR = 0.004
 

@@ -24,7 +24,7 @@ from drakegrasp.arithmetic import dot
 from drakegrasp.config import ObjectConfig, PhysicsConfig
 from drakegrasp.errors import MeshError, one_line
 from drakegrasp.foreign_files import is_name, read_npz
-from drakegrasp.frames import Array
+from drakegrasp.frames import Array, make_pose
 from drakegrasp.mesh.components import count_parts
 from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
 from drakegrasp.mesh.remeshing import MOST_FACES, coarsen, decimate, resting_hull
@@ -47,7 +47,7 @@ MIN_VOLUME = 1e-9  # [m^3]
 _ARRAYS = {
     **dict.fromkeys(("visual_vertices", "collision_vertices"), (np.float64, (None, 3))),
     **dict.fromkeys(("visual_faces", "collision_faces"), (np.int32, (None, 3))),
-    "p_OOcm": (np.float64, (3,)),
+    **dict.fromkeys(("p_OOcm", "p_OM"), (np.float64, (3,))),
     "I_OOcm_O": (np.float64, (3, 3)),
 }
 
@@ -67,6 +67,7 @@ class ObjectModel:
         collision_faces: (l, 3) int32.
         mass: Mass [kg].
         p_OOcm: (3,) centre of mass.
+        p_OM: (3,) origin of the source file, see `X_OM`.
         I_OOcm_O: (3, 3) rotational inertia about the centre of mass, in axes of {O} [kg m^2].
         collision_error: Largest distance between visual and collision surface.
         notes: What was repaired, and what is unexpected about how the object rests, in sentences.
@@ -85,6 +86,7 @@ class ObjectModel:
     collision_faces: npt.NDArray[np.int32]
     mass: float
     p_OOcm: Array
+    p_OM: Array
     I_OOcm_O: Array
     collision_error: float
     notes: tuple[str, ...] = ()
@@ -104,6 +106,11 @@ class ObjectModel:
     def half_extents(self) -> Array:
         """Half of the bounding box's edges (3,) [m]; its centre is the origin of {O}."""
         return np.asarray(np.ptp(self.visual_vertices, axis=0) / 2.0)
+
+    @property
+    def X_OM(self) -> Array:
+        """Pose (4, 4) in {O} of the frame of the source file, with lengths in metres."""
+        return make_pose(UPRIGHT[self.up], self.p_OM)
 
     @property
     def volume(self) -> float:
@@ -250,6 +257,7 @@ def make_object(
         collision_faces=collision.faces.astype(np.int32),
         mass=config.mass,
         p_OOcm=p_OOcm,
+        p_OM=-centre,
         I_OOcm_O=I_OOcm_O,
         collision_error=error,
         notes=notes,

@@ -39,7 +39,7 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Licence, Positive, describe_mistake
 from drakegrasp.errors import MeshError, one_line
 from drakegrasp.foreign_files import NAME_RULE, is_name, read_text
-from drakegrasp.frames import Array, make_pose
+from drakegrasp.frames import Array
 from drakegrasp.mesh.loading import MANY_FACES, SUFFIXES, clean_triangles, parse_mesh, read_bytes
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.yaml_text import parse_yaml
@@ -303,20 +303,6 @@ def upright_vertices(mesh: trimesh.Trimesh, source: MeshSource) -> Array:
     """Return the vertices (n, 3) of a file [m], turned so that the file's axis `up` is +z."""
     vertices = np.asarray(mesh.vertices) * source.scale
     return vertices if source.up == "+z" else multiply(vertices, np.transpose(UPRIGHT[source.up]))
-
-
-def file_frame(source: MeshSource) -> Array:
-    """Return the pose X_OM (4, 4) in {O} of a mesh file's frame M, with lengths in metres.
-
-    The origin of {O} is the centre of the bounding box of everything in the file.
-
-    Raises:
-        MeshError: If the file cannot be read.
-    """
-    mesh, _ = load_source(source)
-    vertices = upright_vertices(mesh, source)
-    centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
-    return make_pose(UPRIGHT[source.up], -centre)
 
 
 def _sha256(content: bytes, source: MeshSource) -> str:

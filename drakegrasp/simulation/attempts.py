@@ -23,7 +23,6 @@ from drakegrasp.config import Config
 from drakegrasp.errors import NAMED, GraspError, listed
 from drakegrasp.frames import (
     FARTHEST,
-    NO_MESH_FRAME,
     X_WT,
     Array,
     as_numbers,
@@ -164,7 +163,7 @@ class Attempts:
             X_OM: Pose (4, 4) of the mesh file's frame in {O}, for the frame "mesh".
 
         Raises:
-            GraspError: If the frame is "mesh" and its pose is unknown.
+            GraspError: If the frame is "mesh" and its pose is not given.
         """
         X_OG = multiply(self.frame_pose(i, X_TO, X_OM), self.X_FG[i])
         return _posture(self, i, X_OG)
@@ -175,7 +174,7 @@ class Attempts:
             return np.eye(4)
         if self.frame == "mesh":
             if X_OM is None:
-                raise GraspError(NO_MESH_FRAME)
+                raise GraspError("X_OM must be given for the frame mesh, got None")
             return X_OM
         X_OT = invert_pose(X_TO)
         if self.frame == "table":
@@ -717,7 +716,7 @@ _IN_PLAN = ("q_grasp", "q_pregrasp", "q_squeeze", "row", "said", "preshape")
 
 
 def given_candidates(
-    model: ObjectModel, X_TO: Array, table: Attempts, X_OM: Array, config: Config
+    model: ObjectModel, X_TO: Array, table: Attempts, config: Config
 ) -> Candidates:
     """Return the postures of an object as its palm poses, up to `candidates.max` of them.
 
@@ -727,7 +726,6 @@ def given_candidates(
         model: The object.
         X_TO: Resting poses of the object, (r, 4, 4).
         table: Rows of any objects.
-        X_OM: Pose of the mesh file's frame in {O}, (4, 4).
         config: The configuration.
     """
     # Rows in {O}: one per resting pose if none is named, and one per preshape if `EACH` is named.
@@ -743,7 +741,7 @@ def given_candidates(
     count, table = len(tried), table.at([i for i, _, _ in tried])
     table = replace(table, preshape=tuple(shape for _, _, shape in tried))
     resting = np.array([k for _, k, _ in tried], dtype=np.int64)
-    X_OG = [table.posture(i, X_TO[k], X_OM).X_OG for i, k in enumerate(resting)]
+    X_OG = [table.posture(i, X_TO[k], model.X_OM).X_OG for i, k in enumerate(resting)]
 
     return Candidates(
         X_OG=np.array(X_OG).reshape(-1, 4, 4),

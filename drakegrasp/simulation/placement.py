@@ -23,7 +23,7 @@ from drakegrasp.frames import Array, make_pose, read_pose, transform_points
 from drakegrasp.hand.settings import load_config
 from drakegrasp.mesh.loading import clean_triangles
 from drakegrasp.objects.model import ObjectModel, make_object, prepare_object
-from drakegrasp.objects.sources import UNITS, file_frame, find_mesh, refuse_units
+from drakegrasp.objects.sources import UNITS, find_mesh, refuse_units
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.settle import settle
 
@@ -52,14 +52,11 @@ class PlacedObject:
         model: Meshes and mass properties.
         X_TO: Pose in the table-top frame, (4, 4).
         config: The configuration with which the object was prepared and dropped; default `paper`.
-        X_OM: Pose (4, 4) of the mesh file's frame in {O}, in metres; None if unknown, as for an
-            object of a dataset.
     """
 
     model: ObjectModel
     X_TO: Array
     config: Config = field(default_factory=load_config)
-    X_OM: Array | None = None
 
     @cached_property
     def X_TO_simulated(self) -> Array:
@@ -106,12 +103,12 @@ def place_object(
             raise MeshError(f"units must be None for a prepared object, got {units!r}")
         if isinstance(mesh, PlacedObject):
             refuse_other_objects(config, mesh.config, "as the object was placed with")
-        model, known, X_OM = mesh.model, np.asarray(mesh.X_TO), getattr(mesh, "X_OM", None)
+        model, known = mesh.model, np.asarray(mesh.X_TO)
     elif isinstance(mesh, trimesh.Trimesh):
-        (model, X_OM), known = _model_of(mesh, units or "m", config), None
+        model, known = _model_of(mesh, units or "m", config), None
     elif isinstance(mesh, str | Path):
-        source = find_mesh(mesh, units=units or "m")
-        model, known, X_OM = prepare_object(source, config.objects), None, file_frame(source)
+        model = prepare_object(find_mesh(mesh, units=units or "m"), config.objects)
+        known = None
     else:
         raise MeshError(
             "mesh must be a mesh file, a trimesh.Trimesh or a placed object, "
@@ -122,7 +119,7 @@ def place_object(
     if X_TO is not None:
         known = _standing(model, read_pose(X_TO, "X_TO"))
     X_TO = settle(model, config).X_TO if known is None else known
-    return PlacedObject(model=model, X_TO=X_TO, config=config, X_OM=X_OM)
+    return PlacedObject(model=model, X_TO=X_TO, config=config)
 
 
 def config_for(mesh: object, config: Config | None) -> Config:
@@ -181,14 +178,14 @@ def canonical_pose(X_TO: Array) -> Array:
     return make_pose(R, [0.0, 0.0, X_TO[2, 3]])
 
 
-def _model_of(mesh: trimesh.Trimesh, units: str, config: Config) -> tuple[ObjectModel, Array]:
-    """Return the object of a mesh, and the pose X_OM (4, 4) of the mesh's frame in {O}."""
+def _model_of(mesh: trimesh.Trimesh, units: str, config: Config) -> ObjectModel:
+    """Return the object of a mesh."""
     given = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64)
     clean = clean_triangles(*given, "mesh")
     vertices = clean.vertices * UNITS[units]
     digest = hashlib.sha256(vertices.tobytes() + clean.faces.tobytes()).hexdigest()
     try:
-        model = make_object(
+        return make_object(
             vertices,
             clean.faces,
             config.objects,
@@ -199,8 +196,6 @@ def _model_of(mesh: trimesh.Trimesh, units: str, config: Config) -> tuple[Object
         )
     except MeshError as reason:
         raise MeshError(f"mesh: {reason}") from reason
-    centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
-    return model, make_pose(np.eye(3), -centre)
 
 
 def _standing(model: ObjectModel, X_TO: Array) -> Array:

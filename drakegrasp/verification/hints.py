@@ -28,7 +28,7 @@ from drakegrasp.table import Table
 from drakegrasp.verification.forces import surface_feet
 from drakegrasp.verification.placing import PlacedGrasp
 from drakegrasp.verification.wrist_problem import hand_constants
-from drakegrasp.verification.wrist_solver import make_postures, posture_misfit
+from drakegrasp.verification.wrist_solver import fit_wrist, make_postures, posture_misfit
 
 #: A face may be farther than the closest one by this and still be next to the point [m]. A
 #: predicted point is as often on the wrong side of a cup's wall as beside the wall.
@@ -80,9 +80,11 @@ LEAST_SPREAD = 0.01
 AGREEMENT = 0.5
 #: Points this close to the surface are on the intended side of a thin wall [m].
 ON_SURFACE = 0.001
-#: Another order of the fingers fits much better if its misfit to the hand's postures is at most
-#: this fraction of the given order's misfit.
-MUCH_LIKER = 0.25
+#: Another order of the fingers fits much better if the sum of squares of its wrist problem is below
+#: this fraction of the given order's. In 40 samples of `fast`, no true order lost to another one.
+MUCH_LIKER = 0.5
+#: Number of other orders for which the wrist problem is solved; all of them for three fingers.
+MOST_ORDERS = 5
 #: Units that lengths may have been meant in, by their factors to metres.
 _UNITS = {
     1.0: "",
@@ -107,8 +109,8 @@ def _frames(grasp: PlacedGrasp, thing: PlacedObject) -> dict[str, Array]:
         "the object's frame (object)": np.eye(4),
         "the table's frame (table)": X_OT,
         "the world's frame": multiply(X_OT, invert_pose(X_WT)),
+        "the mesh file's frame (mesh)": thing.model.X_OM,
     }
-    frames |= {} if thing.X_OM is None else {"the mesh file's frame (mesh)": thing.X_OM}
     frames |= {name: multiply(X_OT, X_TC) for name, X_TC in grasp.cameras.items()}
     if given is not None and not grasp.cameras:
         # A caller who gives the pose of a camera may mean another pose.
@@ -148,7 +150,7 @@ def find_hints(
             return (place,)
     if fits:
         return ()
-    return (*_turned(thing.model, fit, p_OQ, nhat_Q_O), *_reordered(hand, p_OQ, nhat_Q_O))
+    return (*_turned(thing.model, fit, p_OQ, nhat_Q_O), *_reordered(hand, thing, p_OQ, nhat_Q_O))
 
 
 def find_posture_hints(
@@ -264,13 +266,23 @@ def _turned(model: ObjectModel, fit: Table, p_OQ: Array, nhat_Q_O: Array) -> Ite
         yield REVERSED
 
 
-def _reordered(hand: Hand, p_OQ: Array, nhat_Q_O: Array) -> Iterator[str]:
-    """Yield the order of the fingers that is most similar to a posture of the hand, if better."""
-    postures, given = make_postures(hand), tuple(range(hand.num_fingers))
-    misfits = {
-        order: posture_misfit(postures, p_OQ[list(order)], nhat_Q_O[list(order)])
-        for order in permutations(given)  # 6 for three fingers, 120 for five
+def _reordered(hand: Hand, thing: PlacedObject, p_OQ: Array, nhat_Q_O: Array) -> Iterator[str]:
+    """Yield the order of the fingers in which the hand reaches the contacts best, if much better.
+
+    The table of postures is coarse and permits palms below the table, where the mirror image of an
+    order fits as well. So it only chooses the orders that the wrist problem is solved for.
+    """
+    postures, X_TO = make_postures(hand), thing.X_TO_simulated
+    given, *others = permutations(range(hand.num_fingers))  # 6 for three fingers, 120 for five
+    likely = sorted(
+        others, key=lambda order: posture_misfit(postures, p_OQ[[*order]], nhat_Q_O[[*order]])
+    )
+    reach = {
+        order: fit_wrist(
+            hand, p_OQ[[*order]], nhat_Q_O[[*order]], up_O=X_TO[2, :3], height=float(X_TO[2, 3])
+        )[0].objective
+        for order in (given, *likely[:MOST_ORDERS])
     }
-    best = min(misfits, key=lambda order: misfits[order])
-    if misfits[best] < MUCH_LIKER * misfits[given]:
+    best = min(reach, key=lambda order: reach[order])
+    if reach[best] < MUCH_LIKER * reach[given]:
         yield f"contacts in the order {' '.join(str(i + 1) for i in best)} of the fingers"

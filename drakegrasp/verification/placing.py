@@ -22,7 +22,6 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import GraspError, HandError
 from drakegrasp.frames import (
-    NO_MESH_FRAME,
     Array,
     as_numbers,
     read_pose,
@@ -99,11 +98,11 @@ class PlacedGrasp:
 
     def X_OA(self, thing: PlacedObject) -> Array:
         """Return the pose (4, 4) of the frame of the grasp's numbers in {O} of a resting object."""
-        return self.attempt.frame_pose(0, thing.X_TO, thing.X_OM)
+        return self.attempt.frame_pose(0, thing.X_TO, thing.model.X_OM)
 
     def posture(self, thing: PlacedObject) -> Posture:
         """Return wrist and joints of a posture, in {O} of a resting object."""
-        return self.attempt.posture(0, thing.X_TO, thing.X_OM)
+        return self.attempt.posture(0, thing.X_TO, thing.model.X_OM)
 
     def contacts(self) -> tuple[Array, Array]:
         """Return points p_OQ [m] and unit normals nhat_Q_O (k, 3) in {O}; NaN without contacts."""
@@ -358,9 +357,15 @@ def place_on_dataset(
         how: See `_placed`.
 
     Raises:
-        GraspError: If the rows are in the frames of mesh files.
+        GraspError: If the rows are postures in the frames of mesh files.
         DataError: If the dataset cannot be used.
     """
+    if table.frame == "mesh" and table.points is None:
+        # Meshes of a dataset are exported in {O}: a file cannot say which of both meshes it means.
+        raise GraspError(
+            "frame must not be mesh for postures on a dataset, got mesh: for its exported meshes "
+            "use --frame object, or give the mesh itself (drakegrasp verify FILE --object MESH)"
+        )
     manifest, placed = read_manifest(out), list[PlacedGrasp]()
     names = [entry.name for entry in manifest.objects]
     table = table.refuse(unknown_objects(table, names))
@@ -406,8 +411,6 @@ def _placed(
         cameras: Poses X_TC (n, 4, 4) for all rows of the table, by their frames.
     """
     model, known_cameras = things[0].model, dict(cameras or {})
-    if table.frame == "mesh" and things[0].X_OM is None:
-        raise GraspError(NO_MESH_FRAME)
     if table.points is None:
         method = "posture"
         known_cameras |= {} if table.X_TC is None else {CAMERA: table.X_TC}

@@ -32,7 +32,7 @@ from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import run_trial, start_of
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
-from drakegrasp.simulation.trial import TrialRecord, run_attempt
+from drakegrasp.simulation.trial import TrialRecord, run_attempt, start_meetings
 from drakegrasp.verification.forces import force_margin, hand_contacts, judge_forces
 from drakegrasp.verification.hints import find_hints, find_posture_hints, fit_surface
 from drakegrasp.verification.placing import PlacedGrasp
@@ -205,7 +205,12 @@ def _of_all_fingers(trial: TrialRecord, unused: int, fingers: int) -> TrialRecor
 def _judged(base: Verification, tries: tuple[PoseTrial, ...]) -> Verification:
     """Return the verdict of the first trial, which decides."""
     trial = tries[0].trial
-    reason = trial.outcome.text + (f": {trial.message}" if trial.message else "")
+    placed, start, message = base.placed, tries[0].pregrasp, trial.message
+    if trial.outcome is Outcome.START_COLLISION:
+        about = base.config.physics, base.config.hand_source, start.preshape
+        met = start_meetings(cached_scene(placed.model, *about), placed.X_TO_simulated, start)
+        message = "; ".join(f"{', '.join(links)} in the {other}" for other, links in met.items())
+    reason = trial.outcome.text + (f": {message}" if message else "")
     return replace(base, outcome=trial.outcome, reason=reason, tries=tries)
 
 

@@ -86,6 +86,7 @@ def picture(item: BuiltinObject) -> npt.NDArray[np.float32]:
         collision_faces=faces,
         mass=1.0,
         p_OOcm=np.zeros(3),
+        p_OM=np.zeros(3),
         I_OOcm_O=np.eye(3),
         collision_error=0.0,
     )

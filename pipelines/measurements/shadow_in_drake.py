@@ -44,7 +44,7 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.file_format import Finger
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import prepare_object
-from drakegrasp.objects.sources import MeshSource, file_frame
+from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome
 from drakegrasp.protocols.files import read_grasp_file, read_object_folder
 from drakegrasp.simulation import construction, trial
@@ -224,7 +224,7 @@ class Bench:
         trimesh.util.concatenate(hulls).export(path)
         source = MeshSource(name=path.stem, class_name="thing", path=path, scale=scale)
         model = prepare_object(source, self.config.objects)
-        return build_scene(model, self.config.physics, self.hand), file_frame(source)
+        return build_scene(model, self.config.physics, self.hand), model.X_OM
 
 
 def _say(found: list[dict[str, Any]], mujoco: Path | None, grasps: Path) -> None:

@@ -25,7 +25,7 @@ from drakegrasp.exchange.export import ClosedGrasp, export_dataset
 from drakegrasp.exchange.meshes import PLACE
 from drakegrasp.frames import unpack_pose
 from drakegrasp.objects.model import load_object, prepare_object
-from drakegrasp.objects.sources import file_frame, find_meshes
+from drakegrasp.objects.sources import find_meshes
 from drakegrasp.simulation.attempts import quaternion_poses
 
 
@@ -140,4 +140,4 @@ def test_meshes_are_in_the_frame_of_the_objects_with_a_table_of_their_rows(
             entry.class_name,
             entry.mass,
         )
-        np.testing.assert_allclose(file_frame(source), np.eye(4), atol=1e-15)
+        np.testing.assert_allclose(again.X_OM, np.eye(4), atol=1e-15)

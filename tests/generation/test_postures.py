@@ -333,12 +333,12 @@ def test_postures_in_the_frame_of_the_mesh_file_are_moved_to_the_object(tmp_path
     prepared = prepare(source, posture_config(CONFIG, moved), moved)
     np.testing.assert_allclose(prepared.candidates.X_OG, table.X_FG, atol=1e-9)
 
-    # On a mesh its frame is known, on an object alone it is not.
+    # The object knows the frame; a dataset, whose meshes are exported in {O}, does not guess.
     placed = place_object(tmp_path / f"{NAME}.obj", units="cm", X_TO=standing(box))
     own, again = (place_on_object(each, placed) for each in (table, moved))
     assert not any(grasp.invalid for grasp in (*own, *again))
     for one, other in zip(own, again, strict=True):
         poses = [each.posture(each.placed).X_OG for each in (one, other)]
         np.testing.assert_allclose(*poses, atol=1e-9)
-    with pytest.raises(GraspError, match=r"\(drakegrasp verify FILE --object MESH\)"):
-        place_on_object(moved, replace(placed, X_OM=None))
+    with pytest.raises(GraspError, match="for its exported meshes use --frame object, or give"):
+        place_on_dataset(moved, tmp_path)
