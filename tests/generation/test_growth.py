@@ -1,0 +1,82 @@
+"""A dataset only grows: more meshes and a larger target add rows and change none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TypeAlias
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from helpers.meshes import write
+
+from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
+from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.generation.pipeline import build
+from drakegrasp.hand.settings import load_config
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.runtime.executor import run_here
+
+#: An attempt in any dataset: its object, resting pose, palm pose and stand-off.
+Identity: TypeAlias = tuple[str, int, int, int]
+#: The bytes of each column of a row.
+Row: TypeAlias = dict[str, bytes]
+#: Full extents [m].
+BOXES = {"1_box_a": [0.05, 0.06, 0.12], "2_can_b": [0.06, 0.05, 0.1], "3_jar_c": [0.05, 0.05, 0.08]}
+SMALL = ["objects.resting_poses=1", "camera.size=16", "seed=3"]
+
+
+def grown(folder: Path, out: Path, names: list[str], samples: int) -> None:
+    folder.mkdir(exist_ok=True)
+    for name in names:
+        write(folder / f"{name}.obj", trimesh.creation.box(BOXES[name]).subdivide())
+    config = load_config("fast", [*SMALL, f"samples={samples}"])
+    build(find_meshes(folder), out, config, run_here, show=False)
+
+
+def rows(out: Path) -> tuple[dict[Identity, Row], dict[tuple[str, Identity], tuple[str, Row]]]:
+    """Return the attempts by identity; and the split and row of each sample, by file too."""
+
+    def taken(group: h5py.Group, number: int) -> list[Row]:
+        columns = dict[str, np.ndarray]()
+
+        def add(name: str, item: object) -> None:
+            if isinstance(item, h5py.Dataset) and name not in ("trial_id", "object"):
+                columns[name] = item.asstr()[:].astype(str) if item.dtype == object else item[:]
+
+        group.visititems(add)
+        return [
+            {name: values[i].tobytes() for name, values in columns.items()} for i in range(number)
+        ]
+
+    with h5py.File(out / TRIALS_FILE) as file:
+        trials, names = file["trials"], file["objects/name"].asstr()[:].tolist()
+        keys = [
+            trials[name][:].tolist()
+            for name in ("object", "resting", "candidate", "standoff_index")
+        ]
+        of = [(names[k], *rest) for k, *rest in zip(*keys, strict=True)]
+        identity = dict(zip(trials["trial_id"][:].tolist(), of, strict=True))
+        attempts = dict(zip(of, taken(trials, len(of)), strict=True))
+    samples = {}
+    for camera, name in DATA_FILES.items():
+        with h5py.File(out / name) as file:
+            for split in SPLITS:
+                ids = file[split]["trial_id"][:].tolist()
+                for number, row in zip(ids, taken(file[split], len(ids)), strict=True):
+                    samples[camera, identity[number]] = split, row
+    return attempts, samples
+
+
+@pytest.mark.sim
+def test_more_meshes_and_a_larger_target_only_add_rows(tmp_path: Path) -> None:
+    meshes, out = tmp_path / "meshes", tmp_path / "out"
+    grown(meshes, out, ["1_box_a", "2_can_b"], 6)
+    attempts, samples = rows(out)
+    assert len(samples) == 2 * 6
+    grown(meshes, out, [*BOXES], 7)
+    more_attempts, more_samples = rows(out)
+    assert len(more_samples) == 2 * 7
+    assert {k: more_attempts.get(k) for k in attempts} == attempts
+    assert {k: more_samples.get(k) for k in samples} == samples
