@@ -40,7 +40,6 @@ ORDER = (
     "protocols",
     "exchange",
     "scoring",
-    "bench",
     "api",
     "cli",
 )
@@ -58,17 +57,10 @@ WALLS = {
     "jinja2": ("page",),
     "matplotlib": ("pictures", "verification.figure"),
     "pydrake": (
-        *("hand", "vision", "simulation", "pictures", "commissioning", "verification"),
-        *("bench", "mjcf"),
+        *("hand", "vision", "simulation", "mjcf", "pictures", "commissioning", "verification"),
     ),
-    "mujoco": (
-        "mjcf",
-        "commissioning.draft.mjcf",
-        "protocols.scene",
-        "bench",
-        "exchange.mjcf",
-    ),
-    "coacd": ("mjcf.scene",),
+    "mujoco": ("mjcf", "commissioning.draft.mjcf", "protocols.scene", "exchange.mjcf"),
+    "coacd": ("mjcf.decomposition",),
     "pyarrow": ("exchange",),
     "torch": ("dataset.torch_samples",),
 }

@@ -38,7 +38,6 @@ NOT_RUN = {
     "ssh ": "another machine",
     "dask ": "a cluster; tests/cluster starts one",
     "drakegrasp submit ": "a cluster; tests/cluster/test_submit.py",
-    "kubectl ": "a cluster; tests/cluster/test_kubernetes.py",
     "python pipelines/make_certificates.py ": "a cluster; tests/cluster/test_submit.py",
     "tls=": "options of the lines below it",
     "python pipelines/baseline/": "trains with torch; tests/test_baseline.py",

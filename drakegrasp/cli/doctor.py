@@ -125,7 +125,7 @@ def check_allocator() -> Finding:
     from drakegrasp.runtime.allocator import LIBRARY, allocator, jemalloc_environment
 
     if jemalloc_environment():
-        return Finding(name="allocator", ok=True, what=f"{LIBRARY} for workers, bench and verify")
+        return Finding(name="allocator", ok=True, what=f"{LIBRARY} for workers and verify")
     what = f"{allocator()}: works; with jemalloc a build is a tenth faster: {JEMALLOC_PACKAGE}"
     return Finding(name="allocator", ok=True, what=what)
 

@@ -14,7 +14,6 @@ from pathlib import Path
 import click
 
 from drakegrasp import __version__
-from drakegrasp.cli.bench import bench
 from drakegrasp.cli.console import Commands, restart_with_utf8, say_finding
 from drakegrasp.cli.datasets import (
     assemble,
@@ -64,7 +63,7 @@ def doctor(directory: Path) -> None:
 # The help lists the commands in this order.
 for _command in (
     *(doctor, objects, audit, hand, build, submit, assemble, merge, scenes, check, stats, inspect_),
-    *(figures, replay, predict, verify, score, bench_set, export, bench),
+    *(figures, replay, predict, verify, score, bench_set, export),
 ):
     main.add_command(_command)
 
@@ -79,6 +78,6 @@ def run() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    if sys.argv[1:2] in (["bench"], ["verify"], ["score"], ["hand"]):
+    if sys.argv[1:2] in (["verify"], ["score"], ["hand"]):
         restart_with_jemalloc()
     main()

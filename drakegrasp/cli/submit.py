@@ -17,13 +17,6 @@ from drakegrasp.cli.options import NEW_FILE, Named, chosen_tls, described, parse
 if TYPE_CHECKING:
     from drakegrasp.cluster.kinds import Local
 
-#: Options that specify the workers: those with a value, and those without.
-_WHERE = (
-    *("cluster", "workers", "cores", "memory", "walltime", "interface", "host", "with"),
-    "script",
-)
-_ALONE = ("--dry-run", "--tls")
-
 
 @click.command(cls=OneCommand, context_settings={"help_option_names": ["-h", "--help"]})
 @described
@@ -59,8 +52,8 @@ def submit(
 
     Options:
         --cluster KIND (kind): Where the work runs: local, ssh, slurm, pbs, lsf, sge, htcondor, oar,
-            kubernetes, scheduler, scheduler-file, or a kind of another package. Hosts follow ssh,
-            an address follows scheduler, and a path follows scheduler-file.
+            scheduler, scheduler-file, or a kind of another package. Hosts follow ssh, an address
+            follows scheduler, and a path follows scheduler-file.
         --scheduler ADDRESS: In place of --cluster: use the running Dask scheduler at this address.
         BUILD
         --workers N: Total number of processes. [default with local: one per core]
@@ -69,12 +62,12 @@ def submit(
         --walltime TIME: Time limit of each job, [D-]HH:MM:SS.
         --interface NAME: Network interface on which scheduler and workers listen.
         --host ADDRESS: In place of --interface: address on which the scheduler listens.
-        --with KEY=VALUE (own): A setting that only this kind of cluster has, e.g. image for
-            kubernetes; may be given several times.
+        --with KEY=VALUE (own): A setting that only this kind of cluster has, as one of another
+            package may; may be given several times.
         TLS
         --dry-run: Only print which workers would run, the amount of work that is known before the
             build, and the script of a job.
-        --script FILE: Only write the script of a job, or the manifest of kubernetes.
+        --script FILE: Only write the script of a job.
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.api.building import build_on, find_sources, known_work
     from drakegrasp.cluster.kinds import AddressMissingError, cluster_of, describe, present
@@ -104,11 +97,6 @@ def submit(
     if dry_run or script is not None:
         _give_script(cluster, request.out, script)
         return
-    if not cluster.starts:
-        raise click.UsageError(
-            f"--script FILE or --dry-run must be given with --cluster {kind}: "
-            f"{cluster.submission().split()[0]} starts the workers"
-        )
 
     sources = find_sources(request.objects, request.units, request.manifest)
     running = present(cluster.connected(request.out), request.show)
@@ -130,7 +118,7 @@ def submit(
 
 
 def _give_script(cluster: Local, out: Path, file: Path | None) -> None:
-    """Print or write the script for the program that starts the workers, and the next step."""
+    """Print or write the script of a job, and the next steps."""
     script = cluster.script(out)
     if not script:
         if file is not None:
@@ -141,18 +129,16 @@ def _give_script(cluster: Local, out: Path, file: Path | None) -> None:
     else:
         file.write_text(script, encoding="utf-8")
         say(f"{cluster.submission()} {shlex.quote(str(file))}")
-    say(f"client: {_client_command(cluster, sys.argv[1:])}")
+    say(f"client: {_client_command(sys.argv[1:])}")
 
 
-def _client_command(cluster: Local, words: Sequence[str]) -> str:
+def _client_command(words: Sequence[str]) -> str:
     """Return the command of the process that distributes the work, from the present words."""
-    without = [f"--{name}" for name in (("script",) if cluster.starts else _WHERE)]
-    flags = _ALONE[:1] if cluster.starts else _ALONE
     kept, left = list[str](), iter(words)
     for word in left:
-        if word in without:
+        if word == "--script":
             next(left, None)
-        elif word not in flags and word.partition("=")[0] not in without:
+        elif word != "--dry-run" and not word.startswith("--script="):
             kept.append(word)
     kept = kept[1:] if kept[:1] == ["submit"] else kept
-    return shlex.join(["drakegrasp", "submit", *cluster.client_options(), *kept])
+    return shlex.join(["drakegrasp", "submit", *kept])

@@ -332,55 +332,6 @@ _VERDICTS = {
 }
 
 
-def bench_table(report: Mapping[str, Any]) -> Table:
-    """Return a report of `measure.summarize` as a table: rates, and CPU seconds by stage."""
-    stages = ("prepare", "scene", "field", "screen", "try", "look")
-    with_mujoco = "peer" in report["all"]
-    heads = ["object", "faces", "attempts", "grasps", "attempts\nper s", "grasps\nper h"]
-    heads += [f"{stage}\n[s]" for stage in stages] + ["MuJoCo\ngrasps/h", "ratio"] * with_mujoco
-
-    def row(name: str, rates: Mapping[str, Any]) -> list[str]:
-        mujoco = rates.get("peer", {})
-        ratio = mujoco.get("ratio", mujoco.get("median_ratio"))
-        cells = [
-            _count(rates["faces"]) if "faces" in rates else "",
-            _count(rates["attempts"]),
-            _count(rates["outcomes"].get(Outcome.SUCCESS.label, 0)),
-            f"{rates['resolved_per_core_second']:.1f}",
-            f"{rates['grasps_per_core_hour']:,.0f}",
-            *(f"{rates['seconds'][stage]:.1f}" for stage in stages),
-        ]
-        if with_mujoco:
-            cells += [f"{mujoco['grasps_per_core_hour']:,.0f}", f"{ratio:.2f}" if ratio else "-"]
-        return [name, *cells]
-
-    rows = (row(rates["name"], rates) for rates in report["objects"])
-    total = row("all (ratio: median)" if with_mujoco else "all", report["all"])
-    return make_table("Attempts on one core", heads, rows, [total])
-
-
-def bench_lines(report: Mapping[str, Any]) -> list[str]:
-    """Return the rates with preparing, the funnel, the memory and the machine of a report."""
-    every = report["all"]
-    runs = {"here": every} | ({"MuJoCo": every["peer"]} if "peer" in every else {})
-    poses = sum(each["candidates"] for each in report["objects"]) // len(report["objects"])
-    paid = [
-        f"grasps per h with preparing, {int(times) * poses:,} palm poses per object"
-        f"{'' if times == '1' else ' (estimate)'}: "
-        + ", ".join(f"{name} {run['with_preparing'][times]:,.0f}" for name, run in runs.items())
-        for times in every["with_preparing"]
-    ]
-    outcomes = Counter(every["outcomes"])
-    funnel = ", ".join(f"{outcomes[o.label]:,} {o.label}" for o in _FUNNEL if outcomes[o.label])
-    versions = ", ".join(f"{name} {version}" for name, version in report["versions"].items())
-    return [
-        *paid,
-        f"outcomes: {funnel}",
-        f"peak memory: {report['peak_memory'] / 1e6:,.0f} MB",
-        f"on {report['cpu']}; {versions}",
-    ]
-
-
 def score_table(card: Mapping[str, Any], seconds: Mapping[str, float]) -> Table:
     """Return the sets of a score card, one row per set, with seconds per verdict of the lift."""
     names = [name for name in card["measures"] if name != "headline"]

@@ -58,7 +58,6 @@ class Local:
     """Workers on this machine, as on the command line; the base class of all kinds.
 
     Attributes:
-        starts: Whether `connected` starts or finds workers; otherwise there is only a `script`.
         follow: How many words follow the name of the kind on the command line (minimum, maximum),
             and what they are.
         options: Names of the options that the kind has.
@@ -75,7 +74,6 @@ class Local:
             private key. Without them, certificates are created for this run if workers are started.
     """
 
-    starts: ClassVar[bool] = True
     follow: ClassVar[tuple[int, float, str]] = (0, 0, "nothing")
     options: ClassVar[tuple[str, ...]] = ("workers", "memory")
     kind: str
@@ -129,7 +127,7 @@ class Local:
         return False
 
     def script(self, out: Path) -> str:
-        """Return the script with which another program starts workers; empty if there is none.
+        """Return the script of a job that starts workers; empty if there is none.
 
         Args:
             out: Directory of the dataset.
@@ -139,10 +137,6 @@ class Local:
     def submission(self) -> str:
         """Return the command that submits the script."""
         return ""
-
-    def client_options(self) -> list[str]:
-        """Return the options with which a client finds the workers that the script starts."""
-        return []
 
     def connected(self, out: Path) -> AbstractContextManager[Client]:
         """Return a context manager that starts the workers and yields a client.

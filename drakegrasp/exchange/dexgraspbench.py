@@ -76,7 +76,7 @@ OBJECTS = ASSETS / "objects"
 def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
     """Write the files and return the number of samples; see `export.export_dataset`."""
     require_mujoco("mujoco", "coacd")
-    from drakegrasp.mjcf.scene import convex_parts
+    from drakegrasp.mjcf.decomposition import convex_parts
 
     # Write the hand under a name that the benchmark does not use.
     hand = load_hand(read_manifest(out).config.hand_source)
@@ -347,7 +347,7 @@ def write_grasps(
 
 def _write_parts(task: tuple[ObjectModel, Path, Path | None]) -> None:
     """Decompose an object into convex parts and write them."""
-    from drakegrasp.mjcf.scene import convex_parts, kept_convex_parts
+    from drakegrasp.mjcf.decomposition import convex_parts, kept_convex_parts
 
     model, folder, keep = task
     write_object(folder, convex_parts(model) if keep is None else kept_convex_parts(model, keep))

@@ -24,8 +24,8 @@ from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import Hand, load_plain_hand
 from drakegrasp.mesh.wavefront import hull_text
+from drakegrasp.mjcf.decomposition import convex_parts
 from drakegrasp.mjcf.links import MEMORY, make_hand_model, pair_friction, set_inertia
-from drakegrasp.mjcf.scene import convex_parts
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.runtime.progress import Report

@@ -1,1 +1,1 @@
-"""Hands and objects as models of MuJoCo (MJCF). Needs the extra `[peer]`."""
+"""Hands as models of MuJoCo (MJCF), objects as convex parts. Needs the extra `[peer]`."""

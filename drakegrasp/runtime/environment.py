@@ -218,18 +218,15 @@ def _libraries() -> Any:
 
 
 @contextmanager
-def timed(
-    seconds: dict[str, float], stage: str, clock: Callable[[], float] = time.perf_counter
-) -> Iterator[None]:
+def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     """Add the duration of the block to a stage's total, even if the block raises an error.
 
     Args:
         seconds: Total by stage [s]; updated in place.
         stage: Name of the stage.
-        clock: Returns the time [s]: wall clock by default, `time.process_time` for CPU time.
     """
-    start = clock()
+    start = time.perf_counter()
     try:
         yield
     finally:
-        seconds[stage] = seconds.get(stage, 0.0) + clock() - start
+        seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start

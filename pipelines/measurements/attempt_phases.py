@@ -14,17 +14,30 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections import Counter, defaultdict
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from unittest.mock import patch
 
 import click
 
-from drakegrasp.bench.measure import measure
+from drakegrasp.config import Config
+from drakegrasp.generation.attempts import (
+    TrialSetup,
+    list_attempts,
+    look_at,
+    predict_attempts,
+    try_attempt,
+)
+from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.settings import load_config
-from drakegrasp.objects.sources import find_meshes
+from drakegrasp.objects.sources import MeshSource, find_meshes
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.simulation.scene import Scene, TrialLimits
+from drakegrasp.simulation.scene_cache import cached_scene
 
 #: What is summed for each phase; the last two at the end of each period.
 COUNTED = "seconds", "steps", "periods", "hand", "table"
@@ -56,8 +69,11 @@ def main(meshes: Path, units: str, config: str, candidates: int, only: tuple[str
         for name, value in zip(COUNTED, (seconds, steps, 1, hand, table), strict=True):
             phase[name] = phase.get(name, 0.0) + value
 
-    with patch.object(TrialLimits, "advance", timed), progress_bar("measure", "attempts") as report:
-        objects = list(measure(sources, rules, progress=report))
+    stages, held = dict[str, float](), 0
+    with patch.object(TrialLimits, "advance", timed), progress_bar("measure", "objects") as report:
+        for number, source in enumerate(sources, 1):
+            held += try_object(source, rules, stages)
+            report(number, len(sources), grasps=held)
     total = sum(phase["seconds"] for phase in phases.values())
     rows = {
         name: {
@@ -70,12 +86,47 @@ def main(meshes: Path, units: str, config: str, candidates: int, only: tuple[str
         }
         for name, phase in sorted(phases.items(), key=lambda item: -item[1]["seconds"])
     }
-    stages = Counter[str]()
-    for one in objects:
-        stages.update(one["seconds"])
-    held = sum(one["outcomes"].get("success", 0) for one in objects)
-    result = {"objects": len(objects), "held": held, "stages": dict(stages), "phases": rows}
+    result = {"objects": len(sources), "held": held, "stages": stages, "phases": rows}
     sys.stdout.write(json.dumps(result, indent=1) + "\n")
+
+
+@one_thread
+def try_object(source: MeshSource, config: Config, stages: dict[str, float]) -> int:
+    """Try the attempts of a mesh as a build does, and return how many hold.
+
+    Args:
+        source: The mesh.
+        config: The configuration.
+        stages: CPU seconds by stage; updated in place.
+    """
+
+    @contextmanager
+    def stage(name: str) -> Iterator[None]:
+        began = time.process_time()
+        yield
+        stages[name] = stages.get(name, 0.0) + time.process_time() - began
+
+    with stage("prepare"):
+        prepared = prepare(source, config)
+    attempts = list_attempts(prepared, range(len(prepared.candidates)), config)
+    with stage("scene"):
+        scene = cached_scene(prepared.model, config.physics, config.hand_source)
+        setup = TrialSetup(prepared=prepared, config=config, scene=scene)
+    with stage("field"):
+        _ = prepared.model.field
+    with stage("screen"):
+        predictions = predict_attempts(setup, attempts)
+    with stage("try"):
+        records = list(map(try_attempt, [setup] * len(attempts), attempts, predictions))
+    held = [
+        (attempt, record)
+        for attempt, record in zip(attempts, records, strict=True)
+        if record.outcome is Outcome.SUCCESS
+    ]
+    with stage("look"):
+        for attempt, record in held:
+            look_at(setup, attempt, record.X_TO)
+    return len(held)
 
 
 def count_polygons(scene: Scene) -> tuple[int, int]:

@@ -211,7 +211,7 @@ def _try_object(
 ) -> Iterator[dict[str, Any]]:
     """Yield a row of the report for each lift of one object."""
     # Imported here, so that lifts can be drawn without the extra.
-    from drakegrasp.bench.mujoco_baseline import MujocoBaseline
+    from mujoco_baseline import MujocoBaseline
 
     prepared = load_prepared(out, name, config)
     peer = MujocoBaseline(prepared.model, prepared.X_TO, config)

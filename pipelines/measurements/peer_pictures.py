@@ -24,10 +24,10 @@ from unittest import mock
 import mujoco
 import numpy as np
 from cross_check import StoredLift, draw_lifts
+from mujoco_baseline import MujocoBaseline, PeerContacts
 from PIL import Image, ImageDraw
 
 from drakegrasp.arithmetic import norm
-from drakegrasp.bench.mujoco_baseline import MujocoBaseline, PeerContacts
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, rotation_angle

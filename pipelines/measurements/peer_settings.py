@@ -22,15 +22,16 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import mujoco_baseline
+import mujoco_scene
 from cross_check import Group, StoredLift, draw_lifts
+from mujoco_baseline import MujocoBaseline
 
-from drakegrasp.bench import mujoco_baseline
-from drakegrasp.bench.mujoco_baseline import MujocoBaseline
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.quality import wilson_interval
-from drakegrasp.mjcf import links, scene
-from drakegrasp.mjcf.scene import convex_parts
+from drakegrasp.mjcf import links
+from drakegrasp.mjcf.decomposition import convex_parts
 from drakegrasp.outcomes import Outcome
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.conditions import usual_conditions
@@ -55,7 +56,7 @@ def with_step(stack: ExitStack, finer: int) -> None:
 
     Contacts keep their time constant, and checks keep their period.
     """
-    for module in (scene, mujoco_baseline):
+    for module in (mujoco_scene, mujoco_baseline):
         stack.enter_context(mock.patch.object(module, "TIME_STEP", links.TIME_STEP / finer))
     for name in ("CLOSING_STRIDE", "LIFTING_STRIDE"):
         stride = finer * getattr(mujoco_baseline, name)
@@ -68,7 +69,7 @@ def try_object(out: Path, name: str, lifts: Sequence[StoredLift]) -> Iterator[di
     prepared = load_prepared(out, name, config)
     usual = usual_conditions(prepared.model, config.physics)
     cut = cache(convex_parts)
-    with mock.patch.object(scene, "convex_parts", lambda _: cut(prepared.model)):
+    with mock.patch.object(mujoco_scene, "convex_parts", lambda _: cut(prepared.model)):
         peers = {}
         for finer in (1, 2):
             with ExitStack() as stack:

@@ -41,7 +41,7 @@ from drakegrasp.verification.placing import METHODS
 from drakegrasp.verification.prediction import FRAMES
 
 #: Commands that take any setting of a configuration.
-SETTINGS_OF = ("build", "submit", "verify", "score", "bench-set", "bench")
+SETTINGS_OF = ("build", "submit", "verify", "score", "bench-set")
 
 
 def test_help_answers_without_loading_the_simulator() -> None:
@@ -179,10 +179,7 @@ REFUSED = [
     ("assemble {tmp}", "{tmp}"),
     ("figures {tmp} --quiet", "{tmp}/trials.hdf5: must be the trials"),
     ("build --objects {tmp} --out {tmp}/out --per-class 3", "--per-class must be used with"),
-    (
-        "bench --objects {tmp} --objects-seed 3",
-        "--objects-seed must be used with --objects",
-    ),
+    ("build --objects {tmp} --out {tmp}/out --objects-seed 3", "--objects-seed must be used"),
     ("bench-set {tmp}/bench --only 99_chair_1", "'99_chair_1'"),
     ("verify gone.npy --object cube.obj", "cube.obj: must be a mesh file"),
     ("verify a.npy --object gone.obj", "gone.obj: must be a mesh file"),

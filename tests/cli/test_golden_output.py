@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from drakegrasp.cli.main import main
-from drakegrasp.cli.tables import bench_lines, bench_table, score_table, verdict_table
+from drakegrasp.cli.tables import score_table, verdict_table
 from drakegrasp.outcomes import Outcome
 
 
@@ -82,45 +82,6 @@ def printed(table: Table) -> str:
     text = StringIO()
     Console(width=200, file=text).print(table)
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
-
-
-def rates(**more: Any) -> dict[str, Any]:
-    """Return the rates of a made-up benchmark."""
-    return {
-        "candidates": 100,
-        "attempts": 1200,
-        "with_preparing": {"1": 1000.0, "10": 1200.0},
-        "outcomes": {"success": 25, "dropped": 3, "below_table": 1172},
-        "resolved_per_core_second": 12.34,
-        "grasps_per_core_hour": 1234.5,
-        "seconds": {
-            "prepare": 4.5,
-            "scene": 1.25,
-            "field": 2.25,
-            "screen": 3.5,
-            "try": 40.0,
-            "look": 5.5,
-        },
-        **more,
-    }
-
-
-def test_tables_of_a_benchmark(golden: Golden) -> None:
-    prepared = {"with_preparing": {"1": 300.0, "10": 700.0}}
-    mujoco = {"grasps_per_core_hour": 800.0, "ratio": 1.543, **prepared}
-    report = {
-        "objects": [
-            rates(name="1_mug", faces=3456, peer=mujoco),
-            rates(name="2_box", outcomes={}, peer={**mujoco, "ratio": None}),
-        ],
-        "all": rates(peer={"grasps_per_core_hour": 900.0, "median_ratio": 1.5, **prepared}),
-        "versions": {"drake": "1.2", "mujoco": "3.4"},
-        "peak_memory": 2.5e9,
-        "cpu": "a processor",
-    }
-    alone = {**report, "objects": [rates(name="1_mug", faces=3456)], "all": rates()}
-    tables = [printed(bench_table(each)) for each in (report, alone)]
-    golden("commands/bench", "\n".join([*tables, *bench_lines(report)]))
 
 
 def test_table_of_verdicts(golden: Golden) -> None:

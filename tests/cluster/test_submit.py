@@ -10,6 +10,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -32,7 +33,7 @@ from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.certificates import make_certificates, private_directory, security_of
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect, dask_settings
 from drakegrasp.cluster.jobqueue import _exports, walltime_seconds
-from drakegrasp.cluster.kinds import cluster_of
+from drakegrasp.cluster.kinds import Local, cluster_of
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.settings import load_config
@@ -147,8 +148,6 @@ def test_workers_elsewhere_need_a_certificate_unless_told_otherwise(
         (["--scheduler", "tls://a:1", "--cluster", "ssh", "a"], "--scheduler must be used without"),
         (["--address", "tls://a:1", "--cluster", "ssh", "a"], "--scheduler must be used without"),
         (["--with", "image=x"], "--with must be left out for --cluster local, got 'image=x'"),
-        (["--cluster", "kubernetes", "--with", "size=1"], "KEY one of image, claim, name, namesp"),
-        (["--cluster", "kubernetes", "--workers", "2"], "--with image=NAME must be given"),
         (["--cluster", "ssh", "me@a", "--cores", "2", "--host", "x"], "go into ~/.ssh/config"),
         (["--cluster", "ssh", "a;b", "--cores", "2", "--host", "x"], "a host must be a name or"),
         (["--cluster", "ssh", "a", "--cores", "2", "--host", "$(b)"], "host must be a name or an"),
@@ -190,6 +189,22 @@ def test_dask_gets_no_quotation_mark_for_its_commands_over_ssh(
     monkeypatch.setenv("OPENBLAS_CORETYPE", "a'; touch ran; '")
     with pytest.raises(ConfigError, match="OPENBLAS_CORETYPE must be without ', got a'; touch"):
         cluster.start(None)
+
+
+def test_kind_of_another_package_has_settings_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclass(kw_only=True)
+    class Pods(Local):
+        image: str
+
+    monkeypatch.setattr(registry, "find", lambda *_: Pods)
+    cluster = cluster_of("pods", ["image=a;b=$(c)"])
+    assert isinstance(cluster, Pods) and cluster.image == "a;b=$(c)"
+    for text in ("size=1", "image=", "image", "workers=2"):
+        with pytest.raises(ConfigError) as told:
+            cluster_of("pods", [text])
+        assert f"must be KEY=VALUE with KEY one of image for --cluster pods, got {text!r}" in str(
+            told.value
+        )
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ def test_samples_are_verified_as_they_lay(dataset: Path) -> None:
 def test_lifts_are_tried_elsewhere_as_they_lay(
     dataset: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mujoco_baseline = pytest.importorskip("drakegrasp.bench.mujoco_baseline")
+    mujoco_baseline = pytest.importorskip("mujoco_baseline")
     stood: list[np.ndarray] = []
 
     class Peer:

@@ -105,7 +105,7 @@ def test_another_allocator_of_the_users_stays(
     assert jemalloc_environment() == {}
 
 
-@pytest.mark.parametrize("command", ["bench", "verify"])
+@pytest.mark.parametrize("command", ["score", "verify"])
 @pytest.mark.usefixtures("library")
 def test_commands_that_simulate_start_again(monkeypatch: pytest.MonkeyPatch, command: str) -> None:
     calls: list[tuple[str, list[str], dict[str, str]]] = []
@@ -142,7 +142,7 @@ def test_program_that_started_again_has_jemalloc(jemalloc: dict[str, str]) -> No
     code = (
         "import sys; from drakegrasp.cli import main as cli; "
         "from drakegrasp.runtime.allocator import allocator; "
-        "sys.argv = ['drakegrasp', 'bench']; cli.main = lambda: print(allocator()); cli.run()"
+        "sys.argv = ['drakegrasp', 'verify']; cli.main = lambda: print(allocator()); cli.run()"
     )
     assert run_child(code, {}) == f"{LIBRARY}\n"
 

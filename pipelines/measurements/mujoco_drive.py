@@ -1,6 +1,7 @@
-"""The drive of the fingers in MuJoCo, with the rules of `drakegrasp.simulation.drive`.
+"""The drive of the fingers in MuJoCo, for mujoco_baseline.py.
 
-MuJoCo's joint limits replace the holding of the drive. The motor's torque stays on.
+The rules are those of `drakegrasp.simulation.drive`. MuJoCo's joint limits replace its holding;
+the motor's torque stays on.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ class FingerDrive:
         """Find the joints and motors.
 
         Args:
-            model: Model with the joints and motors of `mjcf.scene`; its limits are changed.
+            model: Model with the joints and motors of `mujoco_scene`; its limits are changed.
             hand: The hand.
             drive: What holds the closing joints, see `drakegrasp.simulation.drive`.
         """

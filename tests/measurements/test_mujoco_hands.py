@@ -8,7 +8,8 @@ import pytest
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("coacd")
 
-from drakegrasp.bench.mujoco_baseline import MujocoBaseline  # noqa: E402
+from mujoco_baseline import MujocoBaseline  # noqa: E402
+
 from drakegrasp.commissioning.trial_grasps import trial_grasps  # noqa: E402
 from drakegrasp.frames import invert_pose, make_pose  # noqa: E402
 from drakegrasp.hand.description import load_hand  # noqa: E402

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from mujoco_drive import FingerDrive
+from mujoco_scene import IMMOVABLE, build_mujoco_scene
 
-from drakegrasp.bench.mujoco_drive import FingerDrive
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, rotation_angle
 from drakegrasp.hand.description import load_plain_hand
 from drakegrasp.hand.kinematics import within_load
 from drakegrasp.mjcf.links import TIME_STEP, pair_friction, quaternion
-from drakegrasp.mjcf.scene import IMMOVABLE, build_mujoco_scene
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.attempt import Attempt
@@ -70,11 +70,7 @@ class PeerContacts:
 
 
 class MujocoBaseline:
-    """One object, the table and the hand in MuJoCo.
-
-    Attributes:
-        parts: Number of the object's convex parts.
-    """
+    """One object, the table and the hand in MuJoCo."""
 
     def __init__(self, model: ObjectModel, X_TO: Array, config: Config) -> None:
         """Build the scene.
@@ -94,7 +90,7 @@ class MujocoBaseline:
         self._usual = usual_materials(model, config.physics)
         self.place(X_TO)
         scene = build_mujoco_scene(model, self._hand, config)
-        self.parts, self._spreads = scene.parts, scene.spreads
+        self._spreads = scene.spreads
         self._model, self._data = scene.model, mujoco.MjData(scene.model)
         self._drive = FingerDrive(self._model, self._hand, drive_of(self._hand, config.lift))
         self._find_addresses()

@@ -1,27 +1,22 @@
-"""Object, table and hand as a model of MuJoCo, for the attempts of a build.
+"""Object, table and hand as a model of MuJoCo, for mujoco_baseline.py.
 
 Input: a prepared object, a hand and the configuration. Output: a compiled `MujocoScene`. MuJoCo
 only collides convex shapes, so the object is divided into convex parts. Masses, inertias, joints,
-shapes and friction are those that Drake simulates. Needs the extra `[peer]`.
+shapes and friction are those that Drake simulates.
 """
 
 from __future__ import annotations
 
-import hashlib
-import io
 from dataclasses import dataclass
-from importlib import metadata
-from pathlib import Path
 
-import coacd
 import mujoco
 import numpy as np
 
 from drakegrasp.config import Config
-from drakegrasp.foreign_files import read_npz
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import SLIDE, Hand
 from drakegrasp.hand.parsing import joint_slides
+from drakegrasp.mjcf.decomposition import convex_parts
 from drakegrasp.mjcf.links import (
     RIGID,
     STIFF,
@@ -33,70 +28,6 @@ from drakegrasp.mjcf.links import (
     set_inertia,
 )
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.runtime.files import write_atomic
-
-#: Largest concavity of a convex part over the object's size, the seed, and the largest number of
-#: corners of a part.
-SETTINGS = {"threshold": 0.02, "seed": 0, "max_convex_hull": 64}
-
-
-def convex_parts(model: ObjectModel) -> list[Array]:
-    """Return the corners of an object's convex parts, each (n, 3) in {O} [m]."""
-    coacd.set_log_level("error")
-    mesh = coacd.Mesh(model.collision_vertices, model.collision_faces)
-    parts = coacd.run_coacd(mesh, **SETTINGS)
-    return [np.asarray(corners, dtype=float) for corners, _ in parts]
-
-
-def kept_convex_parts(model: ObjectModel, keep: Path) -> list[Array]:
-    """Return the convex parts of an object, cached in a folder, since dividing takes many seconds.
-
-    Args:
-        model: The object.
-        keep: The folder, created with the first object. A file without valid parts is rewritten.
-
-    Raises:
-        OSError: If the folder cannot be written.
-    """
-    path = keep / f"{_digest(model)}.npz"
-    try:
-        return _read_parts(path)
-    except Exception:  # missing, or damaged in any way: it can be computed again
-        parts = convex_parts(model)
-
-    # The parts are read in the order in which they are written.
-    buffer = io.BytesIO()
-    np.savez(buffer, *parts)
-    write_atomic(path, buffer.getvalue())
-    return parts
-
-
-def _read_parts(path: Path) -> list[Array]:
-    """Return the parts in a file.
-
-    Raises:
-        Exception: Of any kind, if the file is missing or holds something else.
-    """
-    content = read_npz(path)
-    parts = [content[f"arr_{k}"] for k in range(len(content))]
-    if not parts or not all(map(_is_part, parts)):
-        raise ValueError(f"{path}: must hold the corners of convex parts, got something else")
-    return parts
-
-
-def _is_part(corners: Array) -> bool:
-    shaped = corners.dtype == float and corners.shape[1:] == (3,) and len(corners) >= 4
-    return shaped and bool(np.isfinite(corners).all())
-
-
-def _digest(model: ObjectModel) -> str:
-    """Return 32 hex digits that identify everything that determines an object's parts."""
-    digest = hashlib.sha256(repr((SETTINGS, metadata.version("coacd"))).encode())
-    for array in (model.collision_vertices, model.collision_faces):
-        digest.update(repr((array.shape, array.dtype.str)).encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()[:32]
-
 
 #: Friction is stiffer than the normal direction by this factor, and is solved again until it is
 #: exact (`noslip`): with MuJoCo's regularized friction a held object creeps.
@@ -143,25 +74,22 @@ class MujocoScene:
     Attributes:
         model: The model, with the bodies `object` and `wrist_x` to `wrist_z` and the geom `table`.
         spreads: The spread joints.
-        parts: Number of the object's convex parts.
     """
 
     model: mujoco.MjModel
     spreads: tuple[SpreadJoint, ...]
-    parts: int
 
 
 def build_mujoco_scene(model: ObjectModel, hand: Hand, config: Config) -> MujocoScene:
     """Return object, table and hand as a model of MuJoCo."""
     config = config.model_copy(update={"physics": model.own_physics(config.physics)})
-    parts = convex_parts(model)
     spec = make_spec(TIME_STEP, FRICTION_STIFFNESS, NOSLIP_ITERATIONS)
     spec.compiler.degree, spec.compiler.balanceinertia = False, True
     spec.option.tolerance = 1e-10
     _add_table(spec, config)
-    _add_object(spec, model, parts, config)
+    _add_object(spec, model, config)
     spreads = _add_hand(spec, hand, config)
-    return MujocoScene(model=spec.compile(), spreads=tuple(spreads), parts=len(parts))
+    return MujocoScene(model=spec.compile(), spreads=tuple(spreads))
 
 
 def _add_table(spec: mujoco.MjSpec, config: Config) -> None:
@@ -181,13 +109,11 @@ def _add_table(spec: mujoco.MjSpec, config: Config) -> None:
     )
 
 
-def _add_object(
-    spec: mujoco.MjSpec, model: ObjectModel, parts: list[Array], config: Config
-) -> None:
+def _add_object(spec: mujoco.MjSpec, model: ObjectModel, config: Config) -> None:
     body = spec.worldbody.add_body(name="object")
     body.add_freejoint(name="object")
     set_inertia(body, model.mass, model.p_OOcm, model.I_OOcm_O)
-    for k, corners in enumerate(parts):
+    for k, corners in enumerate(convex_parts(model)):
         spec.add_mesh(name=f"part_{k}", uservert=corners.ravel())
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_MESH,

@@ -12,12 +12,12 @@ pytest.importorskip("mujoco")
 pytest.importorskip("coacd")
 
 import mujoco
+from mujoco_drive import FingerDrive
+from mujoco_scene import build_mujoco_scene
 
-from drakegrasp.bench.mujoco_drive import FingerDrive
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import Drive
 from drakegrasp.hand.settings import load_config
-from drakegrasp.mjcf.scene import build_mujoco_scene
 
 pytestmark = pytest.mark.sim
 

@@ -1,1 +1,0 @@
-"""The cost of attempts, and the same attempts in MuJoCo."""
