@@ -196,6 +196,8 @@ class Predictions(Gallery):
         snapshot, camera = self.snapshot, self.rows.camera
         places, cards = self._places[shown].tolist(), []
         rows, verdicts = read_rows(snapshot, places, THUMBNAIL), self.read(shown.tolist(), ON_CARDS)
+        # A number that no prediction has, as a confidence, is left out.
+        there = [name for name in _CARD if not np.isnan(self.table[name]).all()]
 
         for i, at, row, verdict in zip(shown.tolist(), places, rows, verdicts, strict=True):
             marks, size = self._marks(verdict, row, camera), snapshot.config.camera.size
@@ -208,7 +210,7 @@ class Predictions(Gallery):
                     "verdict": self._verdict(i),
                     "reason": verdict["reason"] or "",
                     "numbers": [
-                        (QUANTITIES[n].title, QUANTITIES[n].text(self.table[n][i])) for n in _CARD
+                        (QUANTITIES[n].title, QUANTITIES[n].text(self.table[n][i])) for n in there
                     ],
                 }
             )
