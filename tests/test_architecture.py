@@ -68,7 +68,6 @@ WALLS = {
 NAMES_TYPES = {
     *((f"api.{module}", "distributed") for module in ("building", "scoring", "verifying")),
     ("verification.result", "matplotlib"),
-    ("page.plots", "matplotlib"),
 }
 #: Reading data: NumPy and h5py, and nothing of these.
 HEAVY = (

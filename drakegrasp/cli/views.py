@@ -24,28 +24,24 @@ def inspect_(
     out: Path,
     results: Path | None = None,
     port: Annotated[int, click.IntRange(0, 65535)] = PORT,
-    folder: Path | None = None,
     no_browser: bool = False,
 ) -> None:
     """Look at grasps in a browser, and reject them.
 
     The page shows every attempt in OUT with images, contacts, forces and a 3D view, the most
     suspicious first. Rejections are written to OUT/reject.json immediately; assemble --reject reads
-    that file. The page also works while a build runs. It can be reached from this machine only.
-    Ctrl-C ends the command.
+    that file. The page can be reached from this machine only. Ctrl-C ends the command.
 
     Options:
         --predictions RESULTS (results): Show predictions next to their rows of the dataset: the
             results that verify --dataset FILE --out NAME wrote.
         --port N: Port on this machine; 0 selects any free port.
-        --static DIR (folder): Only write the pages to DIR, as files that open without a server.
         --no-browser: Only print the address.
     """
     from drakegrasp.errors import MachineError, one_line
 
     try:
         from drakegrasp.page.serve import serve
-        from drakegrasp.page.site import write_site
     except ImportError as error:
         if (error.name or "").partition(".")[0] == "drakegrasp":
             raise
@@ -53,14 +49,7 @@ def inspect_(
             f"inspect needs its packages: pip install 'drakegrasp[inspect]' ({one_line(error)})"
         ) from None
 
-    if folder is None:
-        serve(out, results=results, port=port, browser=not no_browser, announce=say)
-        return
-
-    with progress_bar("inspect", "grasps") as progress:
-        site = write_site(out, folder, results=results, progress=progress)
-    rest = "" if site.grasps == site.successes else f", the most suspicious of {site.successes:,}"
-    say(f"{counted(site.grasps, 'grasp')} in {folder / 'index.html'}{rest}")
+    serve(out, results=results, port=port, browser=not no_browser, announce=say)
 
 
 @click.command()

@@ -141,17 +141,6 @@ class Trials:
         trials._rows = rows
         return trials
 
-    def part_of(self, trial_id: int) -> tuple[TrialPart, int]:
-        """Return the file that holds an attempt, and its row there.
-
-        Raises:
-            IndexError: If there is no such attempt.
-        """
-        for part, start in self._starts():
-            if trial_id < start + part.count:
-                return part, trial_id - start
-        raise IndexError(f"trial must be below {self._count}, got {trial_id}")
-
     def __len__(self) -> int:
         return self._count if self._rows is None else len(self._rows)
 

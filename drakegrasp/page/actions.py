@@ -13,7 +13,6 @@ import sys
 import tempfile
 import threading
 import time
-from collections import OrderedDict, deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import FileIO
@@ -34,26 +33,14 @@ from drakegrasp.runtime.files import lock_file, open_own
 LOCK_NAME = f".{FILE_NAME}.lock"
 #: Time [s] that a decision waits for those of other inspections, each of which takes milliseconds.
 PATIENCE = 10.0
-#: Number of pages whose decisions can be undone, and number of decisions of each page.
-KEPT_PAGES, KEPT_DECISIONS = 100, 1000
 
 
-#: An attempt, its decision before, and its decision after.
-_Step = tuple[AttemptKey, str, str]
-
-
-class Undo(NamedTuple):
-    """Result of withdrawing a decision.
-
-    Attributes:
-        key: The attempt.
-        decision: The present decision on the attempt.
-        done: Whether the decision was withdrawn; False if another decision was made since.
-    """
+class Step(NamedTuple):
+    """A change of the decision on an attempt."""
 
     key: AttemptKey
-    decision: str
-    done: bool
+    before: str
+    after: str
 
 
 class DecisionFile:
@@ -72,7 +59,7 @@ class DecisionFile:
     def __init__(self, out: Path) -> None:
         self._path = out / FILE_NAME
         self._lock = threading.Lock()
-        self._steps: OrderedDict[str, deque[_Step]] = OrderedDict()
+        self._last: Step | None = None
         self.read()
 
     def read(self) -> Decisions:
@@ -83,13 +70,12 @@ class DecisionFile:
         """
         return read_decisions(self._path)
 
-    def decide(self, key: AttemptKey, decision: str, page: str = "") -> Decisions:
+    def decide(self, key: AttemptKey, decision: str) -> Decisions:
         """Write a decision and return all decisions including it.
 
         Args:
             key: The attempt.
             decision: `rejected`, `kept`, or empty text to withdraw the decision.
-            page: The page that decides, for `undo`.
 
         Raises:
             ValueError: If the text is not a decision.
@@ -102,36 +88,28 @@ class DecisionFile:
             if decision == before:
                 return decisions
             write_decisions(self._path, changed)
-            self._steps_of(page).append((key, before, decision))
+            self._last = Step(key, before, decision)
             return changed
 
-    def undo(self, page: str = "") -> Undo | None:
-        """Withdraw the last decision of a page; None if there is none left.
+    def undo(self) -> Step | None:
+        """Withdraw the last decision and return it; None if there is none.
 
-        If another page or inspection has decided differently since, that decision stays.
+        If another inspection has decided differently since, that decision stays.
 
         Raises:
             DataError: If the file is no longer a list of rejections.
             OSError: If the file cannot be written.
         """
         with self._lock, _held(self._path.with_name(LOCK_NAME)):
-            steps = self._steps_of(page)
-            if not steps:
+            last = self._last
+            if last is None:
                 return None
-            (key, before, after), decisions = steps[-1], self.read()
-            now = decisions.of(key)
-            done = now == after
-            if done:
-                write_decisions(self._path, decisions.with_decision(key, before))
-            steps.pop()
-            return Undo(key, before if done else now, done)
-
-    def _steps_of(self, page: str) -> deque[_Step]:
-        steps = self._steps.setdefault(page, deque(maxlen=KEPT_DECISIONS))
-        self._steps.move_to_end(page)
-        if len(self._steps) > KEPT_PAGES:
-            self._steps.popitem(last=False)
-        return steps
+            decisions = self.read()
+            stands = decisions.of(last.key) == last.after
+            if stands:
+                write_decisions(self._path, decisions.with_decision(last.key, last.before))
+            self._last = None
+            return last if stands else None
 
 
 @contextmanager

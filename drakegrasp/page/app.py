@@ -8,7 +8,6 @@ nothing. Files are only changed by a POST with the token of this run, which only
 from __future__ import annotations
 
 import os
-import re
 import secrets
 import threading
 from collections import OrderedDict
@@ -36,9 +35,8 @@ from drakegrasp.foreign_files import parse_json
 from drakegrasp.page.actions import DecisionFile, Recordings
 from drakegrasp.page.attempts import Attempts
 from drakegrasp.page.catalog import Catalog, Snapshot, Watched
-from drakegrasp.page.gallery import Gallery, Places, Query, Site, render
+from drakegrasp.page.gallery import Gallery, Places, Query, render
 from drakegrasp.page.looks import HandView, object_surface, read_look
-from drakegrasp.page.plots import PLOTS, plot_svg, plots_values
 from drakegrasp.page.predictions import Predictions, result_file
 from drakegrasp.page.scenes import Scenes
 from drakegrasp.pictures.style import colour_png, strip_png
@@ -57,8 +55,6 @@ HEADERS = {
     "cross-origin-opener-policy": "same-origin",
     "cache-control": "no-store",
 }
-#: A standalone SVG has inline styles only.
-PLOT_POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 #: A recording contains its own scripts; it runs without access to this server or any other.
 RECORDING_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' data: blob:; style-src "
@@ -102,10 +98,14 @@ class Inspection:
         """Return the state of the files."""
         return self.catalog.current()
 
-    def site(self) -> Site:
-        """Return where the pages are; scenes may be created while the pages are open."""
-        scened = os.path.lexists(self._scenes.path)
-        return Site(predicted=self._results is not None, scened=scened)
+    def galleries(self) -> list[type[Gallery]]:
+        """Return the galleries that there are; scenes may be created while the pages are open."""
+        found: list[type[Gallery]] = [Attempts]
+        if self._results is not None:
+            found.append(Predictions)
+        if os.path.lexists(self._scenes.path):
+            found.append(Scenes)
+        return found
 
     def table(self, kind: type[Gallery]) -> Gallery:
         """Return the present state of a table.
@@ -114,9 +114,9 @@ class Inspection:
             HTTPException: If there is no such table.
             DataError: If its file cannot be read, or belongs to another dataset.
         """
-        snapshot, site = self.snapshot(), self.site()
+        snapshot = self.snapshot()
         if kind is Scenes:
-            if not site.scened:
+            if kind not in self.galleries():
                 raise HTTPException(404, "there are no scenes; drakegrasp scenes makes them")
             return self._scenes.current(snapshot)
         if kind is Predictions:
@@ -163,25 +163,14 @@ class Inspection:
 def _gallery(kind: type[Gallery], inspection: Inspection, name: str, params: Params) -> Response:
     table, query = inspection.table(kind), kind.query(params)
     chosen = inspection.select(table, query)
-    return HTMLResponse(table.gallery_page(query, chosen, inspection.site()))
+    return HTMLResponse(table.gallery_page(query, chosen, inspection.galleries()))
 
 
 def _row(kind: type[Gallery], inspection: Inspection, name: str, params: Params) -> Response:
     table, query = inspection.table(kind), kind.query(params)
     i = _there(table.find(name), kind.NOUN)
     chosen = inspection.select(table, query)
-    return HTMLResponse(table.row_page(i, query, chosen, inspection.site(), inspection.hand))
-
-
-def _plots(inspection: Inspection, name: str, params: Params) -> Response:
-    values = plots_values(inspection.snapshot())
-    return HTMLResponse(render("plots.html", inspection.site(), **values))
-
-
-def _plot(inspection: Inspection, name: str, params: Params) -> Response:
-    _there(PLOTS.get(name), "plot")
-    svg, headers = plot_svg(inspection.snapshot(), name), {"content-security-policy": PLOT_POLICY}
-    return Response(svg, media_type="image/svg+xml", headers=headers)
+    return HTMLResponse(table.row_page(i, query, chosen, inspection.galleries(), inspection.hand))
 
 
 def _view(inspection: Inspection, name: str, params: Params) -> Response:
@@ -233,30 +222,15 @@ def _there(found: Any, noun: str) -> Any:
 
 
 Answer: TypeAlias = Callable[[Inspection, str, Params], Response]
-#: Function that answers each address: galleries and rows of tables, plots, and parts of pages.
+#: Function that answers each address: galleries and rows of tables, and parts of pages.
 PAGES: dict[str, Answer] = {
     **{kind.HOME: partial(_gallery, kind) for kind in (Attempts, Predictions, Scenes)},
     **{f"/{kind.ROW}/{{name}}": partial(_row, kind) for kind in (Attempts, Predictions, Scenes)},
-    "/plots": _plots,
-    "/plot/{name}.svg": _plot,
     "/view/{name}.png": _view,
     "/strip/{name}.png": _strip,
     "/mesh/{name}.json": _mesh,
     "/recording/{name}.html": _recording,
 }
-
-
-def answer(inspection: Inspection, address: str) -> Response:
-    """Return the answer to an address without a query, by the function in PAGES.
-
-    Raises:
-        HTTPException: If there is no such address.
-    """
-    for pattern, found in PAGES.items():
-        match = re.fullmatch(pattern.replace(".", r"\.").replace("{name}", "([^/]+)"), address)
-        if match is not None:
-            return found(inspection, match[1] if match.groups() else "", {})
-    raise HTTPException(404)
 
 
 # Changes.
@@ -268,7 +242,7 @@ def _decide(inspection: Inspection, content: dict[str, Any]) -> Response:
     if i is None or not snapshot.table.held[i]:
         raise HTTPException(404, "the attempt must be a success of the dataset")
     try:
-        found = inspection.decisions.decide(snapshot.key(i), str(decision), _tab(content))
+        found = inspection.decisions.decide(snapshot.key(i), str(decision))
     except ValueError as error:
         raise HTTPException(400, str(error)) from None
     counts = Attempts(snapshot, found).counts()
@@ -276,17 +250,16 @@ def _decide(inspection: Inspection, content: dict[str, Any]) -> Response:
 
 
 def _undo(inspection: Inspection, content: dict[str, Any]) -> Response:
-    undo = inspection.decisions.undo(_tab(content))
-    if undo is None:
+    undone = inspection.decisions.undo()
+    if undone is None:
         return JSONResponse({"name": None})
     snapshot = inspection.snapshot()
-    place = snapshot.find_key(undo.key)
+    place = snapshot.find_key(undone.key)
     return JSONResponse(
         {
-            "name": printable(str(undo.key)),
+            "name": printable(str(undone.key)),
             "label": None if place is None else snapshot.label(place),
-            "decision": undo.decision,
-            "done": undo.done,
+            "decision": undone.before,
             "counts": Attempts(snapshot, inspection.decisions.read()).counts(),
         }
     )
@@ -295,16 +268,10 @@ def _undo(inspection: Inspection, content: dict[str, Any]) -> Response:
 def _record(inspection: Inspection, content: dict[str, Any]) -> Response:
     snapshot, label = inspection.snapshot(), str(content.get("label"))
     i = snapshot.find(label)
-    trial = None if i is None else snapshot.trial_id(i)
-    if trial is None:
-        raise HTTPException(404, "the attempt must be a row of trials.hdf5")
-    found = inspection.recordings.make(label, trial)
+    if i is None:
+        raise HTTPException(404, "the attempt must be one of the dataset")
+    found = inspection.recordings.make(label, i)
     return JSONResponse({"url": f"/recording/{label}.html", "same": found.same, "text": found.text})
-
-
-def _tab(content: dict[str, Any]) -> str:
-    """Return the browser page that sends a request; decisions are undone per page."""
-    return str(content.get("page", ""))[:64]
 
 
 # The application.
@@ -396,5 +363,5 @@ def _error(request: Request, error: Exception) -> Response:
         status, text = error.status_code, str(error.detail)
     if request.method == "POST":
         return JSONResponse({"error": text}, status_code=status)
-    page = render("error.html", Site(), title="error", text=text)
+    page = render("error.html", [], title="error", text=text)
     return HTMLResponse(page, status_code=status)

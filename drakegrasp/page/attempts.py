@@ -154,14 +154,13 @@ class Attempts(Gallery):
             "token": self.token,
             "counts": self.counts(),
             "assemble": shlex.join(words),
-            "assembled": snapshot.assembled,
         }
 
     # Contents of pages.
 
     def identity(self, i: int) -> dict[str, Any]:
-        """Return how people name an attempt, see `name_of`."""
-        return {**super().identity(i), "number": name_of(self.snapshot, i)}
+        """Return how people name an attempt: by object, class and row of trials.hdf5."""
+        return {**super().identity(i), "number": f"trial {i}"}
 
     def summary(self, query: Query, chosen: Places) -> dict[str, Any]:
         """Return the content of the gallery besides its cards."""
@@ -207,7 +206,7 @@ class Attempts(Gallery):
         # The row of the attempt, and where both cameras see its contacts.
         snapshot = self.snapshot
         (row,) = read_rows(snapshot, [i])
-        outcome, trial = Outcome(int(snapshot.table.outcome[i])), snapshot.trial_id(i)
+        outcome = Outcome(int(snapshot.table.outcome[i]))
         views = []
         for camera in CAMERAS if outcome is Outcome.SUCCESS else ():
             look = read_look(snapshot, i, camera)
@@ -218,10 +217,7 @@ class Attempts(Gallery):
 
         key = snapshot.key(i)
         return {
-            "trial": trial,
-            "replay": shlex.join(
-                ["drakegrasp", "replay", str(snapshot.out), "--trial", f"{trial}"]
-            ),
+            "replay": shlex.join(["drakegrasp", "replay", str(snapshot.out), "--trial", str(i)]),
             **self._decisions(),
             "outcome": outcome.label.replace("_", " "),
             "words": words_of(snapshot, i),
@@ -235,14 +231,6 @@ class Attempts(Gallery):
             "fingers": _fingers(row),
             "scene": attempt_scene(snapshot, i, row, hand),
         }
-
-
-def name_of(snapshot: Snapshot, i: int) -> str:
-    """Return how people name an attempt: by trial id, or by palm pose if it has no id yet."""
-    trial, key = snapshot.trial_id(i), snapshot.key(i)
-    if trial is not None:
-        return f"trial {trial}"
-    return f"pose {key.candidate}, stand-off {key.standoff_index}"
 
 
 def _text(snapshot: Snapshot, name: str, i: int) -> str:

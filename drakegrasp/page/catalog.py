@@ -12,9 +12,8 @@ import hashlib
 import json
 import os
 import threading
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Generic, TypeAlias, TypeVar
@@ -28,14 +27,12 @@ from drakegrasp.dataset.manifest import Manifest, read_manifest
 from drakegrasp.dataset.paths import (
     ASSEMBLED_FILES,
     DATA_FILES,
-    FILE_NAME,
     TRIALS_FILE,
     model_path,
 )
 from drakegrasp.dataset.quality import COLUMNS, PARTS, suspicion
 from drakegrasp.dataset.rejections import AttemptKey
-from drakegrasp.dataset.shards import ShardHeader
-from drakegrasp.dataset.trials import Stamp, TrialPart, Trials, shard_part, stamp
+from drakegrasp.dataset.trials import Stamp, Trials, stamp
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import is_name, parse_json
 from drakegrasp.hand.folder import carried_hand
@@ -61,17 +58,11 @@ _KEPT: dict[str, type[np.generic]] = {
     "precision": np.bool_,
     "stable": np.bool_,
 }
-#: Interval [s] at which new shards are listed while a build runs.
-LISTING_PERIOD = 5.0
-#: Maximum number of damaged shards that are named.
-NAMED = 3
-
-
 #: Columns of n attempts in memory, in the order of the dataset's rows. First a table of n rows with
-#: the columns _KEPT and `held`; `removal` is NONE for an attempt that is not a success or not yet
-#: decided, `split` is NONE for one that is not a sample. Then a table with a row for each attempt
-#: whose hand closed: `place` (m,) int32, rising indices into the first table, and FEATURES as
-#: float32, NaN if an attempt ended before, and infinite if a contact has no normal.
+#: the columns _KEPT and `held`; `removal` is NONE for an attempt that is not a success, `split`
+#: is NONE for one that is not a sample. Then a table with a row for each attempt whose hand closed:
+#: `place` (m,) int32, rising indices into the first table, and FEATURES as float32, NaN if an
+#: attempt ended before, and infinite if a contact has no normal.
 Kept: TypeAlias = tuple[Table, Table]
 
 
@@ -82,12 +73,8 @@ def read_attempts(trials: Trials) -> Kept:
         DataError: If a file cannot be read.
     """
     names = dict.fromkeys((*_KEPT, *COLUMNS, *_READ))
-    return _join([_columns_of(block) for block in trials.blocks(list(names))])
-
-
-def _join(parts: Sequence[Kept]) -> Kept:
-    """Return one or more parts joined to one, in order."""
-    tables, few = zip(*parts, strict=True)
+    blocks = [_columns_of(block) for block in trials.blocks(list(names))]
+    tables, few = zip(*blocks, strict=True)
     starts = np.cumsum([0, *(table.count for table in tables)]).tolist()
     moved = [
         closed.with_columns(place=closed.place + start)
@@ -135,9 +122,8 @@ class Snapshot:
         own_hashes: The same hash for each object with its own seed, by name.
         names, classes: Names and classes of the objects, by number.
         meshes: Hashes of the objects' meshes, hexadecimal.
-        trials: The attempts in their files.
+        trials: The attempts in trials.hdf5.
         table, closed: Columns of the attempts in memory, see `Kept`.
-        assembled: Whether the attempts are rows of trials.hdf5; otherwise they are in shards.
         stamps: Stamps of the assembled files; shards never change.
         missing: What is missing, in sentences.
     """
@@ -151,9 +137,8 @@ class Snapshot:
     trials: Trials
     table: Table
     closed: Table
-    assembled: bool
-    own_hashes: Mapping[str, str] = field(default_factory=dict)
-    stamps: Mapping[Path, Stamp] = field(default_factory=dict)
+    own_hashes: Mapping[str, str]
+    stamps: Mapping[Path, Stamp]
     missing: tuple[str, ...]
 
     @cached_property
@@ -217,10 +202,6 @@ class Snapshot:
         )
         return int(found[0]) if len(found) else None
 
-    def trial_id(self, i: int) -> int | None:
-        """Return the row of an attempt in trials.hdf5, or None if it is not there yet."""
-        return i if self.assembled else None
-
     def refuse_replaced(self) -> None:
         """Raise an error if a file was replaced while it was being read.
 
@@ -239,18 +220,12 @@ class Catalog:
         out: Directory of the dataset.
 
     Raises:
-        DataError: If the directory holds neither a trials.hdf5 nor a manifest.
+        DataError: If the directory holds no dataset, or one whose build has not ended.
     """
 
     def __init__(self, out: Path) -> None:
         self.out = out
         self._lock = threading.Lock()
-        self._parts: dict[ShardHeader, tuple[TrialPart, Kept]] = {}
-        self._stamps: dict[Path, Stamp] = {}
-        self._listed = -LISTING_PERIOD
-        # The assembled files, if there are any, and the manifest of a build not yet in them.
-        self._assembled: Snapshot | None = None
-        self._manifest: Manifest | None = None
         self._snapshot: Snapshot | None = None
         self.current()
 
@@ -261,99 +236,10 @@ class Catalog:
             DataError: If the files cannot be read.
         """
         with self._lock:
-            stamps = {self.out / n: stamp(self.out / n) for n in (*ASSEMBLED_FILES, FILE_NAME)}
-            changed = self._snapshot is None or stamps != self._stamps
-            if changed:
-                self._read_files(stamps)
-            waited = time.monotonic() - self._listed >= LISTING_PERIOD
-            if self._snapshot is None or changed or (self._manifest is not None and waited):
-                self._snapshot = self._list_shards()
-                self._stamps, self._listed = stamps, time.monotonic()
+            stamps = {self.out / name: stamp(self.out / name) for name in ASSEMBLED_FILES}
+            if self._snapshot is None or stamps != self._snapshot.stamps:
+                self._snapshot = _read_snapshot(self.out, stamps)
             return self._snapshot
-
-    def _read_files(self, stamps: Mapping[Path, Stamp]) -> None:
-        """Read the assembled files, and the manifest of a build not yet in them."""
-        assembled = os.path.lexists(self.out / TRIALS_FILE)  # a link that leads nowhere is damage
-        self._assembled, self._manifest = None, None
-        try:
-            self._manifest = read_manifest(self.out)
-        except DataError:
-            if not assembled:
-                raise  # else the assembled files are enough
-        if assembled:
-            self._parts.clear()
-            self._assembled, signature = _read_assembled(self.out, self._manifest, stamps)
-            if self._manifest is not None and self._manifest.signature() == signature:
-                self._manifest = None
-
-    def _list_shards(self) -> Snapshot:
-        """Return the state of the files with the existing shards."""
-        before, manifest, assembled = self._snapshot, self._manifest, self._assembled
-        if assembled is None:
-            assert manifest is not None
-            return self._read_shards(manifest)
-        if manifest is None or not (newer := _count_newer(assembled, manifest)):
-            return assembled
-        notice = (
-            f"{TRIALS_FILE} and the data files are of an earlier state: {newer:,} work units are "
-            "newer. They are shown when the build has ended."
-        )
-        if before is not None and before.table is assembled.table and notice in before.missing:
-            return before
-        return replace(assembled, missing=(notice, *assembled.missing))
-
-    def _read_shards(self, manifest: Manifest) -> Snapshot:
-        """Return the state of a build that runs or was stopped."""
-        # Shards never change, so only new ones are read; those of removed objects are dropped.
-        entries = manifest.objects
-        numbers = {entry.name: i for i, entry in enumerate(entries)}
-        objects = {
-            key: np.array([getattr(entry, key) for entry in entries], dtype=object)
-            for key in ("name", "class_name")
-        }
-        parts, damaged = {}, []
-        for header in _done_headers(self.out, manifest):
-            try:
-                if (read := self._parts.get(header)) is None:
-                    part = shard_part(self.out, header, numbers[header.object_name])
-                    read = part, read_attempts(Trials.of_parts(self.out, objects, [part]))
-                parts[header] = read
-            except DataError:
-                damaged.append(header.path(self.out).relative_to(self.out))
-        self._parts = parts
-
-        # The number of an object is its position in this manifest, which may have grown.
-        own, rows = [], []
-        for header, (part, (table, closed)) in parts.items():
-            number = numbers[header.object_name]
-            own.append(replace(part, object=number))
-            column = np.full(table.count, number, dtype=np.int32)
-            rows.append((table.with_columns(object=column), closed))
-        trials = Trials.of_parts(self.out, objects, own)
-        table, closed = _join(rows) if rows else read_attempts(trials)
-
-        missing = [
-            f"{TRIALS_FILE} and the data files are not there yet: {len(parts):,} of "
-            f"{manifest.units:,} work units are done. Filters and split are decided at the end."
-        ]
-        if damaged:
-            named = ", ".join(map(str, damaged[:NAMED]))
-            more = f" and {len(damaged) - NAMED:,} more" if len(damaged) > NAMED else ""
-            missing.append(f"Damaged, and not shown: {named}{more}. The build makes them again.")
-        return Snapshot(
-            out=self.out,
-            config=manifest.config,
-            config_hash=manifest.config.simulation_hash(),
-            names=tuple(entry.name for entry in entries),
-            classes=tuple(entry.class_name for entry in entries),
-            meshes=tuple(entry.mesh_sha256 for entry in entries),
-            trials=trials,
-            table=table,
-            closed=closed,
-            assembled=False,
-            own_hashes=_own_hashes(manifest),
-            missing=tuple(missing),
-        )
 
 
 class Watched(Generic[Found]):
@@ -392,13 +278,19 @@ def find_model(out: Path, name: str) -> Path | None:
     return path if path is not None and path.is_file() else None
 
 
-def _read_assembled(
-    out: Path, manifest: Manifest | None, stamps: Mapping[Path, Stamp]
-) -> tuple[Snapshot, str]:
-    """Return the state of a dataset with a trials.hdf5, and the signature of its manifest then.
+def _read_snapshot(out: Path, stamps: Mapping[Path, Stamp]) -> Snapshot:
+    """Return the state of a dataset, of which only trials.hdf5 is required."""
+    if not os.path.lexists(out / TRIALS_FILE):  # a link that leads nowhere is damage
+        read_manifest(out)  # what is no dataset at all gets another message
+        raise DataError(
+            f"{out}: must be a finished dataset, got one without {TRIALS_FILE}; finish it first, "
+            "with the same command that began to build it"
+        )
+    try:
+        manifest = read_manifest(out)
+    except DataError:
+        manifest = None
 
-    No other file is required.
-    """
     # Objects and configuration.
     trials = Trials(out, any_name=True)
     try:
@@ -424,7 +316,7 @@ def _read_assembled(
         missing.append(f"{len(gone):,} of {len(names):,} objects have no mesh: no 3D view of them.")
 
     table, closed = read_attempts(trials)
-    state = Snapshot(
+    return Snapshot(
         out=out,
         config=config,
         config_hash=str(trials.attributes.get("config_hash", "")),
@@ -434,12 +326,10 @@ def _read_assembled(
         trials=trials,
         table=table,
         closed=closed,
-        assembled=True,
         own_hashes=_own_hashes(manifest),
-        stamps={path: then for path, then in stamps.items() if path.name in ASSEMBLED_FILES},
+        stamps=stamps,
         missing=tuple(missing),
     )
-    return state, str(trials.attributes.get("signature", ""))
 
 
 def _own_hashes(manifest: Manifest | None) -> dict[str, str]:
@@ -451,37 +341,3 @@ def _own_hashes(manifest: Manifest | None) -> dict[str, str]:
         for entry in manifest.objects
         if entry.seed is not None
     }
-
-
-def _count_newer(state: Snapshot, manifest: Manifest) -> int:
-    """Return the number of finished work units that are not in the assembled files."""
-    # Each object's last palm pose in the files.
-    table = state.table
-    last = np.full(len(state.names), -1, dtype=np.int32)
-    np.maximum.at(last, table.object, table.candidate)
-
-    numbers = {key: i for i, key in enumerate(zip(state.names, state.meshes, strict=True))}
-    newer = 0
-    for header in _done_headers(state.out, manifest):
-        number = numbers.get((header.object_name, header.mesh_sha256))
-        newer += number is None or header.start > last[number]
-    return newer
-
-
-def _done_headers(out: Path, manifest: Manifest) -> Iterator[ShardHeader]:
-    """Yield the work units whose shards exist, in the order of the dataset's rows."""
-    # One listing per object, since checking each file of a large build takes seconds.
-    folder, names = None, frozenset[str]()
-    for header in manifest.headers():
-        path = header.path(out)
-        if path.parent != folder:
-            folder, names = path.parent, _names_in(path.parent)
-        if path.name in names:
-            yield header
-
-
-def _names_in(folder: Path) -> frozenset[str]:
-    try:
-        return frozenset(os.listdir(folder))
-    except OSError:
-        return frozenset()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
 from urllib.parse import urlencode
 
@@ -58,54 +58,9 @@ TEMPLATES.globals["kinds"] = {"true": TRUE, "requested": PREDICTED, "reached": R
 TEMPLATES.globals["counted"] = counted
 
 
-@dataclass(frozen=True, kw_only=True)
-class Site:
-    """Location of the pages: at a server, or as files that open without a server.
-
-    Attributes:
-        predicted, scened: Whether there are pages of predictions, and pages of scenes.
-        up: For files, the path from the page to the common folder: empty, or "../"; None for a
-            server.
-        grasps: For files, the addresses of the grasps that have a page.
-        asked: The addresses that pages have requested.
-    """
-
-    predicted: bool = False
-    scened: bool = False
-    up: str | None = None
-    grasps: frozenset[str] = frozenset()
-    asked: set[str] = field(default_factory=set)
-
-    @property
-    def static(self) -> bool:
-        """Whether the pages are files, without a server."""
-        return self.up is not None
-
-    def at(self, address: str) -> str:
-        """Return where a page finds an address of the server; empty if there is no such file."""
-        path = address.partition("?")[0]
-        if self.up is None or not path:
-            return address
-        if path.startswith("/grasp/") and path not in self.grasps:
-            return ""
-        self.asked.add(path)
-        return self.up + file_of(path)
-
-
-def file_of(path: str) -> str:
-    """Return the file of an address; the query of the address has no effect without a server.
-
-    A mesh becomes a script that contains it, since a page opened as a file may not read files.
-    """
-    name = path.strip("/") or "index"
-    if name.endswith(".json"):
-        return name.removesuffix("json") + "js"
-    return name if "." in name else f"{name}.html"
-
-
-def render(name: str, site: Site, **values: Any) -> str:
-    """Return the page of a template."""
-    return TEMPLATES.get_template(name).render(site=site, **values)
+def render(name: str, galleries: Sequence[type[Gallery]], **values: Any) -> str:
+    """Return the page of a template, with links to the galleries that there are."""
+    return TEMPLATES.get_template(name).render(galleries=galleries, **values)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,29 +237,25 @@ class Gallery(ABC):
         few = values[there] if query.ascending else -values[there]
         return np.concatenate([places[there][np.argsort(few, kind="stable")], places[~there]])
 
-    def gallery_page(self, query: Query, chosen: Places, site: Site) -> str:
+    def gallery_page(self, query: Query, chosen: Places, galleries: Sequence[type[Gallery]]) -> str:
         """Return the gallery.
 
         Args:
             query: The query; a page number beyond the last page means the last page.
             chosen: All rows that the query selects, in order.
-            site: Location of the pages; a file contains all cards, with the values for its script
-                to filter and sort by.
+            galleries: The galleries that there are.
         """
         pages = max(1, -(-len(chosen) // PAGE))
         page = min(int(query.values["page"]), pages)
-        shown = chosen if site.static else chosen[(page - 1) * PAGE : page * PAGE]
+        shown = chosen[(page - 1) * PAGE : page * PAGE]
 
         # The cards, each with the address of its page.
         cards = self.cards(shown)
-        values = self._values(shown) if site.static else [{}] * len(cards)
-        for i, card, own in zip(shown.tolist(), cards, values, strict=True):
+        for i, card in zip(shown.tolist(), cards, strict=True):
             card |= self.identity(i) | {"label": self.label(i), "href": self._address(i, query)}
-            named = {"object": card["title"], "class": card["class_name"]}
-            card["values"] = named | own if site.static else {}
         return render(
             f"gallery_{self.ROW}.html",
-            site,
+            galleries,
             cards=cards,
             total=len(chosen),
             all=self.table.count,
@@ -315,18 +266,25 @@ class Gallery(ABC):
             previous=self._home(query, page=page - 1) if page > 1 else "",
             next=self._home(query, page=page + 1) if page < pages else "",
             address=self._home(query),
-            form=self._form(query, site),
+            form=self._form(query),
             **self.summary(query, chosen),
         )
 
-    def row_page(self, i: int, query: Query, chosen: Places, site: Site, hand: HandView) -> str:
+    def row_page(
+        self,
+        i: int,
+        query: Query,
+        chosen: Places,
+        galleries: Sequence[type[Gallery]],
+        hand: HandView,
+    ) -> str:
         """Return the page of a row.
 
         Args:
             i: Number of the row.
             query: The query whose rows next and previous step through.
             chosen: All rows that the query selects, in order.
-            site: Location of the other pages.
+            galleries: The galleries that there are.
             hand: Hand of the dataset.
 
         Raises:
@@ -335,14 +293,13 @@ class Gallery(ABC):
         values = self.row(i, hand)
         scene, place = values["scene"], np.flatnonzero(chosen == i)
         k = int(place[0]) if len(place) else None
-        meshes = (f"link-{number}" for number in range(scene["links"]))
 
         def address(place: int) -> str:
             return self._address(int(chosen[place]), query)
 
         return render(
             f"{self.ROW}.html",
-            site,
+            galleries,
             label=self.label(i),
             noun=self.ROW,
             position="not in the selection" if k is None else f"{k + 1:,} of {len(chosen):,}",
@@ -350,33 +307,14 @@ class Gallery(ABC):
             next=address(k + 1) if k is not None and k + 1 < len(chosen) else "",
             gallery=self._home(query),
             meshes={
-                "object": site.at(f"/mesh/object-{scene['objectCode']}.json"),
-                "links": [site.at(f"/mesh/{name}.json") for name in meshes],
+                "object": f"/mesh/object-{scene['objectCode']}.json",
+                "links": [f"/mesh/link-{number}.json" for number in range(scene["links"])],
             },
             problem=hand.problem,
             size=self.snapshot.config.camera.size,
             **self.identity(i),
             **values,
         )
-
-    def _values(self, shown: Places) -> list[dict[str, str]]:
-        """Return the numbers and words by which a page without a server filters and sorts."""
-        columns = {}
-        for name in (
-            *self.QUANTITIES,
-            *(name for name in self.SORTS if name not in self.QUANTITIES),
-        ):
-            factor = self.QUANTITIES[name].factor if name in self.QUANTITIES else 1
-            numbers = self.column(name)[shown] * factor
-            columns[name] = [f"{x:.9g}".replace("inf", "Infinity") for x in numbers.tolist()]
-        for name, values in self.CHOICES.items():
-            words = [""] * len(shown)
-            for value in values:
-                if value != "any":
-                    those = self.matches(name, value)[shown].tolist()
-                    words = [f"{w} {value}" if t else w for w, t in zip(words, those, strict=True)]
-            columns[name] = [word.strip() for word in words]
-        return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
     def _address(self, i: int, query: Query) -> str:
         params = query.params()
@@ -386,8 +324,8 @@ class Gallery(ABC):
         params = query.params(**changes)
         return self.HOME + f"?{params}" * bool(params)
 
-    def _form(self, query: Query, site: Site) -> dict[str, Any]:
-        """Return the fields of the form for filters and order; files have a single outcome."""
+    def _form(self, query: Query) -> dict[str, Any]:
+        """Return the fields of the form for filters and order."""
         names = {"object": self.snapshot.names, "class": sorted(set(self.snapshot.classes))}
         # Fields with a list of options.
         selects = []
@@ -395,8 +333,7 @@ class Gallery(ABC):
             known = {n: n for n in names[name]} if name in names else self.options(name)
             any_ = "any" if query.default.get(name) else ""
             options = [(value, text, value == query[name]) for value, text in known.items()]
-            if not (any_ and site.static):
-                selects.append((name, title, [(any_, "any", not query[name]), *options]))
+            selects.append((name, title, [(any_, "any", not query[name]), *options]))
 
         # Numbers between two limits.
         ranges = []

@@ -20,9 +20,8 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.dataset.paths import DATA_FILES, shards_folder
+from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE, shards_folder
 from drakegrasp.dataset.schema import CERTIFICATE_FIELDS, SPLITS, TRIAL_FIELDS
-from drakegrasp.dataset.shards import ASSEMBLED_FIELDS
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points, unpack_pose
@@ -77,13 +76,12 @@ def read_rows(
     Args:
         snapshot: State of the files.
         places: Indices of the attempts in the table.
-        names: Names of the columns; if None, all except those of the whole dataset.
+        names: Names of the columns; all if None.
 
     Raises:
         DataError: If a file was replaced in the meantime.
     """
-    own = [f.name for f in TRIAL_FIELDS if f.name not in ASSEMBLED_FIELDS]
-    columns = snapshot.trials[places].columns(names or own)
+    columns = snapshot.trials[places].columns(names or [f.name for f in TRIAL_FIELDS])
     return [
         dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)
     ]
@@ -218,12 +216,11 @@ def read_certificate(snapshot: Snapshot, i: int) -> dict[str, float]:
     Raises:
         DataError: If a file was replaced in the meantime.
     """
-    group, key = ("successes", "trial_id") if snapshot.assembled else ("looks", "row")
-    part, row = snapshot.trials.part_of(i)
     try:
-        with open_hdf5(part.path) as file:
-            (found,) = np.nonzero(file[group][key][:] == row)
-            certificate = {f.name: float(file[group][f.name][found[0]]) for f in CERTIFICATE_FIELDS}
+        with open_hdf5(snapshot.out / TRIALS_FILE) as file:
+            successes = file["successes"]
+            (found,) = np.nonzero(successes["trial_id"][:] == i)
+            certificate = {f.name: float(successes[f.name][found[0]]) for f in CERTIFICATE_FIELDS}
     except (OSError, KeyError, ValueError, IndexError):
         certificate = {f.name: float("nan") for f in CERTIFICATE_FIELDS}
     snapshot.refuse_replaced()

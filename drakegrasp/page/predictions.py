@@ -31,7 +31,7 @@ from drakegrasp.dataset.trials import Stamp, stamp
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.outcomes import Outcome
-from drakegrasp.page.attempts import name_of, words_of
+from drakegrasp.page.attempts import words_of
 from drakegrasp.page.catalog import Snapshot
 from drakegrasp.page.gallery import Gallery, Places, Query
 from drakegrasp.page.looks import (
@@ -196,6 +196,8 @@ class Predictions(Gallery):
         snapshot, camera = self.snapshot, self.rows.camera
         places, cards = self._places[shown].tolist(), []
         rows, verdicts = read_rows(snapshot, places, THUMBNAIL), self.read(shown.tolist(), ON_CARDS)
+        # A number that no prediction has, as a confidence, is left out.
+        there = [name for name in _CARD if not np.isnan(self.table[name]).all()]
 
         for i, at, row, verdict in zip(shown.tolist(), places, rows, verdicts, strict=True):
             marks, size = self._marks(verdict, row, camera), snapshot.config.camera.size
@@ -208,7 +210,7 @@ class Predictions(Gallery):
                     "verdict": self._verdict(i),
                     "reason": verdict["reason"] or "",
                     "numbers": [
-                        (QUANTITIES[n].title, QUANTITIES[n].text(self.table[n][i])) for n in _CARD
+                        (QUANTITIES[n].title, QUANTITIES[n].text(self.table[n][i])) for n in there
                     ],
                 }
             )
@@ -235,7 +237,7 @@ class Predictions(Gallery):
             "verdict": self._verdict(i),
             "reason": verdict.get("reason") or "",
             "hints": verdict.get("hints") or "",
-            "trial": name_of(snapshot, at),
+            "trial": f"trial {at}",
             "row_words": [_outcome(row["outcome"]), *words_of(snapshot, at)],
             "row_page": f"/grasp/{snapshot.label(at)}",
             "views": views,
@@ -321,7 +323,7 @@ def _matched(path: Path, file: h5py.File, snapshot: Snapshot, names: list[str]) 
     rows = read_predicted_rows(file)
     if rows is None:
         raise DataError(f"{path}: must say which rows of a dataset it is for, got none; {again}")
-    if not snapshot.assembled or rows.shards != snapshot.trials.attributes.get("shards"):
+    if rows.shards != snapshot.trials.attributes.get("shards"):
         raise DataError(f"{path}: must be for {snapshot.out} as it is now, got another; {again}")
 
     # The rows must exist, and have the objects that the verdicts name.

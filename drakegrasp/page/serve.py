@@ -47,16 +47,15 @@ def serve(
     """
     # Check everything first; the page must be fast from its first request on.
     inspection = Inspection(out, results)
-    listener = listen(port)
-    inspection.warm_up()
-
-    page = "" if results is None else "predictions"
-    address = f"http://{LOOPBACK}:{listener.getsockname()[1]}/{page}"
-    config = server_config(make_app(inspection))
-    announce(address)
-    if browser and has_screen():
-        webbrowser.open(address)
-    uvicorn.Server(config).run(sockets=[listener])
+    with listen(port) as listener:
+        inspection.warm_up()
+        page = "" if results is None else "predictions"
+        address = f"http://{LOOPBACK}:{listener.getsockname()[1]}/{page}"
+        config = server_config(make_app(inspection))
+        announce(address)
+        if browser and has_screen():
+            webbrowser.open(address)
+        uvicorn.Server(config).run(sockets=[listener])
 
 
 def server_config(app: Any) -> uvicorn.Config:

@@ -10,15 +10,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from drakegrasp.errors import counted
-from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
-from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.style import INK, PREDICTED, png_bytes, shortened
 
 #: Colours of groups of grasps (Okabe and Ito), and of failures.
@@ -43,23 +40,6 @@ _OWN = (PREDICTED, "#56B4E9")
 LONGEST = 28
 #: Width that the caption needs [in].
 NARROWEST = 7.6
-
-
-def draw_codes(
-    counts: Sequence[int] | npt.NDArray[np.int64], first: Outcome | Removal, what: str
-) -> tuple[Figure, dict[str, int]]:
-    """Return the counts of each code that occurs, as a bar chart and as numbers.
-
-    Args:
-        counts: Counts by code.
-        first: The desired code, which is shown first.
-        what: What is counted, e.g. "attempts".
-    """
-    shown = [code for code in type(first) if counts[code] or code is first]
-    shown.sort(key=lambda code: (code is not first, -counts[code]))
-    names = {code: "samples" if code is Removal.KEPT else code.label for code in shown}
-    numbers = {names[code]: int(counts[code]) for code in shown}
-    return draw_counts(numbers, what), numbers
 
 
 def draw_counts(

@@ -238,7 +238,7 @@ def png_bytes(figure: Figure, *, dpi: int) -> bytes:
     return buffer.getvalue()
 
 
-def svg_bytes(figure: Figure, *, dpi: int = 72) -> bytes:
+def svg_bytes(figure: Figure, *, dpi: int) -> bytes:
     """Return a figure as SVG; the same figure produces the same bytes.
 
     Args:

@@ -17,6 +17,9 @@ import uvicorn
 from playwright.sync_api import sync_playwright
 
 from drakegrasp.page.app import Inspection, make_app
+from drakegrasp.page.attempts import Attempts
+from drakegrasp.page.predictions import Predictions
+from drakegrasp.page.scenes import Scenes
 from drakegrasp.page.serve import listen
 
 #: Chromium cannot use its sandbox when it runs as root; the CPU computes WebGL.
@@ -51,23 +54,22 @@ def main(argv: Sequence[str] | None = None) -> None:
         browser = driver.chromium.launch(executable_path=program, args=list(OPTIONS))
         page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
         page.set_default_timeout(PATIENCE)
-        for gallery, grasp, path in (
-            ("gallery", "grasp", "/?split=samples"),
-            ("scenes", "scene", "/scenes?split=train&sort=tested"),
-            ("predictions", "prediction", "/predictions?verdict=held&sort=true_error"),
+        for kind, name, path in (
+            (Attempts, "gallery", "/?split=samples"),
+            (Scenes, "scenes", "/scenes?split=train&sort=tested"),
+            (Predictions, "predictions", "/predictions?verdict=held&sort=true_error"),
         ):
-            site = inspection.site()
-            if not {"scenes": site.scened, "predictions": site.predicted}.get(gallery, True):
+            if kind not in inspection.galleries():
                 continue
             page.goto(f"{address}{path}")
             page.wait_for_load_state("networkidle")
-            page.screenshot(path=arguments.pictures / f"inspect_{gallery}.png")
-            if grasp == "prediction":
+            page.screenshot(path=arguments.pictures / f"inspect_{name}.png")
+            if kind is Predictions:
                 page.select_option("#theme", "dark")
             page.click("#cards a")
             page.wait_for_selector("#view3d[data-ready]")
             page.wait_for_load_state("networkidle")
-            page.screenshot(path=arguments.pictures / f"inspect_{grasp}.png")
+            page.screenshot(path=arguments.pictures / f"inspect_{kind.ROW}.png")
         browser.close()
     server.should_exit = True
     thread.join()

@@ -47,6 +47,9 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DrakegraspError
+from drakegrasp.page.app import Inspection
+from drakegrasp.page.attempts import Attempts
+from drakegrasp.page.gallery import PAGE
 from drakegrasp.runtime.progress import progress_bar
 
 #: Memory that a process may use in addition to this one's [byte], its CPU time [s], and the
@@ -211,6 +214,16 @@ def load(out: Path) -> None:
     sys.stdout.write(digest.hexdigest() + "\n")
 
 
+def look(out: Path) -> None:
+    """Make the first gallery of `inspect`, and the pages of its attempts."""
+    inspection = Inspection(out)
+    table, query = inspection.table(Attempts), Attempts.query()
+    chosen = table.select(query)
+    table.gallery_page(query, chosen, [Attempts])
+    for i in chosen[:PAGE].tolist():
+        table.row_page(i, query, chosen, [Attempts], inspection.hand)
+
+
 def commands(everything: bool, assembled: bool) -> dict[str, Callable[[Path], object]]:
     """Return the readers of a dataset by name; `assemble`, which also writes, comes last.
 
@@ -235,7 +248,7 @@ def commands(everything: bool, assembled: bool) -> dict[str, Callable[[Path], ob
         readers |= {
             "replay": say("replay", "OUT", "--trial", "0"),
             "figures": say("figures", "OUT", "--out", "OUT/pictures"),
-            "inspect": say("inspect", "OUT", "--static", "OUT/page"),
+            "inspect": look,
             "export": say("export", "OUT", "OUT/exported", "--to", "glb"),
             "verify": say(
                 *("verify", "OUT/grasping_oto.hdf5", "--dataset", "OUT/grasping_oto.hdf5"),

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import uvicorn
 import yaml
 from click.testing import CliRunner, Result
 from helpers.bad_inputs import array_kinds, hdf5_kinds, manifests, text_kinds
@@ -26,6 +27,7 @@ from helpers.tiers import in_second_tier
 
 from drakegrasp.cli.main import main
 from drakegrasp.hand.files import MODELS
+from drakegrasp.page.attempts import Attempts
 
 MANIFEST, REJECT = "manifest.json", "reject.json"
 SHARD = "shards/1_box_a/0000000-0000002.h5"
@@ -47,7 +49,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "check FILE": ("check", "{out}/{file}", "--workers", "1"),
     "replay": ("replay", "{out}", "--trial", "0"),
     "figures": ("figures", "{out}", "--out", "{to}/figures", "--quiet"),
-    "inspect": ("inspect", "{out}", "--static", "{to}/site"),
+    "inspect": ("inspect", "{out}", "--port", "0", "--no-browser"),
     "export original": ("export", "{out}", "{to}/original", "--to", "original", "--quiet"),
     "export hf": ("export", "{out}", "{to}/hf", "--to", "hf", "--quiet"),
     "export dexgraspbench": ("export", "{out}", "{to}/dex", "--to", "dexgraspbench", "--quiet"),
@@ -71,6 +73,21 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (base / "manifest.json").write_text(json.dumps({**manifest, "rejected": [key]}))
     (base / "reject.json").write_text(json.dumps({"version": 1, "rejected": [key], "kept": [key]}))
     return base
+
+
+@pytest.fixture(autouse=True)
+def no_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `inspect` make the pages of all attempts, and end, in place of serving them."""
+
+    def make_pages(server: uvicorn.Server, sockets: object) -> None:
+        inspection = server.config.app.state.inspection  # type: ignore[union-attr]
+        table, query = inspection.table(Attempts), Attempts.query({"outcome": "any"})
+        chosen = table.select(query)
+        table.gallery_page(query, chosen, [Attempts])
+        for i in chosen.tolist():
+            table.row_page(i, query, chosen, [Attempts], inspection.hand)
+
+    monkeypatch.setattr(uvicorn.Server, "run", make_pages)
 
 
 #: A bad input is refused within this computing time, and by the clock of a busy machine [s].

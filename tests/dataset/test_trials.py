@@ -238,8 +238,6 @@ def test_attempts_in_shards_are_those_of_the_file(sound: Path) -> None:
         np.testing.assert_array_equal(building[name], whole[name])
     assert (building["removal"] == NONE).all()
     assert (building["split"] == NONE).all()
-    part, row = building.part_of(15)
-    assert (part.header, row) == (parts[2].header, 3)
 
 
 def test_the_working_directory_may_change(

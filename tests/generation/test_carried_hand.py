@@ -14,6 +14,8 @@ from helpers.commands import error_line, run
 from helpers.datasets import edit_manifest
 from helpers.hands import write_tongs
 from helpers.machine import needs_egl
+from helpers.pages import state_of
+from starlette.testclient import TestClient
 
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
@@ -23,6 +25,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
+from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.pictures.still_scene import StillScene, link_surfaces
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.shapes.catalog import builtin_sources
@@ -112,15 +115,12 @@ def test_an_export_has_the_links_of_the_hand(passed_on: Path, tmp_path: Path) ->
     assert any("left_tip" in name for name in scene.graph.nodes)
 
 
-def test_the_page_without_a_server_shows_the_hand(
-    passed_on: Path, shapes: dict[str, bytes], tmp_path: Path
-) -> None:
-    result = run("inspect", passed_on, "--static", tmp_path / "site")
-    assert result.exit_code == 0, result.output
-    for number, surface in enumerate(shapes.values()):
-        assert surface.decode() in (tmp_path / "site" / "mesh" / f"link-{number}.js").read_text()
-    pages = [page.read_text() for page in (tmp_path / "site" / "grasp").glob("*.html")]
-    assert pages and not any("the hand cannot be shown" in page for page in pages)
+def test_the_page_shows_the_hand(passed_on: Path, shapes: dict[str, bytes]) -> None:
+    with TestClient(make_app(Inspection(passed_on)), base_url="http://127.0.0.1") as client:
+        for number, surface in enumerate(shapes.values()):
+            assert client.get(f"/mesh/link-{number}.json").content == surface
+        page = client.get(f"/grasp/{state_of(client).label(0)}")
+    assert page.status_code == 200 and "the hand cannot be shown" not in page.text
 
 
 def test_it_names_the_hand_its_joints_and_its_licence(passed_on: Path) -> None:

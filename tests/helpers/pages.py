@@ -6,7 +6,6 @@ import base64
 import json
 import re
 from html.parser import HTMLParser
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -75,12 +74,3 @@ class Tags(HTMLParser):
 
     def handle_data(self, data: str) -> None:
         self.text += data
-
-
-def missing_files(page: Path) -> list[str]:
-    """Return the addresses of a page that is a file, meshes included, that are no files."""
-    text = page.read_text(encoding="utf-8")
-    found = [str(a[n]) for _, a in Tags(text).tags for n in ("src", "href") if a.get(n)]
-    found += re.findall(r'"((?:\.\./)?mesh/[^"]+)"', text)
-    assert found
-    return [address for address in found if not (page.parent / address).is_file()]

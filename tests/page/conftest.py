@@ -46,9 +46,3 @@ def inspection(out: Path) -> Inspection:
 def client(inspection: Inspection) -> Iterator[TestClient]:
     with TestClient(make_app(inspection), base_url="http://127.0.0.1:8321") as client:
         yield client
-
-
-@pytest.fixture
-def without_plots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw no plots, whose drawing takes most of the time of the pages of a few grasps."""
-    monkeypatch.setitem(make_app.__globals__, "plot_svg", lambda *_: b"<svg/>")

@@ -12,7 +12,7 @@ import pytest
 from drakegrasp.dataset.rejections import AttemptKey, read_decisions
 from drakegrasp.errors import DataError
 from drakegrasp.page import actions
-from drakegrasp.page.actions import LOCK_NAME, DecisionFile, Recordings, Rerun, Undo
+from drakegrasp.page.actions import LOCK_NAME, DecisionFile, Recordings, Rerun, Step
 
 A, B = AttemptKey("1_box_a", 0, 0), AttemptKey("3_brick", 1, 0)
 #: Many decisions of one process.
@@ -36,34 +36,22 @@ def test_two_servers_lose_no_decision(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["reject.json"]
 
 
-def test_undo_leaves_what_another_server_decided_since(tmp_path: Path) -> None:
-    ours, theirs = DecisionFile(tmp_path), DecisionFile(tmp_path)
-    ours.decide(B, "kept")
-    ours.decide(A, "rejected")
-    theirs.decide(A, "kept")
-    assert ours.undo() == Undo(A, "kept", done=False)
-    assert ours.read().of(A) == "kept"
-    # The decision before is still undone.
-    assert ours.undo() == Undo(B, "", done=True)
-    assert ours.undo() is None
-
-
-def test_each_page_undoes_its_own_and_an_equal_decision_is_none(tmp_path: Path) -> None:
+def test_the_last_decision_is_undone_once(tmp_path: Path) -> None:
     file = DecisionFile(tmp_path)
-    for key, page in ((A, "first"), (A, "first"), (B, "second")):
-        file.decide(key, "rejected", page)
-    assert file.undo("third") is None
-    assert file.undo("first") == Undo(A, "", done=True)
-    assert file.undo("first") is None
+    assert file.undo() is None
+    for key in (B, A, A):  # an equal decision is none
+        file.decide(key, "rejected")
+    assert file.undo() == Step(A, "", "rejected")
+    assert file.undo() is None
     assert file.read().rejected == {B}
 
 
-def test_few_pages_are_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(actions, "KEPT_PAGES", 2)
-    file = DecisionFile(tmp_path)
-    for page in ("first", "second", "third"):
-        file.decide(A, "rejected" if page == "second" else "kept", page)
-    assert file.undo("first") is None
+def test_undo_leaves_what_another_server_decided_since(tmp_path: Path) -> None:
+    ours, theirs = DecisionFile(tmp_path), DecisionFile(tmp_path)
+    ours.decide(A, "rejected")
+    theirs.decide(A, "kept")
+    assert ours.undo() is None
+    assert ours.read().of(A) == "kept"
 
 
 def test_a_lock_that_stays_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""The attempts in memory: of assembled files, of a build that runs, of files that are missing."""
+"""The attempts in memory: of assembled files, and of files that are missing or replaced."""
 
 from __future__ import annotations
 
@@ -18,16 +18,9 @@ from drakegrasp.dataset.rejections import Decisions
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
-from drakegrasp.page import catalog as catalog_module
 from drakegrasp.page.attempts import Attempts
 from drakegrasp.page.catalog import FEATURES, Catalog
 from drakegrasp.page.looks import read_look, read_rows
-
-
-def build_again(out: Path) -> None:
-    """Take away what is assembled: a build that has done all units but not ended."""
-    for name in (TRIALS, OTO, OTM):
-        (out / name).unlink()
 
 
 def test_table_is_what_the_files_say(boxes: Path) -> None:
@@ -62,17 +55,13 @@ def test_attempts_are_found_by_their_label(boxes: Path) -> None:
         assert snapshot.find(label) is None
 
 
-@pytest.mark.parametrize("assembled", [True, False], ids=["assembled", "building"])
-def test_rows_and_images_are_those_of_the_attempt(out: Path, assembled: bool) -> None:
-    with h5py.File(out / TRIALS) as trials, h5py.File(out / OTM) as data:
+def test_rows_and_images_are_those_of_the_attempt(boxes: Path) -> None:
+    with h5py.File(boxes / TRIALS) as trials, h5py.File(boxes / OTM) as data:
         X_OG = trials["trials/X_OG"][15]
         split = next(s for s in data if 15 in data[s]["trial_id"][:])
         place = data[split]["trial_id"][:].tolist().index(15)
         image, mask = data[split]["images"][place], data[split]["masks"][place]
-    if not assembled:
-        build_again(out)
-    snapshot = Catalog(out).current()
-    assert snapshot.assembled is assembled
+    snapshot = Catalog(boxes).current()
     i = snapshot.find(coded(snapshot, "1-1-0"))
     assert i is not None
     (row,) = read_rows(snapshot, [i], ("X_OG",))
@@ -113,35 +102,6 @@ def test_data_files_alone_are_enough_for_images(out: Path) -> None:
     assert [line.split()[0] for line in snapshot.missing] == [OTM, "3"]
 
 
-def test_a_build_that_runs_shows_what_is_done(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    build_again(out)
-    hidden = out / "shards" / "3_brick"
-    hidden.rename(out / "later")
-    catalog = Catalog(out)
-    first = catalog.current()
-    assert first.table.count == 24
-    assert "4 of 6 work units are done" in first.missing[0]
-    assert first.trial_id(0) is None
-
-    # A new shard shows after a while, and the assembled files at once.
-    (out / "later").rename(hidden)
-    assert catalog.current() is first
-    monkeypatch.setattr(catalog_module, "LISTING_PERIOD", 0.0)
-    assert catalog.current().table.count == 36
-    assert catalog.current().table.held.sum() == 9
-    assemble(out)
-    assert catalog.current().assembled
-    assert catalog.current() is catalog.current()
-
-
-def test_a_build_that_has_done_nothing_yet_has_no_attempts(out: Path) -> None:
-    build_again(out)
-    shutil.rmtree(out / "shards")
-    table = Catalog(out).current().table
-    assert table.count == 0
-    assert table.candidate.dtype == np.int32
-
-
 def without_first(out: Path) -> Manifest:
     """Make the dataset one of the last two objects; return the manifest of all three."""
     whole = read_manifest(out)
@@ -149,22 +109,16 @@ def without_first(out: Path) -> Manifest:
     return whole
 
 
-@pytest.mark.parametrize("assembled", [True, False], ids=["assembled", "building"])
-def test_a_label_stays_that_of_its_attempt_when_objects_are_added(
-    out: Path, assembled: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_label_stays_that_of_its_attempt_when_objects_are_added(out: Path) -> None:
     """Another object comes first by its name, so the numbers of all others change."""
-    monkeypatch.setattr(catalog_module, "LISTING_PERIOD", 0.0)
-    build_again(out)
     whole = without_first(out)
-    if assembled:
-        assemble(out)
+    assemble(out)
     catalog = Catalog(out)
     before = catalog.current()
     labels = {before.label(i): before.key(i) for i in range(before.table.count)}
     write_manifest(whole, out)
-    if assembled:
-        assemble(out)
+    assert catalog.current() is before  # the files are still those of before
+    assemble(out)
     after = catalog.current()
     assert after.table.count == len(labels) + 12
     for label, key in labels.items():
@@ -183,24 +137,6 @@ def test_a_label_of_another_mesh_or_configuration_is_another(boxes: Path) -> Non
         assert other.find(label) is None
 
 
-def test_attempts_stay_with_their_objects_when_the_manifest_grows(
-    out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(catalog_module, "LISTING_PERIOD", 0.0)
-    build_again(out)
-    whole = without_first(out)
-    catalog = Catalog(out)
-    assert [catalog.current().key(i).object for i in (0, 12)] == ["2_box_b", "3_brick"]
-    write_manifest(whole, out)
-    grown = catalog.current()
-    assert [grown.key(i).object for i in (0, 12, 24)] == ["1_box_a", "2_box_b", "3_brick"]
-    np.testing.assert_array_equal(grown.table.object, Catalog(out).current().table.object)
-
-    # And when it shrinks: what is gone is not kept.
-    write_manifest(replace(whole, objects=whole.objects[1:]), out)
-    assert catalog.current().table.count == 24
-
-
 def test_a_file_that_was_replaced_is_not_read_as_the_one_before(out: Path) -> None:
     """By row the files would give the numbers and images of other attempts."""
     whole = without_first(out)
@@ -217,47 +153,12 @@ def test_a_file_that_was_replaced_is_not_read_as_the_one_before(out: Path) -> No
     assert len(read_rows(catalog.current(), [0], ("slip",))) == 1
 
 
-def test_a_shard_of_another_mesh_is_not_read_as_the_one_before(out: Path) -> None:
-    build_again(out)
-    before = Catalog(out).current()
-    for i in range(0, before.table.count, 6):
-        part, _ = before.trials.part_of(i)
-        with h5py.File(part.path, "r+") as file:
-            file.attrs["mesh_sha256"] = "0" * 64
-    with pytest.raises(DataError, match="must be a shard of"):
-        read_rows(before, [0], ("slip",))
-    assert read_look(before, 0, "oto") is None
-
-
-def test_a_damaged_shard_is_named_and_the_others_are_shown(out: Path) -> None:
-    build_again(out)
-    path = next((out / "shards" / "2_box_b").iterdir())
-    path.write_bytes(path.read_bytes()[:1000])
-    snapshot = Catalog(out).current()
-    assert snapshot.table.count == 30
-    assert snapshot.missing[1].startswith("Damaged, and not shown: shards/2_box_b/")
-    assert "5 of 6 work units are done" in snapshot.missing[0]
-
-
-def test_files_of_an_earlier_state_are_told(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A build went on with another object: the files are still those of before."""
-    monkeypatch.setattr(catalog_module, "LISTING_PERIOD", 0.0)
-    whole = without_first(out)
-    assemble(out)
-    catalog = Catalog(out)
-    assert catalog.current().missing == ()
-    hidden = out / "shards" / "1_box_a"
-    hidden.rename(out / "later")
-    write_manifest(whole, out)
-    assert catalog.current().missing == ()  # no unit is newer yet
-    (out / "later").rename(hidden)
-    first = catalog.current()
-    assert "2 work units are newer" in first.missing[0]
-    assert first.table.count == 24
-    assert catalog.current() is first
-    assemble(out)
-    assert catalog.current().missing == ()
-    assert catalog.current().table.count == 36
+def test_a_shard_of_another_mesh_has_no_images_of_an_attempt(out: Path) -> None:
+    assemble(out, rejected=[0])
+    (path,) = sorted(out.glob("shards/*/0000000-*.h5"))[:1]
+    with h5py.File(path, "r+") as file:
+        file.attrs["mesh_sha256"] = "0" * 64
+    assert read_look(Catalog(out).current(), 0, "oto") is None
 
 
 def test_a_contact_without_a_normal_has_the_largest_angle(out: Path) -> None:

@@ -46,7 +46,6 @@ def certified(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("gallery", "/?object=1_box_a&outcome=any&sort=row&order=up"),
         ("grasp", "/grasp/1-3-2?sort=slip"),
         ("grasp_failed", "/grasp/0-1-1?outcome=any"),
-        ("plots", "/plots"),
         ("predictions", "/predictions?sort=row&order=up"),
         ("prediction", "/prediction/1"),
         ("prediction_not_closed", "/prediction/2"),

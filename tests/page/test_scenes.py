@@ -12,15 +12,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from helpers.pages import Tags, missing_files, state_of
+from helpers.pages import Tags, state_of
 from PIL import Image
 from starlette.testclient import TestClient
 
 from drakegrasp.generation.scenes import make_scenes
-from drakegrasp.page import site as site_module
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.page.scenes import FAILS, HOLDS, UNKNOWN
-from drakegrasp.page.site import write_site
 
 pytestmark = pytest.mark.sim
 
@@ -174,36 +172,7 @@ def test_file_that_cannot_be_shown_is_a_line(
         assert 'href="/scenes"' in client.get("/").text
 
 
-@pytest.mark.usefixtures("without_plots")
-def test_files_without_a_server_say_what_cannot_be_shown(
-    spoiled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """And hold all else."""
-    monkeypatch.setattr(site_module, "MAX_GRASPS", 1)
-    damage(spoiled / "scenes.hdf5")
-    write_site(spoiled, tmp_path / "site")
-    index = Tags((tmp_path / "site" / "index.html").read_text(encoding="utf-8")).text
-    assert "Scenes are left out" in index and "must be the scenes of a dataset, got none" in index
-    assert not (tmp_path / "site" / "scenes.html").exists()
-
-
 def test_without_scenes_there_is_no_link(boxes: Path, tmp_path: Path) -> None:
     with TestClient(make_app(Inspection(boxes)), base_url="http://127.0.0.1:8321") as client:
         assert "scenes" not in client.get("/").text
         assert client.get("/scenes").status_code == 404
-
-
-@pytest.mark.usefixtures("without_plots")
-def test_every_address_of_the_files_is_there(
-    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Few trials have a page, and few objects a grasp with one.
-    monkeypatch.setattr(site_module, "MAX_GRASPS", 1)
-    write_site(made, tmp_path / "site")
-    pages = [tmp_path / "site" / "scenes.html", *(tmp_path / "site" / "scene").iterdir()]
-    assert len(pages) == 4
-    for page in pages:
-        assert missing_files(page) == []
-        text = page.read_text(encoding="utf-8")
-        shown = 3 if page.name == "scenes.html" else text.count("<figure>")
-        assert len(re.findall('href="[^"]*view/', text)) == shown

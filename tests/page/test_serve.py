@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 import uvicorn
 from click.testing import CliRunner
+from helpers.datasets import TRIALS
 
 from drakegrasp.cli.main import main
 from drakegrasp.page import serve as serving
@@ -84,12 +85,22 @@ def test_a_taken_port_is_one_line(boxes: Path) -> None:
 
 
 def test_a_directory_without_a_dataset_is_one_line(tmp_path: Path) -> None:
-    for option in ([], ["--static", str(tmp_path / "site")]):
-        result = CliRunner().invoke(main, ["inspect", str(tmp_path / "none"), *option])
-        assert result.exit_code == 1
-        assert result.stderr.startswith("error: ")
-        assert "must be the directory of a dataset" in result.stderr
+    result = CliRunner().invoke(main, ["inspect", str(tmp_path / "none")])
+    assert result.exit_code == 1
+    assert result.stderr.startswith("error: ")
+    assert "must be the directory of a dataset" in result.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_a_build_that_has_not_ended_is_one_line_that_says_how_to_end_it(out: Path) -> None:
+    (out / TRIALS).unlink()
+    result = CliRunner().invoke(main, ["inspect", str(out)])
+    assert result.exit_code == 1
+    (line,) = result.stderr.splitlines()
+    assert line == (
+        f"error: {out}: must be a finished dataset, got one without trials.hdf5; finish it first, "
+        "with the same command that began to build it"
+    )
 
 
 @pytest.mark.parametrize("library", ["starlette", "uvicorn", "jinja2", "h11"])

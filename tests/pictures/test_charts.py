@@ -40,7 +40,7 @@ def test_the_objects_with_most_grasps_are_drawn() -> None:
     labels = [text.get_text() for text in figure.axes[0].get_yticklabels()]
     assert len(labels) == MAX_OBJECTS
     assert labels[0] == f"object {number - 1}"
-    assert b"<svg" in svg_bytes(figure)
+    assert b"<svg" in svg_bytes(figure, dpi=72)
 
 
 def test_what_is_beyond_a_histogram_is_in_its_last_bin() -> None:
@@ -57,9 +57,9 @@ def test_what_is_beyond_a_histogram_is_in_its_last_bin() -> None:
 @pytest.mark.parametrize("name", ["<script>alert(1)</script>", "a $x^2$ b", "$", "ä & ö"])
 def test_names_are_drawn_as_they_are(name: str) -> None:
     counts = {"samples": [1]}
-    svg = svg_bytes(draw_objects([name], counts)).decode()
+    svg = svg_bytes(draw_objects([name], counts), dpi=72).decode()
     assert "<script" not in svg
-    assert svg == svg_bytes(draw_objects([name], counts)).decode()
+    assert svg == svg_bytes(draw_objects([name], counts), dpi=72).decode()
 
 
 def test_panels_of_a_card_state_what_they_draw(monkeypatch: pytest.MonkeyPatch) -> None:

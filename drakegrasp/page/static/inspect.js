@@ -6,10 +6,6 @@
   const grasp = document.getElementById("grasp");
   let busy = false;
 
-  // Undo goes through the decisions of this tab, whatever others decide meanwhile.
-  const page = (token && sessionStorage.getItem("page")) || String(Math.random());
-  if (token) sessionStorage.setItem("page", page);
-
   function say(text, kind = "bad") {
     message.textContent = text;
     message.className = kind;
@@ -65,7 +61,7 @@
     return act(async () => {
       const now = element.dataset.decision || (element.classList.contains(decision) ? decision : "");
       const wanted = now === decision && !advance ? "" : decision;
-      const result = await post("/decide", { label: element.dataset.label, decision: wanted, page });
+      const result = await post("/decide", { label: element.dataset.label, decision: wanted });
       show(element, wanted);
       count(result.counts);
       if (advance) go("next");
@@ -74,12 +70,11 @@
 
   function undo() {
     return act(async () => {
-      const result = await post("/undo", { page });
+      const result = await post("/undo", {});
       if (result.name === null) return say("Nothing to undo.", "good");
       count(result.counts);
       const card = document.querySelector(`[data-label="${result.label}"]`);
       if (card) show(card, result.decision);
-      if (!result.done) return say(`Not undone, decided otherwise since (${result.decision || "open"}): ${result.name}`);
       if (card || result.label === null) return say(`Undone: ${result.name}`, "good");
       location.href = `/grasp/${result.label}${location.search}`;
     });

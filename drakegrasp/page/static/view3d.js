@@ -140,32 +140,15 @@
     draw();
   }
 
-  // A page that is a file may not read other files: there a mesh is a script.
-  window.drakegraspMeshes = window.drakegraspMeshes || {};
-  async function read(url) {
-    if (url.endsWith(".json")) {
-      const answer = await fetch(url);
-      if (!answer.ok) throw new Error(`${url}: ${answer.status}`);
-      return answer.json();
-    }
-    await new Promise((done, failed) => {
-      const script = document.createElement("script");
-      script.src = url;
-      script.onload = done;
-      script.onerror = () => failed(new Error(`${url} is missing`));
-      document.head.append(script);
-    });
-    const name = url.split("/").pop().replace(/\.js$/, "");
-    return window.drakegraspMeshes[name];
-  }
-
   // Numbers of four bytes, in base64.
   function numbers(text, Kind) {
     return new Kind(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
   }
 
   async function load(url, group) {
-    for (const part of await read(url)) {
+    const answer = await fetch(url);
+    if (!answer.ok) throw new Error(`${url}: ${answer.status}`);
+    for (const part of await answer.json()) {
       const surface = new THREE.BufferGeometry();
       surface.setAttribute("position", new THREE.BufferAttribute(numbers(part.vertices, Float32Array), 3));
       surface.setIndex(new THREE.BufferAttribute(numbers(part.faces, Uint32Array), 1));

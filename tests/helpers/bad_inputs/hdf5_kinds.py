@@ -131,7 +131,7 @@ def group_kinds(groups: Sequence[str]) -> Iterator[Kind]:
 
 #: Wrong values of an attribute.
 ATTRIBUTES: dict[str, Any] = {
-    "a number": 5,
+    "a number": 55,
     "a text": "x",
     "empty": "",
     "an array": np.zeros((2, 2)),
