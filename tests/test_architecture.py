@@ -87,7 +87,7 @@ READERS = (
     *("grasp", "dataset.schema", "dataset.shards", "dataset.reader", "dataset.trials"),
     "dataset.scenes",
 )
-CHECKERS = ("dataset.checks.run", "dataset.assemble")
+CHECKERS = ("dataset.check", "dataset.assemble")
 
 
 def modules() -> dict[str, Path]:
