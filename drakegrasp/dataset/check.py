@@ -19,7 +19,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from drakegrasp.config import CarriedHand
+from drakegrasp.config import CarriedHand, parse_stored
 from drakegrasp.dataset.assembly.survey import (
     file_attributes,
     headers_by_object,
@@ -59,12 +59,13 @@ from drakegrasp.dataset.shards import ShardHeader, open_shard
 from drakegrasp.dataset.trials import Trials, stamp
 from drakegrasp.errors import DataError, DrakegraspError, first_line
 from drakegrasp.filters import Removal
-from drakegrasp.foreign_files import read_json
+from drakegrasp.foreign_files import parse_json, read_json
 from drakegrasp.hand.folder import HAND_FOLDER, hand_digest
 from drakegrasp.objects.model import load_object
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.files import refuse_broken_seal
 from drakegrasp.runtime.progress import Report, silent
+from drakegrasp.vision.camera import intrinsics
 
 __all__ = ["Violation", "check_dataset"]
 
@@ -76,8 +77,9 @@ KINDS: Mapping[str, tuple[Mapping[str, Rule], Tables]] = {
     "trials": (ORIGIN, TRIAL_TABLES),
     "views": (OF_SCENES, SCENE_TABLES),
 }
-#: Attributes that tell the state of a dataset which a file is of: a cause of other differences.
-STATE = ("signature", "shards")
+#: Attributes of the state of a dataset that a file is of, a cause of other differences first;
+#: scenes have the first two.
+STATE = ("signature", "shards", "camera", "split_by", "versions", "fingers", "joints")
 
 #: A part of the check that runs in any process.
 Task = Callable[[], list[Violation]]
@@ -175,6 +177,7 @@ def _look_at(path: Path, file: h5py.File, kind: str) -> _Look:
         Violation(file=path.name, what=each.what, got=each.got)
         for each in attribute_mistakes(file, rules).values()
     ]
+    found += [] if found else _attributes(path.name, file.attrs, scenes=kind == "views")
     # A group with an invalid column is not read; without sound attributes, nothing is.
     broken = {*tables} if found else set[str]()
     for each in differences(file, tables, thorough=True):
@@ -189,6 +192,30 @@ def _look_at(path: Path, file: h5py.File, kind: str) -> _Look:
         attributes=dict(file.attrs),
         found=found,
     )
+
+
+def _attributes(name: str, attributes: Mapping[str, Any], *, scenes: bool) -> Iterator[Violation]:
+    """The attributes that follow from the configuration agree with it.
+
+    Args:
+        name: Name of the file.
+        attributes: Attributes that each are as their rules say.
+        scenes: Whether the file is scenes.hdf5, whose cameras have settings of their own.
+    """
+    try:
+        config = parse_stored(parse_json(attributes["config"]))
+    except ValueError as error:
+        what = "attribute config must be a configuration of drakegrasp"
+        yield Violation(file=name, what=what, got=f"another ({first_line(error)})")
+        return
+    lens = config.scenes if scenes else config.camera
+    due: dict[str, Any] = {"config_hash": config.simulation_hash(), "seed": config.seed}
+    due |= {"near": lens.near, "far": lens.far}
+    due |= {} if scenes else {"K": intrinsics(config.camera)}
+    for key, value in due.items():
+        if not np.array_equal(attributes[key], value):
+            got = " ".join(str(attributes[key]).split())
+            yield Violation(file=name, what=f"attribute {key} must be that of its config", got=got)
 
 
 def _look_at_one(path: Path) -> tuple[list[Violation], list[Task]]:
@@ -256,22 +283,15 @@ def _other_state(look: _Look, due: Mapping[str, Any]) -> Iterator[Violation]:
         due: The attributes that the file would be written with now; `shards` is empty if a shard is
             missing.
     """
-    scenes, name = "views" in look.tables, look.path.name
-    for key in (*STATE, *(key for key in due if key not in STATE)):
-        # The section `verify` of a configuration may have changed since; wording may improve; and
-        # scenes have settings of their own.
-        free = key in ("config", "schema_version") or key.startswith("convention_")
-        free |= (scenes and key not in STATE) or (key == "shards" and not due[key])
-        if free or key not in look.attributes or np.array_equal(look.attributes[key], due[key]):
-            continue
-        of = "the shards that are there" if key == "shards" else FILE_NAME
-        command = "scenes" if scenes else "assemble"
-        yield Violation(
-            file=name,
-            what=f"attribute {key} must be that of {of}",
-            got=f"another; run `drakegrasp {command}` again",
-        )
-        return  # other differences follow from this one
+    scenes, of = "views" in look.tables, {"shards": "the shards that are there"}
+    for key in STATE[:2] if scenes else STATE:
+        if due.get(key) and key in look.attributes and look.attributes[key] != due[key]:
+            yield Violation(
+                file=look.path.name,
+                what=f"attribute {key} must be that of {of.get(key, FILE_NAME)}",
+                got=f"another; run `drakegrasp {'scenes' if scenes else 'assemble'}` again",
+            )
+            return  # other differences follow from this one
 
 
 def _seal(path: Path) -> list[Violation]:
